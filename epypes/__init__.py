@@ -1,0 +1,110 @@
+"""EPypes: vision algorithms as computational graphs, seen, tuned, promoted and served.
+
+The rooms, from the bottom up; imports point downwards only (checked by ``lint-imports``):
+
+- ``errors``: every error EPypes raises
+- ``hints``: which values a hyperparameter may take
+- ``graph``: what is connected to what
+- ``run``: which functions must run, and running them
+- ``pipeline``: the paper's ladder of nodes and pipelines; ``acquisition``: where images come from;
+  ``display``: how a graph, a run and a value look; ``wire``: how a value travels
+- ``bundle``: from notebook to a folder of text; ``transport``: sockets
+- ``service``: a bundle as a running process
+- ``cli``: the commands; ``epypes_widgets``: the notebook front end
+
+Names are loaded when they are first used, so ``import epypes`` costs little and imports no other package.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from epypes import errors
+    from epypes.bundle import load, load_pipeline, promote
+    from epypes.graph import CompGraph
+    from epypes.hints import Param
+    from epypes.pipeline import (
+        EventLoop,
+        EventView,
+        FullPipeline,
+        Mailbox,
+        Node,
+        NodeBasedCompGraph,
+        Pipeline,
+        SinkPipeline,
+        SourcePipeline,
+    )
+    from epypes.run import CompGraphRunner, Failure, Plan, Run, RunReport, TokenManager
+    from epypes.run.guard import unguarded
+    from epypes.transport import ZMQPublisher, ZMQSubscriber
+
+_HOMES = {
+    "errors": "epypes",
+    "CompGraph": "epypes.graph",
+    "CompGraphRunner": "epypes.run",
+    "Failure": "epypes.run",
+    "Plan": "epypes.run",
+    "Run": "epypes.run",
+    "RunReport": "epypes.run",
+    "TokenManager": "epypes.run",
+    "unguarded": "epypes.run.guard",
+    "EventLoop": "epypes.pipeline",
+    "EventView": "epypes.pipeline",
+    "FullPipeline": "epypes.pipeline",
+    "Mailbox": "epypes.pipeline",
+    "Node": "epypes.pipeline",
+    "NodeBasedCompGraph": "epypes.pipeline",
+    "Param": "epypes.hints",
+    "Pipeline": "epypes.pipeline",
+    "SinkPipeline": "epypes.pipeline",
+    "SourcePipeline": "epypes.pipeline",
+    "ZMQPublisher": "epypes.transport",
+    "ZMQSubscriber": "epypes.transport",
+    "load": "epypes.bundle",
+    "load_pipeline": "epypes.bundle",
+    "promote": "epypes.bundle",
+}
+
+__version__ = "1.0.0.dev0"
+
+__all__ = [
+    "CompGraph",
+    "CompGraphRunner",
+    "EventLoop",
+    "EventView",
+    "Failure",
+    "FullPipeline",
+    "Mailbox",
+    "Node",
+    "NodeBasedCompGraph",
+    "Param",
+    "Pipeline",
+    "Plan",
+    "Run",
+    "RunReport",
+    "SinkPipeline",
+    "SourcePipeline",
+    "TokenManager",
+    "ZMQPublisher",
+    "ZMQSubscriber",
+    "errors",
+    "load",
+    "load_pipeline",
+    "promote",
+    "unguarded",
+]
+
+
+def __getattr__(name: str) -> Any:
+    home = _HOMES.get(name)
+    if home is None:
+        raise AttributeError(f"module 'epypes' has no attribute {name!r}")
+    value = importlib.import_module("epypes.errors") if name == "errors" else getattr(importlib.import_module(home), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

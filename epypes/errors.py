@@ -1,0 +1,225 @@
+"""Which errors EPypes raises, and what each one carries.
+
+Everything an error's text mentions is an attribute of it::
+
+    EpypesError
+    +-- GraphError              a graph can't be built; .findings lists every problem
+    +-- UnknownName             no such token, function, output ...; .name, .known
+    +-- NotComputed             a token has no value yet; .token
+    |   +-- StaleToken          a token's value is out of date; .token
+    +-- PayloadError            run() was given too little or the wrong tokens; .tokens
+    +-- HyperparameterError     a token can't be set, frozen or unfrozen; .token
+    +-- OutputArityError        a function returned another number of values; .function
+    +-- StillRunning            something did not stop in time; .name, .functions, .timeout_s
+    +-- MailboxOverflow         a mailbox with policy "fault" is full; .size
+    +-- LayoutUnavailable       no Graphviz engine answers; .tried
+    +-- ImageFileError          an image file can't be read or written; .path
+    +-- MessageError            a message can't be made or understood; .reason
+    +-- AddressError            an address can't be bound or connected to; .address
+    +-- BundleError             a bundle is not what it says; .path
+    |   +-- PromotionRefused    a graph can't become a bundle; .reasons
+    |   +-- ReplayDiffers       a bundle computes something else; .report
+    +-- ServiceError            a service can't start or can't be called; .path
+        +-- RemoteFailure       a function failed in the service; .function, .message
+
+The user's own exceptions are never wrapped: they keep their type and traceback and get a note.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from epypes.bundle.compare import ReplayReport
+
+
+class EpypesError(Exception):
+    """Every error of EPypes; catch it to catch them all."""
+
+    def __str__(self) -> str:
+        # KeyError shows the repr of its argument; a sentence should be shown as it is.
+        return str(self.args[0]) if self.args else type(self).__name__
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One problem of a graph.
+
+    Attributes
+    ----------
+    kind
+        ``"cycle"``, ``"two producers"``, ``"no io"``, ``"no function"``, ``"bad io"``, ``"arity"`` or
+        ``"not callable"``.
+    text
+        What is wrong and the way out, as a sentence.
+    names
+        The functions and tokens concerned.
+    """
+
+    kind: str
+    text: str
+    names: tuple[str, ...]
+
+
+class GraphError(EpypesError, ValueError):
+    """A graph can't be built; ``findings`` holds every problem that was found."""
+
+    def __init__(self, findings: Sequence[Finding]) -> None:
+        self.findings = tuple(findings)
+        super().__init__("\n".join(finding.text for finding in self.findings))
+
+
+class UnknownName(EpypesError, KeyError):
+    """A name that is not there, with the nearest one that is."""
+
+    def __init__(self, kind: str, name: object, known: Iterable[str], where: str = "in this graph") -> None:
+        self.kind, self.name, self.known, self.where = kind, name, tuple(known), where
+        super().__init__(f"No {kind} {name!r} {where}.{self._hint()}")
+
+    def _hint(self) -> str:
+        near = difflib.get_close_matches(str(self.name), self.known, n=1, cutoff=0.6)
+        if near:
+            return f" Did you mean {near[0]!r}?"
+        if not self.known:
+            return " There is none."
+        some = ", ".join(self.known[:12])
+        return f" There are: {some}{', ...' if len(self.known) > 12 else ''}."
+
+
+class NotComputed(EpypesError, KeyError):
+    """A token that has no value: it was not computed, or the function that makes it failed."""
+
+    def __init__(self, token: str, text: str) -> None:
+        self.token = token
+        super().__init__(text)
+
+
+class StaleToken(NotComputed):
+    """A token whose value is out of date, since something it depends on has changed."""
+
+    def __init__(self, token: str) -> None:
+        super().__init__(
+            token, f"Token {token!r} is stale: something it depends on has changed. Call rerun() first."
+        )
+
+
+class PayloadError(EpypesError, TypeError):
+    """``run()`` was called with missing or with wrong tokens; ``tokens`` names them."""
+
+    def __init__(self, tokens: Iterable[str], text: str) -> None:
+        self.tokens = tuple(tokens)
+        super().__init__(text)
+
+
+class HyperparameterError(EpypesError, TypeError):
+    """A token that can't be set as a hyperparameter."""
+
+    def __init__(self, token: str, text: str) -> None:
+        self.token = token
+        super().__init__(text)
+
+
+class OutputArityError(EpypesError, ValueError):
+    """A function with n output tokens returned something else than n values."""
+
+    def __init__(self, function: str, outputs: Sequence[str], got: str) -> None:
+        self.function, self.outputs, self.got = function, tuple(outputs), got
+        wanted = f"{len(self.outputs)} value{'s' if len(self.outputs) != 1 else ''} ({', '.join(self.outputs)})"
+        super().__init__(
+            f"Function {function!r} must return a tuple or list of {wanted}, but it returned {got}."
+        )
+
+
+class StillRunning(EpypesError, TimeoutError):
+    """Something did not stop in time; the functions that had not returned are named."""
+
+    def __init__(self, name: str, functions: Sequence[str], timeout_s: float) -> None:
+        self.name, self.functions, self.timeout_s = name, tuple(functions), timeout_s
+        busy = f": still in {', '.join(map(repr, self.functions))}" if self.functions else ""
+        super().__init__(f"{name!r} did not stop within {timeout_s:g} s{busy}. Its thread is a daemon.")
+
+
+class MailboxOverflow(EpypesError):
+    """A mailbox with policy ``"fault"`` was full."""
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        super().__init__(f"The mailbox is full ({size}) and its policy is 'fault'. Take faster, or drop.")
+
+
+class LayoutUnavailable(EpypesError):
+    """No Graphviz engine could lay out a graph."""
+
+    def __init__(self, tried: Sequence[str]) -> None:
+        self.tried = tuple(tried)
+        super().__init__(
+            "No Graphviz engine answered, so the graph is shown as text. "
+            f"Run: pip install 'epypes[notebook]'. Tried: {'; '.join(self.tried)}."
+        )
+
+
+class ImageFileError(EpypesError, OSError):
+    """An image file that can't be read or written."""
+
+    def __init__(self, path: str, text: str) -> None:
+        self.path = path
+        super().__init__(text)
+
+
+class MessageError(EpypesError, ValueError):
+    """A message that can't be made or can't be understood; ``reason`` is a short word to count by."""
+
+    def __init__(self, reason: str, text: str) -> None:
+        self.reason = reason
+        super().__init__(text)
+
+
+class AddressError(EpypesError, OSError):
+    """An address that can't be bound or connected to."""
+
+    def __init__(self, address: str, text: str) -> None:
+        self.address = address
+        super().__init__(text)
+
+
+class BundleError(EpypesError):
+    """A bundle that is not what it says it is."""
+
+    def __init__(self, path: object, text: str) -> None:
+        self.path = str(path)
+        super().__init__(text)
+
+
+class PromotionRefused(BundleError):
+    """A graph that can't become a bundle; ``reasons`` lists all of them."""
+
+    def __init__(self, path: object, reasons: Sequence[str]) -> None:
+        self.reasons = tuple(reasons)
+        super().__init__(path, "Not promoted:\n" + "\n".join(f"- {reason}" for reason in self.reasons))
+
+
+class ReplayDiffers(BundleError):
+    """A bundle that does not compute what was recorded; ``report`` has every difference."""
+
+    def __init__(self, path: object, report: ReplayReport) -> None:
+        self.report = report
+        super().__init__(path, f"{path} does not compute what was recorded:\n{report}")
+
+
+class ServiceError(EpypesError):
+    """A service that can't be started or can't be called."""
+
+    def __init__(self, path: object, text: str) -> None:
+        self.path = str(path)
+        super().__init__(text)
+
+
+class RemoteFailure(ServiceError):
+    """A function, f_in or f_out that failed in the service while it worked on this call's event."""
+
+    def __init__(self, path: object, function: str, exception: str, message: str) -> None:
+        self.function, self.exception, self.message = function, exception, message
+        super().__init__(path, f"Function {function!r} failed in the service: {exception}: {message}")

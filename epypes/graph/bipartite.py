@@ -1,0 +1,148 @@
+"""In which order can functions run, and where is the shortest cycle?
+
+A computational graph G = (F, T, E) is a bipartite digraph of functions F and tokens T (Semeniuta and
+Falkman 2019). The two kinds of vertex live in separate name spaces, so a function may be called like a token.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True)
+class BipartiteDigraph:
+    """Functions, tokens and the edges between them.
+
+    Attributes
+    ----------
+    inputs, outputs
+        By function name, its input and output tokens; the order of the functions is the order of definition.
+    producer
+        By token, the function that makes it (the first one, where a faulty graph has several).
+    consumers
+        By token, the functions that take it, in order of definition.
+    """
+
+    inputs: Mapping[str, tuple[str, ...]]
+    outputs: Mapping[str, tuple[str, ...]]
+    producer: dict[str, str] = field(init=False)
+    consumers: dict[str, list[str]] = field(init=False)
+
+    def __post_init__(self) -> None:
+        producer: dict[str, str] = {}
+        consumers: dict[str, list[str]] = {}
+        for function, tokens in self.outputs.items():
+            for token in tokens:
+                producer.setdefault(token, function)
+        for function, tokens in self.inputs.items():
+            for token in dict.fromkeys(tokens):
+                consumers.setdefault(token, []).append(function)
+        object.__setattr__(self, "producer", producer)
+        object.__setattr__(self, "consumers", consumers)
+
+    def successors(self, function: str) -> Iterable[str]:
+        """Return the functions that take an output of ``function``, each once, in order of definition."""
+        return dict.fromkeys(
+            consumer for token in self.outputs[function] for consumer in self.consumers.get(token, ())
+        )
+
+    def predecessors(self, function: str) -> Iterable[str]:
+        """Return the functions that make an input of ``function``, each once."""
+        return dict.fromkeys(
+            self.producer[token] for token in self.inputs[function] if token in self.producer
+        )
+
+    def run_order(self) -> tuple[str, ...]:
+        """Sort the functions topologically (Kahn 1962); of those that can run, the first defined comes first.
+
+        Functions on a cycle, and those behind one, are left out.
+        """
+        position = {function: index for index, function in enumerate(self.inputs)}
+        names = tuple(position)
+        waiting = {function: len(tuple(self.predecessors(function))) for function in names}
+        ready = [position[function] for function, count in waiting.items() if not count]
+        order: list[str] = []
+        while ready:
+            function = names[heapq.heappop(ready)]
+            order.append(function)
+            for successor in self.successors(function):
+                waiting[successor] -= 1
+                if not waiting[successor]:
+                    heapq.heappush(ready, position[successor])
+        return tuple(order)
+
+    def ancestors(self, functions: Iterable[str]) -> set[str]:
+        """Return ``functions`` and every function whose output reaches one of them."""
+        return _reach(functions, self.predecessors)
+
+    def descendants(self, functions: Iterable[str]) -> set[str]:
+        """Return ``functions`` and every function that an output of them reaches."""
+        return _reach(functions, self.successors)
+
+    def shortest_cycle(self) -> tuple[str, ...]:
+        """Return the vertices of a shortest cycle, tokens and functions in turn, beginning and ending with one token.
+
+        Empty if there is none. Only functions that no order can place are searched.
+        """
+        ordered = set(self.run_order())
+        suspects = [function for function in self.inputs if function not in ordered]
+        best: tuple[str, ...] = ()
+        for start in suspects:
+            found = self._cycle_through(start, set(suspects), len(best))
+            if found and (not best or len(found) < len(best)):
+                best = found
+                if len(best) == 2:  # a function that takes its own output: nothing is shorter
+                    break
+        return self._with_tokens(best) if best else ()
+
+    def _cycle_through(self, start: str, allowed: set[str], shorter_than: int) -> tuple[str, ...]:
+        """Search breadth-first for the shortest way from ``start`` back to itself."""
+        parent: dict[str, str] = {}
+        depth = {start: 0}
+        queue = deque([start])
+        while queue:
+            function = queue.popleft()
+            if shorter_than and depth[function] + 2 >= shorter_than:
+                return ()
+            for successor in self.successors(function):
+                if successor == start:
+                    return _path(parent, start, function)
+                if successor in allowed and successor not in depth:
+                    depth[successor] = depth[function] + 1
+                    parent[successor] = function
+                    queue.append(successor)
+        return ()
+
+    def _with_tokens(self, functions: tuple[str, ...]) -> tuple[str, ...]:
+        """Put between each two functions the token that joins them; begin with the token that closes the cycle."""
+        joints = [
+            next(token for token in self.outputs[left] if token in self.inputs[right])
+            for left, right in zip(functions, functions[1:], strict=False)
+        ]
+        vertices = [joints[-1]]
+        for function, token in zip(functions[:-1], joints, strict=True):
+            vertices += [function, token]
+        return tuple(vertices)
+
+
+def _reach(starts: Iterable[str], neighbours: Callable[[str], Iterable[str]]) -> set[str]:
+    found = set(starts)
+    pending = list(found)
+    while pending:
+        for neighbour in neighbours(pending.pop()):
+            if neighbour not in found:
+                found.add(neighbour)
+                pending.append(neighbour)
+    return found
+
+
+def _path(parent: Mapping[str, str], start: str, last: str) -> tuple[str, ...]:
+    path = [start]
+    while last != start:
+        path.append(last)
+        last = parent[last]
+    path.append(start)
+    return tuple(reversed(path))

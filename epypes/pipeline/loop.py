@@ -1,0 +1,140 @@
+"""Who takes events from a queue, and how does that end?"""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import queue
+import threading
+import warnings
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from epypes.errors import StillRunning
+
+# How long one take from a queue may block before the stop flag is looked at. Queues that others made can't be
+# woken without putting a sentinel into them, which would be an event of theirs.
+POLL_S = 0.05
+
+_log = logging.getLogger("epypes.pipeline")
+_left_running: weakref.WeakSet[EventLoop] = weakref.WeakSet()
+
+
+class EventLoop:
+    """A daemon thread that takes events from a queue and, for each, calls ``callback(**f_in(event))``.
+
+    Parameters
+    ----------
+    q_in
+        Anything with ``get(timeout=seconds)`` that raises ``queue.Empty``: queue.Queue, queue.SimpleQueue, Mailbox.
+    callback
+        Called on the loop's thread.
+    f_in
+        Makes the callback's keyword arguments from an event. Events can be anything, arrays and None included.
+    on_error
+        Called with the event and the exception when f_in or the callback raises; logged without one. The loop
+        goes on in any case.
+    name
+        For the thread's name and for errors.
+    busy
+        Returns the functions that have not returned; for errors.
+
+    Notes
+    -----
+    Semeniuta and Falkman 2019, "Reactive pipelines".
+    """
+
+    def __init__(
+        self,
+        q_in: Any,
+        callback: Callable[..., Any],
+        f_in: Callable[[Any], Mapping[str, Any]],
+        *,
+        on_error: Callable[[Any, Exception], None] | None = None,
+        name: str = "EventLoop",
+        busy: Callable[[], Sequence[str]] = tuple,
+    ) -> None:
+        self.q_in, self.callback, self.f_in, self.on_error = q_in, callback, f_in, on_error
+        self.name, self._busy = name, busy
+        self.handled = 0
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._lock = threading.Lock()
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the thread is alive."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def start(self) -> None:
+        """Start the thread; does nothing while it runs."""
+        with self._lock:
+            if self.is_running and not self._stop.is_set():
+                return
+            self._stop = threading.Event()
+            self._thread = threading.Thread(
+                target=self._loop, args=(self._stop,), name=f"epypes {self.name}", daemon=True
+            )
+            _left_running.add(self)
+            self._thread.start()
+
+    def stop(self, timeout_s: float = 5.0) -> None:
+        """Stop after the event under way; may be called twice, from any thread, the loop's own included.
+
+        Events that are still in the queue stay there.
+
+        Raises
+        ------
+        StillRunning
+            The event under way took longer than ``timeout_s``; the functions are named.
+        """
+        with self._lock:
+            self._stop.set()
+            thread = self._thread
+        _left_running.discard(self)
+        if thread is None or thread is threading.current_thread():
+            return
+        thread.join(timeout_s)
+        if thread.is_alive():
+            raise StillRunning(self.name, self._busy(), timeout_s)
+
+    def _loop(self, stop: threading.Event) -> None:
+        while not stop.is_set():
+            try:
+                event = self.q_in.get(timeout=POLL_S)
+            except queue.Empty:
+                continue
+            self._handle(event)
+            self.handled += 1
+
+    def _handle(self, event: Any) -> None:
+        try:
+            self.callback(**self.f_in(event))
+        except Exception as exception:
+            self._report(event, exception)
+
+    def _report(self, event: Any, exception: Exception) -> None:
+        if self.on_error is None:
+            _log.error("%s: an event failed", self.name, exc_info=exception)
+            return
+        try:
+            self.on_error(event, exception)
+        except Exception:
+            _log.exception("%s: on_error itself failed", self.name)
+
+    def __repr__(self) -> str:
+        state = "running" if self.is_running else "stopped"
+        return f"<EventLoop {self.name!r:.40}: {state}, {self.handled} events>"
+
+
+@atexit.register
+def _warn_of_running_loops() -> None:
+    for loop in list(_left_running):
+        if loop.is_running:
+            warnings.warn(
+                f"{loop.name!r} was left running. Call stop(), or use it in a with statement.",
+                ResourceWarning,
+                stacklevel=1,
+                source=loop,
+            )

@@ -1,0 +1,117 @@
+"""What happens to events that arrive faster than they are taken?"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections import Counter, deque
+from time import monotonic
+from typing import Any, Final, Literal, get_args
+
+from epypes.errors import MailboxOverflow
+
+Policy = Literal["latest", "drop_oldest", "block", "fault"]
+_POLICIES: Final = get_args(Policy)
+
+
+class Mailbox:
+    """A bounded queue with a policy for when it is full; ``put`` and ``get`` as in ``queue.Queue``.
+
+    Parameters
+    ----------
+    policy
+        ``"latest"``: keeps the newest only; ``"drop_oldest"``: makes room for the new; ``"block"``: put waits;
+        ``"fault"``: put raises MailboxOverflow.
+    size
+        How many items it holds; 1 for ``"latest"``.
+
+    Attributes
+    ----------
+    dropped
+        How many items were dropped, by reason.
+
+    Raises
+    ------
+    ValueError
+        There is no such policy, or the size does not fit it.
+
+    Examples
+    --------
+    >>> mailbox = Mailbox("latest")
+    >>> mailbox.put(1); mailbox.put(2)
+    >>> mailbox.get(), dict(mailbox.dropped)
+    (2, {'superseded': 1})
+    """
+
+    def __init__(self, policy: Policy = "latest", size: int = 1) -> None:
+        if policy not in _POLICIES:
+            raise ValueError(f"No policy {policy!r}. There are: {', '.join(_POLICIES)}.")
+        if size < 1 or (policy == "latest" and size != 1):
+            raise ValueError(f"A mailbox with policy {policy!r} can't have size {size}.")
+        self.policy, self.size = policy, size
+        self.dropped: Counter[str] = Counter()
+        self._items: deque[Any] = deque()
+        self._changed = threading.Condition()
+
+    def put(self, item: Any, block: bool = True, timeout: float | None = None) -> None:
+        """Put an item; never blocks unless the policy is ``"block"``.
+
+        Raises
+        ------
+        queue.Full
+            The policy is ``"block"`` and there was no room within ``timeout`` seconds.
+        MailboxOverflow
+            The policy is ``"fault"`` and there was no room.
+        """
+        with self._changed:
+            if len(self._items) >= self.size:
+                self._make_room(block, timeout)
+            self._items.append(item)
+            self._changed.notify_all()
+
+    def _make_room(self, block: bool, timeout: float | None) -> None:
+        if self.policy == "fault":
+            raise MailboxOverflow(self.size)
+        if self.policy == "block":
+            wait_s = timeout if block else 0.0
+            if not self._changed.wait_for(lambda: len(self._items) < self.size, wait_s):
+                raise queue.Full
+            return
+        self._items.popleft()
+        self.dropped["superseded" if self.policy == "latest" else "oldest"] += 1
+
+    def get(self, block: bool = True, timeout: float | None = None) -> Any:
+        """Take the oldest item; raises queue.Empty if there is none within ``timeout`` seconds."""
+        deadline = None if timeout is None else monotonic() + timeout
+        with self._changed:
+            while not self._items:
+                wait_s = None if deadline is None else deadline - monotonic()
+                if not block or (wait_s is not None and wait_s <= 0):
+                    raise queue.Empty
+                self._changed.wait(wait_s)
+            item = self._items.popleft()
+            self._changed.notify_all()
+            return item
+
+    def put_nowait(self, item: Any) -> None:
+        """Put without waiting."""
+        self.put(item, block=False)
+
+    def get_nowait(self) -> Any:
+        """Take without waiting."""
+        return self.get(block=False)
+
+    def qsize(self) -> int:
+        """Return how many items are waiting."""
+        return len(self._items)
+
+    def empty(self) -> bool:
+        """Whether no item is waiting."""
+        return not self._items
+
+    def full(self) -> bool:
+        """Whether as many items are waiting as it holds."""
+        return len(self._items) >= self.size
+
+    def __repr__(self) -> str:
+        return f"<Mailbox {self.policy}: {len(self._items)} of {self.size}, {self.dropped.total()} dropped>"

@@ -1,0 +1,103 @@
+"""How is a graph used as one node, with its times and attributes?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from epypes.errors import PayloadError
+from epypes.graph import CompGraph
+from epypes.pipeline.network import NodeBasedCompGraph
+from epypes.pipeline.node import Node
+from epypes.run import CompGraphRunner, Run
+
+
+class Pipeline(Node):
+    """A Node that runs a graph.
+
+    Called with the free source tokens in order of first appearance in func_io, it returns its sink token, or a
+    tuple of them in graph order: so it can be a function of another graph.
+
+    Parameters
+    ----------
+    name
+        Its name.
+    cg
+        The graph.
+    hparams
+        Values of hyperparameter tokens.
+
+    Attributes
+    ----------
+    attributes
+        What is to be known of it besides its tokens; a reactive pipeline copies them for every event.
+    runner
+        The runner of its network of nodes.
+
+    Notes
+    -----
+    Semeniuta and Falkman 2019, "Nodes and pipelines".
+    """
+
+    def __init__(self, name: str, cg: CompGraph, hparams: Mapping[str, Any] | None = None) -> None:
+        self.network = NodeBasedCompGraph(cg)
+        self.runner = CompGraphRunner(self.network.cg, hparams)
+        self.source_cg = cg
+        self.attributes: dict[str, Any] = {}
+        super().__init__(name, self._run_positional)
+
+    @property
+    def cg(self) -> CompGraph:
+        """The graph as it was given, with the user's own functions."""
+        return self.source_cg
+
+    def run(self, **payload: Any) -> Run:
+        """Run the graph on a payload; see ``CompGraphRunner.run``. It counts as a call of the node."""
+        run: Run = Node.__call__(self, payload)
+        return run
+
+    def __call__(self, *args: Any) -> Any:
+        """Run the graph on the free source tokens, in order; return its sink token or tokens."""
+        run = self.run(**self._by_name(args))
+        sinks = tuple(run[token] for token in self.cg.sink_tokens)
+        return sinks[0] if len(sinks) == 1 else sinks
+
+    def compute(self, *args: Any) -> Any:
+        """Run the graph on one payload, a mapping by token; the hook for subclasses."""
+        (payload,) = args
+        return self.runner.run(**payload)
+
+    def _run_positional(self, *args: Any) -> Any:
+        return self(*args)
+
+    def _by_name(self, args: tuple[Any, ...]) -> dict[str, Any]:
+        free = self.runner.free_source_tokens
+        if len(args) != len(free):
+            text = f"Pipeline {self.name!r} takes {len(free)} inputs ({', '.join(free)}), not {len(args)}."
+            raise PayloadError(free, text)
+        return dict(zip(free, args, strict=True))
+
+    def __getitem__(self, token: str) -> Any:
+        return self.runner[token]
+
+    def __setitem__(self, token: str, value: Any) -> None:
+        self.runner[token] = value
+
+    def traverse_time(self) -> tuple[Any, ...]:
+        """Return ``(name, seconds of the last call, the nodes' tuples)``."""
+        return self.name, self.time, self.network.traverse_time()
+
+    def compute_overhead(self) -> float:
+        """Return the graph overhead of the last call, in seconds: its time less the sum of its nodes' times."""
+        return overhead_s(self.traverse_time())
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
+        from epypes.display import mimebundle
+
+        return mimebundle(self)
+
+
+def overhead_s(times: tuple[Any, ...]) -> float:
+    """Return what a pipeline's ``traverse_time()`` leaves when its nodes' times are taken off, in seconds."""
+    _, total, nodes = times
+    return float(total - sum(node[1] for node in nodes))

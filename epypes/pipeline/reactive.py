@@ -1,0 +1,186 @@
+"""How does a pipeline answer events?
+
+The paper's reactive pipelines: a SourcePipeline puts what it computes on q_out, a SinkPipeline is driven by q_in,
+a FullPipeline does both.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from typing import Any, Self
+
+from epypes.errors import EpypesError
+from epypes.graph import CompGraph
+from epypes.pipeline.loop import EventLoop
+from epypes.pipeline.pipeline import Pipeline
+from epypes.pipeline.view import EventView
+from epypes.run import Failure, Run
+
+FIn = Callable[[Any], Mapping[str, Any]]
+FOut = Callable[[EventView], Any]
+
+_log = logging.getLogger("epypes.pipeline")
+
+
+class SourcePipeline(Pipeline):
+    """A Pipeline that puts ``f_out(view)`` on ``q_out`` after every run.
+
+    Parameters
+    ----------
+    q_out
+        Anything with ``put(item)``.
+    f_out
+        Called on the thread that runs the pipeline, with this event's EventView.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        cg: CompGraph,
+        q_out: Any,
+        f_out: FOut,
+        hparams: Mapping[str, Any] | None = None,
+    ) -> None:
+        super().__init__(name, cg, hparams)
+        self.q_out, self.f_out = q_out, f_out
+
+    def run(self, **payload: Any) -> Run:
+        """Run the graph on a payload and put the result on q_out."""
+        run = super().run(**payload)
+        _emit(self, self.f_out, self.q_out, None, run)
+        return run
+
+
+class SinkPipeline(Pipeline):
+    """A Pipeline that runs for every event on ``q_in``.
+
+    Parameters
+    ----------
+    q_in
+        Anything with ``get(timeout=seconds)`` that raises ``queue.Empty``.
+    f_in
+        Makes the payload, a mapping by free source token, from an event; called on the loop's thread.
+
+    Attributes
+    ----------
+    on_error
+        None, or called with a Failure on the loop's thread when f_in, a function or f_out raises. Without it,
+        failures are logged. The loop goes on.
+    failed
+        How many events failed.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        cg: CompGraph,
+        q_in: Any,
+        f_in: FIn,
+        hparams: Mapping[str, Any] | None = None,
+    ) -> None:
+        super().__init__(name, cg, hparams)
+        self.q_in, self.f_in = q_in, f_in
+        self.on_error: Callable[[Failure], None] | None = None
+        self.failed = 0
+        self.loop = EventLoop(
+            q_in, self.handle, lambda event: {"event": event}, name=name, busy=lambda: self.network.running
+        )
+
+    def handle(self, event: Any) -> None:
+        """Work on one event; every failure is reported, none is raised. The hook for subclasses."""
+        try:
+            payload = self._payload(event)
+            run = self.run(**payload)
+        except Exception as exception:
+            self._fail(event, self._failure_of(exception, "f_in", {"event": event}))
+            return
+        try:
+            self.emit(event, run)
+        except Exception as exception:
+            self._fail(event, Failure("f_out", self.cg.sink_tokens, dict(run), exception))
+
+    def emit(self, event: Any, run: Run) -> None:
+        """Do something with an event's run; a SinkPipeline does nothing. The hook for subclasses."""
+
+    def _payload(self, event: Any) -> Mapping[str, Any]:
+        payload = self.f_in(event)
+        if not isinstance(payload, Mapping):
+            text = f"f_in of {self.name!r} must return a mapping by free source token, not {type(payload).__name__}."
+            raise TypeError(text)
+        return payload
+
+    def _failure_of(self, exception: Exception, otherwise: str, inputs: Mapping[str, Any]) -> Failure:
+        """Return the failure of the graph if that is where the exception is from."""
+        last = self.runner.last
+        if last is not None and last.failure is not None and last.failure.exception is exception:
+            return last.failure
+        return Failure(otherwise, self.runner.free_source_tokens, inputs, exception)
+
+    def _fail(self, event: Any, failure: Failure) -> None:
+        self.failed += 1
+        event_id = getattr(event, "id", "")
+        failure = Failure(
+            failure.function,
+            failure.tokens,
+            failure.inputs,
+            failure.exception,
+            event_id if isinstance(event_id, str) else "",
+        )
+        if self.on_error is None:
+            expected = isinstance(failure.exception, EpypesError)
+            _log.error(
+                "%s: an event failed in %s", self.name, failure, exc_info=None if expected else failure.exception
+            )
+            return
+        try:
+            self.on_error(failure)
+        except Exception:
+            _log.exception("%s: on_error itself failed", self.name)
+
+    def listen(self) -> None:
+        """Start the event loop; does nothing while it runs."""
+        self.loop.start()
+
+    def stop(self, timeout_s: float = 5.0) -> None:
+        """Stop the event loop; may be called twice, before listen(), and from any thread.
+
+        Raises
+        ------
+        StillRunning
+            A function did not return within ``timeout_s``.
+        """
+        self.loop.stop(timeout_s)
+
+    def __enter__(self) -> Self:
+        self.listen()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.stop()
+
+
+class FullPipeline(SinkPipeline):
+    """A Pipeline that runs for every event on ``q_in`` and puts ``f_out(view)`` on ``q_out``."""
+
+    def __init__(
+        self,
+        name: str,
+        cg: CompGraph,
+        q_in: Any,
+        q_out: Any,
+        f_in: FIn,
+        f_out: FOut,
+        hparams: Mapping[str, Any] | None = None,
+    ) -> None:
+        super().__init__(name, cg, q_in, f_in, hparams)
+        self.q_out, self.f_out = q_out, f_out
+
+    def emit(self, event: Any, run: Run) -> None:
+        """Put what f_out makes of the event's run on q_out."""
+        _emit(self, self.f_out, self.q_out, event, run)
+
+
+def _emit(pipeline: Pipeline, f_out: FOut, q_out: Any, event: Any, run: Run) -> None:
+    view = EventView(pipeline.name, event, run, pipeline.traverse_time(), pipeline.attributes)
+    q_out.put(f_out(view))

@@ -1,0 +1,62 @@
+"""What does f_out see of an event?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from epypes.pipeline.pipeline import overhead_s
+from epypes.run import Run, RunReport
+
+
+class EventView(Mapping[str, Any]):
+    """One event's run of a pipeline: what f_out is given, never shared with another event.
+
+    Reads like the pipeline: ``view["edges"]``, ``view.attributes``, ``view.traverse_time()``.
+
+    Attributes
+    ----------
+    event
+        What was taken from q_in; None for a SourcePipeline.
+    run
+        The event's run.
+    attributes
+        A copy of the pipeline's attributes, this event's own.
+    """
+
+    def __init__(
+        self, name: str, event: Any, run: Run, times: tuple[Any, ...], attributes: Mapping[str, Any]
+    ) -> None:
+        self.name, self.event, self.run = name, event, run
+        self.attributes = dict(attributes)
+        self._times = times
+
+    @property
+    def report(self) -> RunReport:
+        """The times of the event's run."""
+        return self.run.report
+
+    @property
+    def time(self) -> float:
+        """How long the event's run took, in seconds."""
+        return float(self._times[1])
+
+    def traverse_time(self) -> tuple[Any, ...]:
+        """Return ``(name, seconds, the nodes' tuples)`` of the event's run."""
+        return self._times
+
+    def compute_overhead(self) -> float:
+        """Return the graph overhead of the event's run, in seconds."""
+        return overhead_s(self._times)
+
+    def __getitem__(self, token: str) -> Any:
+        return self.run[token]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.run)
+
+    def __len__(self) -> int:
+        return len(self.run)
+
+    def __repr__(self) -> str:
+        return f"<EventView of {self.name!r:.40}: {len(self)} tokens>"

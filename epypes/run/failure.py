@@ -1,0 +1,37 @@
+"""What is known of a function that failed?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A function, or a reactive pipeline's f_in or f_out, that raised.
+
+    Attributes
+    ----------
+    function
+        Its name in the graph, or ``"f_in"`` or ``"f_out"``.
+    tokens
+        Its input tokens, then its output tokens.
+    inputs
+        The values that it was called with, by token; by ``"event"`` for f_in.
+    exception
+        What it raised, unchanged.
+    event_id
+        The id of the event that was being worked on, if it has one.
+    """
+
+    function: str
+    tokens: tuple[str, ...]
+    inputs: Mapping[str, Any] = field(repr=False)
+    exception: BaseException
+    event_id: str = ""
+
+    def __str__(self) -> str:
+        kind = type(self.exception).__name__
+        text = str(self.exception).strip()
+        return f"{self.function}: {kind}{': ' + text if text else ''}"

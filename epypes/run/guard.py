@@ -1,0 +1,74 @@
+"""How is a function kept from spoiling another function's input?
+
+Arrays travel as read-only views (rule 7 of the design). Writing in place raises at the line that did it.
+numpy is never imported here: an array can only turn up once somebody else has imported it.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+_MARK = "__epypes_unguarded__"
+
+
+def unguarded(function: F) -> F:
+    """Mark a function that rejects read-only arrays: it gets them writable, and must not write.
+
+    Examples
+    --------
+    >>> @unguarded
+    ... def smooth(image):
+    ...     return image
+    """
+    setattr(function, _MARK, True)
+    return function
+
+
+def is_unguarded(function: object) -> bool:
+    """Whether a function, or the function that it wraps, is marked as unguarded."""
+    return bool(getattr(function, _MARK, False))
+
+
+def read_only(value: Any) -> Any:
+    """Return arrays, and arrays in a tuple or list, as read-only views; anything else as it is."""
+    numpy = sys.modules.get("numpy")
+    if numpy is None:
+        return value
+    if isinstance(value, numpy.ndarray):
+        view = value.view()
+        view.flags.writeable = False
+        return view
+    if type(value) in (tuple, list) and any(isinstance(item, numpy.ndarray) for item in value):
+        return type(value)(read_only(item) if isinstance(item, numpy.ndarray) else item for item in value)
+    return value
+
+
+def writable(value: Any) -> Any:
+    """Return a writable view of a guarded array, for an unguarded function; a copy where memory is read-only."""
+    numpy = sys.modules.get("numpy")
+    if numpy is not None and isinstance(value, numpy.ndarray):
+        view = value.view()
+        try:
+            view.flags.writeable = True
+        except ValueError:
+            return value.copy()
+        return view
+    if type(value) in (tuple, list):
+        return type(value)(writable(item) for item in value)
+    return value
+
+
+def explain_write(function: str, tokens: Sequence[str], exception: BaseException) -> str | None:
+    """Return a sentence on why writing in place failed, if that is what this exception is about."""
+    text = str(exception).replace("-", "").replace(" ", "")
+    if "readonly" not in text:
+        return None
+    which = ", ".join(map(repr, tokens))
+    return (
+        f"Inputs are read-only, so that {function!r} can't change {which} for other functions. "
+        "Work on a copy (x = x.copy()), or mark the function with @ep.unguarded if it only reads."
+    )
