@@ -101,7 +101,9 @@ def __getattr__(name: str) -> Any:
     home = _HOMES.get(name)
     if home is None:
         raise AttributeError(f"module 'epypes' has no attribute {name!r}")
-    value = importlib.import_module("epypes.errors") if name == "errors" else getattr(importlib.import_module(home), name)
+    value = (
+        importlib.import_module("epypes.errors") if name == "errors" else getattr(importlib.import_module(home), name)
+    )
     globals()[name] = value
     return value
 

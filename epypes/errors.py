@@ -101,9 +101,7 @@ class StaleToken(NotComputed):
     """A token whose value is out of date, since something it depends on has changed."""
 
     def __init__(self, token: str) -> None:
-        super().__init__(
-            token, f"Token {token!r} is stale: something it depends on has changed. Call rerun() first."
-        )
+        super().__init__(token, f"Token {token!r} is stale: something it depends on has changed. Call rerun() first.")
 
 
 class PayloadError(EpypesError, TypeError):
@@ -128,9 +126,7 @@ class OutputArityError(EpypesError, ValueError):
     def __init__(self, function: str, outputs: Sequence[str], got: str) -> None:
         self.function, self.outputs, self.got = function, tuple(outputs), got
         wanted = f"{len(self.outputs)} value{'s' if len(self.outputs) != 1 else ''} ({', '.join(self.outputs)})"
-        super().__init__(
-            f"Function {function!r} must return a tuple or list of {wanted}, but it returned {got}."
-        )
+        super().__init__(f"Function {function!r} must return a tuple or list of {wanted}, but it returned {got}.")
 
 
 class StillRunning(EpypesError, TimeoutError):

@@ -152,8 +152,8 @@ def param_from_value(value: Any) -> Param | None:
         return Param(choices=tuple(type(value)))
     if isinstance(value, int):
         span = max(3 * abs(value), 10)
-        return Param(min(0, -span if value < 0 else 0), span if value >= 0 else 0, 1)
+        return Param(-span if value < 0 else 0, span if value >= 0 else 0, 1)
     if isinstance(value, float) and abs(value) < float("inf"):
-        span = 3 * abs(value) or 1.0
-        return Param(-span if value < 0 else 0.0, span if value >= 0 else 0.0)
+        reach = 3 * abs(value) or 1.0
+        return Param(-reach if value < 0 else 0.0, reach if value >= 0 else 0.0)
     return None

@@ -156,13 +156,13 @@ def _mask_picture(mask: Array, max_side_px: int | None) -> Image.Image:
     import numpy as np
     from PIL import Image
 
-    white = mask if mask.dtype.kind == "b" else mask > 0
+    white: npt.NDArray[np.bool_] = mask.astype(bool, copy=False)
     pool = 1 if max_side_px is None else -(-max(white.shape) // max_side_px)
     if pool > 1:
         rows, columns = -(-white.shape[0] // pool), -(-white.shape[1] // pool)
         padded = np.zeros((rows * pool, columns * pool), dtype=bool)
         padded[: white.shape[0], : white.shape[1]] = white
-        white = padded.reshape(rows, pool, columns, pool).any(axis=(1, 3))
+        white = np.asarray(padded.reshape(rows, pool, columns, pool).any(axis=(1, 3)))
     return Image.fromarray(np.ascontiguousarray(white)).convert("1")
 
 

@@ -7,6 +7,7 @@ Falkman 2019). The two kinds of vertex live in separate name spaces, so a functi
 from __future__ import annotations
 
 import heapq
+import itertools
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -45,15 +46,11 @@ class BipartiteDigraph:
 
     def successors(self, function: str) -> Iterable[str]:
         """Return the functions that take an output of ``function``, each once, in order of definition."""
-        return dict.fromkeys(
-            consumer for token in self.outputs[function] for consumer in self.consumers.get(token, ())
-        )
+        return dict.fromkeys(consumer for token in self.outputs[function] for consumer in self.consumers.get(token, ()))
 
     def predecessors(self, function: str) -> Iterable[str]:
         """Return the functions that make an input of ``function``, each once."""
-        return dict.fromkeys(
-            self.producer[token] for token in self.inputs[function] if token in self.producer
-        )
+        return dict.fromkeys(self.producer[token] for token in self.inputs[function] if token in self.producer)
 
     def run_order(self) -> tuple[str, ...]:
         """Sort the functions topologically (Kahn 1962); of those that can run, the first defined comes first.
@@ -120,7 +117,7 @@ class BipartiteDigraph:
         """Put between each two functions the token that joins them; begin with the token that closes the cycle."""
         joints = [
             next(token for token in self.outputs[left] if token in self.inputs[right])
-            for left, right in zip(functions, functions[1:], strict=False)
+            for left, right in itertools.pairwise(functions)
         ]
         vertices = [joints[-1]]
         for function, token in zip(functions[:-1], joints, strict=True):

@@ -72,9 +72,7 @@ class CompGraph:
         self._functions = MappingProxyType({name: func_dict[name] for name in order})
         self._func_io = MappingProxyType({name: _as_tuples(func_io[name]) for name in order})
         self._tokens = tuple(
-            dict.fromkeys(
-                token for name in order for token in (*digraph.inputs[name], *digraph.outputs[name])
-            )
+            dict.fromkeys(token for name in order for token in (*digraph.inputs[name], *digraph.outputs[name]))
         )
 
     @property

@@ -48,6 +48,7 @@ class Node:
         functools.update_wrapper(self, func)
 
     def __call__(self, *args: Any) -> Any:
+        """Compute, and measure the time."""
         self._calls_under_way += 1
         start_ns = perf_counter_ns()
         try:

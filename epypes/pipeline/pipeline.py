@@ -89,15 +89,10 @@ class Pipeline(Node):
 
     def compute_overhead(self) -> float:
         """Return the graph overhead of the last call, in seconds: its time less the sum of its nodes' times."""
-        return overhead_s(self.traverse_time())
+        _, total, nodes = self.traverse_time()
+        return float(total - sum(node[1] for node in nodes))
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         from epypes.display import mimebundle
 
         return mimebundle(self)
-
-
-def overhead_s(times: tuple[Any, ...]) -> float:
-    """Return what a pipeline's ``traverse_time()`` leaves when its nodes' times are taken off, in seconds."""
-    _, total, nodes = times
-    return float(total - sum(node[1] for node in nodes))

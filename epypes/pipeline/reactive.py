@@ -130,7 +130,10 @@ class SinkPipeline(Pipeline):
         if self.on_error is None:
             expected = isinstance(failure.exception, EpypesError)
             _log.error(
-                "%s: an event failed in %s", self.name, failure, exc_info=None if expected else failure.exception
+                "%s: an event failed in %s",
+                self.name,
+                failure,
+                exc_info=None if expected else failure.exception,
             )
             return
         try:
@@ -182,5 +185,5 @@ class FullPipeline(SinkPipeline):
 
 
 def _emit(pipeline: Pipeline, f_out: FOut, q_out: Any, event: Any, run: Run) -> None:
-    view = EventView(pipeline.name, event, run, pipeline.traverse_time(), pipeline.attributes)
+    view = EventView(pipeline.name, event, run, pipeline.attributes)
     q_out.put(f_out(view))

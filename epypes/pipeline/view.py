@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from epypes.pipeline.pipeline import overhead_s
 from epypes.run import Run, RunReport
 
 
@@ -24,12 +23,9 @@ class EventView(Mapping[str, Any]):
         A copy of the pipeline's attributes, this event's own.
     """
 
-    def __init__(
-        self, name: str, event: Any, run: Run, times: tuple[Any, ...], attributes: Mapping[str, Any]
-    ) -> None:
+    def __init__(self, name: str, event: Any, run: Run, attributes: Mapping[str, Any]) -> None:
         self.name, self.event, self.run = name, event, run
         self.attributes = dict(attributes)
-        self._times = times
 
     @property
     def report(self) -> RunReport:
@@ -39,15 +35,16 @@ class EventView(Mapping[str, Any]):
     @property
     def time(self) -> float:
         """How long the event's run took, in seconds."""
-        return float(self._times[1])
+        return self.report.total_ns / 1e9
 
     def traverse_time(self) -> tuple[Any, ...]:
-        """Return ``(name, seconds, the nodes' tuples)`` of the event's run."""
-        return self._times
+        """Return ``(name, seconds, ((function, seconds), ...))`` of the event's own run."""
+        nodes = tuple((entry.function, entry.duration_ns / 1e9) for entry in self.report.functions)
+        return self.name, self.time, nodes
 
     def compute_overhead(self) -> float:
         """Return the graph overhead of the event's run, in seconds."""
-        return overhead_s(self._times)
+        return self.report.overhead_ns / 1e9
 
     def __getitem__(self, token: str) -> Any:
         return self.run[token]

@@ -7,4 +7,13 @@ from epypes.run.report import FunctionTime, RunReport
 from epypes.run.runner import CompGraphRunner
 from epypes.run.tokens import NOT_COMPUTED, TokenManager
 
-__all__ = ["NOT_COMPUTED", "CompGraphRunner", "Failure", "FunctionTime", "Plan", "Run", "RunReport", "TokenManager"]
+__all__ = [
+    "NOT_COMPUTED",
+    "CompGraphRunner",
+    "Failure",
+    "FunctionTime",
+    "Plan",
+    "Run",
+    "RunReport",
+    "TokenManager",
+]

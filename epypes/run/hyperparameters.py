@@ -25,9 +25,7 @@ class Hyperparameters:
 
     __slots__ = ("_versions", "cg", "revision", "values")
 
-    def __init__(
-        self, cg: CompGraph, values: Mapping[str, Any], versions: Mapping[str, int], revision: int
-    ) -> None:
+    def __init__(self, cg: CompGraph, values: Mapping[str, Any], versions: Mapping[str, int], revision: int) -> None:
         self.cg, self.revision = cg, revision
         self.values: Mapping[str, Any] = MappingProxyType(dict(values))
         self._versions = dict(versions)
@@ -37,9 +35,7 @@ class Hyperparameters:
         """The source tokens that are not frozen: the graph's input, in order of first appearance in func_io."""
         return tuple(token for token in self.cg.source_tokens if token not in self.values)
 
-    def frozen(
-        self, changes: Mapping[str, Any], next_version: Callable[[], int], guard: bool
-    ) -> Hyperparameters:
+    def frozen(self, changes: Mapping[str, Any], next_version: Callable[[], int], guard: bool) -> Hyperparameters:
         """Return these with source tokens given values; all or nothing. An equal value changes nothing."""
         for token in changes:
             self.require_source(token)

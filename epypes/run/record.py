@@ -83,9 +83,7 @@ class Run(Mapping[str, Any]):
 
     def __iter__(self) -> Iterator[str]:
         manager = self._manager
-        return (
-            token for token in self.cg.tokens if manager.is_computed(token) and not manager.is_stale(token)
-        )
+        return (token for token in self.cg.tokens if manager.is_computed(token) and not manager.is_stale(token))
 
     def __len__(self) -> int:
         return sum(1 for _ in self)

@@ -59,7 +59,12 @@ class RunReport:
 
         return pd.DataFrame(
             [
-                (entry.function, entry.ran, entry.duration_ns / 1e6, entry.duration_ns / max(self.total_ns, 1))
+                (
+                    entry.function,
+                    entry.ran,
+                    entry.duration_ns / 1e6,
+                    entry.duration_ns / max(self.total_ns, 1),
+                )
                 for entry in self.functions
             ],
             columns=["function", "ran", "time_ms", "share"],

@@ -58,9 +58,7 @@ class CompGraphRunner:
     7
     """
 
-    def __init__(
-        self, cg: CompGraph, hparams: Mapping[str, Any] | None = None, *, guard: bool = True
-    ) -> None:
+    def __init__(self, cg: CompGraph, hparams: Mapping[str, Any] | None = None, *, guard: bool = True) -> None:
         self.cg = cg
         self.guard = guard
         self.reports: deque[RunReport] = deque(maxlen=_KEPT_REPORTS)
@@ -147,9 +145,7 @@ class CompGraphRunner:
             failure = failed.failure
             manager.forget(self._program.downstream([failed.step.index]))
         partial = failure is not None or len(order) < len(self._program.steps)
-        manager.stale = (
-            frozenset(manager.stale_steps(range(len(self._program.steps)))) if partial else frozenset()
-        )
+        manager.stale = frozenset(manager.stale_steps(range(len(self._program.steps)))) if partial else frozenset()
         report = RunReport(
             tuple(
                 FunctionTime(name, durations_ns.get(name, 0), name in durations_ns)
@@ -255,9 +251,7 @@ class CompGraphRunner:
         stale = set(self.stale) if last is not None and last.revision != hparams.revision else ()
         producer = self.cg.digraph.producer
         readable = set(last or ()) | set(hparams.values)
-        return tuple(
-            token for token in self.cg.tokens if token in readable and producer.get(token) not in stale
-        )
+        return tuple(token for token in self.cg.tokens if token in readable and producer.get(token) not in stale)
 
     def __repr__(self) -> str:
         if self._last is None:

@@ -1,0 +1,7 @@
+"""From a notebook's graph to a folder of text that proves what it computes, and back."""
+
+from epypes.bundle.load import load, load_pipeline
+from epypes.bundle.promote import promote
+from epypes.bundle.replay import verify
+
+__all__ = ["load", "load_pipeline", "promote", "verify"]

@@ -1,0 +1,113 @@
+"""How is a notebook file executed fresh, and its graph promoted in its own kernel?"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from epypes.bundle.promote import promote
+from epypes.errors import BundleError, EpypesError, PromotionRefused, UnknownName
+from epypes.pipeline import Pipeline
+from epypes.run import CompGraphRunner
+
+Progress = Callable[[int, int], None]
+
+
+def promote_notebook(
+    notebook: str | Path,
+    name: str,
+    to: str | Path,
+    outputs: Sequence[str] | None = None,
+    on_cell: Progress = lambda done, total: None,
+) -> None:
+    """Execute every cell of a notebook in a new kernel of this Python, then promote one of its objects there.
+
+    Parameters
+    ----------
+    notebook
+        An ``.ipynb`` file; it is not changed.
+    name
+        The variable that holds the runner or pipeline.
+    to, outputs
+        As for ``promote``.
+    on_cell
+        Called with the number of code cells done and their total.
+
+    Raises
+    ------
+    BundleError
+        The file can't be read, or a cell raises; the cell is named.
+    PromotionRefused
+        The graph can't be promoted, or there is no such variable.
+    """
+    path = Path(notebook)
+    with tempfile.TemporaryDirectory(prefix="epypes-promote-") as scratch:
+        outcome = Path(scratch) / "outcome.json"
+        code = (
+            "from epypes.bundle.notebook import promote_here as _promote_here\n"
+            f"_promote_here({name!r}, {str(Path(to).resolve())!r}, "
+            f"{None if outputs is None else list(outputs)!r}, {str(outcome)!r})"
+        )
+        _execute(path, code, on_cell)
+        told = json.loads(outcome.read_text(encoding="utf-8"))
+    if told["reasons"]:
+        raise PromotionRefused(to, told["reasons"])
+
+
+def _execute(path: Path, last_cell: str, on_cell: Progress) -> None:
+    import nbformat
+    from nbclient import NotebookClient
+    from nbclient.exceptions import CellExecutionError, DeadKernelError
+
+    try:
+        document = nbformat.read(path, as_version=4)
+    except OSError as error:
+        raise BundleError(path, f"Notebook {path} can't be read: {error.strerror or error}.") from error
+    except Exception as error:  # nbformat raises its own and json's errors for what is no notebook
+        raise BundleError(path, f"{path} is not a notebook: {type(error).__name__}.") from error
+    total = sum(cell.cell_type == "code" for cell in document.cells)
+    document.cells.append(nbformat.v4.new_code_cell(last_cell))
+    done = 0
+
+    def cell_executed(cell: Any, cell_index: int, **_: Any) -> None:
+        nonlocal done
+        done += 1
+        on_cell(min(done, total), total)
+
+    client = NotebookClient(
+        document,
+        timeout=None,
+        kernel_name="python3",
+        resources={"metadata": {"path": str(path.resolve().parent)}},
+        on_cell_executed=cell_executed,
+    )
+    try:
+        client.execute()
+    except CellExecutionError as error:
+        number = done
+        raise BundleError(
+            path, f"{path}: code cell {number} of {total} raised {error.ename}: {error.evalue}"
+        ) from error
+    except DeadKernelError as error:
+        raise BundleError(path, f"{path}: the kernel died in code cell {done + 1} of {total}.") from error
+
+
+def promote_here(name: str, to: str, outputs: Sequence[str] | None, outcome: str) -> None:
+    """Promote a variable of the notebook that this kernel runs; write the reasons against it, if any, as JSON."""
+    names = vars(sys.modules["__main__"])
+    try:
+        if name not in names:
+            known = [key for key, value in names.items() if isinstance(value, CompGraphRunner | Pipeline)]
+            raise UnknownName("variable", name, known, "that holds a runner or pipeline in the notebook")
+        promote(names[name], to, outputs)
+    except PromotionRefused as refused:
+        reasons = list(refused.reasons)
+    except EpypesError as error:
+        reasons = [str(error)]
+    else:
+        reasons = []
+    Path(outcome).write_text(json.dumps({"reasons": reasons}), encoding="utf-8")

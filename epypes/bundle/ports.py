@@ -1,0 +1,81 @@
+"""How does an event become a payload, and a run an answer?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+from epypes.errors import MessageError
+from epypes.pipeline import EventView
+from epypes.run import Failure
+
+if TYPE_CHECKING:
+    from epypes.wire import Envelope
+
+REQUEST: Final = "epypes.request"
+RESULT: Final = "epypes.result"
+FAILURE: Final = "epypes.failure"
+
+
+def payload_of(inputs: Sequence[str]) -> Callable[[Any], Mapping[str, Any]]:
+    """Return an f_in: it takes the parts of an Envelope that are named like the input tokens.
+
+    The f_in raises MessageError for anything but an Envelope, and for one whose parts are not the inputs.
+    """
+
+    def f_in(event: Any) -> Mapping[str, Any]:
+        from epypes.wire import Envelope
+
+        if not isinstance(event, Envelope):
+            raise MessageError("not an envelope", f"The event is a {type(event).__name__}, not an epypes.v1 Envelope.")
+        missing = [token for token in inputs if token not in event.parts]
+        unknown = [name for name in event.parts if name not in inputs]
+        if missing or unknown:
+            got = ", ".join(map(repr, event.parts)) or "none"
+            text = f"The event must have the parts {', '.join(map(repr, inputs))}; it has {got}."
+            raise MessageError("wrong parts", text)
+        return dict(event.parts)
+
+    return f_in
+
+
+def answer_with(outputs: Sequence[str], bundle_digest: str) -> Callable[[EventView], Envelope]:
+    """Return an f_out: an Envelope with the output tokens and the times, which answers the event by its id."""
+
+    def f_out(view: EventView) -> Envelope:
+        from epypes.wire import Envelope
+
+        return Envelope(
+            type=RESULT,
+            parts={token: view[token] for token in outputs},
+            source=view.name,
+            correlation_id=view.event.id,
+            acquired_ns=view.event.acquired_ns,
+            revision=view.run.revision,
+            bundle_digest=bundle_digest,
+            attributes={**view.attributes, "total_ns": view.report.total_ns, "overhead_ns": view.report.overhead_ns},
+            timings=view.report.durations_ns,
+        )
+
+    return f_out
+
+
+def failure_event(failure: Failure, source: str, bundle_digest: str) -> Envelope:
+    """Return the Envelope that reports a failure."""
+    from epypes.wire import Envelope, FailureRecord
+
+    record = FailureRecord(
+        function=failure.function,
+        tokens=failure.tokens,
+        exception=type(failure.exception).__name__,
+        message=str(failure.exception),
+        input_id=failure.event_id,
+        attempt=1,
+    )
+    return Envelope(
+        type=FAILURE,
+        source=source,
+        correlation_id=failure.event_id,
+        bundle_digest=bundle_digest,
+        failure=record,
+    )

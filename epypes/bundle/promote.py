@@ -1,0 +1,150 @@
+"""How does a notebook's graph become a bundle?
+
+Resolve every function, slice what it needs, emit the module, record the sample, replay it in a fresh isolated
+process, pin what that imported, seal. Each step may refuse with a reason and a way out; none guesses; and only a
+bundle that passed them all takes the place of an older one.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from epypes.bundle.compare import ReplayReport
+from epypes.bundle.emit import emit_module
+from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
+from epypes.bundle.replay import replay_isolated
+from epypes.bundle.seal import MANIFEST, seal
+from epypes.bundle.settings import Settings, unwritable, write_settings
+from epypes.bundle.slicer import slice_graph
+from epypes.errors import BundleError, MessageError, PromotionRefused
+from epypes.graph import CompGraph
+from epypes.pipeline import Node, Pipeline
+from epypes.run import CompGraphRunner, Run
+
+REQUIREMENTS: Final = "requirements.txt"
+
+
+def promote(
+    runner_or_pipeline: CompGraphRunner | Pipeline,
+    to: str | Path,
+    outputs: Sequence[str] | None = None,
+    f_in: Callable[[Any], Mapping[str, Any]] | None = None,
+    f_out: Callable[[Any], Any] | None = None,
+) -> Bundle:
+    """Write a bundle: a folder of text that computes what the runner's last run computed, and proves it.
+
+    Parameters
+    ----------
+    runner_or_pipeline
+        Its last run becomes the recorded sample.
+    to
+        The folder; a bundle that is there is replaced, anything else is not.
+    outputs
+        The tokens that the service answers with; the sink tokens without.
+    f_in, f_out
+        Refused so far: a bundle takes and gives Envelopes with one part per token.
+
+    Raises
+    ------
+    PromotionRefused
+        With every reason: no run to record, a function or value that can't be promoted, or a replay in a fresh
+        process that computes something else.
+    """
+    target = Path(to)
+    runner, cg = _subject(runner_or_pipeline, target)
+    if f_in is not None or f_out is not None:
+        raise PromotionRefused(target, ["f_in and f_out can't be promoted yet. Leave them out."])
+    if target.exists() and not (target / MANIFEST).is_file() and (not target.is_dir() or any(target.iterdir())):
+        raise PromotionRefused(target, [f"{target} exists and is not a bundle. Name another folder, or remove it."])
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{target.name}-", dir=target.parent) as scratch:
+        draft = Path(scratch) / target.name
+        _write(draft, target, runner, cg, outputs)
+        _prove(draft, target)
+        _replace(draft, target)
+    return read_bundle(target)
+
+
+def _subject(given: object, target: Path) -> tuple[CompGraphRunner, CompGraph]:
+    if isinstance(given, CompGraphRunner):
+        return given, given.cg
+    if type(given) is Pipeline:
+        return given.runner, given.source_cg
+    if isinstance(given, Pipeline):
+        kind = type(given).__name__
+        text = f"A {kind} can't be promoted yet. Promote its runner: promote(CompGraphRunner(pipe.cg, hparams), ...)."
+        raise PromotionRefused(target, [text])
+    raise PromotionRefused(target, [f"A {type(given).__name__} is neither a CompGraphRunner nor a Pipeline."])
+
+
+def _write(draft: Path, target: Path, runner: CompGraphRunner, cg: CompGraph, outputs: Sequence[str] | None) -> None:
+    """Write all that can be written without running anything; raise every reason against it at once."""
+    wanted = cg.sink_tokens if outputs is None else tuple(outputs)
+    for token in wanted:
+        cg.require_token(token)
+    reasons = [*_unready(runner, wanted), *unwritable(runner.hyperparameters)]
+    functions = {name: function.func if type(function) is Node else function for name, function in cg.functions.items()}
+    needed, references = slice_graph(functions)
+    reasons += needed.refusals
+    if reasons:
+        raise PromotionRefused(target, reasons)
+    (draft / SAMPLES).mkdir(parents=True)
+    (draft / MODULE).write_text(emit_module(target.name, cg, needed, references), encoding="utf-8")
+    settings = Settings(target.name, runner.free_source_tokens, wanted, runner.hyperparameters)
+    write_settings(draft / SETTINGS, settings, cg)
+    if runner.last is not None:  # as _unready has made sure
+        _record(draft / SAMPLES / "000.npz", target, runner.last, runner.free_source_tokens, wanted)
+
+
+def _unready(runner: CompGraphRunner, outputs: Sequence[str]) -> list[str]:
+    """Return why the last run can't serve as a sample."""
+    call = f"run({', '.join(f'{token}=...' for token in runner.free_source_tokens)})"
+    if not outputs:
+        return ["The graph has no output: name at least one token as output."]
+    if runner.last is None:
+        return [f"Nothing has been run, so there is nothing to compare with. Call {call} first."]
+    if runner.last.failure is not None:
+        return [f"The last run failed in {runner.last.failure}. Call {call} again first."]
+    if runner.stale:
+        return [f"These functions are stale: {', '.join(runner.stale)}. Call rerun() first."]
+    return []
+
+
+def _record(path: Path, target: Path, run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> None:
+    from epypes.wire.samples import save_sample
+
+    try:
+        save_sample(path, {token: run[token] for token in inputs}, {token: run[token] for token in outputs})
+    except MessageError as error:
+        raise PromotionRefused(target, [str(error)]) from error
+
+
+def _prove(draft: Path, target: Path) -> ReplayReport:
+    try:
+        report = replay_isolated(draft, sealed=False)
+    except BundleError as error:
+        raise PromotionRefused(target, [str(error).replace(str(draft.resolve()), str(target))]) from error
+    if not report.identical:
+        why = "A function may depend on something that is not a token, such as a counter, the time or random numbers."
+        raise PromotionRefused(target, [*map(str, report.differences), why])
+    (draft / REQUIREMENTS).write_text("".join(f"{line}\n" for line in report.requirements), encoding="utf-8")
+    seal(draft)
+    return report
+
+
+def _replace(draft: Path, target: Path) -> None:
+    """Put the new bundle in the place of the old one, which is deleted only when that is done."""
+    old = draft.parent / "old"
+    if target.exists():
+        target.rename(old)
+    try:
+        draft.rename(target)
+    except OSError:
+        if old.exists():
+            old.rename(target)
+        raise
+    shutil.rmtree(old, ignore_errors=True)

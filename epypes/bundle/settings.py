@@ -1,0 +1,143 @@
+"""What stands in pipeline.toml, and how is it read back?"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from epypes.errors import BundleError
+from epypes.graph import CompGraph
+from epypes.hints import Param, annotated_param
+
+FORMAT: Final = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """The settings of a bundle.
+
+    Attributes
+    ----------
+    name
+        The bundle's name.
+    inputs
+        The free source tokens that an event brings.
+    outputs
+        The tokens that an answer carries.
+    hyperparameters
+        Values by token.
+    """
+
+    name: str
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    hyperparameters: Mapping[str, Any]
+
+
+def unwritable(hyperparameters: Mapping[str, Any]) -> list[str]:
+    """Return a reason for each hyperparameter whose value TOML can't hold."""
+    return [
+        f"Hyperparameter {token!r} is a {type(value).__name__}, which pipeline.toml can't hold. "
+        "Use a number, string, bool, None, or a tuple or list of them; or unfreeze it and pass it to run()."
+        for token, value in hyperparameters.items()
+        if not _fits(value)
+    ]
+
+
+def _fits(value: Any) -> bool:
+    if type(value) in (tuple, list):
+        # One kind per table entry: what is inside a sequence keeps its type only if TOML has it.
+        return all(type(item) in (bool, int, float, str) and _fits(item) for item in value)
+    if type(value) is int:
+        return -(2**63) <= value < 2**63
+    return value is None or type(value) in (bool, float, str)
+
+
+def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
+    """Write pipeline.toml, with a comment per section and the ranges that annotations give."""
+    import tomlkit
+
+    document = tomlkit.document()
+    document.add(tomlkit.comment("What the graph in pipeline.py is run with. Change a value, then promote or verify."))
+    bundle = tomlkit.table()
+    bundle.add("format", FORMAT)
+    bundle.add("name", settings.name)
+    document.add("bundle", bundle)
+    ports = tomlkit.table()
+    ports.add(tomlkit.comment("The tokens that an event brings, and those that its answer carries."))
+    ports.add("inputs", list(settings.inputs))
+    ports.add("outputs", list(settings.outputs))
+    document.add("ports", ports)
+    hyperparameters = tomlkit.table(is_super_table=True)
+    for token, value in settings.hyperparameters.items():
+        hyperparameters.add(token, _entry(value, hint_of(cg, token)))
+    document.add("hyperparameters", hyperparameters)
+    path.write_text(tomlkit.dumps(document), encoding="utf-8")
+
+
+def _entry(value: Any, hint: Param | None) -> Any:
+    import tomlkit
+
+    table = tomlkit.table()
+    if value is None:
+        table.add("kind", "none")
+    else:
+        table.add("value", list(value) if isinstance(value, tuple) else value)
+        if isinstance(value, tuple):
+            table.add("kind", "tuple")
+    for key in ("low", "high", "step", "odd", "log", "unit"):
+        setting = getattr(hint, key, None)
+        if setting:
+            table.add(key, setting)
+    if hint and hint.choices and all(_fits(choice) and choice is not None for choice in hint.choices):
+        table.add("choices", list(hint.choices))
+    return table
+
+
+def hint_of(cg: CompGraph, token: str) -> Param | None:
+    """Return the hint in the annotation of the first function that takes the token."""
+    for name in cg.digraph.consumers.get(token, ()):
+        hint = annotated_param(cg.functions[name], cg.func_inputs(name).index(token))
+        if hint is not None:
+            return hint
+    return None
+
+
+def read_settings(path: Path) -> Settings:
+    """Read pipeline.toml.
+
+    Raises
+    ------
+    BundleError
+        It is not TOML, has another format, or lacks an entry; the entry is named.
+    """
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        bundle, ports = document["bundle"], document["ports"]
+        if bundle["format"] != FORMAT:
+            raise BundleError(path, f"{path} has format {bundle['format']}; this EPypes reads format {FORMAT}.")
+        return Settings(
+            str(bundle["name"]),
+            _strings(ports["inputs"]),
+            _strings(ports["outputs"]),
+            {token: _value(entry) for token, entry in document.get("hyperparameters", {}).items()},
+        )
+    except KeyError as error:
+        raise BundleError(path, f"{path} lacks {error.args[0]!r}. Promote the graph again.") from error
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, TypeError, AttributeError) as error:
+        raise BundleError(path, f"{path} can't be read: {error}.") from error
+
+
+def _strings(values: Sequence[Any]) -> tuple[str, ...]:
+    if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
+        raise TypeError(f"{values!r} is not a list of token names")
+    return tuple(values)
+
+
+def _value(entry: Mapping[str, Any]) -> Any:
+    if entry.get("kind") == "none":
+        return None
+    return tuple(entry["value"]) if entry.get("kind") == "tuple" else entry["value"]

@@ -1,0 +1,243 @@
+"""What does a notebook function need to stand in a module of its own?
+
+Imports, small constants and other plain functions are followed; everything else is refused by name.
+"""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import dis
+import types
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Final
+
+from epypes.bundle.source import Definition, Importable, Refused, definition, importable
+
+_CONSTANT_CHARACTERS: Final = 400
+RESERVED: Final = frozenset({"func_dict", "func_io"})
+
+
+class Slice:
+    """What a module needs, gathered from several functions.
+
+    Attributes
+    ----------
+    imports
+        Import statements, by the name that each binds and what it binds it to.
+    constants
+        Source of values, by name.
+    definitions
+        Functions by name, each after those that it calls.
+    refusals
+        Why something can't be promoted.
+    """
+
+    def __init__(self) -> None:
+        self.imports: dict[tuple[str, str], str] = {}
+        self.constants: dict[str, str] = {}
+        self.definitions: dict[str, Definition] = {}
+        self.refusals: list[str] = []
+        self._meanings: dict[str, tuple[str, object]] = {}
+        self._seen: set[int] = set()
+
+    def add_graph_function(self, name: str, function: Callable[..., Any]) -> str:
+        """Add a function of the graph; return the expression by which the module refers to it."""
+        what = f"Function {name!r}"
+        home = importable(function)
+        try:
+            if home is None:
+                return self._add_definition(function, what).name
+            return f"{self._module_name(home.module, what)}.{home.qualname}"
+        except Refused as refusal:
+            self.refusals.append(str(refusal))
+            return "None"
+
+    def _module_name(self, module: str, what: str) -> str:
+        """Import a module, unless a function has brought it already under a name of its own (``np``)."""
+        aliases = [name for name, imported in self.imports if imported == module]
+        if not aliases:
+            self._import_module(module, what)
+        return min(aliases, default=module)
+
+    def _add_definition(self, function: Callable[..., Any], what: str) -> Definition:
+        found = definition(function, what)
+        self._claim(found.name, ("object", id(function)), what)
+        if id(function) in self._seen:
+            return found
+        self._seen.add(id(function))
+        _check_defaults(found, what)
+        for name in _global_names(found, what):
+            try:
+                self._add_name(name, found, what)
+            except Refused as refusal:
+                self.refusals.append(str(refusal))
+        self.definitions[found.name] = found
+        return found
+
+    def _claim(self, name: str, meaning: tuple[str, object], what: str) -> None:
+        """Make a name mean one thing in the module."""
+        if name in RESERVED:
+            raise Refused(f"{what} uses the name {name!r}, which the module keeps for the graph. Rename it.")
+        if self._meanings.setdefault(name, meaning) != meaning:
+            raise Refused(
+                f"{what} uses the name {name!r}, which means something else in another function of the graph. "
+                "Rename one of the two."
+            )
+
+    def _add_name(self, name: str, found: Definition, what: str) -> None:
+        """Add what one global name of a function means at the time of promotion."""
+        names = found.function.__globals__
+        if name not in names:
+            if not hasattr(builtins, name):
+                raise Refused(f"{what} uses {name!r}, which is not defined ({found.place}). Define it, or rename.")
+            return
+        value = names[name]
+        if isinstance(value, types.ModuleType):
+            self._add_module(name, value, found, what)
+            return
+        home = importable(value, name) if callable(value) or not _is_data(value) else None
+        if home is not None:
+            self._claim(name, ("object", id(value)), what)
+            self._import_from(home, name)
+        elif isinstance(value, types.FunctionType):
+            self._add_helper(name, value, found, what)
+        else:
+            self._add_constant(name, value, found, what)
+
+    def _add_helper(self, name: str, helper: types.FunctionType, found: Definition, what: str) -> None:
+        if helper.__name__ != name and helper.__name__ != "<lambda>":
+            raise Refused(
+                f"{what} calls {name!r} ({found.place}), which was defined as {helper.__name__!r}. "
+                "Call it by the name that it was defined with."
+            )
+        self._add_definition(helper, f"Function {name!r}, which {what[0].lower()}{what[1:]} calls,")
+
+    def _add_constant(self, name: str, value: Any, found: Definition, what: str) -> None:
+        source = repr(value) if _is_data(value) else ""
+        if not source or len(source) > _CONSTANT_CHARACTERS or not _reads_back(source, value):
+            raise Refused(
+                f"{what} is defined in the notebook ({found.place}) and uses {name!r} from it, "
+                f"a {type(value).__name__}. Make {name} a token, or move both into a module."
+            )
+        if self.constants.get(name, source) != source:
+            raise Refused(f"{what} uses {name!r}, which has another value elsewhere. Rename one of the two.")
+        if name not in self.constants:
+            self._claim(name, ("constant", name), what)
+            self.constants[name] = source
+
+    def _add_module(self, name: str, module: types.ModuleType, found: Definition, what: str) -> None:
+        if module.__name__ == "__main__":
+            raise Refused(f"{what} uses the notebook itself as module {name!r} ({found.place}).")
+        if name != module.__name__:
+            self._claim(name, ("object", id(module)), what)
+            self.imports[name, module.__name__] = f"import {module.__name__} as {name}"
+            return
+        for dotted in _submodules(found.node, name, module) or (name,):
+            self._import_module(dotted, what)
+
+    def _import_module(self, module: str, what: str) -> None:
+        top = module.partition(".")[0]
+        self._claim(top, ("module", top), what)
+        self.imports[module, module] = f"import {module}"
+
+    def _import_from(self, home: Importable, name: str) -> None:
+        top, _, rest = home.qualname.partition(".")
+        alias = "" if name == top else f" as {name}"
+        if rest:
+            # A nested name can't be imported by itself.
+            raise Refused(
+                f"{name!r} is {home.module}.{home.qualname}, a name inside a class. Use it through the class."
+            )
+        self.imports[name, f"{home.module}.{top}"] = f"from {home.module} import {top}{alias}"
+
+
+def _is_data(value: object) -> bool:
+    kinds = (bool, int, float, complex, str, bytes, type(None), tuple, list, dict, set, frozenset)
+    return type(value) in kinds
+
+
+def _reads_back(source: str, value: Any) -> bool:
+    """Whether source is a literal of this very value."""
+    try:
+        read = ast.literal_eval(source)
+    except (ValueError, SyntaxError):
+        return False
+    return type(read) is type(value) and bool(read == value)
+
+
+def _check_defaults(found: Definition, what: str) -> None:
+    arguments = found.node.args
+    for default in (*arguments.defaults, *(default for default in arguments.kw_defaults if default)):
+        try:
+            ast.literal_eval(default)
+        except ValueError:
+            text = f"{what} has the default {ast.unparse(default)!r} ({found.place}), which is not a literal."
+            raise Refused(f"{text} Write the value itself.") from None
+
+
+def _global_names(found: Definition, what: str) -> Iterator[str]:
+    """Return the global names that a function reads when it is called or defined, each once, in order of use."""
+    names: dict[str, None] = {}
+    for code in _nested_codes(found.function.__code__):
+        for instruction in dis.get_instructions(code):
+            if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
+                raise Refused(f"{what} changes the global {instruction.argval!r} ({found.place}). Return the value.")
+            if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
+                names[instruction.argval] = None
+    arguments = found.node.args
+    every = (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs, arguments.vararg, arguments.kwarg)
+    outside = [argument.annotation for argument in every if argument] + [found.node.returns]
+    for expression in (*outside, *found.node.decorator_list):
+        for node in ast.walk(expression) if expression else ():
+            if isinstance(node, ast.Name):
+                names[node.id] = None
+    return iter(names)
+
+
+def _nested_codes(code: types.CodeType) -> Iterator[types.CodeType]:
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, types.CodeType):
+            yield from _nested_codes(constant)
+
+
+def _submodules(tree: ast.AST, name: str, module: types.ModuleType) -> tuple[str, ...]:
+    """Return the submodules that are reached as attributes (``skimage.filters``): each needs an import of its own."""
+    found: dict[str, None] = {}
+    for node in ast.walk(tree):
+        chain = _chain(node)
+        if chain and chain[0] == name:
+            reached: Any = module
+            dotted = name
+            for part in chain[1:]:
+                reached = getattr(reached, part, None)
+                if not isinstance(reached, types.ModuleType) or reached.__name__ != f"{dotted}.{part}":
+                    break
+                dotted = f"{dotted}.{part}"
+            if dotted != name:
+                found[dotted] = None
+    return tuple(found)
+
+
+def _chain(node: ast.AST) -> list[str]:
+    parts: list[str] = []
+    while isinstance(node, ast.Attribute):
+        parts.append(node.attr)
+        node = node.value
+    return [node.id, *reversed(parts)] if isinstance(node, ast.Name) and parts else []
+
+
+def slice_graph(functions: Mapping[str, Callable[..., Any]]) -> tuple[Slice, dict[str, str]]:
+    """Slice all functions of a graph.
+
+    Returns
+    -------
+    tuple
+        What the module needs, and by function of the graph the expression that refers to it.
+    """
+    gathered = Slice()
+    # The notebook's own functions first: they know by which names they import modules.
+    own_first = sorted(functions, key=lambda name: importable(functions[name]) is not None)
+    references = {name: gathered.add_graph_function(name, functions[name]) for name in own_first}
+    return gathered, {name: references[name] for name in functions}

@@ -1,0 +1,22 @@
+"""Which commands are there?"""
+
+from __future__ import annotations
+
+import typer
+
+from epypes.cli.call import call
+from epypes.cli.demo import demo
+from epypes.cli.promote import promote
+from epypes.cli.serve import serve
+from epypes.cli.verify import verify
+
+app = typer.Typer(
+    name="epypes",
+    help="Vision algorithms as computational graphs: promoted from a notebook, verified, served and called.",
+    no_args_is_help=True,
+    add_completion=False,
+    # A traceback's locals would print whole images.
+    pretty_exceptions_enable=False,
+)
+for command in (promote, verify, serve, call, demo):
+    app.command()(command)

@@ -1,0 +1,100 @@
+"""``epypes call``: one image to a running service, and its answer to a file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from epypes.cli.terminal import out, print_times
+from epypes.errors import ServiceError, UnknownName
+
+if TYPE_CHECKING:
+    from epypes.service import Answer
+
+
+def call(
+    bundle: Annotated[Path, typer.Argument(help="The folder of the bundle that is being served.")],
+    images: Annotated[list[str], typer.Argument(help="An image file, or TOKEN=FILE for each input token.")],
+    out_file: Annotated[
+        list[str], typer.Option("--out", help="The file for the output token, or TOKEN=FILE; an image or .npy.")
+    ],
+    timeout: Annotated[float, typer.Option(help="How long to wait for the answer, in seconds.", min=0.001)] = 10.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the times as JSON, in nanoseconds.")] = False,
+) -> None:
+    """Send one image to the service of a bundle and write what comes back."""
+    from epypes.acquisition import read_image
+    from epypes.bundle.load import SETTINGS
+    from epypes.bundle.seal import check_seal
+    from epypes.bundle.settings import read_settings
+    from epypes.service import call as call_service
+
+    check_seal(bundle)
+    settings = read_settings(bundle / SETTINGS)
+    files = by_token(images, settings.inputs, "input")
+    targets = by_token(out_file, settings.outputs, "output")
+    payload = {token: read_image(file) for token, file in files.items()}
+    answer = call_service(bundle, payload, timeout_s=timeout)
+    for token, file in targets.items():
+        _write(file, answer.tokens[token])
+    if as_json:
+        out.print(json.dumps(times_of(answer)))
+        return
+    totals = {"graph overhead": answer.overhead_ns, "run in all": answer.total_ns, "round trip": answer.round_trip_ns}
+    print_times(f"{bundle}: {', '.join(targets.values())}", answer.timings_ns, totals)
+
+
+def by_token(given: Sequence[str], tokens: Sequence[str], kind: str) -> dict[str, str]:
+    """Read ``FILE`` or ``TOKEN=FILE`` arguments; a file alone is the one token's.
+
+    Raises
+    ------
+    UnknownName
+        There is no such token.
+    ServiceError
+        A token is missing, or it is not clear which one a file is for.
+    """
+    found: dict[str, str] = {}
+    for text in given:
+        name, equals, file = text.partition("=")
+        if equals and name in tokens:
+            found[name] = file
+        elif len(tokens) == 1 and len(given) == 1:
+            found[tokens[0]] = text
+        elif equals:
+            raise UnknownName(f"{kind} token", name, tokens, "in this bundle")
+        else:
+            raise ServiceError(
+                text, f"Which {kind} is {text!r}? Write one of: {', '.join(f'{t}=FILE' for t in tokens)}"
+            )
+    missing = [token for token in tokens if token not in found] if kind == "input" else []
+    if missing:
+        raise ServiceError(missing, f"Missing {kind}: {', '.join(f'{token}=FILE' for token in missing)}")
+    return found
+
+
+def times_of(answer: Answer) -> dict[str, Any]:
+    """Return the times of an answer, in nanoseconds, ready for JSON."""
+    return {
+        "functions_ns": dict(answer.timings_ns),
+        "overhead_ns": answer.overhead_ns,
+        "total_ns": answer.total_ns,
+        "round_trip_ns": answer.round_trip_ns,
+    }
+
+
+def _write(file: str, value: Any) -> None:
+    import numpy as np
+
+    from epypes.acquisition import write_image
+
+    if Path(file).suffix == ".npy":
+        np.save(file, value, allow_pickle=False)
+    elif isinstance(value, np.ndarray):
+        write_image(file, value)
+    else:
+        kind = type(value).__name__
+        raise ServiceError(file, f"The answer is a {kind}, not an image. Use a file ending in .npy for numbers.")

@@ -1,0 +1,92 @@
+"""Which forms of an object does a notebook get?"""
+
+from __future__ import annotations
+
+from html import escape
+from typing import Any
+
+from epypes.display.svg import alt_text, paint_svg
+from epypes.display.text import paint_text
+from epypes.display.view import GraphView, duration_text, view
+from epypes.errors import LayoutUnavailable
+from epypes.graph import CompGraph
+from epypes.run import CompGraphRunner, Run, RunReport
+
+_HIDDEN = "position:absolute;width:1px;height:1px;overflow:hidden;clip-path:inset(50%);white-space:nowrap"
+
+
+def mimebundle(shown: Any) -> dict[str, str]:
+    """Return ``text/plain``, ``text/html`` and ``image/svg+xml`` of a graph, a runner, a run, a pipeline or a report.
+
+    Never raises: what can't be painted is shown as text, with the reason and the way out.
+    """
+    plain = repr(shown)
+    try:
+        return {"text/plain": plain, **_painted(shown)}
+    except LayoutUnavailable as error:
+        return {"text/plain": f"{plain}\n{paint_text(view(_subject(shown)))}\n{error}"}
+    except Exception as error:
+        return {"text/plain": f"{plain}\n(no picture: {type(error).__name__}: {error!s:.200})"}
+
+
+def _painted(shown: Any) -> dict[str, str]:
+    if isinstance(shown, RunReport):
+        return {"text/html": paint_report(shown)}
+    graph = view(_subject(shown))
+    svg = paint_svg(graph)
+    return {"text/html": _figure(svg, graph), "image/svg+xml": svg}
+
+
+def _subject(shown: Any) -> CompGraph | CompGraphRunner | Run:
+    """Return what is to be seen of an object: of a pipeline, its runner."""
+    if isinstance(shown, CompGraph | CompGraphRunner | Run):
+        return shown
+    runner: CompGraphRunner = shown.runner
+    return runner
+
+
+def to_svg(shown: CompGraph | CompGraphRunner | Run) -> str:
+    """Return the picture as the text of an SVG file.
+
+    Raises
+    ------
+    LayoutUnavailable
+        No Graphviz engine answered.
+    """
+    return paint_svg(view(shown))
+
+
+def _figure(svg: str, graph: GraphView) -> str:
+    return (
+        f'<figure style="margin:0">{svg}'
+        f'<figcaption style="font-size:11px">{escape(graph.caption)}</figcaption>{_table_twin(graph)}</figure>'
+    )
+
+
+def _table_twin(graph: GraphView) -> str:
+    """Return the graph as a table for screen readers; it also stays where a page strips the picture."""
+    rows = "".join(
+        f"<tr><td>{escape(function.name)}</td><td>{escape(', '.join(inputs))}</td>"
+        f"<td>{escape(', '.join(outputs))}</td><td>{escape(function.state)}</td></tr>"
+        for (inputs, outputs), function in zip(graph.io(), graph.functions, strict=True)
+    )
+    return (
+        f'<table style="{_HIDDEN}"><caption>{escape(alt_text(graph))}</caption>'
+        f"<tr><th>function</th><th>inputs</th><th>outputs</th><th>state</th></tr>{rows}</table>"
+    )
+
+
+def paint_report(report: RunReport) -> str:
+    """Paint a report as an HTML table: per function its time and its share of the whole."""
+    total_ns = max(report.total_ns, 1)
+    rows = "".join(
+        f"<tr><td>{escape(entry.function)}</td>"
+        f"<td>{duration_text(entry.duration_ns) if entry.ran else 'reused'}</td>"
+        f"<td>{f'{entry.duration_ns / total_ns:.0%}' if entry.ran else ''}</td></tr>"
+        for entry in report.functions
+    )
+    return (
+        f"<table><tr><th>function</th><th>time</th><th>share</th></tr>{rows}"
+        f"<tr><td>graph overhead</td><td>{duration_text(report.overhead_ns)}</td>"
+        f"<td>{report.overhead_ns / total_ns:.0%}</td></tr></table>"
+    )

@@ -1,0 +1,85 @@
+"""What is shown of one value: a line of text, and a thumbnail if it is an image?"""
+
+from __future__ import annotations
+
+import enum
+import math
+import reprlib
+from dataclasses import dataclass
+from typing import Any, Final
+
+from epypes.display.raster import Picture, encode_image, is_image, sampled
+
+THUMBNAIL_PX: Final = 128
+_TEXT_WIDTH: Final = 24
+_PLAIN = (int, float, complex, str, bytes, bool, type(None), enum.Enum)
+_CONTAINERS = (tuple, list, dict, set, frozenset)
+
+
+@dataclass(frozen=True, slots=True)
+class Preview:
+    """What is shown of a value.
+
+    Attributes
+    ----------
+    text
+        A short line; for arrays dtype and shape.
+    detail
+        A longer line: dtype, shape and range.
+    picture
+        A thumbnail of at most 128 x 128 pixels, or None.
+    """
+
+    text: str
+    detail: str
+    picture: Picture | None = None
+
+
+def preview(value: Any) -> Preview:
+    """Look at a value; never raises, and never calls the ``__repr__`` of an object that is not Python's own."""
+    try:
+        return _array_preview(value) if _is_array(value) else _object_preview(value)
+    except Exception as error:
+        reason = f"no preview: {type(error).__name__}"
+        return Preview(reason, f"{type(value).__name__}, {reason}")
+
+
+def _is_array(value: Any) -> bool:
+    return type(value).__module__.startswith("numpy") and hasattr(value, "dtype") and hasattr(value, "shape")
+
+
+def _array_preview(array: Any) -> Preview:
+    if not array.shape:
+        return Preview(_cut(str(array.item())), f"{array.dtype} {array.item()!s:.60}")
+    text = f"{array.dtype} {' x '.join(map(str, array.shape))}"
+    detail = text + _range_text(array)
+    return Preview(text, detail, encode_image(array, THUMBNAIL_PX) if is_image(array) else None)
+
+
+def _range_text(array: Any) -> str:
+    """Return the least and the largest value, of a strided sample where the array is large."""
+    import numpy as np
+
+    if not array.size or array.dtype.kind not in "biuf":
+        return ""
+    looked_at = sampled(array) if array.ndim in (2, 3) else array.reshape(-1)[:1_000_000]
+    finite = looked_at[np.isfinite(looked_at)] if array.dtype.kind == "f" else looked_at
+    if not finite.size:
+        return ", no finite value"
+    marked = " of a sample" if looked_at.size < array.size else ""
+    return f", {finite.min()} to {finite.max()}{marked}"
+
+
+def _object_preview(value: Any) -> Preview:
+    if isinstance(value, float) and math.isfinite(value):
+        return Preview(f"{value:.6g}", f"float {value!r}")
+    if isinstance(value, _PLAIN):
+        return Preview(_cut(reprlib.repr(value)), f"{type(value).__name__} {reprlib.repr(value)}")
+    kind = type(value).__name__
+    if isinstance(value, _CONTAINERS):
+        return Preview(f"{kind} of {len(value)}", f"{kind} of {len(value)}")
+    return Preview(_cut(kind), kind)
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= _TEXT_WIDTH else text[: _TEXT_WIDTH - 3] + "..."

@@ -1,0 +1,239 @@
+"""How is a GraphView painted as SVG?
+
+Graphviz gives the geometry only; every mark is painted here, so that names, values, thumbnails and states change
+without a new layout, and colours follow the page's theme.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+import re
+from collections.abc import Iterable
+from html import escape
+from typing import Final
+
+from epypes.display.layout import Box, Layout, Point, lay_out
+from epypes.display.view import FunctionView, GraphView, TokenView, duration_text
+
+_LINE_PX: Final = 16
+_CHARACTER_PX: Final = 6.9
+_NAME_CHARACTERS: Final = 26
+_THUMB_WIDTH: Final = 128
+_THUMB_HEIGHT: Final = 96
+_MARGIN: Final = 6
+
+# The fallbacks serve where the page has no Jupyter theme: dark text on light vertices, grey edges, readable on white
+# and on black paper alike.
+STYLE: Final = """
+.epypes-graph{max-width:100%;height:auto;font:12px var(--jp-ui-font-family,system-ui,sans-serif)}
+.epypes-graph text{fill:var(--jp-ui-font-color1,#1f2328);text-anchor:middle;stroke:none}
+.epypes-graph .small{font-size:10px}
+.epypes-graph .name{font-weight:600}
+.epypes-graph .shape{fill:var(--jp-layout-color1,#fff);stroke:#80868f}
+.epypes-graph .function .shape{fill:var(--jp-layout-color2,#e9eef6);stroke-width:1.4}
+.epypes-graph .function .shape{stroke:var(--jp-brand-color1,#1976d2)}
+.epypes-graph .hyperparameter .shape{fill:var(--jp-layout-color3,#dcdfe4)}
+.epypes-graph .bar{fill:var(--jp-brand-color1,#1976d2)}
+.epypes-graph .failed .shape{stroke:var(--jp-error-color1,#d32f2f);stroke-width:3}
+.epypes-graph .stale .shape,.epypes-graph .not-computed .shape,.epypes-graph .not-run .shape{stroke-dasharray:2 3}
+.epypes-graph .stale image{opacity:.35}
+.epypes-graph .edge{fill:none;stroke:#80868f}
+.epypes-graph .tip{fill:#80868f}
+""".replace("\n", "")
+
+
+def paint_svg(graph: GraphView) -> str:
+    """Paint a graph; the same view gives the same text.
+
+    Raises
+    ------
+    LayoutUnavailable
+        No Graphviz engine answered.
+    """
+    functions = len(graph.functions)
+    boxes = (*map(_function_box, graph.functions), *map(_token_box, graph.tokens))
+    edges = tuple(
+        (functions + token, function) if taken else (function, functions + token)
+        for function, token, taken in graph.edges
+    )
+    layout = lay_out(boxes, edges)
+    size = f"{layout.width + 2 * _MARGIN:.0f}", f"{layout.height + 2 * _MARGIN:.0f}"
+    box = f"{-_MARGIN} {-_MARGIN} {size[0]} {size[1]}"
+    head = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" class="epypes-graph" role="figure" '
+        f'aria-label="{escape(alt_text(graph))}" width="{size[0]}" height="{size[1]}" viewBox="{box}">'
+    )
+    parts = [head, f"<style>{STYLE}</style>"]
+    parts += map(_paint_edge, layout.splines)
+    parts += _paint_vertices(graph, boxes, layout)
+    parts.append("</svg>")
+    return "\n".join(parts)
+
+
+def alt_text(graph: GraphView) -> str:
+    """Return the graph in one sentence, for screen readers."""
+    order = ", ".join(function.name for function in graph.functions[:12])
+    more = ", ..." if len(graph.functions) > 12 else ""
+    return f"Computational graph of {len(graph.functions)} functions: {order}{more}. {graph.caption}".strip()
+
+
+def _paint_vertices(graph: GraphView, boxes: tuple[Box, ...], layout: Layout) -> Iterable[str]:
+    functions = len(graph.functions)
+    for function, box, centre in zip(graph.functions, boxes, layout.centres, strict=False):
+        yield _paint_function(function, box, centre)
+    for token, box, centre in zip(graph.tokens, boxes[functions:], layout.centres[functions:], strict=True):
+        yield _paint_token(token, box, centre)
+
+
+# -- sizes ------------------------------------------------------------------------------------------------------------
+
+
+def _width(*lines: str) -> float:
+    return max(len(line) for line in lines) * _CHARACTER_PX + 22
+
+
+def _function_lines(function: FunctionView) -> tuple[str, ...]:
+    name = _cut(function.name)
+    if function.state in ("static", "not run"):
+        return (name,)
+    if function.state == "ran" and function.duration_ns is not None:
+        return name, f"{duration_text(function.duration_ns)}, {function.share:.0%}"
+    if function.state == "failed":
+        return name, _cut(function.message.partition(":")[2].strip() or "failed")
+    return name, function.state
+
+
+def _function_box(function: FunctionView) -> Box:
+    lines = _function_lines(function)
+    # The widest time is reserved for, so that another run's times do not move anything.
+    widest = "000.0 ms, 100%" if len(lines) > 1 and function.state != "failed" else ""
+    return Box("box", max(_width(*lines, widest), 64), _LINE_PX * len(lines) + 14)
+
+
+def _token_lines(token: TokenView) -> tuple[str, ...]:
+    name = _cut(token.name)
+    if token.preview is None:
+        return (name,)
+    if token.role == "hyperparameter":
+        return (f"{name} = {token.preview.text}",)
+    return name, token.preview.text
+
+
+def _token_box(token: TokenView) -> Box:
+    lines = _token_lines(token)
+    if token.preview and token.preview.picture:
+        return Box("box", max(_THUMB_WIDTH + 12, _width(*lines)), _THUMB_HEIGHT + 2 * _LINE_PX + 12)
+    if token.role == "hyperparameter":
+        return Box("hexagon", _width(*lines) + 14, _LINE_PX + 12)
+    return Box("ellipse", _width(*lines) * 1.18, _LINE_PX * len(lines) + 16)
+
+
+def _cut(text: str) -> str:
+    text = " ".join(text.split())
+    return text if len(text) <= _NAME_CHARACTERS else text[: _NAME_CHARACTERS - 1] + "…"
+
+
+# -- marks ------------------------------------------------------------------------------------------------------------
+
+
+def vertex_id(kind: str, name: str) -> str:
+    """Return the id of a vertex's element, made from its name so that the same graph has the same ids."""
+    return f"{kind}-{re.sub(r'[^A-Za-z0-9_.-]', lambda match: f':{ord(match[0]):x}:', name)}"
+
+
+def _group(kind: str, name: str, states: tuple[str, ...], title: str, body: str) -> str:
+    classes = " ".join(state.replace(" ", "-") for state in (kind, *states))
+    return f'<g id="{vertex_id(kind, name)}" class="{classes}"><title>{escape(title)}</title>{body}</g>'
+
+
+def _paint_function(function: FunctionView, box: Box, centre: Point) -> str:
+    x, y = centre[0] - box.width / 2, centre[1] - box.height / 2
+    body = f'<rect class="shape" x="{x:.1f}" y="{y:.1f}" width="{box.width:.1f}" height="{box.height:.1f}" rx="3"/>'
+    if function.share > 0:
+        body += (
+            f'<rect class="bar" x="{x:.1f}" y="{y + box.height - 4:.1f}" '
+            f'width="{box.width * min(function.share, 1):.1f}" height="4"/>'
+        )
+    body += _text(_function_lines(function), centre)
+    title = f"function {function.name}: {function.state}. {function.message}".removesuffix(" ")
+    return _group("function", function.name, (function.state,), title[:600], body)
+
+
+def _paint_token(token: TokenView, box: Box, centre: Point) -> str:
+    lines = _token_lines(token)
+    x, y = centre[0] - box.width / 2, centre[1] - box.height / 2
+    if box.shape == "box":
+        body = (
+            f'<rect class="shape" x="{x:.1f}" y="{y:.1f}" width="{box.width:.1f}" height="{box.height:.1f}" rx="10"/>'
+        )
+        body += _text(lines, (centre[0], y + _LINE_PX + 2)) + _thumbnail(token, centre[0], y + 2 * _LINE_PX + 6)
+    elif box.shape == "hexagon":
+        body = f'<polygon class="shape" points="{_hexagon(x, y, box)}"/>' + _text(lines, centre)
+    else:
+        body = (
+            f'<ellipse class="shape" cx="{centre[0]:.1f}" cy="{centre[1]:.1f}" '
+            f'rx="{box.width / 2:.1f}" ry="{box.height / 2:.1f}"/>'
+        ) + _text(lines, centre)
+    detail = token.preview.detail if token.preview else "no value"
+    state = "" if token.state == "static" else f": {detail}, {token.state}"
+    return _group("token", token.name, (token.role, token.state), _title(token, state), body)
+
+
+def _title(token: TokenView, state: str) -> str:
+    kind = "hyperparameter token" if token.role == "hyperparameter" else "token"
+    return f"{kind} {token.name}{state}"[:600]
+
+
+def _hexagon(x: float, y: float, box: Box) -> str:
+    cut = 10.0
+    right, bottom, middle = x + box.width, y + box.height, y + box.height / 2
+    points = (
+        (x, middle),
+        (x + cut, y),
+        (right - cut, y),
+        (right, middle),
+        (right - cut, bottom),
+        (x + cut, bottom),
+    )
+    return " ".join(f"{a:.1f},{b:.1f}" for a, b in points)
+
+
+def _text(lines: tuple[str, ...], centre: Point) -> str:
+    """Write the lines around a centre: the first is the name, the second smaller."""
+    top = centre[1] - _LINE_PX * (len(lines) - 1) / 2 + 4
+    kinds = ("name", "small")
+    return "".join(
+        f'<text class="{kinds[min(row, 1)]}" x="{centre[0]:.1f}" y="{top + row * _LINE_PX:.1f}">{escape(line)}</text>'
+        for row, line in enumerate(lines)
+    )
+
+
+def _thumbnail(token: TokenView, x: float, y: float) -> str:
+    picture = token.preview.picture if token.preview else None
+    if picture is None:
+        return ""
+    scale = min(_THUMB_WIDTH / picture.width, _THUMB_HEIGHT / picture.height)
+    width, height = picture.width * scale, picture.height * scale
+    data = base64.b64encode(picture.data).decode()
+    return (
+        f'<image x="{x - width / 2:.1f}" y="{y + (_THUMB_HEIGHT - height) / 2:.1f}" width="{width:.1f}" '
+        f'height="{height:.1f}" href="data:{picture.media_type};base64,{data}"/>'
+    )
+
+
+def _paint_edge(points: tuple[Point, ...]) -> str:
+    *spline, tip = points
+    start, *controls = spline
+    path = f"M{start[0]:.1f},{start[1]:.1f}C" + " ".join(f"{x:.1f},{y:.1f}" for x, y in controls)
+    end = controls[-1] if controls else start
+    return f'<path class="edge" d="{path}"/><polygon class="tip" points="{_arrow(end, tip)}"/>'
+
+
+def _arrow(end: Point, tip: Point) -> str:
+    """Return a triangle from the end of a spline to its tip."""
+    dx, dy = tip[0] - end[0], tip[1] - end[1]
+    length = math.hypot(dx, dy) or 1.0
+    across = (-dy / length * 3.5, dx / length * 3.5)
+    corners = (tip, (end[0] + across[0], end[1] + across[1]), (end[0] - across[0], end[1] - across[1]))
+    return " ".join(f"{x:.1f},{y:.1f}" for x, y in corners)
