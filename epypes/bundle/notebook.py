@@ -52,14 +52,15 @@ def promote_notebook(
             f"_promote_here({name!r}, {str(Path(to).resolve())!r}, "
             f"{None if outputs is None else list(outputs)!r}, {str(outcome)!r})"
         )
-        _execute(path, code, on_cell)
+        _execute(path, code, on_cell, Path(scratch))
         told = json.loads(outcome.read_text(encoding="utf-8"))
     if told["reasons"]:
         raise PromotionRefused(to, told["reasons"])
 
 
-def _execute(path: Path, last_cell: str, on_cell: Progress) -> None:
+def _execute(path: Path, last_cell: str, on_cell: Progress, scratch: Path) -> None:
     import nbformat
+    from jupyter_client.manager import AsyncKernelManager
     from nbclient import NotebookClient
     from nbclient.exceptions import CellExecutionError, DeadKernelError
 
@@ -78,8 +79,18 @@ def _execute(path: Path, last_cell: str, on_cell: Progress) -> None:
         done += 1
         on_cell(min(done, total), total)
 
+    class PrivateKernelManager(AsyncKernelManager):
+        """Talks to the kernel through sockets in a folder of this user: over TCP others on the machine could listen."""
+
+        def _transport_default(self) -> str:
+            return "ipc"
+
+        def _ip_default(self) -> str:
+            return str(scratch / "kernel")
+
     client = NotebookClient(
         document,
+        kernel_manager_class=PrivateKernelManager,
         timeout=None,
         kernel_name="python3",
         resources={"metadata": {"path": str(path.resolve().parent)}},

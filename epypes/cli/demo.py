@@ -15,8 +15,9 @@ from typing import Annotated, Any, Final
 import typer
 
 from epypes.cli.promote import run_promotion
-from epypes.cli.terminal import err, out, print_times
+from epypes.cli.terminal import err, out, print_answer
 from epypes.errors import ServiceError
+from epypes.service import Answer
 
 _START_TIMEOUT_S: Final = 60.0
 _STOP_TIMEOUT_S: Final = 20.0
@@ -52,15 +53,13 @@ def demo(
     with _service(bundle) as ready:
         out.print(f"   {ready}")
         _step(4, f"Call it from a third process, {_CALLS} times, with {', '.join(map(str, images.values()))}")
-        times = [_call(bundle, images, output, answer_file) for _ in range(_CALLS)]
+        answer = _call(bundle, images, output, answer_file)
     difference = first_difference(outputs[output], read_image(answer_file))
     _step(5, f"Compare {answer_file} with what the notebook computed")
     if difference:
         raise ServiceError(answer_file, f"The service's {output!r} differs from the notebook's: {difference}")
     out.print(f"   identical: {outputs[output].size} values of {outputs[output].dtype}")
-    best = min(times, key=lambda entry: int(entry["round_trip_ns"]))
-    totals = {key: best[f"{key.replace(' ', '_')}_ns"] for key in ("overhead", "total", "round trip")}
-    print_times(f"Best of {_CALLS} calls", best["functions_ns"], totals)
+    print_answer(f"The fastest of {_CALLS} calls", answer)
     out.print(f"Left in {to}: graph.svg, {answer_file.name}, the bundle. Next: make lab, and move the sliders.")
 
 
@@ -103,13 +102,13 @@ def _service(bundle: Path) -> Iterator[str]:
                 process.kill()
 
 
-def _call(bundle: Path, images: dict[str, Path], output: str, file: Path) -> dict[str, Any]:
+def _call(bundle: Path, images: dict[str, Path], output: str, file: Path) -> Answer:
     arguments = [f"{token}={path}" for token, path in images.items()]
     command = [sys.executable, "-m", "epypes.cli", "call", str(bundle), *arguments]
+    options = ["--out", f"{output}={file}", "--count", str(_CALLS), "--json"]
     done = subprocess.run(  # noqa: S603 - our own command
-        [*command, "--out", f"{output}={file}", "--json"], capture_output=True, text=True, check=False
+        [*command, *options], capture_output=True, text=True, check=False
     )
     if done.returncode:
         raise ServiceError(bundle, f"The call failed: {done.stderr.strip()}")
-    times: dict[str, Any] = json.loads(done.stdout)
-    return times
+    return Answer(**json.loads(done.stdout))

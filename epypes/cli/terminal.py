@@ -5,7 +5,7 @@ Results go to standard output, progress to standard error, so that a result can 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,8 @@ from epypes.display.view import duration_text
 
 if TYPE_CHECKING:
     from rich.progress import Progress
+
+    from epypes.service import Answer
 
 out = Console(highlight=False, soft_wrap=True)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -30,16 +32,17 @@ def progress() -> Iterator[Progress]:
         yield shown
 
 
-def print_times(title: str, functions_ns: Mapping[str, int], totals_ns: Mapping[str, int]) -> None:
-    """Print a table of durations: functions first, then totals."""
+def print_answer(title: str, answer: Answer) -> None:
+    """Print the times of a service's answer as a table."""
     from rich.table import Table
 
     table = Table(title=title, title_justify="left")
     table.add_column("where")
     table.add_column("time", justify="right")
-    for name, duration_ns in functions_ns.items():
+    for name, duration_ns in answer.timings_ns.items():
         table.add_row(f"function {name}", duration_text(duration_ns))
     table.add_section()
-    for name, duration_ns in totals_ns.items():
-        table.add_row(name, duration_text(duration_ns))
+    table.add_row("graph overhead", duration_text(answer.overhead_ns))
+    table.add_row("run in all", duration_text(answer.total_ns))
+    table.add_row("round trip", duration_text(answer.round_trip_ns))
     out.print(table)

@@ -46,7 +46,12 @@ class BipartiteDigraph:
 
     def successors(self, function: str) -> Iterable[str]:
         """Return the functions that take an output of ``function``, each once, in order of definition."""
-        return dict.fromkeys(consumer for token in self.outputs[function] for consumer in self.consumers.get(token, ()))
+        return dict.fromkeys(
+            consumer
+            for token in self.outputs[function]
+            if self.producer[token] == function  # in a faulty graph a token may have a second producer
+            for consumer in self.consumers.get(token, ())
+        )
 
     def predecessors(self, function: str) -> Iterable[str]:
         """Return the functions that make an input of ``function``, each once."""

@@ -1,4 +1,4 @@
-"""How is a running service called, once?"""
+"""How is a running service called?"""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic, perf_counter_ns
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from epypes.bundle.ports import REQUEST
 from epypes.errors import RemoteFailure, ServiceError
@@ -17,6 +17,7 @@ from epypes.transport import ZMQPublisher, ZMQSubscriber
 if TYPE_CHECKING:
     from epypes.wire import Envelope
 
+# How often it is looked, while an answer is awaited, whether the service still lives.
 _LOOK_S = 0.2
 
 
@@ -43,37 +44,91 @@ class Answer:
     round_trip_ns: int
 
 
-def call(path: str | Path, payload: Mapping[str, Any], *, timeout_s: float = 10.0) -> Answer:
-    """Send one event to the service of a bundle and wait for its answer.
+class Client:
+    """A connection to the service of a bundle; use it in a ``with`` statement.
 
     Parameters
     ----------
     path
         The bundle's folder.
-    payload
-        The input tokens by name.
     timeout_s
-        How long to wait, in seconds.
+        How long connecting, and each call, may take, in seconds.
 
     Raises
     ------
     ServiceError
-        No service runs, it ended, or it did not answer in time.
-    RemoteFailure
-        A function failed on this event.
+        No service runs, or it can't be reached.
     """
-    state = _running(path)
-    deadline = monotonic() + timeout_s
-    requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    with (
-        ZMQSubscriber(state.pub, answers) as subscriber,
-        ZMQPublisher(state.sub, requests, bind=False) as publisher,
-    ):
-        joined = subscriber.wait_joined(deadline - monotonic())
-        if not joined or not publisher.wait_for_subscriber(deadline - monotonic()):
-            raise ServiceError(path, f"The service at {state.sub} can't be reached within {timeout_s:g} s.")
-        return _exchange(path, payload, requests, answers, deadline, timeout_s)
+
+    def __init__(self, path: str | Path, *, timeout_s: float = 10.0) -> None:
+        self.path, self.timeout_s = path, timeout_s
+        state = _running(path)
+        self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._subscriber = ZMQSubscriber(state.pub, self._answers)
+        self._publisher = ZMQPublisher(state.sub, self._requests, bind=False)
+
+    def __enter__(self) -> Self:
+        deadline = monotonic() + self.timeout_s
+        try:
+            self._subscriber.start()
+            self._publisher.start()
+            joined = self._subscriber.wait_joined(self.timeout_s)
+            if not joined or not self._publisher.wait_for_subscriber(max(deadline - monotonic(), 0)):
+                text = f"The service of {self.path} can't be reached within {self.timeout_s:g} s."
+                raise ServiceError(self.path, text)
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._publisher.stop()
+        self._subscriber.stop()
+
+    def call(self, payload: Mapping[str, Any]) -> Answer:
+        """Send one event and wait for its answer.
+
+        Parameters
+        ----------
+        payload
+            The input tokens by name.
+
+        Raises
+        ------
+        ServiceError
+            The service ended, or did not answer in time.
+        RemoteFailure
+            A function failed on this event.
+        """
+        from epypes.wire import Envelope
+
+        request = Envelope(type=REQUEST, parts=payload, source="epypes call")
+        deadline = monotonic() + self.timeout_s
+        start_ns = perf_counter_ns()
+        self._requests.put(request)
+        while (left_s := deadline - monotonic()) > 0:
+            try:
+                answer = self._answers.get(timeout=min(_LOOK_S, left_s))
+            except queue.Empty:
+                self._check_alive()
+                continue
+            if isinstance(answer, Envelope) and answer.correlation_id == request.id:
+                return _read(self.path, answer, perf_counter_ns() - start_ns)
+        raise ServiceError(self.path, f"The service of {self.path} did not answer within {self.timeout_s:g} s.")
+
+    def _check_alive(self) -> None:
+        refused = self._publisher.rejected
+        if refused:
+            raise ServiceError(self.path, f"The event could not be sent: {', '.join(refused)}.")
+        if read_state(self.path) is None:
+            raise ServiceError(self.path, f"The service of {self.path} ended before it answered. Look at its log.")
+
+
+def call(path: str | Path, payload: Mapping[str, Any], *, timeout_s: float = 10.0) -> Answer:
+    """Send one event to the service of a bundle and wait for its answer; see Client."""
+    with Client(path, timeout_s=timeout_s) as client:
+        return client.call(payload)
 
 
 def _running(path: str | Path) -> ServiceState:
@@ -87,33 +142,13 @@ def _running(path: str | Path) -> ServiceState:
     return state
 
 
-def _exchange(
-    path: str | Path, payload: Mapping[str, Any], requests: Any, answers: Any, deadline: float, timeout_s: float
-) -> Answer:
-    from epypes.wire import Envelope
-
-    request = Envelope(type=REQUEST, parts=payload, source="epypes call")
-    start_ns = perf_counter_ns()
-    requests.put(request)
-    while monotonic() < deadline:
-        try:
-            answer = answers.get(timeout=min(_LOOK_S, max(deadline - monotonic(), 0.001)))
-        except queue.Empty:
-            if read_state(path) is None:
-                raise ServiceError(path, f"The service of {path} ended before it answered. Look at its log.") from None
-            continue
-        if isinstance(answer, Envelope) and answer.correlation_id == request.id:
-            return _read(path, answer, perf_counter_ns() - start_ns)
-    raise ServiceError(path, f"The service of {path} did not answer within {timeout_s:g} s.")
-
-
 def _read(path: str | Path, answer: Envelope, round_trip_ns: int) -> Answer:
     if answer.failure is not None:
         failure = answer.failure
         raise RemoteFailure(path, failure.function, failure.exception, failure.message)
     return Answer(
-        answer.parts,
-        answer.timings,
+        dict(answer.parts),
+        dict(answer.timings),
         int(answer.attributes["total_ns"]),
         int(answer.attributes["overhead_ns"]),
         round_trip_ns,

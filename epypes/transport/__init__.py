@@ -1,0 +1,33 @@
+"""How messages leave and enter the process: publishers, subscribers, and the one I/O thread under them."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from epypes.transport.addresses import check_bind, is_loopback
+    from epypes.transport.publisher import ZMQPublisher
+    from epypes.transport.subscriber import ZMQSubscriber
+
+__all__ = ["ZMQPublisher", "ZMQSubscriber", "check_bind", "is_loopback"]
+
+_HOME = {
+    "ZMQPublisher": "publisher",
+    "ZMQSubscriber": "subscriber",
+    "check_bind": "addresses",
+    "is_loopback": "addresses",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = getattr(importlib.import_module(f"epypes.transport.{_HOME[name]}"), name)
+    # So that the next look-up does not come here.
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

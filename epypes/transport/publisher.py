@@ -1,0 +1,165 @@
+"""How does what is put into a queue leave the process? Through a publisher."""
+
+from __future__ import annotations
+
+import threading
+import warnings
+import weakref
+from collections import Counter
+from types import TracebackType
+from typing import Any, Self
+
+from epypes.transport.addresses import check_bind
+from epypes.transport.bridge import Bridge, Counts, TakeQueue
+from epypes.wire import Limits, topic_frame
+
+HIGH_WATER_MARK = 1_000
+
+
+class ZMQPublisher:
+    """Publishes what is put into a queue, on a ZeroMQ XPUB socket.
+
+    Parameters
+    ----------
+    address
+        ``"tcp://127.0.0.1:5555"``; ``"tcp://127.0.0.1:*"`` takes a free port, which `address` then names.
+    queue
+        Any object with ``get(timeout=...)`` that raises queue.Empty. bytes, bytearray and memoryview go out as one
+        frame, and so does a protobuf message (2019 mode: without a topic, for peers of the published system);
+        an Envelope goes out as topic, header and payload frames. Anything else is counted in `rejected`.
+    topic
+        Topic of the envelopes. 2019 mode knows none.
+    bind
+        False to connect to a subscriber that binds.
+    insecure
+        True to bind an address that other machines can reach.
+    max_message_bytes
+        Larger messages are rejected here, since the receiver would drop the connection.
+    high_water_mark
+        Messages kept for a subscriber that does not keep up; what is more is dropped, which the subscriber sees in
+        its ``lost``.
+
+    Raises
+    ------
+    AddressError
+        If ``bind`` is asked for an address that is not loopback, without ``insecure``.
+    MessageError
+        If ``topic`` can't be one.
+
+    Notes
+    -----
+    Start it, or use ``with``. Each start begins a new epoch; within it the sequence numbers of the envelopes of one
+    source rise by 1 from 1. Threads are daemons. Semeniuta and Falkman 2019, "Reactive pipelines".
+    """
+
+    def __init__(
+        self,
+        address: str,
+        queue: TakeQueue,
+        topic: str = "",
+        bind: bool = True,
+        *,
+        insecure: bool = False,
+        max_message_bytes: int = Limits().total_bytes,
+        high_water_mark: int = HIGH_WATER_MARK,
+    ) -> None:
+        if bind:
+            check_bind(address, insecure)
+        topic_frame(topic)
+        self._given = address
+        self._queue, self._topic, self._bind = queue, topic, bind
+        self._limits = Limits(total_bytes=max_message_bytes)
+        self._high_water_mark = high_water_mark
+        self._counts = Counts()
+        self._lock = threading.Lock()
+        self._bridge: Bridge | None = None
+        self._finalizer: weakref.finalize[Any, Any] | None = None
+
+    @property
+    def address(self) -> str:
+        """The endpoint that is bound, once it is started; before that, the address that was given."""
+        bridge = self._bridge
+        return self._given if bridge is None else bridge.address
+
+    @property
+    def sent(self) -> int:
+        """How many messages were handed to ZeroMQ."""
+        return self._counts.sent
+
+    @property
+    def rejected(self) -> Counter[str]:
+        """How many items could not be sent, by reason; a copy."""
+        return Counter(self._counts.rejected)
+
+    def start(self) -> Self:
+        """Open the socket and begin to publish; nothing happens if it runs already.
+
+        Raises
+        ------
+        AddressError
+            If the address can't be bound or understood.
+        StillRunning
+            If another thread's stop takes too long.
+        """
+        with self._lock:
+            if self._bridge is not None and not self._bridge.finish_if_stopping():
+                return self
+            self._bridge = bridge = Bridge(self._queue, self._topic, self._limits, self._counts)
+            try:
+                bridge.start(self._given, self._bind, self._high_water_mark)
+            except BaseException:
+                self._bridge = None
+                raise
+            self._finalizer = weakref.finalize(self, _abandon, bridge, self._given)
+        return self
+
+    def stop(self, timeout_s: float = 5.0) -> None:
+        """Send what is queued, then close the socket; from any thread, as often as you like.
+
+        Called by a queue's own ``get`` or ``put``, it does not wait: the rest happens when that has returned.
+
+        Parameters
+        ----------
+        timeout_s
+            Longest wait, in seconds. What is still queued then stays in the queue.
+
+        Raises
+        ------
+        StillRunning
+            If the queue's ``get`` does not return in time. The socket is closed all the same.
+        """
+        bridge = self._bridge
+        if bridge is None:
+            return
+        if self._finalizer is not None:
+            self._finalizer.detach()
+        bridge.stop(timeout_s)
+        with self._lock:
+            if self._bridge is bridge and not bridge.is_alive():
+                self._bridge = None
+
+    def wait_for_subscriber(self, timeout_s: float = 5.0) -> bool:
+        """Return whether a subscriber, of any topic, is there within ``timeout_s`` seconds."""
+        bridge = self._bridge
+        return bridge is not None and bridge.doorkeeper.wait(timeout_s)
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def __repr__(self) -> str:
+        state = "stopped" if self._bridge is None else "running"
+        return f"<ZMQPublisher {self.address[:40]} {state}: {self.sent} sent>"
+
+
+def _abandon(bridge: Bridge, address: str) -> None:
+    # By the garbage collector or at exit: so no waiting, no locks.
+    if bridge.is_alive():
+        bridge.stopping = True
+        warnings.warn(
+            f"ZMQPublisher {address} was left running. Call stop(), or use with.", ResourceWarning, stacklevel=2
+        )

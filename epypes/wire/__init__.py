@@ -1,0 +1,76 @@
+"""How a value travels: the v1 envelope, the codecs, the messages of 2019, samples in files.
+
+Neither protobuf nor numpy is imported before it is needed.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from epypes.wire.attribute_list import add_attribute, attributes, serialized
+    from epypes.wire.envelope import Envelope, FailureRecord
+    from epypes.wire.limits import Limits
+    from epypes.wire.messages2019 import (
+        Attribute,
+        AttributeList,
+        Event,
+        Image,
+        ImagePair,
+        JustBytes,
+        TimeStamp,
+        TimeStampList,
+    )
+    from epypes.wire.multipart import decode, encode, topic_frame
+    from epypes.wire.samples import load_sample, save_sample
+
+__all__ = [
+    "Attribute",
+    "AttributeList",
+    "Envelope",
+    "Event",
+    "FailureRecord",
+    "Image",
+    "ImagePair",
+    "JustBytes",
+    "Limits",
+    "TimeStamp",
+    "TimeStampList",
+    "add_attribute",
+    "attributes",
+    "decode",
+    "encode",
+    "load_sample",
+    "save_sample",
+    "serialized",
+    "topic_frame",
+]
+
+_HOME = {
+    "Envelope": "envelope",
+    "FailureRecord": "envelope",
+    "Limits": "limits",
+    "add_attribute": "attribute_list",
+    "attributes": "attribute_list",
+    "decode": "multipart",
+    "encode": "multipart",
+    "load_sample": "samples",
+    "save_sample": "samples",
+    "serialized": "attribute_list",
+    "topic_frame": "multipart",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    home = importlib.import_module(f"epypes.wire.{_HOME.get(name, 'messages2019')}")
+    found = getattr(home, name)
+    # So that the next look-up does not come here.
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,112 @@
+"""How are attributes put into a 2019 message, and read from it?"""
+
+from __future__ import annotations
+
+import numbers
+from typing import TYPE_CHECKING, Any
+
+from epypes.errors import MessageError
+
+if TYPE_CHECKING:
+    from google.protobuf.message import Message
+
+_INT32 = range(-(2**31), 2**31)
+
+
+def _entries(message: Any) -> Any:
+    owner = message if hasattr(message, "entries") else getattr(message, "attributes", None)
+    if owner is None or not hasattr(owner, "entries"):
+        raise MessageError(
+            "no attributes",
+            f"A {type(message).__name__} has no attributes. "
+            "Give an AttributeList, Event, JustBytes, Image or ImagePair.",
+        )
+    return owner.entries
+
+
+def _as_int32(key: str, value: numbers.Integral) -> int:
+    number = int(value)
+    if number not in _INT32:
+        raise MessageError(
+            "out of range",
+            f"Attribute {key!r} is {number}, and an int of the 2019 messages has 32 bit. "
+            f"Give float({number}) or str({number}), or send an Envelope, which has no such limit.",
+        )
+    return number
+
+
+def _fields(key: str, value: object) -> dict[str, object]:
+    # The numbers of messages.proto: STRING = 1, DOUBLE = 2, INT = 3.
+    if isinstance(value, str):
+        return {"type": 1, "str_val": value}
+    if isinstance(value, numbers.Integral) and not isinstance(value, bool):
+        return {"type": 3, "int_val": _as_int32(key, value)}
+    if isinstance(value, numbers.Real) and not isinstance(value, bool):
+        return {"type": 2, "double_val": float(value)}
+    raise MessageError(
+        "no codec",
+        f"Attribute {key!r} is a {type(value).__name__}, and the 2019 messages know str, float and int. "
+        "Give int(...), float(...) or str(...) of it, or send an Envelope.",
+    )
+
+
+def add_attribute(message: Message, key: str, value: str | float) -> None:
+    """Append an attribute to a 2019 message.
+
+    Parameters
+    ----------
+    message
+        An AttributeList, or a message with a field ``attributes``.
+    key
+        Name of the attribute.
+    value
+        A str, float or int (32 bit); numpy's scalars count as such. A bool is refused, since the reader would
+        get an int.
+
+    Raises
+    ------
+    MessageError
+        Of reason ``"no codec"`` for a value of another type, ``"out of range"`` for an int beyond 32 bit,
+        ``"not utf-8"`` for text with lone surrogates, ``"no attributes"`` for another message.
+    """
+    entries = _entries(message)
+    fields = _fields(key, value)
+    try:
+        entries.add(key=key, **fields)
+    except ValueError as error:
+        raise MessageError("not utf-8", f"Attribute {key!r} can't be sent as text: {error}") from error
+
+
+def attributes(message: Message) -> dict[str, str | float]:
+    """Return the attributes of a 2019 message by key; of two with one key the last counts.
+
+    Raises
+    ------
+    MessageError
+        Of reason ``"bad attribute"`` if an entry lacks the value that its type promises, ``"no attributes"``
+        for a message that has none.
+    """
+    result: dict[str, str | float] = {}
+    for entry in _entries(message):
+        field = {1: "str_val", 2: "double_val", 3: "int_val"}[entry.type]
+        if not entry.HasField(field):
+            raise MessageError("bad attribute", f"Attribute {entry.key!r} has no {field}, as its type says.")
+        result[entry.key] = getattr(entry, field)
+    return result
+
+
+def serialized(message: Message) -> bytes:
+    """Return the bytes of a protobuf message.
+
+    Raises
+    ------
+    MessageError
+        Of reason ``"incomplete"`` if a required field is missing.
+    """
+    from google.protobuf.message import EncodeError
+
+    try:
+        return message.SerializeToString()
+    except (EncodeError, ValueError) as error:
+        name = type(message).__name__
+        raise MessageError("incomplete", f"This {name} can't be sent: {error}. Fill these fields.") from error

@@ -1,0 +1,272 @@
+"""How is a notebook opened, run and looked at as a user does?
+
+::
+
+    with JupyterLab(folder, theme="dark") as lab, chromium() as browser:
+        notebook = Notebook(browser, lab, "x.ipynb")
+        notebook.run_all()
+
+Everything stays on loopback, in directories of its own, and only processes started here are ended here.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+THEMES = {"light": "JupyterLab Light", "dark": "JupyterLab Dark"}
+START_TIMEOUT_S = 90
+STOP_TIMEOUT_S = 10
+CELLS_TIMEOUT_MS = 90_000
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+_FLAGS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+_KERNEL = "jupyterapp.shell.currentWidget?.sessionContext?.session?.kernel"
+_SCROLLED = "document.querySelector('.jp-Notebook .jp-WindowedPanel-outer')"
+# More than JupyterLab's own bars take above and below a notebook.
+_LAB_PX = 300
+
+
+class JupyterLab:
+    """A JupyterLab server over a folder, on a free port of loopback.
+
+    Parameters
+    ----------
+    root
+        The folder that it shows.
+    state
+        An empty folder for its settings, its log and its runtime files.
+    theme
+        ``"light"`` or ``"dark"``.
+    """
+
+    def __init__(self, root: Path, state: Path, theme: str = "light") -> None:
+        self.root, self.state, self.theme = root.resolve(), state, theme
+        self.port, self.token = _free_port(), secrets.token_hex(16)
+        self.log: list[str] = []
+        self._listening = threading.Event()
+
+    def __enter__(self) -> Self:
+        self._write_settings()
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "jupyterlab", *self._arguments()],
+            env=self._environment(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
+        self._reader = threading.Thread(target=self._read_log, daemon=True)
+        self._reader.start()
+        if not self._listening.wait(START_TIMEOUT_S) or self._process.poll() is not None:
+            self.stop()
+            raise RuntimeError("JupyterLab did not start:\n" + "".join(self.log))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def url(self, notebook: str) -> str:
+        """Return the address of a notebook, in a workspace of its own."""
+        return f"http://127.0.0.1:{self.port}/lab/tree/{notebook}?token={self.token}&reset"
+
+    def stop(self) -> None:
+        """End the kernels, then the server; kill its process group if it does not end by itself."""
+        with suppress(OSError):
+            for kernel in self._api("kernels"):
+                self._api(f"kernels/{kernel['id']}", "DELETE")
+        self._process.terminate()
+        try:
+            self._process.wait(STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
+        self._reader.join(STOP_TIMEOUT_S)
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+
+    def _api(self, path: str, method: str = "GET") -> Any:
+        request = urllib.request.Request(
+            f"http://127.0.0.1:{self.port}/api/{path}",
+            method=method,
+            headers={"Authorization": f"token {self.token}"},
+        )
+        with urllib.request.urlopen(request, timeout=STOP_TIMEOUT_S) as answer:
+            body = answer.read()
+        return json.loads(body) if body else None
+
+    def _read_log(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self.log.append(line)
+            if f":{self.port}/lab" in line:
+                self._listening.set()
+        self._listening.set()  # it has ended; whoever waits looks at the process
+
+    def _write_settings(self) -> None:
+        folder = self.state / "settings" / "@jupyterlab" / "apputils-extension"
+        folder.mkdir(parents=True)
+        for name, settings in (
+            ("themes", {"theme": THEMES[self.theme]}),
+            ("notification", {"fetchNews": "false", "checkForUpdates": False}),
+        ):
+            (folder / f"{name}.jupyterlab-settings").write_text(json.dumps(settings))
+
+    def _environment(self) -> dict[str, str]:
+        kept = {name: value for name, value in os.environ.items() if not name.startswith("JUPYTER")}
+        return kept | {
+            "JUPYTER_CONFIG_DIR": str(self.state / "config"),
+            "JUPYTER_DATA_DIR": str(self.state / "data"),
+            "JUPYTER_RUNTIME_DIR": str(self.state / "runtime"),
+            "JUPYTERLAB_SETTINGS_DIR": str(self.state / "settings"),
+            "JUPYTERLAB_WORKSPACES_DIR": str(self.state / "workspaces"),
+            "IPYTHONDIR": str(self.state / "ipython"),
+            "PYTHONUNBUFFERED": "1",
+        }
+
+    def _arguments(self) -> list[str]:
+        return [
+            "--no-browser",
+            "--allow-root",
+            "--ip=127.0.0.1",
+            f"--port={self.port}",
+            "--ServerApp.port_retries=0",
+            f"--ServerApp.root_dir={self.root}",
+            f"--IdentityProvider.token={self.token}",
+            "--expose-app-in-browser",  # window.jupyterapp, by which commands are run
+            "--LabApp.news_url=None",
+            "--LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate",
+            "--LabApp.extension_manager=readonly",
+            "--KernelSpecManager.ensure_native_kernel=True",
+        ]
+
+
+class Notebook:
+    """A notebook in a page of JupyterLab, with the file browser folded away."""
+
+    def __init__(self, browser: Any, lab: JupyterLab, name: str, width: int = 1280, height: int = 900) -> None:
+        self.page = browser.new_context(viewport={"width": width, "height": height}).new_page()
+        self.page_errors: list[str] = []
+        self.page.on("pageerror", lambda error: self.page_errors.append(str(error)))
+        self.page.goto(lab.url(name))
+        self.page.wait_for_selector(".jp-Notebook .jp-Cell", timeout=CELLS_TIMEOUT_MS)
+        self.wait_idle()
+        self.page.evaluate("() => jupyterapp.commands.execute('application:toggle-left-area')")
+        self.page.wait_for_selector("#jp-left-stack", state="hidden")
+
+    def wait_idle(self) -> None:
+        """Return when the kernel has nothing to do."""
+        self.page.wait_for_function(f"() => {_KERNEL}?.status === 'idle'", timeout=CELLS_TIMEOUT_MS)
+
+    def run_all(self) -> None:
+        """Run every cell; AssertionError with the traceback if one failed."""
+        self.page.evaluate("() => jupyterapp.commands.execute('notebook:run-all-cells')")
+        self.wait_idle()
+        failed = self.page.evaluate(
+            """() => jupyterapp.shell.currentWidget.content.widgets
+                .flatMap(cell => cell.model.outputs?.toJSON() ?? [])
+                .filter(output => output.output_type === 'error')
+                .map(output => output.traceback.join('\\n'))"""
+        )
+        assert not failed, "\n".join(failed)
+
+    def execute(self, code: str) -> str:
+        """Run code in the kernel outside of any cell; return what it printed, or its traceback."""
+        printed = self.page.evaluate(
+            f"""async code => {{
+                const future = {_KERNEL}.requestExecute({{ code, store_history: false }});
+                let text = '';
+                future.onIOPub = message => {{
+                    if (message.header.msg_type === 'stream') text += message.content.text;
+                    if (message.header.msg_type === 'error') text += message.content.traceback.join('\\n');
+                }};
+                await future.done;
+                return text;
+            }}""",
+            code,
+        )
+        return str(printed)
+
+    def echo_ms(self, count: int) -> list[float]:
+        """Return how long an empty request to the kernel and back takes, ``count`` times."""
+        times: list[float] = self.page.evaluate(
+            f"""async count => {{
+                const times = [];
+                for (let i = 0; i < count; i++) {{
+                    const start = performance.now();
+                    await {_KERNEL}.requestExecute({{ code: '', silent: true }}).done;
+                    times.push(performance.now() - start);
+                }}
+                return times;
+            }}""",
+            count,
+        )
+        return times
+
+    def screenshot(self, path: Path) -> None:
+        """Save the whole notebook: the window is made so high that all of it is rendered, then cut to it."""
+        size = self.page.viewport_size
+        for cell in self.page.locator(".jp-Notebook .jp-Cell").all():
+            cell.scroll_into_view_if_needed()  # JupyterLab renders what comes into view
+        high = self.page.evaluate(f"() => {_SCROLLED}.scrollHeight") + _LAB_PX
+        self.page.set_viewport_size({**size, "height": high})
+        self.page.evaluate(f"() => {{ document.activeElement?.blur(); {_SCROLLED}.scrollTop = 0; }}")
+        end = self.page.evaluate(
+            "() => Math.max(...[...document.querySelectorAll('.jp-Notebook .jp-Cell')]"
+            ".map(cell => cell.getBoundingClientRect().bottom))"
+        )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        clip = {"x": 0, "y": 0, "width": size["width"], "height": min(high, round(end) + 24)}
+        self.page.screenshot(path=path, clip=clip)
+        self.page.set_viewport_size(size)
+
+    def close(self) -> None:
+        """Close the page."""
+        self.page.context.close()
+
+
+@contextmanager
+def chromium() -> Iterator[Any]:
+    """Give a headless Chromium, driven by Playwright."""
+    from playwright.sync_api import sync_playwright
+
+    path = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, _BROWSERS)), None)
+    if path is None:
+        raise RuntimeError(
+            "No Chromium was found. Install one (apt install chromium), or name it: CHROMIUM=/path/to/chromium."
+        )
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, headless=True, args=_FLAGS)
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port

@@ -1,0 +1,50 @@
+"""Which graphs and images do many tests share?"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from skimage import data
+
+import epypes as ep
+
+
+def grayscale(im):
+    return cv2.cvtColor(im, cv2.COLOR_BGR2GRAY)
+
+
+def blur(img, k):
+    return cv2.GaussianBlur(img, (k, k), 0)
+
+
+EDGE_FUNCTIONS = {"grayscale": grayscale, "blur": blur, "canny": cv2.Canny}
+EDGE_IO = {
+    "grayscale": ("image", "image_gray"),
+    "blur": (("image_gray", "blur_kernel"), "image_blurred"),
+    "canny": (("image_blurred", "canny_lo", "canny_hi"), "edges"),
+}
+EDGE_HPARAMS = {"blur_kernel": 11, "canny_lo": 70, "canny_hi": 200}
+
+
+@pytest.fixture
+def edge_graph() -> ep.CompGraph:
+    return ep.CompGraph(EDGE_FUNCTIONS, EDGE_IO)
+
+
+@pytest.fixture
+def edge_runner(edge_graph) -> ep.CompGraphRunner:
+    return ep.CompGraphRunner(edge_graph, EDGE_HPARAMS)
+
+
+@pytest.fixture(scope="session")
+def photograph() -> np.ndarray:
+    """A real photograph, (400, 600, 3) BGR, uint8."""
+    return cv2.cvtColor(data.coffee(), cv2.COLOR_RGB2BGR)
+
+
+@pytest.fixture(scope="session")
+def straight_edges(photograph) -> np.ndarray:
+    """The edges as straight-line OpenCV computes them."""
+    gray = cv2.cvtColor(photograph, cv2.COLOR_BGR2GRAY)
+    return cv2.Canny(cv2.GaussianBlur(gray, (11, 11), 0), 70, 200)

@@ -1,0 +1,384 @@
+from __future__ import annotations
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+import epypes as ep
+from epypes.errors import (
+    HyperparameterError,
+    NotComputed,
+    OutputArityError,
+    PayloadError,
+    StaleToken,
+    UnknownName,
+)
+
+
+class Counting:
+    """A function that counts its calls and does what it is told."""
+
+    def __init__(self, compute):
+        self.compute, self.calls = compute, 0
+
+    def __call__(self, *args):
+        self.calls += 1
+        return self.compute(*args)
+
+
+@pytest.fixture
+def chain():
+    """double: x -> a; add: (a, n) -> b; square: b -> c."""
+    functions = {
+        "double": Counting(lambda x: 2 * x),
+        "add": Counting(lambda a, n: a + n),
+        "square": Counting(lambda b: b * b),
+    }
+    cg = ep.CompGraph(functions, {"double": ("x", "a"), "add": (("a", "n"), "b"), "square": ("b", "c")})
+    return ep.CompGraphRunner(cg, {"n": 1}), functions
+
+
+def test_the_edge_graph_computes_what_straight_code_computes(edge_runner, photograph, straight_edges):
+    run = edge_runner.run(image=photograph)
+    assert np.array_equal(run["edges"], straight_edges)
+    assert list(run) == list(edge_runner.cg.tokens)
+
+
+def test_a_runner_reads_like_a_dictionary(chain):
+    runner, _ = chain
+    runner.run(x=2)
+    assert dict(runner) == {"x": 2, "a": 4, "n": 1, "b": 5, "c": 25}
+    assert "c" in runner
+    assert "nothing" not in runner
+    assert len(runner) == 5
+
+
+def test_none_is_a_value_and_not_computed_is_not():
+    cg = ep.CompGraph({"f": lambda x: None, "g": lambda y: y is None}, {"f": ("x", "y"), "g": ("y", "z")})
+    runner = ep.CompGraphRunner(cg)
+    run = runner.run("y", x=None)
+    assert run["y"] is None
+    assert run["x"] is None
+    with pytest.raises(NotComputed, match=r"Token 'z' has not been computed\. Call rerun\('z'\)"):
+        run["z"]
+    assert "z" not in run
+    assert runner.rerun()["z"] is True
+
+
+def test_reading_before_any_run_says_what_to_run(edge_runner):
+    with pytest.raises(NotComputed, match=r"Call run\(image=\.\.\.\)\."):
+        edge_runner["edges"]
+    assert "edges" not in edge_runner
+    assert edge_runner["canny_lo"] == 70
+    with pytest.raises(UnknownName, match="Did you mean 'edges'"):
+        edge_runner["edgse"]
+
+
+def test_missing_payload_is_named_with_the_call_to_make(chain):
+    runner, _ = chain
+    with pytest.raises(PayloadError, match=r"Missing payload: 'x'\. Call run\(x=\.\.\.\)") as error:
+        runner.run()
+    assert error.value.tokens == ("x",)
+    assert runner.last is None
+
+
+def test_only_what_the_targets_need_must_be_given():
+    cg = ep.CompGraph({"f": lambda x: x, "g": lambda y: y}, {"f": ("x", "a"), "g": ("y", "b")})
+    runner = ep.CompGraphRunner(cg)
+    assert dict(runner.run("a", x=1)) == {"x": 1, "a": 1}
+    with pytest.raises(PayloadError, match="'y'"):
+        runner.run("a", "b", x=1)
+
+
+@pytest.mark.parametrize(
+    ("payload", "error", "words"),
+    [
+        ({"x": 1, "imgae": 2}, UnknownName, "No token 'imgae'"),
+        ({"x": 1, "a": 2}, PayloadError, "made by function 'double'"),
+        ({"x": 1, "n": 2}, PayloadError, "is a hyperparameter. Set runner"),
+    ],
+)
+def test_payload_that_is_none_is_refused_before_anything_runs(chain, payload, error, words):
+    runner, functions = chain
+    with pytest.raises(error, match=words):
+        runner.run(**payload)
+    assert functions["double"].calls == 0
+
+
+def test_an_unknown_target_is_named(chain):
+    runner, _ = chain
+    with pytest.raises(UnknownName, match="No token 'd'"):
+        runner.run("d", x=1)
+
+
+def test_hyperparameters_are_checked_when_the_runner_is_made(edge_graph):
+    with pytest.raises(UnknownName, match="Did you mean 'canny_lo'"):
+        ep.CompGraphRunner(edge_graph, {"cany_lo": 1})
+    with pytest.raises(HyperparameterError, match="made by function 'blur'"):
+        ep.CompGraphRunner(edge_graph, {"image_blurred": 1})
+
+
+def test_only_a_hyperparameter_can_be_set(chain):
+    runner, _ = chain
+    with pytest.raises(HyperparameterError, match=r"Pass it to run\(x=\.\.\.\), or make it one: freeze"):
+        runner["x"] = 1
+    with pytest.raises(HyperparameterError, match="made by function"):
+        runner["a"] = 1
+    with pytest.raises(UnknownName):
+        runner["k"] = 1
+
+
+def test_a_change_downstream_leaves_upstream_alone(chain):
+    runner, functions = chain
+    runner.run(x=2)
+    run = runner.rerun(n=3)
+    assert run["c"] == 49
+    assert [function.calls for function in functions.values()] == [1, 2, 2]
+    assert run.report.reused == ("double",)
+    assert run.report.ran == ("add", "square")
+
+
+def test_an_equal_value_makes_nothing_stale(chain):
+    runner, functions = chain
+    runner.run(x=2)
+    runner["n"] = 1
+    assert runner.stale == ()
+    runner.rerun()
+    assert functions["add"].calls == 1
+    runner["n"] = 1.0
+    assert runner.stale == ("add", "square")
+
+
+def test_an_unchanged_result_stops_the_rerun_early():
+    functions = {"sign": Counting(lambda n: n > 0), "tell": Counting(str)}
+    runner = ep.CompGraphRunner(ep.CompGraph(functions, {"sign": ("n", "s"), "tell": ("s", "t")}), {"n": 1})
+    runner.run()
+    run = runner.rerun(n=2)
+    assert run["t"] == "True"
+    assert run.report.ran == ("sign",)
+    assert functions["tell"].calls == 1
+
+
+def test_a_stale_token_is_not_read(chain):
+    runner, _ = chain
+    run = runner.run(x=2)
+    runner["n"] = 5
+    assert runner.stale == ("add", "square")
+    with pytest.raises(StaleToken, match=r"'c' is stale.*Call rerun\(\) first"):
+        runner["c"]
+    assert runner["a"] == 4
+    assert runner.keys() == ("x", "a", "n")
+    assert run["c"] == 25, "a Run does not change"
+    assert runner.rerun()["c"] == 81
+
+
+def test_a_rerun_of_one_target_leaves_the_others_stale(chain):
+    runner, functions = chain
+    runner.run(x=2)
+    run = runner.rerun("b", n=5)
+    assert run["b"] == 9
+    with pytest.raises(StaleToken):
+        run["c"]
+    assert functions["square"].calls == 1
+    assert runner.stale == ("square",)
+
+
+def test_the_same_buffer_refilled_counts_as_new():
+    cg = ep.CompGraph({"mean": lambda im: float(im.mean())}, {"mean": ("image", "m")})
+    runner, buffer = ep.CompGraphRunner(cg), np.zeros((8, 8))
+    assert runner.run(image=buffer)["m"] == 0.0
+    buffer[:] = 255
+    assert runner.run(image=buffer)["m"] == 255.0
+
+
+def test_a_rerun_before_any_run_is_refused(chain):
+    runner, _ = chain
+    with pytest.raises(PayloadError, match=r"Nothing has been run yet.*Call run\(x=\.\.\.\) first"):
+        runner.rerun(n=2)
+
+
+def test_a_rerun_with_one_bad_name_sets_nothing(edge_runner, photograph):
+    edge_runner.run(image=photograph)
+    with pytest.raises(UnknownName):
+        edge_runner.rerun(canny_lo=10, cany_hi=20)
+    assert edge_runner["canny_lo"] == 70
+
+
+def test_freezing_and_unfreezing_moves_a_token_between_payload_and_hyperparameters(chain):
+    runner, _ = chain
+    runner.freeze(x=10)
+    assert runner.free_source_tokens == ()
+    assert runner.run()["c"] == 441
+    runner.unfreeze("x")
+    assert runner.free_source_tokens == ("x",)
+    with pytest.raises(HyperparameterError):
+        runner.unfreeze("x")
+
+
+def failing_graph():
+    def fail_at_3(b):
+        if b == 3:
+            raise ZeroDivisionError("three")
+        return b
+
+    functions = {"double": lambda x: 2 * x, "check": fail_at_3, "after": lambda c: c, "side": lambda a: -a}
+    io = {"double": ("x", "a"), "check": ("n", "c"), "after": ("c", "d"), "side": ("a", "e")}
+    return ep.CompGraph(functions, io)
+
+
+def test_the_users_exception_stays_the_users_with_a_note():
+    runner = ep.CompGraphRunner(failing_graph(), {"n": 3})
+    with pytest.raises(ZeroDivisionError, match="three") as error:
+        runner.run(x=1)
+    assert error.value.__notes__ == ["In function 'check': (n) -> (c)"]
+    assert error.traceback[-1].name == "fail_at_3"
+    assert runner.last.failure.function == "check"
+    assert runner.last.failure.inputs == {"n": 3}
+    assert runner.last.failure.exception is error.value
+
+
+def test_after_a_failure_what_depends_on_it_is_not_computed_and_the_rest_is_kept():
+    runner = ep.CompGraphRunner(failing_graph(), {"n": 1})
+    runner.run(x=1)
+    with pytest.raises(ZeroDivisionError):
+        runner.rerun(n=3)
+    for token in ("c", "d"):
+        with pytest.raises(NotComputed, match="since check: ZeroDivisionError: three"):
+            runner[token]
+    assert runner["a"] == 2
+    assert runner["e"] == -2
+    run = runner.rerun(n=4)
+    assert run["d"] == 4
+    assert run.report.reused == ("double", "side")
+
+
+def test_an_interrupt_passes_through_and_leaves_a_failure():
+    def interrupted(x):
+        raise KeyboardInterrupt
+
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": interrupted}, {"f": ("x", "y")}))
+    with pytest.raises(KeyboardInterrupt):
+        runner.run(x=1)
+    assert runner.last.failure.function == "f"
+
+
+@pytest.mark.parametrize("value", [(1,), (1, 2, 3), "ab", np.zeros(2), 5, None, {1, 2}])
+def test_a_function_with_two_output_tokens_must_return_two_values(value):
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": lambda: value}, {"f": ((), ("a", "b"))}))
+    with pytest.raises(OutputArityError, match=r"Function 'f' must return a tuple or list of 2 values \(a, b\)"):
+        runner.run()
+
+
+def test_one_token_takes_the_value_as_it_is_and_a_tuple_of_one_takes_a_sequence_of_one():
+    def pair():
+        return [1, 2]
+
+    assert ep.CompGraphRunner(ep.CompGraph({"f": pair}, {"f": ((), "y")})).run()["y"] == [1, 2]
+    assert ep.CompGraphRunner(ep.CompGraph({"f": lambda: [7]}, {"f": ((), ("y",))})).run()["y"] == 7
+    with pytest.raises(OutputArityError, match="list of 2"):
+        ep.CompGraphRunner(ep.CompGraph({"f": pair}, {"f": ((), ("y",))})).run()
+
+
+def test_runs_in_many_threads_do_not_mix():
+    barrier = threading.Barrier(4)
+
+    def slow(x):
+        barrier.wait(10)
+        return x
+
+    cg = ep.CompGraph({"f": slow, "g": lambda y: y * 1000}, {"f": ("x", "y"), "g": ("y", "z")})
+    runner = ep.CompGraphRunner(cg)
+    with ThreadPoolExecutor(4) as pool:
+        runs = list(pool.map(lambda x: (x, runner.run(x=x)), range(200)))
+    assert all(run["x"] == x and run["y"] == x and run["z"] == 1000 * x for x, run in runs)
+    assert len(runner.reports) == 200
+
+
+def test_arrays_are_read_only_where_a_function_or_a_user_gets_them():
+    def draws(image):
+        image[0, 0] = 255
+        return image
+
+    cg = ep.CompGraph({"copy": lambda x: x.copy(), "draw": draws}, {"copy": ("x", "image"), "draw": ("image", "y")})
+    runner = ep.CompGraphRunner(cg)
+    with pytest.raises(ValueError, match="read-only") as error:
+        runner.run(x=np.zeros((2, 2)))
+    assert "'draw'" in error.value.__notes__[0]
+    assert "copy" in error.value.__notes__[0]
+    assert error.traceback[-1].name == "draws"
+    assert runner["image"].sum() == 0
+    with pytest.raises(ValueError, match="read-only"):
+        runner["image"][0, 0] = 1
+
+
+def test_arrays_in_a_tuple_are_guarded_too_and_the_callers_own_array_stays_writable():
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": lambda p: p[0].__setitem__(0, 1)}, {"f": ("pair", "y")}))
+    mine = np.zeros(3)
+    with pytest.raises(ValueError, match="read-only"):
+        runner.run(pair=(mine, 2))
+    mine[0] = 1
+
+
+def test_unguarded_functions_get_writable_arrays_and_guard_can_be_switched_off():
+    flags = []
+
+    @ep.unguarded
+    def look(x):
+        flags.append(x.flags.writeable)
+        return x
+
+    cg = ep.CompGraph({"look": look}, {"look": ("x", "y")})
+    ep.CompGraphRunner(cg).run(x=np.zeros(2))
+    frozen = np.zeros(2)
+    frozen.flags.writeable = False
+    ep.CompGraphRunner(cg).run(x=frozen)
+    ep.CompGraphRunner(ep.CompGraph({"f": lambda x: flags.append(x.flags.writeable)}, {"f": ("x", None)}), guard=False).run(
+        x=np.zeros(2)
+    )
+    assert flags == [True, True, True]
+
+
+def test_the_report_adds_up(edge_runner, photograph):
+    report = edge_runner.run(image=photograph).report
+    assert report.ran == ("grayscale", "blur", "canny")
+    assert report.overhead_ns == report.total_ns - sum(report.durations_ns.values())
+    assert 0 < report.overhead_ns < report.total_ns
+    frame = report.to_frame()
+    assert list(frame["function"]) == ["grayscale", "blur", "canny"]
+    assert frame["share"].sum() < 1
+
+
+def test_a_plan_says_what_would_run_and_what_is_missing(chain):
+    runner, functions = chain
+    plan = runner.plan()
+    assert (plan.order, plan.reused, plan.missing) == (("double", "add", "square"), (), ("x",))
+    runner.run(x=1)
+    runner["n"] = 2
+    assert runner.plan("b").order == ("add",)
+    assert runner.plan("b").reused == ("double",)
+    assert functions["add"].calls == 1
+
+
+def test_a_run_does_not_change(chain):
+    runner, _ = chain
+    run = runner.run(x=1)
+    with pytest.raises(AttributeError, match="does not change"):
+        run.report = None
+
+
+@pytest.mark.parametrize("state", ["new", "run", "stale", "failed"])
+def test_reprs_are_short_and_without_times(state):
+    runner = ep.CompGraphRunner(failing_graph(), {"n": 1})
+    if state != "new":
+        runner.run(x=1)
+    if state == "stale":
+        runner["n"] = 2
+    if state == "failed":
+        with pytest.raises(ZeroDivisionError):
+            runner.rerun(n=3)
+    shown = [runner, runner.cg] + ([runner.last, runner.last.report] if runner.last else [])
+    for thing in shown:
+        assert len(repr(thing)) < 100
+        assert " ms" not in repr(thing)

@@ -1,0 +1,335 @@
+"""Can what was started be stopped: twice, from any thread, in bounded time, and does the process end?"""
+
+from __future__ import annotations
+
+import gc
+import os
+import queue
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+import zmq
+
+from epypes.errors import AddressError, StillRunning
+from epypes.transport import ZMQPublisher, ZMQSubscriber, io
+
+LOCAL = "tcp://127.0.0.1:*"
+WAIT_S = 5.0
+
+
+def io_threads() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name.startswith("epypes-")]
+
+
+def wait_until(condition, timeout_s: float = WAIT_S) -> None:
+    """Wait on an event that nobody sets, a little at a time, until a counter of another thread is right."""
+    never = threading.Event()
+    for _ in range(int(timeout_s / 0.005)):
+        if condition():
+            return
+        never.wait(0.005)
+    raise AssertionError("the condition did not come true in time")
+
+
+@pytest.mark.parametrize("make", [ZMQPublisher, ZMQSubscriber])
+def test_stop_works_before_start_and_twice_and_start_works_again(make):
+    made = make("tcp://127.0.0.1:*", queue.Queue(), bind=True)
+    made.stop()
+    made.start().start()
+    first = made.address
+    assert first != LOCAL
+    made.stop()
+    made.stop()
+    with made:
+        assert "running" in repr(made)
+    assert "stopped" in repr(made)
+    assert io_threads() == []
+
+
+def test_the_same_port_can_be_bound_at_once_after_a_stop():
+    with ZMQPublisher(LOCAL, queue.Queue()) as pub:
+        address = pub.address
+    for kind in [ZMQPublisher, ZMQSubscriber] * 10:
+        with kind(address, queue.Queue(), bind=True) as made:
+            assert made.address == address
+
+
+def test_a_stop_takes_less_than_50_ms():
+    durations = []
+    for _ in range(10):
+        with ZMQPublisher(LOCAL, queue.Queue()) as pub, ZMQSubscriber(pub.address, queue.Queue()) as sub:
+            assert sub.wait_joined(WAIT_S)
+            before = time.perf_counter()
+            pub.stop()
+            durations.append(time.perf_counter() - before)
+    assert sorted(durations)[5] < 0.05
+
+
+def test_what_is_queued_at_the_stop_is_still_sent():
+    out, into = queue.Queue(), queue.Queue()
+    with ZMQSubscriber(LOCAL, into, bind=True) as sub:
+        pub = ZMQPublisher(sub.address, out, bind=False).start()
+        assert sub.wait_joined(WAIT_S)
+        for number in range(500):
+            out.put(b"%d" % number)
+        pub.stop()
+        assert pub.sent == 500
+        assert [int(into.get(timeout=WAIT_S)) for _ in range(500)] == list(range(500))
+
+
+def test_what_was_sent_arrives_even_if_the_last_socket_is_closed_at_once():
+    context = zmq.Context()
+    peer = context.socket(zmq.SUB)
+    peer.subscribe(b"")
+    peer.rcvtimeo = int(WAIT_S * 1000)
+    out = queue.Queue()
+    with ZMQPublisher(LOCAL, out) as pub:
+        peer.connect(pub.address)
+        assert pub.wait_for_subscriber(WAIT_S)
+        for _ in range(50):
+            out.put(bytes(200_000))
+    try:
+        assert {len(peer.recv()) for _ in range(50)} == {200_000}
+    finally:
+        context.destroy(linger=0)
+
+
+def test_a_producer_that_goes_on_does_not_keep_it_from_stopping():
+    class Endless(queue.Queue):
+        def get(self, block=True, timeout=None):
+            return b"x"
+
+        def qsize(self):
+            return 3
+
+    pub = ZMQPublisher(LOCAL, Endless()).start()
+    before = time.perf_counter()
+    pub.stop()
+    assert time.perf_counter() - before < 1.0
+
+
+def test_stop_works_from_the_thread_that_handles_messages():
+    stopped = threading.Event()
+
+    class StopsItself(queue.Queue):
+        def put(self, item, block=True, timeout=None):
+            sub.stop()
+            super().put(item, block, timeout)
+            stopped.set()
+
+    out = queue.Queue()
+    sub = ZMQSubscriber(LOCAL, StopsItself(), bind=True)
+    with sub, ZMQPublisher(sub.address, out, bind=False):
+        assert sub.wait_joined(WAIT_S)
+        out.put(b"x")
+        assert stopped.wait(WAIT_S)
+    assert sub.received == 1
+
+
+def test_stop_works_from_the_thread_that_takes_from_the_queue():
+    class StopsItself(queue.Queue):
+        def get(self, block=True, timeout=None):
+            pub.stop()
+            return super().get(block, timeout)
+
+    pub = ZMQPublisher(LOCAL, StopsItself())
+    pub.start()
+    pub.stop()
+    assert io_threads() == []
+
+
+def test_a_publisher_can_be_stopped_by_the_queue_of_a_subscriber():
+    done = threading.Event()
+
+    class StopsThePublisher(queue.Queue):
+        def put(self, item, block=True, timeout=None):
+            pub.stop()
+            done.set()
+
+    out = queue.Queue()
+    pub = ZMQPublisher(LOCAL, out)
+    with pub, ZMQSubscriber(pub.address, StopsThePublisher()) as sub:
+        assert sub.wait_joined(WAIT_S)
+        before = time.perf_counter()
+        out.put(b"x")
+        assert done.wait(WAIT_S)
+        pub.stop()
+        assert time.perf_counter() - before < 1.0
+    assert io_threads() == []
+
+
+def test_a_put_that_never_returns_is_named():
+    let_go, entered = threading.Event(), threading.Event()
+
+    class Stuck(queue.Queue):
+        def put(self, item, block=True, timeout=None):
+            entered.set()
+            let_go.wait(60)
+
+    out = queue.Queue()
+    sub = ZMQSubscriber(LOCAL, Stuck(), bind=True).start()
+    with ZMQPublisher(sub.address, out, bind=False):
+        assert sub.wait_joined(WAIT_S)
+        out.put(b"x")
+        assert entered.wait(WAIT_S)
+        with pytest.raises(StillRunning, match="put"):
+            sub.stop(timeout_s=0.1)
+        let_go.set()
+    assert io_threads() == []
+
+
+def test_stop_works_from_many_threads_at_once():
+    with ZMQPublisher(LOCAL, queue.Queue()) as pub, ZMQSubscriber(pub.address, queue.Queue()) as sub:
+        threads = [threading.Thread(target=made.stop) for made in (pub, sub) for _ in range(5)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(WAIT_S)
+            assert not thread.is_alive()
+    assert io_threads() == []
+
+
+def test_a_queue_that_never_returns_is_named_and_the_port_is_free():
+    let_go = threading.Event()
+
+    class Stuck(queue.Queue):
+        def get(self, block=True, timeout=None):
+            let_go.wait(60)
+            raise queue.Empty
+
+    pub = ZMQPublisher(LOCAL, Stuck()).start()
+    address = pub.address
+    with pytest.raises(StillRunning, match="get"):
+        pub.stop(timeout_s=0.1)
+    with ZMQPublisher(address, queue.Queue()):
+        pass
+    let_go.set()
+    pub.stop()
+    assert io_threads() == []
+
+
+def test_a_broken_queue_is_counted_and_does_not_end_the_thread():
+    class Broken(queue.Queue):
+        failures = 3
+
+        def get(self, block=True, timeout=None):
+            if self.failures:
+                self.failures -= 1
+                raise OSError("gone")
+            return super().get(block, timeout)
+
+    out = Broken()
+    with ZMQPublisher(LOCAL, out) as pub:
+        out.put(b"x")
+        wait_until(lambda: pub.sent == 1)
+    assert pub.rejected == {"queue failed": 3}
+    assert pub.sent == 1
+
+
+def test_one_io_thread_serves_every_socket_and_ends_with_the_last():
+    made = [ZMQPublisher(LOCAL, queue.Queue()).start() for _ in range(4)]
+    made += [ZMQSubscriber(pub.address, queue.Queue()).start() for pub in made]
+    try:
+        assert len([thread for thread in io_threads() if thread.name == "epypes-io"]) == 1
+        assert all(thread.daemon for thread in io_threads())
+    finally:
+        for one in made:
+            one.stop()
+    assert io_threads() == []
+
+
+def test_commands_return_results_and_exceptions_to_the_thread_that_asked():
+    with ZMQPublisher(LOCAL, queue.Queue()):
+        assert io.call(lambda _: threading.current_thread().name) == "epypes-io"
+        with pytest.raises(ZeroDivisionError):
+            io.call(lambda _: 1 / 0)
+    with pytest.raises(zmq.ZMQError):
+        io.call(lambda _: None)
+
+
+@pytest.mark.parametrize("make", [ZMQPublisher, ZMQSubscriber])
+def test_one_that_is_forgotten_gives_a_warning_and_is_closed(make):
+    made = make(LOCAL, queue.Queue(), bind=True).start()
+    address = made.address
+    with pytest.warns(ResourceWarning, match="left running"):  # noqa: PT031  the last reference must go inside
+        del made
+        gc.collect()
+    for thread in io_threads():
+        thread.join(WAIT_S)
+    with make(address, queue.Queue(), bind=True):
+        pass
+
+
+def run(script: str, *options: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, *options, "-c", script], capture_output=True, text=True, timeout=30, cwd=os.getcwd()
+    )
+
+
+START_BOTH = """
+import queue, time
+from epypes.transport import ZMQPublisher, ZMQSubscriber
+out, into = queue.Queue(), queue.Queue()
+pub = ZMQPublisher("tcp://127.0.0.1:*", out, "t").start()
+sub = ZMQSubscriber(pub.address, into, "t").start()
+assert sub.wait_joined(5)
+"""
+
+
+def test_a_script_that_stops_nothing_ends_promptly_with_a_warning():
+    before = time.perf_counter()
+    done = run(START_BOTH, "-W", "always::ResourceWarning")
+    assert done.returncode == 0
+    assert time.perf_counter() - before < 3
+    assert "ZMQPublisher" in done.stderr
+    assert "ZMQSubscriber" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_an_idle_publisher_and_subscriber_take_less_than_1_percent_of_a_cpu():
+    script = START_BOTH + (
+        "import threading\n"
+        "cpu, wall = time.process_time(), time.perf_counter()\n"
+        "threading.Event().wait(2.0)\n"
+        "cpu, wall = time.process_time() - cpu, time.perf_counter() - wall\n"
+        "sub.stop(); pub.stop()\n"
+        "import sys; sys.exit(0 if cpu / wall < 0.01 else f'{cpu / wall:.2%}')\n"
+    )
+    done = run(script)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_forked_child_starts_an_io_thread_of_its_own():
+    script = (
+        START_BOTH
+        + """
+import os
+child = os.fork()
+if child == 0:
+    pub.stop(); sub.stop()
+    with ZMQPublisher("tcp://127.0.0.1:*", out) as mine, ZMQSubscriber(mine.address, into) as other:
+        ok = other.wait_joined(5)
+    os._exit(0 if ok else 1)
+assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+out.put(b"t/ still works")
+assert into.get(timeout=5) == b"t/ still works"
+sub.stop(); pub.stop()
+"""
+    )
+    done = run(script, "-W", "ignore::DeprecationWarning")
+    assert done.returncode == 0, done.stderr
+
+
+def test_importing_transport_does_not_import_zmq():
+    assert run("import sys, epypes.transport; sys.exit('zmq' in sys.modules)").returncode == 0
+
+
+def test_a_start_that_fails_leaves_nothing_running():
+    with pytest.raises(AddressError):
+        ZMQPublisher("tcp://127.0.0.1:99999", queue.Queue()).start()
+    for thread in io_threads():
+        thread.join(WAIT_S)
+    assert io_threads() == []

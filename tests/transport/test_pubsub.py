@@ -1,0 +1,285 @@
+"""Does what is put into a publisher's queue come out of a subscriber's, and out of a peer's of 2019?"""
+
+from __future__ import annotations
+
+import queue
+import threading
+
+import numpy as np
+import pytest
+import zmq
+
+from epypes.errors import AddressError, MessageError
+from epypes.transport import ZMQPublisher, ZMQSubscriber
+from epypes.wire import Envelope, JustBytes, encode
+
+LOCAL = "tcp://127.0.0.1:*"
+WAIT_S = 5.0
+
+
+@pytest.fixture
+def peer():
+    """Makes raw sockets, as a peer without EPypes has them."""
+    context = zmq.Context()
+    made = []
+
+    def make(kind: int) -> zmq.Socket:
+        socket = context.socket(kind)
+        socket.rcvtimeo = int(WAIT_S * 1000)
+        made.append(socket)
+        return socket
+
+    yield make
+    for socket in made:
+        socket.close(linger=0)
+    context.term()
+
+
+def wait_until(condition, timeout_s: float = WAIT_S) -> None:
+    """Wait on an event that nobody sets, a little at a time, until a counter of another thread is right."""
+    never = threading.Event()
+    for _ in range(int(timeout_s / 0.005)):
+        if condition():
+            return
+        never.wait(0.005)
+    raise AssertionError("the condition did not come true in time")
+
+
+def test_an_envelope_with_an_image_arrives_as_it_was():
+    image = np.arange(480 * 640 * 3, dtype=np.uint8).reshape(480, 640, 3)
+    out, into = queue.Queue(), queue.Queue()
+    with ZMQPublisher(LOCAL, out, "cam1") as pub, ZMQSubscriber(pub.address, into, "cam1") as sub:
+        assert sub.wait_joined(WAIT_S)
+        out.put(Envelope("frame", {"image": image}, source="cam1"))
+        envelope = into.get(timeout=WAIT_S)
+    assert np.array_equal(envelope.parts["image"], image)
+    assert not envelope.parts["image"].flags.writeable
+    assert (envelope.sequence, envelope.source) == (1, "cam1")
+    assert 0 < envelope.epoch < envelope.published_ns
+
+
+def test_twenty_starts_lose_nothing_once_they_have_joined():
+    for _ in range(20):
+        out, into = queue.Queue(), queue.Queue()
+        with ZMQPublisher(LOCAL, out, "cam1") as pub, ZMQSubscriber(pub.address, into, "cam1") as sub:
+            assert sub.wait_joined(WAIT_S)
+            for number in range(50):
+                out.put(Envelope("x", {"n": number}))
+            assert [into.get(timeout=WAIT_S).parts["n"] for _ in range(50)] == list(range(50))
+            assert sub.lost == {}
+            assert sub.rejected == {}
+
+
+def test_topic_cam1_does_not_get_cam10():
+    address = "tcp://127.0.0.1:*"
+    out1, out10, into = queue.Queue(), queue.Queue(), queue.Queue()
+    with ZMQSubscriber(address, into, "cam1", bind=True) as sub:
+        one = ZMQPublisher(sub.address, out1, "cam1", bind=False)
+        ten = ZMQPublisher(sub.address, out10, "cam10", bind=False)
+        with one, ten:
+            assert sub.wait_joined(WAIT_S, publishers=2)
+            out10.put(Envelope("ten"))
+            wait_until(lambda: ten.sent == 1)
+            out1.put(Envelope("one"))
+            assert into.get(timeout=WAIT_S).type == "one"
+    assert into.empty()
+
+
+def test_an_empty_topic_gets_every_topic():
+    into, out = queue.Queue(), queue.Queue()
+    with ZMQPublisher(LOCAL, out, "cam7") as pub, ZMQSubscriber(pub.address, into) as sub:
+        assert sub.wait_joined(WAIT_S)
+        out.put(Envelope("x"))
+        assert into.get(timeout=WAIT_S).type == "x"
+
+
+@pytest.mark.parametrize("make", [queue.Queue, queue.SimpleQueue])
+def test_bytes_and_protobuf_messages_arrive_as_bytes(make):
+    out, into = make(), make()
+    message = JustBytes(contents=b"\0\1", id="7")
+    with ZMQPublisher(LOCAL, out) as pub, ZMQSubscriber(pub.address, into) as sub:
+        assert sub.wait_joined(WAIT_S)
+        for item in (b"one", bytearray(b"two"), memoryview(b"three"), message, b""):
+            out.put(item)
+        received = [into.get(timeout=WAIT_S) for _ in range(5)]
+    assert received == [b"one", b"two", b"three", message.SerializeToString(), b""]
+    assert {type(item) for item in received} == {bytes}
+
+
+def test_a_peer_of_2019_gets_exactly_one_frame_and_nothing_of_a_join(peer):
+    out, into = queue.Queue(), queue.Queue()
+    with ZMQPublisher(LOCAL, out) as pub:
+        socket = peer(zmq.SUB)
+        socket.subscribe(b"")
+        socket.connect(pub.address)
+        assert pub.wait_for_subscriber(WAIT_S)
+        # Another of ours joins meanwhile, several times.
+        for _ in range(3):
+            with ZMQSubscriber(pub.address, into) as sub:
+                assert sub.wait_joined(WAIT_S)
+        out.put(JustBytes(contents=b"x"))
+        assert socket.recv_multipart() == [b"\x0a\x01x"]
+
+
+def test_a_publisher_of_2019_is_understood(peer):
+    socket = peer(zmq.XPUB)
+    socket.bind("tcp://127.0.0.1:*")
+    into = queue.Queue()
+    with ZMQSubscriber(socket.last_endpoint.decode(), into) as sub:
+        # The empty topic comes first, as ZeroMQ sends subscriptions in the order of their bytes.
+        assert socket.recv() == b"\x01"
+        socket.send(b"one frame")
+        assert into.get(timeout=WAIT_S) == b"one frame"
+        assert not sub.wait_joined(0.01)
+
+
+def test_a_second_subscription_keeps_the_first_one_going(peer):
+    out, into = queue.Queue(), queue.Queue()
+    with ZMQPublisher(LOCAL, out, "t") as pub, ZMQSubscriber(pub.address, into, "t") as sub:
+        assert sub.wait_joined(WAIT_S)
+        with ZMQSubscriber(pub.address, queue.Queue(), "t") as other:
+            assert other.wait_joined(WAIT_S)
+        for number in range(20):
+            out.put(Envelope("x", {"n": number}))
+        assert [into.get(timeout=WAIT_S).parts["n"] for _ in range(20)] == list(range(20))
+        assert pub.wait_for_subscriber(0.0)
+
+
+def test_a_publisher_knows_when_the_last_subscriber_has_gone():
+    with ZMQPublisher(LOCAL, queue.Queue()) as pub:
+        assert not pub.wait_for_subscriber(0.0)
+        with ZMQSubscriber(pub.address, queue.Queue(), "a"), ZMQSubscriber(pub.address, queue.Queue(), "a"):
+            assert pub.wait_for_subscriber(WAIT_S)
+        wait_until(lambda: not pub.wait_for_subscriber(0.0))
+
+
+def test_garbage_is_counted_and_the_next_message_arrives(peer, caplog):
+    into = queue.Queue()
+    with ZMQSubscriber(LOCAL, into, bind=True) as sub:
+        socket = peer(zmq.XPUB)
+        socket.connect(sub.address)
+        assert socket.recv() == b"\x01"
+        for garbage in ([b"a", b"b"], [b"/", b"\xff\xff"], [b"", b"", b""], [b"/"] * 3, [b"x"] * 5):
+            socket.send_multipart(garbage)
+        socket.send_multipart(encode(Envelope("good")))
+        assert into.get(timeout=WAIT_S).type == "good"
+        assert sub.rejected == {"bad topic": 3, "no envelope": 2}
+        assert sub.received == 1
+    assert "rejected a message (bad topic)" in caplog.text
+
+
+def test_items_that_can_not_be_sent_are_counted_and_the_next_one_is_sent():
+    out, into = queue.Queue(), queue.Queue()
+
+    class Liar:
+        def SerializeToString(self):
+            raise LookupError("no")
+
+    with (
+        ZMQPublisher(LOCAL, out, max_message_bytes=10_000) as pub,
+        ZMQSubscriber(pub.address, into, max_message_bytes=10_000) as sub,
+    ):
+        assert sub.wait_joined(WAIT_S)
+        for item in (
+            None,
+            42,
+            Liar(),
+            JustBytes(),
+            Envelope("x", {"no": object()}),
+            bytes(10_001),
+            Envelope("x", {"image": np.zeros(20_000, np.uint8)}),
+        ):
+            out.put(item)
+        out.put(Envelope("good"))
+        assert into.get(timeout=WAIT_S).sequence == 1
+        assert pub.rejected == {"no codec": 3, "LookupError": 1, "incomplete": 1, "too large": 2}
+        assert pub.sent == 1
+
+
+def test_a_refused_oversized_message_names_its_size_and_the_limit(caplog):
+    out = queue.Queue()
+    with ZMQPublisher(LOCAL, out, max_message_bytes=1_000) as pub:
+        out.put(bytes(1_500))
+        wait_until(lambda: pub.rejected["too large"] == 1)
+    assert "1,500 bytes; the limit is 1,000" in caplog.text
+
+
+def test_a_full_queue_drops_and_counts_and_never_blocks():
+    out, into = queue.Queue(), queue.Queue(maxsize=2)
+    with ZMQPublisher(LOCAL, out) as pub, ZMQSubscriber(pub.address, into) as sub:
+        assert sub.wait_joined(WAIT_S)
+        for _ in range(5):
+            out.put(b"x")
+        wait_until(lambda: sub.dropped["queue full"] == 3)
+        assert sub.received == 2
+
+
+def test_loss_is_visible_as_gaps_of_a_source(peer):
+    into = queue.Queue()
+    with ZMQSubscriber(LOCAL, into, bind=True) as sub:
+        socket = peer(zmq.XPUB)
+        socket.connect(sub.address)
+        assert socket.recv() == b"\x01"
+        for source, sequence in (("a", 5), ("b", 1), ("a", 6), ("a", 9), ("b", 2), ("a", 10), ("b", 4)):
+            socket.send_multipart(encode(Envelope("x", source=source, epoch=1, sequence=sequence)))
+        for _ in range(7):
+            into.get(timeout=WAIT_S)
+        assert sub.lost == {("a", 1): 2, ("b", 1): 1}
+
+
+def test_two_sources_of_one_publisher_are_no_loss():
+    out, into = queue.Queue(), queue.Queue()
+    with ZMQPublisher(LOCAL, out) as pub, ZMQSubscriber(pub.address, into) as sub:
+        assert sub.wait_joined(WAIT_S)
+        for source in ("left", "right", "left", "right"):
+            out.put(Envelope("x", source=source))
+        numbers = [into.get(timeout=WAIT_S).sequence for _ in range(4)]
+        assert numbers == [1, 1, 2, 2]
+        assert sub.lost == {}
+
+
+def test_ipc_and_inproc_work_as_tcp_does(tmp_path):
+    for address in (f"ipc://{tmp_path}/s", "inproc://here"):
+        for _ in range(2):
+            out, into = queue.Queue(), queue.Queue()
+            with ZMQPublisher(address, out) as pub, ZMQSubscriber(address, into) as sub:
+                assert sub.wait_joined(WAIT_S)
+                out.put(b"x")
+                assert into.get(timeout=WAIT_S) == b"x"
+                assert pub.address == address
+
+
+@pytest.mark.parametrize("kind", [ZMQPublisher, ZMQSubscriber])
+def test_a_port_in_use_is_named_with_a_way_out(kind):
+    with ZMQPublisher(LOCAL, queue.Queue()) as pub:
+        port = pub.address.rpartition(":")[2]
+        with pytest.raises(AddressError, match=rf"port {port} of 127\.0\.0\.1 is in use.*another") as caught:
+            kind(pub.address, queue.Queue(), bind=True).start()
+        assert caught.value.address == pub.address
+
+
+@pytest.mark.parametrize("address", ["", "127.0.0.1:5555", "tcp://127.0.0.1", "tcp://127.0.0.1:99999", "nope://x"])
+@pytest.mark.parametrize("bind", [True, False])
+def test_a_malformed_address_is_an_address_error(address, bind):
+    with pytest.raises(AddressError):
+        ZMQPublisher(address, queue.Queue(), bind=bind).start()
+
+
+def test_an_address_of_another_machine_is_an_address_error():
+    with pytest.raises(AddressError, match="no such address"):
+        ZMQPublisher("tcp://192.0.2.1:5555", queue.Queue(), insecure=True).start()
+
+
+@pytest.mark.parametrize("kind", [ZMQPublisher, ZMQSubscriber])
+@pytest.mark.parametrize("address", ["tcp://*:5555", "tcp://0.0.0.0:5555", "tcp://10.0.0.1:5555", "tcp://eth0:5555"])
+def test_binding_for_other_machines_must_be_asked_for(kind, address):
+    with pytest.raises(AddressError, match="insecure=True"):
+        kind(address, queue.Queue(), bind=True)
+    kind(address, queue.Queue(), bind=True, insecure=True)
+    kind(address, queue.Queue(), bind=False)
+
+
+def test_a_topic_that_is_none_is_refused_at_once():
+    for kind in (ZMQPublisher, ZMQSubscriber):
+        with pytest.raises(MessageError):
+            kind(LOCAL, queue.Queue(), "t" * 2_000)

@@ -1,0 +1,148 @@
+"""Does every hyperparameter get the control that its hint, its annotation or its value asks for?"""
+
+from __future__ import annotations
+
+import enum
+from typing import Annotated, Any, Literal
+
+import annotated_types
+import ipywidgets
+import numpy as np
+import pytest
+from epypes_widgets.controls import control
+from epypes_widgets.ranges import ranges
+
+import epypes as ep
+from epypes.errors import UnknownName
+from epypes.hints import as_param
+
+
+class Mode(enum.Enum):
+    FAST = 1
+    EXACT = 2
+
+
+def made(value: Any, hint: Any = None, function: Any = None) -> Any:
+    """Return the control of a hyperparameter x with this value."""
+    cg = ep.CompGraph({"f": function or (lambda x: x)}, {"f": ("x", "y")})
+    runner = ep.CompGraphRunner(cg, {"x": value})
+    return control("x", value, ranges(runner, {} if hint is None else {"x": hint})["x"])
+
+
+@pytest.mark.parametrize(
+    ("value", "hint", "kind"),
+    [
+        (70, (0, 255), ipywidgets.IntSlider),
+        (70, None, ipywidgets.IntSlider),
+        (np.int64(70), None, ipywidgets.IntSlider),
+        (11, ep.Param(1, 31, odd=True), ipywidgets.IntSlider),
+        (1.5, None, ipywidgets.FloatSlider),
+        (1, (0.0, 2.0), ipywidgets.FloatSlider),
+        (1.5, (1, 3), ipywidgets.FloatSlider),
+        (0.1, ep.Param(0.001, 10, log=True), ipywidgets.FloatLogSlider),
+        ("canny", ["canny", "sobel"], ipywidgets.Dropdown),
+        (None, [1, None], ipywidgets.Dropdown),
+        (Mode.FAST, None, ipywidgets.Dropdown),
+        (True, None, ipywidgets.Checkbox),
+        (None, None, ipywidgets.Label),
+        ("text", None, ipywidgets.Label),
+        (float("inf"), None, ipywidgets.Label),
+        (float("nan"), None, ipywidgets.Label),
+        ((1, 2), None, ipywidgets.Label),
+        (np.zeros((3, 3)), None, ipywidgets.Label),
+    ],
+)
+def test_the_hint_or_the_value_says_which_control(value: Any, hint: Any, kind: type) -> None:
+    entry = made(value, hint)
+    assert isinstance(entry.widget, kind)
+    assert entry.read() is value or entry.read() == value
+
+
+@pytest.mark.parametrize(
+    ("annotation", "kind"),
+    [
+        (Annotated[int, ep.Param(0, 9)], ipywidgets.IntSlider),
+        (Annotated[int, annotated_types.Ge(1)], ipywidgets.IntSlider),
+        (Annotated[int, annotated_types.Le(100)], ipywidgets.IntSlider),
+        (Literal[3, 5], ipywidgets.Dropdown),
+    ],
+)
+def test_the_annotation_says_it_where_there_is_no_hint(annotation: Any, kind: type) -> None:
+    def function(x: Any) -> Any:
+        return x
+
+    function.__annotations__["x"] = annotation
+    entry = made(3, function=function)
+    assert isinstance(entry.widget, kind)
+    assert entry.read() == 3
+
+
+def test_an_annotation_that_does_not_fit_the_value_gives_way_to_it() -> None:
+    def function(x: Annotated[int, ep.Param(5, 9)]) -> int:
+        return x
+
+    function.__annotations__["x"] = Annotated[int, ep.Param(5, 9)]
+    assert made(3, function=function).widget.min == 0
+
+
+def test_a_slider_of_odd_integers_has_odd_ends_and_takes_no_even_one() -> None:
+    slider = made(11, ep.Param(0, 30, odd=True)).widget
+    assert (slider.min, slider.max, slider.step, slider.continuous_update) == (1, 29, 2, True)
+    slider.value = 14
+    assert slider.value == 15
+    slider.value = 99
+    assert slider.value == 29
+
+
+def test_a_value_that_is_not_negative_never_gets_a_negative_range() -> None:
+    assert made(0).widget.min == 0
+    assert made(2.5).widget.min == 0.0
+
+
+@pytest.mark.parametrize(("value", "new"), [(None, 1), ("a", "b"), (Mode.FAST, Mode.EXACT), (True, False)])
+def test_choices_can_be_moved_from_code(value: Any, new: Any) -> None:
+    heard: list[tuple[str, Any]] = []
+    entry = made(value, None if isinstance(value, bool | enum.Enum) else [value, new])
+    entry.on_change(lambda name, at: heard.append((name, at)))
+    entry.write(new)
+    assert (entry.read(), heard) == (new, [("x", new)])
+
+
+def test_code_may_leave_the_soft_range_but_not_the_hard_one() -> None:
+    entry = made(5, ep.Param(0, 100, soft=(0, 10)))
+    assert entry.widget.max == 10
+    entry.write(60)
+    assert (entry.read(), entry.widget.max) == (60, 60)
+    with pytest.raises(ValueError, match=r"can't be 101.*0 to 100"):
+        entry.write(101)
+    assert entry.read() == 60
+
+
+def test_a_whole_number_stays_one_on_a_logarithmic_slider() -> None:
+    entry = made(10, ep.Param(1, 1000, log=True))
+    entry.write(100)
+    assert entry.read() == 100
+    assert isinstance(entry.read(), int)
+
+
+def test_a_hint_for_no_hyperparameter_names_the_nearest(runner: ep.CompGraphRunner) -> None:
+    with pytest.raises(UnknownName, match="Did you mean 'threshold'") as caught:
+        ranges(runner, {"treshold": (0, 255)})
+    assert (caught.value.kind, caught.value.name) == ("hyperparameter", "treshold")
+
+
+def test_a_hint_that_is_none_is_refused_by_name(runner: ep.CompGraphRunner) -> None:
+    with pytest.raises(TypeError, match="Hint of 'threshold' is 5"):
+        ranges(runner, {"threshold": 5})
+    with pytest.raises(ValueError, match=r"Hint of 'threshold': low \(9\) is above high"):
+        ranges(runner, {"threshold": (9, 1)})
+
+
+@pytest.mark.parametrize("hint", [(0, 50), ["a", "b"], ep.Param(1, 101, odd=True)])
+def test_a_value_outside_of_its_hint_is_refused_with_the_way_out(runner: ep.CompGraphRunner, hint: Any) -> None:
+    with pytest.raises(ValueError, match=r"'threshold' is 100, outside.*Set runner\['threshold'\]"):
+        ranges(runner, {"threshold": hint})
+
+
+def test_hints_are_read_as_everywhere() -> None:
+    assert as_param((0, 255)) == ep.Param(0, 255)

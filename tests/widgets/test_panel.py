@@ -1,0 +1,256 @@
+"""Does a panel follow its controls, keep its picture when a function fails, and say what it did?"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+from typing import Any
+
+import numpy as np
+import pytest
+from epypes_widgets import Panel, tune
+
+import epypes as ep
+from epypes.errors import NotComputed, PayloadError, UnknownName
+
+
+class Screen:
+    """A front end of a panel's picture: keeps what arrives and answers as picture.js does."""
+
+    def __init__(self, panel: Panel, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.messages: list[dict[str, Any]] = []
+        self.view = panel._view
+        monkeypatch.setattr(self.view, "send", self._arrives)
+        self.tell({"kind": "ready"})
+
+    @property
+    def frames(self) -> list[dict[str, Any]]:
+        return [message for message in self.messages if message["kind"] == "frame"]
+
+    def tell(self, content: dict[str, Any]) -> None:
+        self.view._answer(self.view, content, [])
+
+    def _arrives(self, content: dict[str, Any], buffers: list[bytes] | None = None) -> None:
+        json.dumps(content, allow_nan=False)
+        self.messages.append(content)
+        if content["kind"] == "frame":
+            self.tell({"kind": "painted", "seq": content["seq"]})
+
+
+@pytest.fixture
+def screen(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> Screen:
+    return Screen(panel, monkeypatch)
+
+
+def test_a_new_view_gets_the_picture_of_the_last_run(panel: Panel, screen: Screen, calls: Any) -> None:
+    assert [frame["token"] for frame in screen.frames] == ["mask"]
+    assert screen.frames[0]["values"] == {"gain": 2, "threshold": 100}
+    assert calls.counts == {}
+
+
+def test_moving_a_control_runs_the_stale_functions_only(panel: Panel, screen: Screen, calls: Any) -> None:
+    panel["threshold"] = 60
+    panel.wait(10)
+    assert calls.counts == {"above": 1}
+    assert screen.frames[-1]["values"] == {"gain": 2, "threshold": 60}
+    assert screen.frames[-1]["seq"] > screen.frames[0]["seq"]
+    assert panel.result.hyperparameters["threshold"] == 60
+    np.testing.assert_array_equal(panel.result["mask"] == 255, panel.result["image_bright"] > 60)
+
+
+def test_the_front_end_moving_a_slider_does_the_same(panel: Panel, runner: ep.CompGraphRunner) -> None:
+    panel._controls["threshold"].widget.value = 61
+    panel.wait(10)
+    assert (panel["threshold"], runner["threshold"]) == (61, 61)
+
+
+def test_a_function_that_fails_keeps_the_picture_and_says_so(panel: Panel, screen: Screen) -> None:
+    panel["threshold"] = 13
+    panel.wait(10)
+    assert [message["kind"] for message in screen.messages if message["kind"] != "latency"] == ["frame", "error"]
+    assert screen.messages[-1]["text"] == "above: ValueError: 13 is not a threshold"
+    assert panel.error == screen.messages[-1]["text"]
+    assert panel.result.hyperparameters["threshold"] == 100
+    assert "epypes-failed" in panel._headings["above"]._dom_classes
+    assert "failed" in repr(panel)
+
+
+def test_the_next_good_value_clears_the_failure(panel: Panel, screen: Screen) -> None:
+    for threshold in (13, 14):
+        panel["threshold"] = threshold
+        panel.wait(10)
+    assert panel.error == ""
+    assert screen.frames[-1]["stale"] is False
+    assert "epypes-failed" not in panel._headings["above"]._dom_classes
+
+
+def test_another_token_can_be_looked_at_while_the_last_values_fail(panel: Panel, screen: Screen) -> None:
+    panel["threshold"] = 13
+    panel.wait(10)
+    panel._tokens.value = "image_bright"
+    panel.wait(10)
+    assert (screen.frames[-1]["token"], screen.frames[-1]["stale"]) == ("image_bright", True)
+    assert panel.error
+
+
+def test_choosing_a_token_shows_it_without_running_anything(
+    panel: Panel, screen: Screen, runner: ep.CompGraphRunner
+) -> None:
+    reports = len(runner.reports)
+    assert panel._tokens.options == ("image", "image_bright", "mask")
+    panel._tokens.value = "image"
+    panel.wait(10)
+    assert (screen.frames[-1]["token"], len(runner.reports)) == ("image", reports)
+
+
+def test_a_view_mounted_later_hears_of_the_failure(panel: Panel, screen: Screen) -> None:
+    panel["threshold"] = 13
+    panel.wait(10)
+    screen.messages.clear()
+    screen.tell({"kind": "ready"})
+    assert [message["kind"] for message in screen.messages] == ["frame", "error"]
+
+
+def test_many_values_while_a_function_is_busy_make_few_runs_and_the_last_one_counts(image: Any) -> None:
+    started, go_on, seen = threading.Event(), threading.Event(), []
+
+    def slow(image: Any, x: int) -> Any:
+        seen.append(x)
+        if len(seen) > 1:
+            started.set()
+            assert go_on.wait(10)
+        return image + x
+
+    runner = ep.CompGraphRunner(ep.CompGraph({"slow": slow}, {"slow": (("image", "x"), "y")}), {"x": 0})
+    runner.run(image=image)
+    panel = tune(runner, x=(0, 200))
+    panel["x"] = 1
+    assert started.wait(10)
+    for x in range(2, 121):
+        panel["x"] = x
+    assert "computing" in repr(panel)
+    go_on.set()
+    panel.wait(10)
+    assert seen == [0, 1, 120]
+    assert (panel["x"], runner["x"], panel.result.hyperparameters["x"]) == (120, 120, 120)
+    panel.close(10)
+
+
+def test_values_set_from_several_threads_are_all_in_the_last_run(panel: Panel) -> None:
+    def move(name: str, values: range) -> None:
+        for value in values:
+            panel[name] = value
+
+    threads = [
+        threading.Thread(target=move, args=("gain", range(1, 6))),
+        threading.Thread(target=move, args=("threshold", range(100, 140))),
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(10)
+    panel.wait(10)
+    assert panel.values == {"gain": 5, "threshold": 139} == dict(panel.result.hyperparameters)
+
+
+def test_the_code_names_what_has_changed(panel: Panel) -> None:
+    assert panel.code() == "runner.rerun()"
+    panel["threshold"] = 60
+    assert panel.code() == "runner.rerun(threshold=60)"
+    panel["threshold"] = 100
+    assert panel.code() == "runner.rerun()"
+    panel.wait(10)
+
+
+def test_a_runner_that_was_not_run_is_refused_with_the_way_out(runner: ep.CompGraphRunner) -> None:
+    with pytest.raises(PayloadError, match=r"Call run\(image=\.\.\.\) first"):
+        tune(ep.CompGraphRunner(runner.cg, {"gain": 1, "threshold": 1}))
+
+
+def test_names_that_are_not_there_are_refused(runner: ep.CompGraphRunner, panel: Panel) -> None:
+    with pytest.raises(UnknownName, match="Did you mean 'mask'"):
+        tune(runner, token="maks")
+    with pytest.raises(UnknownName, match="Did you mean 'gain'"):
+        panel["gian"]
+    with pytest.raises(ValueError, match="can't be 300"):
+        panel["threshold"] = 300
+    assert panel["threshold"] == 100
+
+
+def test_a_runner_with_stale_functions_is_brought_up_to_date(runner: ep.CompGraphRunner) -> None:
+    runner["threshold"] = 50
+    panel = tune(runner)
+    panel.wait(10)
+    assert panel.result.hyperparameters["threshold"] == 50
+    panel.close(10)
+
+
+def test_a_panel_on_a_run_that_failed_opens_and_recovers(runner: ep.CompGraphRunner) -> None:
+    with pytest.raises(ValueError, match="13"):
+        runner.rerun(threshold=13)
+    panel = tune(runner, threshold=(0, 255))
+    panel.wait(10)
+    assert panel.error
+    with pytest.raises(NotComputed, match="13 is not a threshold"):
+        panel.result["mask"]
+    panel["threshold"] = 20
+    panel.wait(10)
+    assert (panel.error, panel.token) == ("", "mask")
+    panel.close(10)
+
+
+def test_a_graph_without_images_is_shown_as_text(monkeypatch: pytest.MonkeyPatch) -> None:
+    runner = ep.CompGraphRunner(ep.CompGraph({"add": lambda x, y: x + y}, {"add": (("x", "y"), "total")}), {"y": 1})
+    runner.run(x=2)
+    panel = tune(runner)
+    screen = Screen(panel, monkeypatch)
+    assert (screen.frames[-1]["media_type"], screen.frames[-1]["text"]) == ("text/plain", "3")
+    panel.close(10)
+
+
+def test_a_value_that_nothing_moves_can_be_set_from_code(image: Any) -> None:
+    cg = ep.CompGraph({"f": lambda image, mask: image & mask}, {"f": (("image", "mask"), "y")})
+    runner = ep.CompGraphRunner(cg, {"mask": np.zeros((48, 64), np.uint8)})
+    runner.run(image=image)
+    panel = tune(runner)
+    panel["mask"] = np.full((48, 64), 255, np.uint8)
+    panel.wait(10)
+    np.testing.assert_array_equal(panel.result["y"], image)
+    panel.close(10)
+
+
+def test_the_repr_is_short_and_the_bundle_shows_the_widgets(panel: Panel) -> None:
+    bundle = panel._repr_mimebundle_()
+    assert bundle["text/plain"] == repr(panel) == "<Panel: 2 hyperparameters, shows 'mask'; up to date>"
+    assert bundle["application/vnd.jupyter.widget-view+json"]["model_id"] == panel.widget.model_id
+
+
+def test_a_closed_panel_takes_no_values_and_its_controls_are_off(panel: Panel, calls: Any) -> None:
+    panel.close(10)
+    panel.close(10)
+    with pytest.raises(RuntimeError, match="closed"):
+        panel["threshold"] = 60
+    assert all(entry.widget.disabled for entry in panel._controls.values())
+    assert calls.counts == {}
+
+
+def test_two_panels_on_one_runner_both_work(runner: ep.CompGraphRunner) -> None:
+    first, second = tune(runner), tune(runner)
+    first["threshold"] = 60
+    first.wait(10)
+    second["gain"] = 3
+    second.wait(10)
+    assert dict(second.result.hyperparameters) == {"gain": 3, "threshold": 60}
+    first.close(10)
+    second.close(10)
+
+
+def test_the_interpreter_ends_while_a_panel_is_open() -> None:
+    code = (
+        "import epypes as ep; from epypes_widgets import tune\n"
+        "r = ep.CompGraphRunner(ep.CompGraph({'f': lambda x, y: x + y}, {'f': (('x', 'y'), 'z')}), {'y': 1})\n"
+        "r.run(x=2); p = tune(r); p['y'] = 2; p.wait(10); assert p.result['z'] == 4"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True, timeout=30)

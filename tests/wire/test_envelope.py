@@ -1,0 +1,308 @@
+"""Is an envelope what its frames say, and are bad frames refused by a MessageError and nothing else?"""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+import random
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import epypes.transport
+import epypes.wire
+from epypes.errors import MessageError
+from epypes.wire import Envelope, FailureRecord, Limits, decode, encode
+from epypes.wire.schema import message_class
+
+
+def full_envelope() -> Envelope:
+    return Envelope(
+        "edges",
+        {
+            "image": np.arange(60 * 80 * 3, dtype=np.uint8).reshape(60, 80, 3),
+            "depth": np.ones((30, 40), "<u2"),
+            "mask": np.eye(20, dtype=bool),
+            "names": np.array(["left", "right"]),
+            "points": [(1.5, 2), {"size": np.float32(3)}, None],
+            "jpeg": b"\xff\xd8" + bytes(500),
+            "huge": 1 << 80,
+        },
+        source="cam1",
+        epoch=1,
+        sequence=7,
+        acquired_ns=11,
+        published_ns=12,
+        correlation_id="request-1",
+        revision=3,
+        bundle_digest="sha256:00",
+        attributes={"exposure": 0.5},
+        timings={"blur": 100},
+        failure=FailureRecord("canny", ("a", "b"), "ValueError", "no", "id", 2),
+    )
+
+
+def test_every_field_comes_back():
+    sent = full_envelope()
+    back = decode(encode(sent, "cam1", inline_below=64))
+    for field in dataclasses.fields(Envelope):
+        if field.name != "parts":
+            assert getattr(back, field.name) == getattr(sent, field.name), field.name
+    assert list(back.parts) == list(sent.parts)
+
+
+def test_the_topic_frame_is_always_there_and_ends_in_a_slash():
+    assert encode(Envelope("x"))[0] == b"/"
+    assert encode(Envelope("x"), "cam1")[0] == b"cam1/"
+    assert encode(Envelope("x"), "cam1/")[0] == b"cam1/"
+
+
+def test_large_arrays_ride_beside_and_small_ones_inside():
+    frames = encode(Envelope("x", {"small": np.zeros(8191, np.uint8), "large": np.zeros(8192, np.uint8)}))
+    assert [len(frame) for frame in frames[2:]] == [8192]
+
+
+def test_an_envelope_can_not_be_changed():
+    envelope = Envelope("x", {"a": 1})
+    with pytest.raises(TypeError):
+        envelope.parts["a"] = 2  # type: ignore[index]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        envelope.type = "y"  # type: ignore[misc]
+
+
+def test_the_repr_is_small_and_free_of_values():
+    envelope = Envelope("x" * 500, {f"part{n}": np.zeros(10) for n in range(100)})
+    assert len(repr(envelope)) < 100
+
+
+def test_a_field_of_the_wrong_type_is_refused_by_the_sender():
+    with pytest.raises(MessageError) as caught:
+        encode(Envelope("x", sequence=-1))
+    assert caught.value.reason == "bad field"
+
+
+def header(**parts) -> object:
+    message = message_class("epypes.v1.Envelope")()
+    for name, fields in parts.items():
+        kind, content = fields
+        part = message.parts.add(name=name)
+        getattr(part.value, kind).SetInParent()
+        for field, value in content.items():
+            target = getattr(part.value, kind)
+            if field == "shape":
+                target.shape.extend(value)
+            else:
+                setattr(target, field, value)
+    return message
+
+
+def refused(message, *payloads, limits=None) -> str:
+    with pytest.raises(MessageError) as caught:
+        decode([b"/", message.SerializeToString(), *payloads], limits or Limits())
+    return caught.value.reason
+
+
+def tensor(**fields) -> tuple[str, dict[str, object]]:
+    return "tensor", {"dtype": "<f4", "shape": [2, 2], "inline": bytes(16), **fields}
+
+
+def image(**fields) -> tuple[str, dict[str, object]]:
+    return "image", {"width": 2, "height": 2, "encoding": "mono8", "step": 2, "inline": bytes(4), **fields}
+
+
+@pytest.mark.parametrize(
+    ("reason", "part"),
+    [
+        ("size differs", tensor(shape=[2, 3])),
+        ("size differs", tensor(shape=[2**40, 2**40])),
+        ("size differs", tensor(dtype="|S0", shape=[2**40], inline=b"")),
+        ("bad shape", tensor(shape=[-2, -2])),
+        ("bad shape", tensor(shape=[2**62, 0], inline=b"")),
+        ("bad shape", tensor(shape=[1] * 33)),
+        ("bad shape", tensor(shape=[1], inline=bytes(4), scalar=True)),
+        ("bad dtype", tensor(dtype="|O8")),
+        ("bad dtype", tensor(dtype="|V4")),
+        ("bad dtype", tensor(dtype="<M8[s]")),
+        ("bad dtype", tensor(dtype="f4,f4")),
+        ("bad dtype", tensor(dtype="<f3")),
+        ("bad data", tensor(dtype="|b1", inline=b"\0\1\2\3")),
+        ("bad data", tensor(dtype="<U1", inline=b"\xff" * 16)),
+        ("bad data", tensor(dtype="<U1", shape=[], inline=b"\xff" * 4, scalar=True)),
+        ("size differs", tensor(dtype="<U2", shape=[], inline=b"\0" * 4, scalar=True)),
+        ("bad step", image(step=1)),
+        ("bad step", image(width=0, step=0, inline=b"")),
+        ("size differs", image(step=3)),
+        ("size differs", image(height=2**32 - 1, step=2**32 - 1)),
+        ("bad encoding", image(encoding="yuv422")),
+        ("missing frame", tensor(frame=1)),
+        ("no data", ("encoded", {})),
+        ("unknown value", ("list", {})),
+    ],
+)
+def test_a_part_that_does_not_fit_its_description_is_refused(reason, part):
+    message = header(part=part)
+    if reason == "unknown value":
+        message.parts[0].value.list.items.add()
+    payloads = [bytes(16)] if reason == "missing frame" else []
+    assert refused(message, *payloads) == reason
+
+
+def test_each_frame_belongs_to_exactly_one_value():
+    assert refused(header(a=tensor()), bytes(16)) == "unused frame"
+    assert refused(header(a=tensor(frame=0), b=tensor(frame=0)), bytes(16)) == "frame used twice"
+
+
+def test_padded_rows_of_other_senders_are_read():
+    message = header(a=image(step=3, inline=b"\1\2\0\3\4\0"))
+    assert decode([b"/", message.SerializeToString()]).parts["a"].tolist() == [[1, 2], [3, 4]]
+
+
+def test_names_and_keys_may_come_once():
+    message = header(a=tensor())
+    message.parts.add(name="a").value.none = True
+    assert refused(message) == "name used twice"
+    twice = header(m=("map", {}))
+    for _ in range(2):
+        entry = twice.parts[0].value.map.entries.add()
+        entry.key.integer = 1
+        entry.value.none = True
+    assert refused(twice) == "bad key"
+    unhashable = header(m=("map", {}))
+    entry = unhashable.parts[0].value.map.entries.add()
+    entry.key.list.SetInParent()
+    entry.value.none = True
+    assert refused(unhashable) == "bad key"
+
+
+def test_limits_hold():
+    many = header(**{f"p{n}": tensor() for n in range(5)})
+    assert refused(many, limits=Limits(parts=4)) == "too many parts"
+    assert refused(many, limits=Limits(values=4)) == "too many values"
+    assert refused(many, limits=Limits(total_bytes=50)) == "too large"
+    assert refused(many, limits=Limits(header_bytes=50)) == "too large"
+    assert refused(many, b"", b"", limits=Limits(frames=1)) == "too many frames"
+    deep = header(a=("list", {}))
+    value = deep.parts[0].value
+    for _ in range(30):
+        value = value.list.items.add()
+    value.none = True
+    assert refused(deep) == "too deep"
+
+
+@pytest.mark.parametrize(
+    "frames", [[], [b"/"], [b"cam1", b""], [b"\xff/", b""], [b"a" * 5000 + b"/", b""], [b"", b""], [b"/", b"\xff"]]
+)
+def test_frames_that_are_no_message_are_refused(frames):
+    with pytest.raises(MessageError):
+        decode(frames)
+
+
+def test_a_header_nested_beyond_the_parser_is_refused():
+    value = b"\x08\x01"
+    for _ in range(500):
+        item = b"\x0a" + varint(len(value)) + value
+        value = b"\x32" + varint(len(item)) + item
+    part = b"\x12" + varint(len(value)) + value
+    with pytest.raises(MessageError):
+        decode([b"/", b"\x62" + varint(len(part)) + part])
+
+
+def varint(number: int) -> bytes:
+    out = bytearray()
+    while number > 127:
+        out.append(number & 127 | 128)
+        number >>= 7
+    return bytes([*out, number])
+
+
+def mutate_bytes(data: bytes, rng: random.Random) -> bytes:
+    changed = bytearray(data)
+    for _ in range(rng.randint(1, 4)):
+        if changed:
+            changed[rng.randrange(len(changed))] = rng.choice([0, 1, 0x7F, 0x80, 0xFF, rng.randrange(256)])
+    what = rng.randrange(5)
+    if what == 0:
+        del changed[rng.randrange(len(changed) + 1) :]
+    elif what == 1:
+        place = rng.randrange(len(changed) + 1)
+        changed[place:place] = rng.randbytes(rng.randint(1, 12))
+    return bytes(changed)
+
+
+def mutate_frames(frames: list[bytes], rng: random.Random) -> list[bytes]:
+    frames = list(frames)
+    what = rng.randrange(8)
+    place = rng.randrange(len(frames))
+    if what == 0:
+        del frames[place]
+    elif what == 1:
+        frames.insert(place, frames[rng.randrange(len(frames))])
+    elif what == 2:
+        frames[place] = frames[place][: rng.randrange(len(frames[place]) + 1)]
+    elif what == 3:
+        rng.shuffle(frames)
+    else:
+        # Most of the meaning is in the header.
+        place = 1 if what > 4 else place
+        frames[place] = mutate_bytes(frames[place], rng)
+    return frames
+
+
+def mutate_description(frames: list[bytes], rng: random.Random) -> list[bytes]:
+    message = message_class("epypes.v1.Envelope").FromString(frames[1])
+    value = rng.choice(message.parts).value
+    numbers = [0, 1, 2, 3, 17, 2**16, 2**31, 2**32 - 1]
+    if value.HasField("image"):
+        setattr(value.image, rng.choice(["width", "height", "step", "frame"]), rng.choice(numbers))
+        value.image.encoding = rng.choice(["mono8", "bgr8", "bgra16", "rgb16", "", "jpeg"])
+    elif value.HasField("tensor"):
+        value.tensor.dtype = rng.choice(["<f4", "|O8", "O", "<U3", "|S0", "|V8", ">c32", "<U999999999", "b1", "f"])
+        value.tensor.shape.append(rng.choice([-1, 0, 2**62, -(2**63), 2**63 - 1, *numbers]))
+        value.tensor.scalar = rng.random() < 0.5
+    else:
+        value.tensor.frame = rng.choice(numbers)
+    return [frames[0], message.SerializeToString(), *frames[2:]]
+
+
+def test_of_10000_broken_messages_none_raises_anything_but_a_message_error():
+    rng = random.Random(2019)
+    frames = [bytes(frame) for frame in encode(full_envelope(), "cam1", inline_below=64)]
+    reasons = []
+    for number in range(10_000):
+        mutation = mutate_description if number % 3 == 0 else mutate_frames
+        try:
+            envelope = decode(mutation(frames, rng))
+        except MessageError as error:
+            reasons.append(error.reason)
+        else:
+            # What is accepted can be looked at in full.
+            repr(dict(envelope.parts))
+    assert all(reasons)
+    assert len(reasons) > 5_000
+
+
+def test_a_pickle_is_never_executed(tmp_path):
+    canary = tmp_path / "canary"
+
+    class Trap:
+        def __reduce__(self):
+            return (Path.touch, (canary,))
+
+    poison = pickle.dumps(Trap())
+    for frames in ([poison], [poison, poison], [b"/", poison], [b"/", header(a=tensor()).SerializeToString(), poison]):
+        with pytest.raises(MessageError):
+            decode(frames)
+    message = header(a=tensor(dtype="|O8", shape=[1], inline=poison[:8]))
+    assert refused(message) == "bad dtype"
+    assert not canary.exists()
+
+
+@pytest.mark.parametrize("package", [epypes.wire, epypes.transport])
+def test_pickle_is_imported_nowhere(package):
+    pattern = re.compile(
+        r"\b(import|from)\s+(pickle|marshal|shelve|dill|cloudpickle)|send_pyobj|recv_pyobj|allow_pickle=True"
+    )
+    for module in Path(package.__file__).parent.glob("*.py"):
+        assert not pattern.search(module.read_text()), module
