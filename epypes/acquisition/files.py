@@ -29,8 +29,12 @@ def read_image(path: str | Path) -> npt.NDArray[np.uint8 | np.uint16]:
     except OSError as error:
         text = f"Image {str(path)!r} can't be read: {error.strerror}. Check the path."
         raise ImageFileError(str(path), text) from error
-    # Decoding bytes that were read keeps OpenCV from printing a warning, and tells a missing file from a broken one.
-    image: Any = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    # Reading the bytes first tells a missing file from a broken one; what OpenCV would print of that is ours to say.
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        image: Any = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    finally:
+        cv2.utils.logging.setLogLevel(level)
     if image is None:
         text = f"{str(path)!r} is not an image that OpenCV can read. Use PNG, JPEG, TIFF, BMP or WebP."
         raise ImageFileError(str(path), text)

@@ -65,15 +65,18 @@ def importable(value: Any, *names: str) -> Importable | None:
     qualname = getattr(value, "__qualname__", None) or getattr(value, "__name__", None)
     if module == "__main__":
         return None
+    fallback = None
     if isinstance(module, str) and isinstance(qualname, str) and _reach(module, qualname) is value:
-        return Importable(_public_module(module, qualname, value), qualname)
+        fallback = Importable(_public_module(module, qualname, value), qualname)
+        if not fallback.module.startswith("_"):
+            return fallback
     # C functions and the special forms of typing often know their name, but not their module.
     own = (getattr(value, "__name__", None), getattr(value, "_name", None))
     for name in dict.fromkeys(name for name in (*own, *names) if isinstance(name, str) and name.isidentifier()):
         home = min(_modules_with(name, value), key=_plainness, default=None)
         if home is not None:
             return Importable(home, name)
-    return None
+    return fallback
 
 
 def _reach(module: str, qualname: str) -> Any:
@@ -87,6 +90,10 @@ def _public_module(module: str, qualname: str, value: Any) -> str:
     """Return the shortest public module that shows an object whose own module is private (``skimage._shared``)."""
     if "._" not in module and not module.startswith("_"):
         return module
+    if (
+        module.startswith("_") and _reach(module.lstrip("_"), qualname) is value
+    ):  # _functools is what functools is made of
+        return module.lstrip("_")
     top = module.partition(".")[0]
     shown = (name for name in list(sys.modules) if name.partition(".")[0] == top and "._" not in name)
     homes = [name for name in shown if not name.startswith("_") and _reach(name, qualname) is value]

@@ -20,12 +20,16 @@ def square_graph() -> ep.CompGraph:
             raise RuntimeError("bad input")
         return x * x
 
-    return ep.CompGraph({"square": square, "shift": lambda s, n: s + n}, {"square": ("x", "s"), "shift": (("s", "n"), "y")})
+    return ep.CompGraph(
+        {"square": square, "shift": lambda s, n: s + n}, {"square": ("x", "s"), "shift": (("s", "n"), "y")}
+    )
 
 
 def full_pipeline(q_in=None, q_out=None, **kwargs):
     q_in, q_out = q_in or queue.Queue(), q_out or queue.Queue()
-    pipe = ep.FullPipeline("squares", square_graph(), q_in, q_out, lambda event: {"x": event}, lambda view: view["y"], {"n": 1})
+    pipe = ep.FullPipeline(
+        "squares", square_graph(), q_in, q_out, lambda event: {"x": event}, lambda view: view["y"], {"n": 1}
+    )
     for name, value in kwargs.items():
         setattr(pipe, name, value)
     return pipe, q_in, q_out
@@ -222,7 +226,9 @@ def test_stop_does_not_work_off_the_backlog():
         release.wait(TIMEOUT_S)
 
     q_in = queue.Queue()
-    pipe = ep.SinkPipeline("hold", ep.CompGraph({"hold": hold}, {"hold": ("x", None)}), q_in, lambda event: {"x": event})
+    pipe = ep.SinkPipeline(
+        "hold", ep.CompGraph({"hold": hold}, {"hold": ("x", None)}), q_in, lambda event: {"x": event}
+    )
     for x in range(20):
         q_in.put(x)
     pipe.listen()
@@ -258,7 +264,9 @@ def test_a_function_that_does_not_return_is_named():
         release.wait(TIMEOUT_S)
 
     q_in = queue.Queue()
-    pipe = ep.SinkPipeline("stuck", ep.CompGraph({"endless": endless}, {"endless": ("x", None)}), q_in, lambda e: {"x": e})
+    pipe = ep.SinkPipeline(
+        "stuck", ep.CompGraph({"endless": endless}, {"endless": ("x", None)}), q_in, lambda e: {"x": e}
+    )
     pipe.listen()
     q_in.put(1)
     assert started.wait(TIMEOUT_S)

@@ -334,9 +334,9 @@ def test_unguarded_functions_get_writable_arrays_and_guard_can_be_switched_off()
     frozen = np.zeros(2)
     frozen.flags.writeable = False
     ep.CompGraphRunner(cg).run(x=frozen)
-    ep.CompGraphRunner(ep.CompGraph({"f": lambda x: flags.append(x.flags.writeable)}, {"f": ("x", None)}), guard=False).run(
-        x=np.zeros(2)
-    )
+    ep.CompGraphRunner(
+        ep.CompGraph({"f": lambda x: flags.append(x.flags.writeable)}, {"f": ("x", None)}), guard=False
+    ).run(x=np.zeros(2))
     assert flags == [True, True, True]
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from epypes_widgets import Panel, tune
 
 import epypes as ep
+from epypes_widgets import Panel, tune
 
 
 def brighten(image: Any, gain: int) -> Any:

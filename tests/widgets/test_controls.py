@@ -9,12 +9,12 @@ import annotated_types
 import ipywidgets
 import numpy as np
 import pytest
-from epypes_widgets.controls import control
-from epypes_widgets.ranges import ranges
 
 import epypes as ep
 from epypes.errors import UnknownName
 from epypes.hints import as_param
+from epypes_widgets.controls import control
+from epypes_widgets.ranges import ranges
 
 
 class Mode(enum.Enum):

@@ -9,11 +9,11 @@ from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
-from epypes_widgets.frames import Frame, FrameSender, make_frame, plain
 from hypothesis import given
 from hypothesis import strategies as st
 
 import epypes as ep
+from epypes_widgets.frames import Frame, FrameSender, make_frame, plain
 
 
 def frame(seq: int) -> Frame:

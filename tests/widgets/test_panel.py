@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from epypes_widgets import Panel, tune
 
 import epypes as ep
 from epypes.errors import NotComputed, PayloadError, UnknownName
+from epypes_widgets import Panel, tune
 
 
 class Screen:

@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import pytest
-from epypes_widgets.worker import Worker
 
 from epypes.errors import StillRunning
+from epypes_widgets.worker import Worker
 
 
 class Slow:

@@ -1,0 +1,88 @@
+"""Does the code keep the rules of the house?"""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import epypes
+
+ROOT = Path(__file__).parents[2]
+MODULES = sorted([*(ROOT / "epypes").rglob("*.py"), *(ROOT / "widgets").rglob("*.py")])
+HEAVY = {"numpy", "cv2", "networkx", "zmq", "google", "ipywidgets", "anywidget", "traitlets", "matplotlib", "pandas",
+         "IPython", "PIL", "graphviz", "pygraphviz", "typer", "rich", "tomlkit", "logging", "skimage"}  # fmt: skip
+
+
+def test_importing_epypes_imports_no_other_package():
+    code = "import sys; before = set(sys.modules); import epypes; print(*sorted(set(sys.modules) - before))"
+    done = subprocess.run([sys.executable, "-I", "-c", code], capture_output=True, text=True, check=True)
+    loaded = {name.partition(".")[0] for name in done.stdout.split()}
+    assert not loaded & HEAVY
+    assert loaded <= set(sys.stdlib_module_names) | {"epypes"}
+
+
+def test_graphs_and_runners_need_the_standard_library_only():
+    code = (
+        "import sys; import epypes as ep\n"
+        "r = ep.CompGraphRunner(ep.CompGraph({'f': lambda x: x + 1}, {'f': ('x', 'y')}))\n"
+        "assert r.run(x=1)['y'] == 2; print(*sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-I", "-c", code], capture_output=True, text=True, check=True)
+    assert not {name.partition(".")[0] for name in done.stdout.split()} & (HEAVY - {"logging"})
+
+
+def test_every_public_name_can_be_had_and_all_is_sorted():
+    assert epypes.__all__ == sorted(epypes.__all__)
+    for name in epypes.__all__:
+        assert getattr(epypes, name) is not None
+        assert name in dir(epypes)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = epypes.nothing
+
+
+def test_the_version_is_the_packages():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert epypes.__version__ == project["version"]
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_every_module_says_first_which_question_it_answers_and_is_short(path):
+    text = path.read_text()
+    docstring = ast.get_docstring(ast.parse(text))
+    assert docstring
+    first = docstring.splitlines()[0]
+    assert first.endswith("?") or path.name in ("__init__.py", "errors.py") or first.startswith("``epypes ")
+    assert len(text.splitlines()) <= 400
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_nothing_prints_but_the_command_line(path):
+    calls = [
+        node.lineno
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
+    ]
+    assert calls == []
+
+
+def test_errors_are_drawn_as_a_tree_that_is_true():
+    from epypes import errors
+
+    docstring = errors.__doc__
+    kinds = [kind for kind in vars(errors).values() if isinstance(kind, type) and issubclass(kind, errors.EpypesError)]
+    for kind in kinds:
+        assert kind.__name__ in docstring, "every error is in the picture"
+        assert kind.__doc__
+
+
+def test_architecture_names_every_room_and_stays_short():
+    text = (ROOT / "ARCHITECTURE.md").read_text()
+    assert len(text.splitlines()) <= 150
+    for room in (ROOT / "epypes").iterdir():
+        if room.is_dir() and room.name != "__pycache__":
+            assert f"`{room.name}/`" in text

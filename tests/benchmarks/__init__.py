@@ -1,0 +1,1 @@
+"""What does EPypes cost beside hand-written code, in one interleaved run?"""

@@ -1,0 +1,359 @@
+from __future__ import annotations
+
+import ast
+import os
+import py_compile
+import re
+import tomllib
+from pathlib import Path
+
+import cv2
+import nbformat
+import numpy as np
+import pytest
+
+import epypes as ep
+from epypes.bundle import verify
+from epypes.bundle.compare import first_difference
+from epypes.bundle.notebook import promote_notebook
+from epypes.bundle.seal import seal
+from epypes.errors import BundleError, PromotionRefused, ReplayDiffers, UnknownName
+
+# Functions of a test module are importable names of it, which a bundle can't have: OpenCV's own serve.
+FUNCTIONS = {"split": cv2.split, "canny": cv2.Canny}
+
+
+@pytest.fixture
+def runner(photograph):
+    cg = ep.CompGraph(
+        {"smooth": cv2.medianBlur, "canny": cv2.Canny},
+        {"smooth": (("image", "side"), "smoothed"), "canny": (("smoothed", "lo", "hi"), "edges")},
+    )
+    runner = ep.CompGraphRunner(cg, {"side": 5, "lo": 70, "hi": 200})
+    runner.run(image=photograph)
+    return runner
+
+
+@pytest.fixture
+def bundle(runner, tmp_path):
+    return ep.promote(runner, tmp_path / "edges", outputs=["edges"])
+
+
+def contents(folder):
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_bundle_is_a_folder_of_text_and_samples_without_pickle(bundle):
+    files = contents(bundle.path)
+    assert set(files) == {"pipeline.py", "pipeline.toml", "requirements.txt", "MANIFEST.sha256", "samples/000.npz"}
+    for name in files.keys() - {"samples/000.npz"}:
+        files[name].decode("ascii")
+    with np.load(bundle.path / "samples" / "000.npz", allow_pickle=False) as sample:
+        assert all(sample[name].dtype != object for name in sample.files)
+
+
+def test_loading_gives_the_same_graph_and_hyperparameters(bundle, runner, photograph):
+    again = ep.load(bundle.path)
+    assert again.cg.func_io == runner.cg.func_io
+    assert again.hyperparameters == runner.hyperparameters
+    assert np.array_equal(again.run(image=photograph)["edges"], runner["edges"])
+
+
+def test_the_same_runner_promotes_to_the_same_bytes(runner, tmp_path):
+    ep.promote(runner, tmp_path / "one" / "edges")
+    ep.promote(runner, tmp_path / "two" / "edges")
+    assert contents(tmp_path / "one" / "edges") == contents(tmp_path / "two" / "edges")
+
+
+def test_requirements_name_what_the_replay_imported_and_nothing_else(bundle):
+    names = [line.partition("==")[0] for line in (bundle.path / "requirements.txt").read_text().splitlines()]
+    assert {"numpy", "opencv-python-headless", "epypes"} <= set(names)
+    assert not {"scikit-image", "ipywidgets", "pytest", "opencv-python"} & set(names)
+
+
+def test_verify_replays_in_a_fresh_process(bundle):
+    report = verify(bundle.path)
+    assert report.identical
+    assert (report.samples, report.tokens) == (1, 1)
+
+
+@pytest.mark.parametrize("name", ["pipeline.py", "pipeline.toml", "requirements.txt", "samples/000.npz"])
+def test_one_changed_byte_is_found_and_the_file_is_named(bundle, name):
+    path = bundle.path / name
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    for use in (verify, ep.load, lambda path: ep.load_pipeline(path, None, None)):
+        with pytest.raises(BundleError, match=f"{name} was changed.*Restore it, or promote again"):
+            use(bundle.path)
+
+
+def test_missing_and_added_files_are_named(bundle):
+    (bundle.path / "requirements.txt").unlink()
+    (bundle.path / "cv2.py").write_text("raise SystemExit('hijacked')")
+    with pytest.raises(BundleError, match=r"requirements\.txt is missing; cv2\.py was added"):
+        ep.load(bundle.path)
+
+
+def test_a_folder_that_is_no_bundle_is_named(tmp_path):
+    with pytest.raises(BundleError, match="does not exist"):
+        ep.load(tmp_path / "nothing")
+    with pytest.raises(BundleError, match="is not a bundle"):
+        ep.load(tmp_path)
+
+
+def test_a_changed_constant_is_found_by_the_replay_with_its_first_difference(bundle):
+    settings = bundle.path / "pipeline.toml"
+    settings.write_text(settings.read_text().replace("value = 70", "value = 30"))
+    seal(bundle.path)
+    with pytest.raises(ReplayDiffers, match=r"token 'edges': \d+ of 240000 values differ, first at \[\d+, \d+\]"):
+        verify(bundle.path)
+
+
+def test_a_replay_that_raises_names_the_line_in_the_bundle(bundle):
+    module = bundle.path / "pipeline.py"
+    module.write_text(module.read_text().replace("cv2.Canny", "(lambda *a: 1 / 0)"))
+    seal(bundle.path)
+    with pytest.raises(BundleError, match=r"at pipeline\.py, line \d+: .*ZeroDivisionError.*In function 'canny'"):
+        verify(bundle.path)
+
+
+@pytest.mark.parametrize(
+    "end", ["import os; os.kill(os.getpid(), 9)", "import sys; sys.exit(3)", "import os; os._exit(4)"]
+)
+def test_a_replay_that_dies_is_reported(bundle, end):
+    module = bundle.path / "pipeline.py"
+    module.write_text(f"{module.read_text()}\n{end}\n")
+    seal(bundle.path)
+    with pytest.raises(BundleError, match="replay of"):
+        verify(bundle.path)
+
+
+def test_a_replay_that_takes_too_long_is_ended(bundle):
+    module = bundle.path / "pipeline.py"
+    module.write_text(f"{module.read_text()}\nimport threading\nthreading.Event().wait(120)\n")
+    seal(bundle.path)
+    with pytest.raises(BundleError, match="did not end within 2 s"):
+        verify(bundle.path, timeout_s=2)
+
+
+def test_the_replay_sees_neither_the_current_folder_nor_the_environment(bundle, tmp_path, monkeypatch):
+    (tmp_path / "cv2.py").write_text("raise SystemExit('hijacked')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    assert verify(bundle.path).identical
+
+
+def test_bytecode_beside_the_module_is_never_read(bundle):
+    module = bundle.path / "pipeline.py"
+    original = module.read_bytes()
+    stamp = module.stat()
+    module.write_text("func_dict = func_io = {}\n".ljust(len(original)))
+    os.utime(module, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+    py_compile.compile(str(module))
+    module.write_bytes(original)
+    os.utime(module, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+    assert list(ep.load(bundle.path).cg.functions) == ["smooth", "canny"]
+
+
+def test_a_runner_that_is_not_ready_is_refused_with_the_call_to_make(runner, tmp_path):
+    fresh = ep.CompGraphRunner(runner.cg, runner.hyperparameters)
+    with pytest.raises(PromotionRefused, match=r"Nothing has been run.*Call run\(image=\.\.\.\) first"):
+        ep.promote(fresh, tmp_path / "b")
+    runner["lo"] = 10
+    with pytest.raises(PromotionRefused, match=r"stale: canny\. Call rerun\(\) first"):
+        ep.promote(runner, tmp_path / "b")
+    with pytest.raises(cv2.error):
+        runner.rerun(side=4)
+    with pytest.raises(PromotionRefused, match="The last run failed in smooth"):
+        ep.promote(runner, tmp_path / "b")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unknown_output_is_named(runner, tmp_path):
+    with pytest.raises(UnknownName, match="Did you mean 'edges'"):
+        ep.promote(runner, tmp_path / "b", outputs=["edgse"])
+
+
+def test_a_token_without_codec_refuses_promotion_by_name(tmp_path):
+    cg = ep.CompGraph({"detect": cv2.ORB_create().detect}, {"detect": ("image", "keypoints")})
+    runner = ep.CompGraphRunner(cg)
+    runner.run(image=np.zeros((64, 64), np.uint8))
+    with pytest.raises(PromotionRefused, match="Function 'detect'"):
+        ep.promote(runner, tmp_path / "b")
+    cg = ep.CompGraph({"zero": cv2.KeyPoint}, {"zero": ((), "keypoint")})
+    runner = ep.CompGraphRunner(cg)
+    runner.run()
+    with pytest.raises(PromotionRefused, match="keypoint"):
+        ep.promote(runner, tmp_path / "b")
+
+
+def test_a_hyperparameter_that_toml_cannot_hold_is_refused_by_name(tmp_path):
+    cg = ep.CompGraph({"add": np.add}, {"add": (("x", "k"), "y")})
+    runner = ep.CompGraphRunner(cg, {"k": np.ones(3)})
+    runner.run(x=np.zeros(3))
+    with pytest.raises(PromotionRefused, match=r"Hyperparameter 'k' is a ndarray, which pipeline\.toml can't hold"):
+        ep.promote(runner, tmp_path / "b")
+
+
+@pytest.mark.parametrize(
+    "value", [3, 2.5, float("inf"), "text", True, None, (3, 5), [1, 2.0], -(2**63), 'a"b\n\\'], ids=repr
+)
+def test_hyperparameters_come_back_with_their_type(tmp_path, value):
+    cg = ep.CompGraph({"keep": repr}, {"keep": ("k", "y")})
+    runner = ep.CompGraphRunner(cg, {"k": value})
+    runner.run()
+    bundle = ep.promote(runner, tmp_path / "b")
+    back = bundle.settings.hyperparameters["k"]
+    assert type(back) is type(value)
+    assert back == value
+
+
+def test_ranges_stand_in_the_settings(runner, tmp_path):
+    bundle = ep.promote(runner, tmp_path / "b")
+    document = tomllib.loads((bundle.path / "pipeline.toml").read_text())
+    assert document["ports"] == {"inputs": ["image"], "outputs": ["edges"]}
+    assert document["hyperparameters"]["lo"] == {"value": 70}
+
+
+def test_a_function_that_depends_on_hidden_state_is_refused(tmp_path):
+    cg = ep.CompGraph({"draw": np.random.random_sample}, {"draw": ("n", "y")})
+    runner = ep.CompGraphRunner(cg, {"n": 3})
+    runner.run()
+    with pytest.raises(PromotionRefused):
+        ep.promote(runner, tmp_path / "b")
+    cg = ep.CompGraph({"pid": os.getpid}, {"pid": ((), "y")})
+    runner = ep.CompGraphRunner(cg)
+    runner.run()
+    with pytest.raises(PromotionRefused, match=r"(?s)token 'y': expected .*something that is not a token"):
+        ep.promote(runner, tmp_path / "b")
+
+
+def test_a_new_bundle_replaces_the_old_and_a_refused_one_leaves_it(runner, tmp_path):
+    target = tmp_path / "edges"
+    ep.promote(runner, target)
+    runner.rerun(lo=10)
+    bundle = ep.promote(runner, target)
+    assert bundle.settings.hyperparameters["lo"] == 10
+    before = contents(target)
+    runner["lo"] = 20
+    with pytest.raises(PromotionRefused):
+        ep.promote(runner, target)
+    assert contents(target) == before
+    assert [path.name for path in tmp_path.iterdir()] == ["edges"]
+
+
+def test_a_folder_that_holds_something_else_is_not_touched(runner, tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(PromotionRefused, match="exists and is not a bundle"):
+        ep.promote(runner, tmp_path)
+    with pytest.raises(PromotionRefused, match="exists and is not a bundle"):
+        ep.promote(runner, tmp_path / "thesis.tex")
+    assert (tmp_path / "thesis.tex").read_text() == "years of work"
+
+
+def test_a_pipeline_is_promoted_too_and_other_things_are_refused_by_name(runner, photograph, tmp_path):
+    pipe = ep.Pipeline("edges", runner.cg, runner.hyperparameters)
+    pipe.run(image=photograph)
+    assert ep.promote(pipe, tmp_path / "b").settings.inputs == ("image",)
+    sink = ep.SinkPipeline("sink", runner.cg, None, lambda event: {}, runner.hyperparameters)
+    with pytest.raises(PromotionRefused, match="A SinkPipeline can't be promoted yet"):
+        ep.promote(sink, tmp_path / "c")
+    with pytest.raises(PromotionRefused, match="A CompGraph is neither"):
+        ep.promote(runner.cg, tmp_path / "c")
+    with pytest.raises(PromotionRefused, match="f_in and f_out"):
+        ep.promote(runner, tmp_path / "c", f_in=dict)
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "words"),
+    [
+        (1, 1.0, "expected a int, got a float"),
+        (np.zeros(3), np.zeros(4), "expected float64"),
+        (np.zeros(3), np.zeros(3, np.float32), "got float32"),
+        (np.array([1.0, 2.0]), np.array([1.0, 3.0]), r"1 of 2 values differ, first at \[1\]: expected 2.0, got 3.0"),
+        (np.array([0.0]), np.array([-0.0]), "1 of 1 values differ"),
+        ([1, (2, 3)], [1, (2, 4)], r"\[1\] \[1\] expected 3, got 4"),
+        ({"a": 1}, {"b": 1}, "expected the keys"),
+        ([1], [1, 2], "expected 1 items, got 2"),
+        (0.0, -0.0, "expected 0.0, got -0.0"),
+    ],
+)
+def test_a_difference_is_described_by_its_first_place(left, right, words):
+    assert re.search(words, first_difference(left, right))
+
+
+@pytest.mark.parametrize(
+    "value", [np.nan, np.array([np.nan, 1]), None, "a", (1, [2.0]), {"k": np.eye(2)}, np.zeros((0, 3))]
+)
+def test_a_value_agrees_with_itself(value):
+    assert first_difference(value, value) is None
+
+
+def cells(path, *sources):
+    nbformat.write(nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source) for source in sources]), path)
+    return path
+
+
+NOTEBOOK = (
+    "import cv2\nimport numpy as np\nimport epypes as ep",
+    "GAIN = 2\n\n# Brightens.\ndef brighten(im):\n    return im * np.uint8(GAIN)",
+    "cg = ep.CompGraph({'brighten': brighten, 'canny': cv2.Canny},"
+    " {'brighten': ('image', 'bright'), 'canny': (('bright', 'lo', 'hi'), 'edges')})",
+    "runner = ep.CompGraphRunner(cg, {'lo': 10, 'hi': 20})\n"
+    "_ = runner.run(image=np.arange(64 * 64, dtype=np.uint8).reshape(64, 64))",
+)
+
+
+def test_a_notebook_is_executed_fresh_and_promoted_to_the_same_bytes_each_time(tmp_path):
+    path, done = cells(tmp_path / "n.ipynb", *NOTEBOOK), []
+    before = path.read_bytes()
+    promote_notebook(path, "runner", tmp_path / "one" / "b", ["edges"], lambda *counts: done.append(counts))
+    promote_notebook(path, "runner", tmp_path / "two" / "b", ["edges"])
+    assert done[:4] == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert path.read_bytes() == before
+    assert contents(tmp_path / "one" / "b") == contents(tmp_path / "two" / "b")
+    assert "# Brightens.\ndef brighten(im):" in (tmp_path / "one" / "b" / "pipeline.py").read_text()
+    assert verify(tmp_path / "one" / "b").identical
+
+
+@pytest.mark.parametrize(
+    ("last", "error", "words"),
+    [
+        ("raise ValueError('wrong')", BundleError, "code cell 5 of 5 raised ValueError: wrong"),
+        ("import os; os.kill(os.getpid(), 9)", BundleError, "the kernel died in code cell 5 of 5"),
+        ("del runner; runer = 3", PromotionRefused, "No variable 'runner'"),
+        ("brighten = lambda im: im\ncg = ep.CompGraph({'b': brighten}, {'b': ('image', 'edges')})\n"
+         "runner = ep.CompGraphRunner(cg)\n_ = runner.run(image=1)", PromotionRefused, r"is a lambda \(cell \[5\], line 1\)"),
+    ],
+    ids=["raises", "dies", "no runner", "lambda"],
+)  # fmt: skip
+def test_a_notebook_that_cannot_be_promoted_names_the_cell(tmp_path, last, error, words):
+    path = cells(tmp_path / "n.ipynb", *NOTEBOOK, last)
+    with pytest.raises(error, match=words):
+        promote_notebook(path, "runner", tmp_path / "b", ["edges"])
+    assert not (tmp_path / "b").exists()
+
+
+@pytest.mark.parametrize("content", [None, "no json", "{}", "[]"])
+def test_a_file_that_is_no_notebook_is_named(tmp_path, content):
+    path = tmp_path / "n.ipynb"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(BundleError, match=r"n\.ipynb"):
+        promote_notebook(path, "runner", tmp_path / "b")
+
+
+ROOMS = [Path(ep.__file__).parent / room for room in ("wire", "bundle", "service", "transport")]
+PICKLERS = {"pickle", "marshal", "shelve", "dill", "cloudpickle", "joblib"}
+
+
+@pytest.mark.parametrize("path", [path for room in ROOMS for path in room.glob("*.py")], ids=lambda path: path.name)
+def test_no_pickle_is_imported_on_the_way_of_a_value(path):
+    imported = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            imported |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            imported.add(node.module or "")
+    assert not {name.partition(".")[0] for name in imported} & PICKLERS

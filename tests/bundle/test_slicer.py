@@ -1,0 +1,196 @@
+"""The matrix of functions that people write in notebooks: each is sliced, or refused with its place."""
+
+from __future__ import annotations
+
+import functools
+import linecache
+import re
+import types
+
+import cv2
+import numpy as np
+import pytest
+import skimage.filters
+from skimage.filters import gaussian
+
+import epypes as ep
+from epypes.bundle.emit import emit_module
+from epypes.bundle.slicer import slice_graph
+from epypes.bundle.source import Importable, importable
+
+_CELLS = 0
+
+
+def notebook(source: str) -> dict:
+    """Run source as a notebook cell is run: compiled under a name of its own, in ``__main__``."""
+    global _CELLS
+    _CELLS += 1
+    name = f"<cell {_CELLS}>"
+    linecache.cache[name] = (len(source), None, source.splitlines(keepends=True), name)
+    names = {"__name__": "__main__", "np": np, "cv2": cv2, "skimage": skimage, "gaussian": gaussian, "ep": ep,
+             "functools": functools}  # fmt: skip
+    exec(compile(source, name, "exec"), names)
+    return names
+
+
+def promoted(source: str, function: str = "f", arity: int = 1):
+    """Slice one function of a cell; return the module's text and its refusals."""
+    names = notebook(source)
+    inputs = tuple(f"x{index}" for index in range(arity))
+    cg = ep.CompGraph({"f": names[function]}, {"f": (inputs, "y")})
+    needed, references = slice_graph(cg.functions)
+    return emit_module("case", cg, needed, references), needed.refusals
+
+
+def executed(text: str) -> types.SimpleNamespace:
+    names: dict = {"__name__": "bundle"}
+    exec(compile(text, "bundle", "exec"), names)
+    return types.SimpleNamespace(**names)
+
+
+SLICED = {
+    "plain": ("def f(x):\n    return x + 1\n", 4),
+    "comment above": ("# Adds one.\ndef f(x):\n    return x + 1  # really\n", 4),
+    "constant": ("STEP = 2\ndef f(x):\n    return x + STEP\n", 5),
+    "tuple constant": ("STEPS = (1, 2.5, 'a', None)\ndef f(x):\n    return x + STEPS[0]\n", 4),
+    "helper": ("def g(x):\n    return 2 * x\ndef f(x):\n    return g(x) + 1\n", 7),
+    "helper defined later": ("def f(x):\n    return g(x) + 1\ndef g(x):\n    return 2 * x\n", 7),
+    "recursion": ("def f(x):\n    return 1 if x < 1 else x * f(x - 1)\n", 6),
+    "mutual recursion": ("def g(x):\n    return f(x - 1)\ndef f(x):\n    return 0 if x < 1 else g(x) + 1\n", 3),
+    "module under a name": ("def f(x):\n    return int(np.sum([x, x]))\n", 6),
+    "import inside": ("def f(x):\n    import math\n    return math.factorial(x)\n", 6),
+    "nested function": ("def f(x):\n    def g(y):\n        return y + x\n    return g(1)\n", 4),
+    "comprehension": ("N = 3\ndef f(x):\n    return sum(x for _ in range(N))\n", 9),
+    "annotation": ("def f(x: np.ndarray) -> np.ndarray:\n    return x\n", 3),
+    "literal default": ("def f(x, k=-1, names=('a',)):\n    return x + k\n", 2),
+    "unguarded": ("@ep.unguarded\ndef f(x):\n    return x\n", 3),
+    "redefinition": ("def f(x):\n    return 0\ndef f(x):\n    return x\n", 3),
+    "in an if": ("if True:\n    def f(x):\n        return x\n", 3),
+    "two lines of comment": ("# One.\n# Two.\ndef f(x): return x\n", 3),
+    "async is refused elsewhere, generator is kept": ("def f(x):\n    return list(y for y in range(x))\n", [0, 1, 2]),
+}
+
+
+@pytest.mark.parametrize(("source", "expected"), SLICED.values(), ids=SLICED)
+def test_a_plain_function_is_sliced_with_what_it_needs(source, expected):
+    text, refusals = promoted(source)
+    assert refusals == []
+    assert executed(text).func_dict["f"](3) == expected
+
+
+REFUSED = {
+    "lambda": ("f = lambda x: x\n", r"'f' is a lambda \(.*line 1\)"),
+    "two lambdas on a line": ("f, g = lambda x: x, lambda x: -x\n", "is a lambda"),
+    "closure": (
+        "def make(k):\n    def f(x):\n        return x + k\n    return f\nf = make(3)\n",
+        r"captures 'k'.*line 2",
+    ),
+    "partial": ("f = functools.partial(pow, 2)\n", "is a functools.partial"),
+    "decorator": (
+        "def d(g):\n    @functools.wraps(g)\n    def w(x):\n        return g(x)\n    return w\n@d\ndef f(x):\n    return x\n",
+        "wrapped by a decorator",
+    ),
+    "plain decorator": ("def d(g):\n    g.seen = 1\n    return g\n@d\ndef f(x):\n    return x\n", "decorated by @d"),
+    "callable object": ("class C:\n    def __call__(self, x):\n        return x\nf = C()\n", "an object of class 'C'"),
+    "class": ("class f:\n    def __init__(self, x):\n        pass\n", "the class 'f', defined in the notebook"),
+    "bound method": (
+        "class C:\n    def m(self, x):\n        return x\nf = C().m\n",
+        "a method of an object of class 'C'",
+    ),
+    "global array": ("K = np.zeros(3)\ndef f(x):\n    return x + K\n", r"uses 'K' from it, a ndarray\. Make K a token"),
+    "big constant": ("K = list(range(1000))\ndef f(x):\n    return K[x]\n", "uses 'K' from it, a list"),
+    "infinite constant": ("K = float('inf')\ndef f(x):\n    return K\n", "uses 'K' from it, a float"),
+    "notebook class inside": ("class C: pass\ndef f(x):\n    return C()\n", "uses 'C' from it"),
+    "lambda inside": ("g = lambda x: x\ndef f(x):\n    return g(x)\n", "is a lambda"),
+    "global write": ("N = 0\ndef f(x):\n    global N\n    N += 1\n    return N\n", "changes the global 'N'"),
+    "missing name": ("def f(x):\n    return x + nothing\n", "uses 'nothing', which is not defined"),
+    "computed default": ("K = 3\ndef f(x, k=K):\n    return x + k\n", "default 'K'"),
+    "helper under another name": (
+        "def g(x):\n    return x\nh = g\ndef f(x):\n    return h(x)\n",
+        "calls 'h' .* which was defined as 'g'",
+    ),
+    "reserved name": ("def func_dict(x):\n    return x\nf = func_dict\n", "uses the name 'func_dict'"),
+}
+
+
+@pytest.mark.parametrize(("source", "words"), REFUSED.values(), ids=REFUSED)
+def test_everything_else_is_refused_by_name_with_a_way_out(source, words):
+    _, refusals = promoted(source)
+    assert len(refusals) == 1
+    assert re.search(words, refusals[0])
+
+
+def test_a_function_made_by_exec_is_refused():
+    names: dict = {"__name__": "__main__"}
+    exec("def f(x):\n    return x", names)
+    needed, _ = slice_graph({"f": names["f"]})
+    assert "has no source" in needed.refusals[0]
+
+
+def test_all_refusals_are_given_at_once():
+    names = notebook("a = lambda x: x\nb = functools.partial(pow, 2)\ndef c(x):\n    return p + q\n")
+    needed, _ = slice_graph({name: names[name] for name in "abc"})
+    assert len(needed.refusals) == 4
+
+
+def test_an_old_function_kept_under_a_new_name_keeps_its_own_source():
+    names = notebook("def f(x):\n    return 'old'\nkept = f\ndef f(x):\n    return 'new'\n")
+    cg = ep.CompGraph({"k": names["kept"]}, {"k": ("x", "y")})
+    needed, references = slice_graph(cg.functions)
+    assert executed(emit_module("case", cg, needed, references)).func_dict["k"](0) == "old"
+
+
+def test_two_functions_of_one_name_are_refused():
+    names = notebook("def f(x):\n    return 'old'\nkept = f\ndef f(x):\n    return 'new'\n")
+    needed, _ = slice_graph({"old": names["kept"], "new": names["f"]})
+    assert "means something else in another function" in needed.refusals[0]
+
+
+def test_one_function_may_serve_twice():
+    names = notebook("def f(x):\n    return x + 1\n")
+    cg = ep.CompGraph({"a": names["f"], "b": names["f"]}, {"a": ("x", "y"), "b": ("y", "z")})
+    needed, references = slice_graph(cg.functions)
+    text = emit_module("case", cg, needed, references)
+    assert text.count("def f(") == 1
+    assert references == {"a": "f", "b": "f"}
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (cv2.Canny, Importable("cv2", "Canny")),
+        (np.sqrt, Importable("numpy", "sqrt")),
+        (np.uint8, Importable("numpy", "uint8")),
+        (gaussian, Importable("skimage.filters", "gaussian")),
+        (functools.reduce, Importable("functools", "reduce")),
+        (len, Importable("builtins", "len")),
+        (lambda x: x, None),
+    ],
+)
+def test_library_functions_have_a_public_name(value, expected):
+    assert importable(value) == expected
+
+
+def test_a_module_is_imported_once_under_the_notebooks_name():
+    names = notebook("def f(x):\n    return np.add(x, skimage.filters.gaussian(x))\n")
+    functions = {"root": np.sqrt, "f": names["f"], "smooth": gaussian, "canny": cv2.Canny}
+    io = {"root": ("x", "a"), "f": ("a", "b"), "smooth": ("b", "c"), "canny": (("c", "lo", "hi"), "d")}
+    cg = ep.CompGraph(functions, io)
+    needed, references = slice_graph(cg.functions)
+    text = emit_module("case", cg, needed, references)
+    assert text.splitlines()[2:5] == ["import cv2", "import numpy as np", "import skimage.filters"]
+    assert references["root"] == "np.sqrt"
+    assert references["smooth"] == "skimage.filters.gaussian"
+    assert list(executed(text).func_dict) == ["root", "f", "smooth", "canny"]
+    assert executed(text).func_io == {name: tuple(pair) for name, pair in io.items()}
+
+
+def test_the_module_reads_like_one_that_a_colleague_wrote():
+    text, _ = promoted(
+        "# Weighs the channels.\ndef weigh(im):\n    return im * GAIN\nGAIN = 1.5\ndef f(im):\n    return weigh(im)\n"
+    )
+    assert text == (
+        '"""The computational graph \'case\': x0 -> y."""\n\nGAIN = 1.5\n\n\n# Weighs the channels.\n'
+        "def weigh(im):\n    return im * GAIN\n\n\ndef f(im):\n    return weigh(im)\n\n\n"
+        'func_dict = {\n    "f": f,\n}\n\nfunc_io = {\n    "f": (("x0",), "y"),\n}\n'
+    )

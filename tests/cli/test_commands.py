@@ -1,0 +1,129 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+import epypes as ep
+from epypes.acquisition import read_image, write_image
+from epypes.cli.call import by_token
+from epypes.errors import ServiceError, UnknownName
+from epypes.service import Service
+from epypes.service.state import StateLock
+
+ANY = "tcp://127.0.0.1:*"
+
+
+@pytest.fixture(autouse=True)
+def own_runtime_folder(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("run")))
+
+
+@pytest.fixture
+def bundle(photograph, tmp_path):
+    runner = ep.CompGraphRunner(
+        ep.CompGraph({"canny": cv2.Canny}, {"canny": (("image", "lo", "hi"), "edges")}), {"lo": 70, "hi": 200}
+    )
+    runner.run(image=photograph)
+    return ep.promote(runner, tmp_path / "edges")
+
+
+def epypes(*arguments, **options):
+    command = [sys.executable, "-m", "epypes.cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, **options)
+
+
+def one_line(done) -> str:
+    """Return what a failing command says: one actionable line, no traceback, exit status 1."""
+    assert done.returncode == 1, done
+    assert done.stderr.startswith("epypes: ")
+    assert "Traceback" not in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    return done.stderr
+
+
+def test_call_writes_the_answer_and_prints_the_times(bundle, photograph, tmp_path):
+    write_image(tmp_path / "photo.png", photograph)
+    with StateLock(bundle.path) as lock, Service(bundle.path, ANY, ANY) as service:
+        lock.publish(service.start())
+        done = epypes("call", bundle.path, tmp_path / "photo.png", "--out", tmp_path / "edges.png", "--count", 2)
+        assert done.returncode == 0, done.stderr
+        for words in ("function canny", "graph overhead", "round trip"):
+            assert words in done.stdout
+        assert np.array_equal(read_image(tmp_path / "edges.png"), cv2.Canny(photograph, 70, 200))
+        done = epypes(
+            "call", bundle.path, f"image={tmp_path}/photo.png", "--out", f"edges={tmp_path}/edges.npy", "--json"
+        )
+        assert done.returncode == 0, done.stderr
+        assert '"round_trip_ns"' in done.stdout
+        assert np.array_equal(np.load(tmp_path / "edges.npy"), cv2.Canny(photograph, 70, 200))
+
+
+def test_an_image_path_that_does_not_exist_is_one_line(bundle):
+    assert "Image 'nothing.png' can't be read" in one_line(epypes("call", bundle.path, "nothing.png", "--out", "x.png"))
+
+
+def test_calling_where_nothing_serves_is_one_line(bundle, photograph, tmp_path):
+    write_image(tmp_path / "photo.png", photograph)
+    said = one_line(epypes("call", bundle.path, tmp_path / "photo.png", "--out", "x.png"))
+    assert "No service runs for" in said
+
+
+def test_verify_says_identical_or_what_differs(bundle):
+    done = epypes("verify", bundle.path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "identical: 1 tokens of 1 samples" in done.stdout
+    (bundle.path / "pipeline.py").write_text("")
+    assert "pipeline.py was changed" in one_line(epypes("verify", bundle.path))
+
+
+@pytest.mark.parametrize("command", ["verify", "serve"])
+def test_a_folder_that_is_not_there_is_one_line(command, tmp_path):
+    assert "does not exist" in one_line(epypes(command, tmp_path / "nothing"))
+
+
+@pytest.mark.parametrize("address", ["nonsense", "tcp://127.0.0.1:99999", "tcp://0.0.0.0:5555", "tcp://"])
+def test_an_address_that_makes_no_sense_is_one_line(bundle, address):
+    one_line(epypes("serve", bundle.path, "--sub", address))
+
+
+def test_wrong_usage_exits_with_2():
+    assert epypes("serve").returncode == 2
+    assert epypes("nonsense").returncode == 2
+
+
+def test_help_names_every_command():
+    done = epypes("--help")
+    assert done.returncode == 0
+    for command in ("promote", "verify", "serve", "call", "demo"):
+        assert command in done.stdout
+
+
+def test_files_are_given_to_tokens():
+    assert by_token(["a.png"], ["image"], "input") == {"image": "a.png"}
+    assert by_token(["a=b.png"], ["image"], "input") == {"image": "a=b.png"}, "a file may be called so"
+    assert by_token(["right=r.png", "left=l.png"], ["left", "right"], "input") == {"right": "r.png", "left": "l.png"}
+    with pytest.raises(ServiceError, match="Missing input: right=FILE"):
+        by_token(["left=l.png"], ["left", "right"], "input")
+    with pytest.raises(ServiceError, match="Which input is 'l.png'"):
+        by_token(["l.png", "r.png"], ["left", "right"], "input")
+    with pytest.raises(UnknownName, match="Did you mean 'left'"):
+        by_token(["lefd=l.png", "right=r.png"], ["left", "right"], "input")
+
+
+def test_a_module_that_an_extra_brings_is_named():
+    code = (
+        "import sys; sys.modules['tomlkit'] = None\n"
+        "from epypes.cli import main, app\n"
+        "@app.app.command()\n"
+        "def probe() -> None:\n"
+        "    import tomlkit\n"
+        "main(['probe'])\n"
+    )
+    code = "import epypes.cli.app\n" + code
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 1
+    assert done.stderr.strip() == "epypes: module 'tomlkit' is missing. Run: pip install 'epypes[all]'"

@@ -1,0 +1,267 @@
+from __future__ import annotations
+
+import base64
+import io
+import re
+import shutil
+import sys
+import xml.etree.ElementTree as ET
+from dataclasses import FrozenInstanceError
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+import epypes as ep
+from epypes.display import encode_image, is_image, mimebundle, to_svg, view
+from epypes.display.layout import lay_out
+from epypes.display.preview import preview
+from epypes.display.view import THUMBNAIL_CHARACTERS
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def vertices(svg: str) -> dict[str, ET.Element]:
+    return {group.get("id"): group for group in ET.fromstring(svg).iter(f"{SVG}g")}
+
+
+def texts(group: ET.Element) -> list[str]:
+    return [text.text for text in group.iter(f"{SVG}text")]
+
+
+@pytest.fixture
+def fresh_layouts():
+    """No layout is remembered, so that an engine is really asked."""
+    lay_out.cache_clear()
+    yield
+    lay_out.cache_clear()
+
+
+def test_a_graph_shows_every_function_and_token_once(edge_graph):
+    found = vertices(to_svg(edge_graph))
+    assert set(found) == {f"function-{name}" for name in edge_graph.functions} | {
+        f"token-{name}" for name in edge_graph.tokens
+    }
+    assert found["function-blur"].find(f"{SVG}rect") is not None
+    assert found["token-image"].find(f"{SVG}ellipse") is not None
+
+
+def test_a_runner_before_a_run_shows_the_values_of_its_hyperparameters(edge_runner):
+    found = vertices(to_svg(edge_runner))
+    assert texts(found["token-canny_lo"]) == ["canny_lo = 70"]
+    assert found["token-canny_lo"].get("class") == "token hyperparameter fresh"
+    assert found["token-canny_lo"].find(f"{SVG}polygon") is not None
+    assert found["token-edges"].get("class") == "token payload not-computed"
+    assert "<image" not in to_svg(edge_runner)
+
+
+@pytest.mark.parametrize("shown", ["run", "runner"])
+def test_after_a_run_thumbnails_values_and_times_show(edge_runner, photograph, shown):
+    run = edge_runner.run(image=photograph)
+    found = vertices(to_svg(run if shown == "run" else edge_runner))
+    images = {name for name, group in found.items() if group.find(f"{SVG}image") is not None}
+    assert images == {"token-image", "token-image_gray", "token-image_blurred", "token-edges"}
+    assert texts(found["token-blur_kernel"]) == ["blur_kernel = 11"]
+    assert re.fullmatch(r"[\d.]+ (ns|µs|ms), \d+%", texts(found["function-canny"])[1])
+
+
+def test_the_thumbnail_shows_the_token_it_stands_on(edge_runner, photograph):
+    edge_runner.run(image=photograph)
+    href = vertices(to_svg(edge_runner))["token-image"].find(f"{SVG}image").get("href")
+    picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(href.partition(",")[2]))))
+    assert max(picture.shape) <= 128
+    expected = cv2.resize(photograph, (picture.shape[1], picture.shape[0]), interpolation=cv2.INTER_AREA)[..., ::-1]
+    assert np.abs(picture.astype(int) - expected).mean() < 12, (
+        "the picture is sampled and compressed, but shows the photograph"
+    )
+
+
+def test_stale_and_failed_functions_show_as_such(edge_runner, photograph):
+    edge_runner.run(image=photograph)
+    edge_runner["canny_lo"] = 90
+    found = vertices(to_svg(edge_runner))
+    assert found["function-canny"].get("class") == "function stale"
+    assert found["token-edges"].get("class") == "token payload stale"
+    with pytest.raises(cv2.error):
+        edge_runner.rerun(blur_kernel=4)
+    found = vertices(to_svg(edge_runner))
+    assert found["function-blur"].get("class") == "function failed"
+    assert "Assertion failed" in found["function-blur"].find(f"{SVG}title").text
+    assert found["function-grayscale"].get("class") == "function reused"
+
+
+def test_the_same_object_renders_to_the_same_bytes(edge_runner, photograph):
+    edge_runner.run(image=photograph)
+    assert to_svg(edge_runner) == to_svg(edge_runner)
+
+
+def test_other_values_do_not_ask_for_another_layout(edge_runner, photograph, fresh_layouts):
+    edge_runner.run(image=photograph)
+    to_svg(edge_runner)
+    edge_runner.rerun(canny_lo=71)
+    edge_runner.run(image=photograph)
+    to_svg(edge_runner)
+    assert lay_out.cache_info().misses == 1
+
+
+def test_a_view_is_frozen(edge_graph):
+    with pytest.raises(FrozenInstanceError):
+        view(edge_graph).caption = "other"
+
+
+def test_a_notebook_gets_text_html_and_svg(edge_runner, photograph):
+    run = edge_runner.run(image=photograph)
+    pipe = ep.Pipeline("edges", edge_runner.cg, edge_runner.hyperparameters)
+    for shown in (edge_runner.cg, edge_runner, run, pipe):
+        bundle = shown._repr_mimebundle_()
+        assert set(bundle) == {"text/plain", "text/html", "image/svg+xml"}
+        assert len(bundle["text/plain"]) < 100
+        ET.fromstring(bundle["image/svg+xml"])
+        assert bundle["image/svg+xml"] in bundle["text/html"]
+        assert "<table" in bundle["text/html"], "the twin for screen readers"
+    assert "graph overhead" in run.report._repr_mimebundle_()["text/html"]
+
+
+def test_without_the_wheel_dot_on_the_path_lays_out(edge_graph, monkeypatch, fresh_layouts, tmp_path):
+    monkeypatch.setitem(sys.modules, "pygraphviz", None)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    fake = tmp_path / "dot"
+    code = (
+        f"#!{sys.executable}\nimport sys, json\nsource = sys.stdin.read()\n"
+        "names = sorted({w.strip() for l in source.splitlines() if '->' in l for w in l.strip().split(' -> ')}, "
+        "key=lambda n: int(n[1:]))\n"
+        "print(json.dumps({'bb': '0,0,100,100', 'objects': [{'_gvid': i, 'name': n, 'pos': '5,5'} for i, n in "
+        "enumerate(names)], 'edges': [{'tail': names.index(a.strip()), 'head': names.index(b.strip()), 'pos': "
+        "'e,1,1 2,2 3,3 4,4 5,5'} for l in source.splitlines() if '->' in l for a, b in [l.split(' -> ')]]}))\n"
+    )
+    fake.write_text(code)
+    fake.chmod(0o755)
+    assert shutil.which("dot") == str(fake)
+    assert "function-canny" in to_svg(edge_graph)
+
+
+def test_without_any_engine_the_text_form_shows_with_a_way_out(
+    edge_runner, photograph, monkeypatch, fresh_layouts, tmp_path
+):
+    monkeypatch.setitem(sys.modules, "pygraphviz", None)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    edge_runner.run(image=photograph)
+    bundle = mimebundle(edge_runner)
+    assert set(bundle) == {"text/plain"}
+    assert "canny(image_blurred, canny_lo, canny_hi) -> edges" in bundle["text/plain"]
+    assert "canny_lo = 70" in bundle["text/plain"]
+    assert "pip install 'epypes[notebook]'" in bundle["text/plain"]
+
+
+def test_names_and_values_are_escaped():
+    evil = "<script>alert(1)</script>"
+    cg = ep.CompGraph({evil: lambda x: x}, {evil: ('a"b&<c', "y")})
+    runner = ep.CompGraphRunner(cg, {'a"b&<c': evil})
+    runner.run()
+    bundle = mimebundle(runner)
+    assert "<script" not in bundle["image/svg+xml"] + bundle["text/html"]
+    ET.fromstring(bundle["image/svg+xml"])
+
+
+def test_ids_differ_where_names_do():
+    cg = ep.CompGraph(
+        dict.fromkeys(["a b", "a_b", "a-b"], lambda: 1), {"a b": ((), "x y"), "a_b": ((), "x_y"), "a-b": ((), "x.y")}
+    )
+    assert len(vertices(to_svg(cg))) == 6
+
+
+class Hostile:
+    def __repr__(self):
+        raise RuntimeError("no repr")
+
+    def __str__(self):
+        raise RuntimeError("no str")
+
+    def __len__(self):
+        raise RuntimeError("no len")
+
+
+class HostileArray:
+    __module__ = "numpy.evil"
+    dtype, shape = property(lambda self: 1 / 0), (3, 3)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        Hostile(), HostileArray(), [Hostile()], {"k": Hostile()}, "x" * 10**6, b"x" * 10**6, 10**300, list(range(10**6)),
+        np.zeros((0, 5)), np.zeros((3, 0, 3), np.uint8), np.full((20, 20), np.nan), np.array([np.inf, 1.0]),
+        np.array([object()], dtype=object), np.zeros((2, 3, 4, 5, 6)), np.array("text"), np.float32(2), np.array(3),
+        np.zeros((9, 9), dtype=[("a", int)]), np.zeros((50, 50), np.complex64), float("nan"), None, True, (), 1 + 2j,
+    ],
+    ids=lambda value: type(value).__name__,
+)  # fmt: skip
+def test_any_value_has_a_preview_that_is_short_and_never_raises(value):
+    shown = preview(value)
+    assert 0 < len(shown.text) <= 60
+    assert len(shown.detail) < 300
+    cg = ep.CompGraph({"f": lambda: value}, {"f": ((), "y")})
+    runner = ep.CompGraphRunner(cg)
+    runner.run()
+    assert "image/svg+xml" in mimebundle(runner)
+
+
+@pytest.mark.parametrize(
+    ("array", "media_type"),
+    [
+        (np.arange(100 * 90, dtype=np.uint8).reshape(100, 90), "image/jpeg"),
+        (np.zeros((100, 90, 3), np.uint8), "image/jpeg"),
+        (np.zeros((100, 90, 4), np.uint8), "image/png"),
+        (np.zeros((100, 90, 1), np.uint8), "image/png"),
+        (np.eye(100, dtype=bool), "image/png"),
+        (np.eye(100, dtype=np.uint8) * 255, "image/png"),
+        (np.random.default_rng(0).random((100, 90)), "image/jpeg"),
+        (np.full((100, 90), np.nan, np.float32), "image/jpeg"),
+        (np.arange(9000, dtype=np.uint16).reshape(100, 90), "image/jpeg"),
+        (np.arange(9000, dtype=np.int64).reshape(100, 90) - 50, "image/jpeg"),
+    ],
+)
+def test_images_of_every_kind_are_encoded_small(array, media_type):
+    picture = encode_image(array, 64)
+    assert picture.media_type == media_type
+    assert max(picture.width, picture.height) <= 64
+    assert Image.open(io.BytesIO(picture.data)).size == (picture.width, picture.height)
+
+
+def test_a_mask_keeps_its_thin_lines_when_it_shrinks():
+    mask = np.zeros((1000, 1000), np.uint8)
+    mask[500, :] = 255
+    shown = np.asarray(Image.open(io.BytesIO(encode_image(mask, 100).data)))
+    assert shown.any(axis=0).all()
+
+
+def test_full_size_masks_are_encoded_without_loss(straight_edges):
+    shown = np.asarray(Image.open(io.BytesIO(encode_image(straight_edges).data)))
+    assert np.array_equal(shown, straight_edges > 0)
+
+
+@pytest.mark.parametrize("shape", [(7, 100), (100, 2), (100, 100, 2), (5,), (9, 9, 9, 9)])
+def test_what_is_not_an_image_is_not_taken_for_one(shape):
+    assert not is_image(np.zeros(shape, np.uint8))
+
+
+def test_pictures_stay_small_and_say_what_was_left_out(photograph):
+    count = 60
+    noise = np.random.default_rng(0).integers(0, 255, (128, 128, 3)).astype(np.uint8)
+    functions = {f"f{index}": lambda x: x.copy() for index in range(count)}
+    cg = ep.CompGraph(functions, {f"f{index}": (f"t{index}", f"t{index + 1}") for index in range(count)})
+    run = ep.CompGraphRunner(cg).run(t0=noise)
+    bundle = mimebundle(run)
+    limit = 20_000 + 600 * (2 * count + 1) + THUMBNAIL_CHARACTERS
+    assert len(bundle["image/svg+xml"]) <= limit
+    assert len(bundle["text/html"]) <= limit
+    assert "thumbnails left out" in bundle["text/html"]
+    assert vertices(bundle["image/svg+xml"])[f"token-t{count}"].find(f"{SVG}image") is not None, "sinks come first"
+
+
+def test_looking_computes_nothing(edge_graph, photograph):
+    calls = []
+    cg = ep.CompGraph({"f": lambda x: calls.append(x)}, {"f": ("x", None)})
+    mimebundle(ep.CompGraphRunner(cg, {"x": 1}))
+    assert calls == []

@@ -1,0 +1,47 @@
+"""How do tests start a service in a process of its own?"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
+
+START_TIMEOUT_S = 60.0
+
+
+@contextmanager
+def running(bundle, *options):
+    """Run ``epypes serve`` until the block ends; yield the process, with its READY line as ``.ready``."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "epypes.cli", "serve", str(bundle), *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ.copy(),
+    )
+    watchdog = threading.Timer(START_TIMEOUT_S, process.kill)
+    watchdog.start()
+    try:
+        process.ready = process.stdout.readline().strip()
+        watchdog.cancel()
+        yield process
+    finally:
+        watchdog.cancel()
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=30)
+
+
+def run_cli(*arguments, timeout_s=90, **options):
+    """Run a command to its end."""
+    return subprocess.run(
+        [sys.executable, "-m", "epypes.cli", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=timeout_s,
+        check=False,
+        **options,
+    )

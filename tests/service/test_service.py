@@ -1,0 +1,206 @@
+from __future__ import annotations
+
+import os
+import queue
+import re
+import shutil
+import signal
+import socket
+
+import cv2
+import numpy as np
+import pytest
+import zmq
+
+import epypes as ep
+from epypes.bundle.seal import seal
+from epypes.errors import AddressError, BundleError, RemoteFailure, ReplayDiffers, ServiceError
+from epypes.service import Client, Service, call
+from epypes.service.state import StateLock, read_state, state_file
+from epypes.wire import Envelope, encode
+from tests.service.processes import run_cli, running
+
+TIMEOUT_S = 20.0
+ANY = "tcp://127.0.0.1:*"
+
+
+@pytest.fixture
+def local(edge_bundle):
+    """A service in this process, with its state published as serve does."""
+    with StateLock(edge_bundle.path) as lock:
+        service = Service(edge_bundle.path, ANY, ANY)
+        lock.publish(service.start())
+        yield service
+        service.stop()
+
+
+def test_a_service_in_another_process_answers_with_what_the_notebook_computed(edge_bundle, photograph):
+    expected = cv2.Canny(cv2.medianBlur(photograph, 5), 70, 200)
+    with running(edge_bundle.path) as process:
+        assert process.ready.startswith("READY")
+        with Client(edge_bundle.path, timeout_s=TIMEOUT_S) as client:
+            answers = [client.call({"image": photograph}) for _ in range(3)]
+        for answer in answers:
+            assert np.array_equal(answer.tokens["edges"], expected)
+            assert set(answer.timings_ns) == {"smooth", "canny"}
+            assert 0 < answer.overhead_ns < answer.total_ns < answer.round_trip_ns
+        process.send_signal(signal.SIGTERM)
+        out, err = process.communicate(timeout=TIMEOUT_S)
+        assert process.returncode == 0, err
+        assert "STOPPED received 3, answered 3, failed 0, dropped 0, rejected 0" in out
+    assert read_state(edge_bundle.path) is None
+
+
+def test_a_function_that_fails_is_told_to_the_caller_and_the_service_goes_on(local, edge_bundle, photograph):
+    with pytest.raises(RemoteFailure, match="Function 'smooth' failed in the service: error") as error:
+        call(edge_bundle.path, {"image": np.zeros((0, 0), np.uint8)}, timeout_s=TIMEOUT_S)
+    assert error.value.function == "smooth"
+    assert call(edge_bundle.path, {"image": photograph}, timeout_s=TIMEOUT_S).tokens["edges"].any()
+    assert local.counts()["failed"] == 1
+
+
+@pytest.mark.parametrize("parts", [{}, {"picture": np.zeros((9, 9), np.uint8)}, {"image": 1, "more": 2}])
+def test_an_event_with_other_parts_is_a_failure_that_names_them(local, edge_bundle, parts):
+    with pytest.raises(RemoteFailure, match="The event must have the parts 'image'; it has"):
+        call(edge_bundle.path, parts, timeout_s=TIMEOUT_S)
+
+
+def test_garbage_on_the_input_socket_is_counted_and_the_service_goes_on(local, edge_bundle, photograph):
+    header = bytes(encode(Envelope(type="x", parts={"image": photograph}))[1])
+    context = zmq.Context()
+    socket_ = context.socket(zmq.XPUB)
+    try:
+        socket_.connect(local.subscriber.address)
+        assert socket_.poll(TIMEOUT_S * 1000), "the service has subscribed"
+        garbage = [
+            [b""], [b"garbage"], [os.urandom(5000)], [b"\x00" * 100], [b"a/", b"garbage"], [b"/", b""],
+            [b"/", header], [b"/", header, b"too short"], [b"/", os.urandom(300), os.urandom(300)], [b""] * 50,
+            [b"\xff\xff"], [b"\x80\x04\x95canary"],
+        ]  # fmt: skip
+        for frames in garbage:
+            socket_.send_multipart(frames)
+        # The same socket: what comes behind the garbage arrives behind it.
+        answers: queue.SimpleQueue = queue.SimpleQueue()
+        with ep.ZMQSubscriber(local.publisher.address, answers) as subscriber:
+            assert subscriber.wait_joined(TIMEOUT_S)
+            request = Envelope(type="x", parts={"image": photograph})
+            socket_.send_multipart(encode(request))
+            while True:
+                answer = answers.get(timeout=TIMEOUT_S)
+                if answer.correlation_id == request.id:
+                    break
+        assert answer.failure is None
+        assert answer.parts["edges"].any()
+    finally:
+        socket_.close(0)
+        context.term()
+    counts = local.counts()
+    assert counts["rejected"] + counts["failed"] + counts["dropped"] >= len(garbage) - 2
+    assert counts["rejected"] >= 4
+    assert call(edge_bundle.path, {"image": photograph}, timeout_s=TIMEOUT_S).tokens["edges"].any()
+
+
+def test_a_port_in_use_is_named_and_nothing_is_left_behind(edge_bundle):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        done = run_cli("serve", edge_bundle.path, "--sub", f"tcp://127.0.0.1:{port}")
+    assert done.returncode == 1
+    assert str(port) in done.stderr
+    assert "Traceback" not in done.stderr
+    assert read_state(edge_bundle.path) is None
+    with running(edge_bundle.path, "--sub", f"tcp://127.0.0.1:{port}") as process:
+        assert f"tcp://127.0.0.1:{port}" in process.ready
+
+
+def test_a_bundle_is_served_once(edge_bundle):
+    with running(edge_bundle.path) as process:
+        done = run_cli("serve", edge_bundle.path)
+        assert done.returncode == 1
+        assert f"is being served already, by process {process.pid} at tcp://127.0.0.1:" in done.stderr
+
+
+def test_a_killed_service_is_not_taken_for_a_running_one(edge_bundle, photograph):
+    with running(edge_bundle.path) as process:
+        process.kill()
+        process.wait(TIMEOUT_S)
+        assert state_file(edge_bundle.path).read_text()
+        with pytest.raises(ServiceError, match="No service runs for .* Start one: epypes serve"):
+            call(edge_bundle.path, {"image": photograph})
+    with running(edge_bundle.path):
+        assert call(edge_bundle.path, {"image": photograph}, timeout_s=TIMEOUT_S).tokens["edges"].any()
+
+
+def test_a_service_that_is_killed_while_it_works_is_told_to_the_caller(edge_bundle, photograph):
+    with running(edge_bundle.path) as process, Client(edge_bundle.path, timeout_s=TIMEOUT_S) as client:
+        client.call({"image": photograph})
+        process.kill()
+        process.wait(TIMEOUT_S)
+        with pytest.raises(ServiceError, match="ended before it answered"):
+            client.call({"image": photograph})
+
+
+def test_a_stopped_service_makes_the_call_time_out(edge_bundle, photograph):
+    with running(edge_bundle.path) as process, Client(edge_bundle.path, timeout_s=1.0) as client:
+        client.call({"image": photograph})
+        process.send_signal(signal.SIGSTOP)
+        try:
+            with pytest.raises(ServiceError, match="did not answer within 1 s"):
+                client.call({"image": photograph})
+        finally:
+            process.send_signal(signal.SIGCONT)
+
+
+def test_a_changed_bundle_is_not_served(edge_bundle, tmp_path):
+    copy = tmp_path / "edges"
+    shutil.copytree(edge_bundle.path, copy)
+    with (copy / "pipeline.toml").open("a") as file:
+        file.write(" ")
+    with pytest.raises(BundleError, match=r"pipeline\.toml was changed"):
+        Service(copy, ANY, ANY)
+    settings = copy / "pipeline.toml"
+    settings.write_text(settings.read_text().replace("value = 70", "value = 20"))
+    seal(copy)
+    with pytest.raises(ReplayDiffers, match="token 'edges'"):
+        Service(copy, ANY, ANY)
+
+
+def test_an_address_that_others_can_reach_is_refused(edge_bundle):
+    with pytest.raises(AddressError, match=r"tcp://0\.0\.0\.0:5999"):
+        Service(edge_bundle.path, "tcp://0.0.0.0:5999", ANY)
+
+
+def test_a_service_can_connect_instead_of_bind(edge_bundle, photograph):
+    requests, answers = queue.Queue(), queue.Queue()
+    with ep.ZMQPublisher(ANY, requests) as publisher, ep.ZMQSubscriber(ANY, answers, bind=True) as subscriber:
+        sub, pub = f"connect:{publisher.address}", f"connect:{subscriber.address}"
+        with StateLock(edge_bundle.path) as lock:
+            service = Service(edge_bundle.path, sub, pub)
+            lock.publish(service.start())
+            assert publisher.wait_for_subscriber(TIMEOUT_S)
+            assert subscriber.wait_joined(TIMEOUT_S)
+            requests.put(Envelope(type="x", parts={"image": photograph}))
+            assert answers.get(timeout=TIMEOUT_S).parts["edges"].any()
+            with pytest.raises(ServiceError, match=re.escape(f"connects to {publisher.address}")):
+                call(edge_bundle.path, {"image": photograph})
+            service.stop()
+
+
+def test_a_service_stops_twice_and_before_it_was_started(edge_bundle):
+    service = Service(edge_bundle.path, ANY, ANY)
+    service.stop()
+    service.start()
+    service.stop()
+    service.stop()
+
+
+def test_load_pipeline_gives_the_pipeline_that_serve_runs(edge_bundle, photograph):
+    q_in, q_out = queue.Queue(), queue.Queue()
+    with ep.load_pipeline(edge_bundle.path, q_in, q_out):
+        request = Envelope(type="x", parts={"image": photograph})
+        q_in.put(request)
+        answer = q_out.get(timeout=TIMEOUT_S)
+    assert answer.correlation_id == request.id
+    assert answer.bundle_digest == edge_bundle.digest
+    assert np.array_equal(answer.parts["edges"], cv2.Canny(cv2.medianBlur(photograph, 5), 70, 200))
