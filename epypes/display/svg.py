@@ -123,7 +123,7 @@ def _token_lines(token: TokenView) -> tuple[str, ...]:
 def _token_box(token: TokenView) -> Box:
     lines = _token_lines(token)
     if token.preview and token.preview.picture:
-        return Box("box", max(_THUMB_WIDTH + 12, _width(*lines)), _THUMB_HEIGHT + 2 * _LINE_PX + 12)
+        return Box("box", max(_THUMB_WIDTH + 12, _width(*lines)), _THUMB_HEIGHT + 2 * _LINE_PX + 16)
     if token.role == "hyperparameter":
         return Box("hexagon", _width(*lines) + 14, _LINE_PX + 12)
     return Box("ellipse", _width(*lines) * 1.18, _LINE_PX * len(lines) + 16)
@@ -167,7 +167,7 @@ def _paint_token(token: TokenView, box: Box, centre: Point) -> str:
         body = (
             f'<rect class="shape" x="{x:.1f}" y="{y:.1f}" width="{box.width:.1f}" height="{box.height:.1f}" rx="10"/>'
         )
-        body += _text(lines, (centre[0], y + _LINE_PX + 2)) + _thumbnail(token, centre[0], y + 2 * _LINE_PX + 6)
+        body += _text(lines, (centre[0], y + _LINE_PX + 4)) + _thumbnail(token, centre[0], y + 2 * _LINE_PX + 8)
     elif box.shape == "hexagon":
         body = f'<polygon class="shape" points="{_hexagon(x, y, box)}"/>' + _text(lines, centre)
     else:

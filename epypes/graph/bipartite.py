@@ -87,18 +87,34 @@ class BipartiteDigraph:
     def shortest_cycle(self) -> tuple[str, ...]:
         """Return the vertices of a shortest cycle, tokens and functions in turn, beginning and ending with one token.
 
-        Empty if there is none. Only functions that no order can place are searched.
+        Empty if there is none.
         """
-        ordered = set(self.run_order())
-        suspects = [function for function in self.inputs if function not in ordered]
         best: tuple[str, ...] = ()
-        for start in suspects:
-            found = self._cycle_through(start, set(suspects), len(best))
+        suspects = self._on_cycles(set(self.inputs))
+        while suspects:
+            start = next(function for function in self.inputs if function in suspects)
+            found = self._cycle_through(start, suspects, len(best))
             if found and (not best or len(found) < len(best)):
                 best = found
-                if len(best) == 2:  # a function that takes its own output: nothing is shorter
-                    break
+            # Every cycle through it has been looked at; what was on no other cycle goes with it.
+            suspects = self._on_cycles(suspects - {start})
         return self._with_tokens(best) if best else ()
+
+    def _on_cycles(self, functions: set[str]) -> set[str]:
+        """Drop the functions that nothing among the others leads to, or that lead to nothing, until none is left."""
+        kept = set(functions)
+        for neighbours, opposite in ((self.predecessors, self.successors), (self.successors, self.predecessors)):
+            count = {function: sum(other in kept for other in neighbours(function)) for function in kept}
+            ends = [function for function, left in count.items() if not left]
+            while ends:
+                gone = ends.pop()
+                kept.discard(gone)
+                for other in opposite(gone):
+                    if other in kept:
+                        count[other] -= 1
+                        if not count[other]:
+                            ends.append(other)
+        return kept
 
     def _cycle_through(self, start: str, allowed: set[str], shorter_than: int) -> tuple[str, ...]:
         """Search breadth-first for the shortest way from ``start`` back to itself."""

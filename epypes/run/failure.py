@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
+
+# OpenCV begins its messages with its version and the place in its own source; what went wrong comes after.
+_OPENCV_PLACE: Final = re.compile(r"^OpenCV\([^)]*\) \S+ error: ")
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,5 +37,5 @@ class Failure:
 
     def __str__(self) -> str:
         kind = type(self.exception).__name__
-        text = str(self.exception).strip()
+        text = _OPENCV_PLACE.sub("", str(self.exception).strip())
         return f"{self.function}: {kind}{': ' + text if text else ''}"

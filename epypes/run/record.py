@@ -1,4 +1,4 @@
-"""What is left of a run: its tokens, its times, its failure."""
+"""What is left of a run? Its tokens, its times, its failure."""
 
 from __future__ import annotations
 

@@ -305,6 +305,7 @@ NOTEBOOK = (
 )
 
 
+@pytest.mark.notebook
 def test_a_notebook_is_executed_fresh_and_promoted_to_the_same_bytes_each_time(tmp_path):
     path, done = cells(tmp_path / "n.ipynb", *NOTEBOOK), []
     before = path.read_bytes()
@@ -317,6 +318,7 @@ def test_a_notebook_is_executed_fresh_and_promoted_to_the_same_bytes_each_time(t
     assert verify(tmp_path / "one" / "b").identical
 
 
+@pytest.mark.notebook
 @pytest.mark.parametrize(
     ("last", "error", "words"),
     [
