@@ -10,14 +10,16 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from epypes.cli.promote import run_promotion
 from epypes.cli.terminal import err, out, print_answer
 from epypes.errors import ServiceError
-from epypes.service import Answer
+
+if TYPE_CHECKING:
+    from epypes.service import Answer
 
 _START_TIMEOUT_S: Final = 60.0
 _STOP_TIMEOUT_S: Final = 20.0
@@ -103,6 +105,8 @@ def _service(bundle: Path) -> Iterator[str]:
 
 
 def _call(bundle: Path, images: dict[str, Path], output: str, file: Path) -> Answer:
+    from epypes.service import Answer
+
     arguments = [f"{token}={path}" for token, path in images.items()]
     command = [sys.executable, "-m", "epypes.cli", "call", str(bundle), *arguments]
     options = ["--out", f"{output}={file}", "--count", str(_CALLS), "--json"]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import itertools
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 
@@ -76,14 +76,6 @@ class BipartiteDigraph:
                     heapq.heappush(ready, position[successor])
         return tuple(order)
 
-    def ancestors(self, functions: Iterable[str]) -> set[str]:
-        """Return ``functions`` and every function whose output reaches one of them."""
-        return _reach(functions, self.predecessors)
-
-    def descendants(self, functions: Iterable[str]) -> set[str]:
-        """Return ``functions`` and every function that an output of them reaches."""
-        return _reach(functions, self.successors)
-
     def shortest_cycle(self) -> tuple[str, ...]:
         """Return the vertices of a shortest cycle, tokens and functions in turn, beginning and ending with one token.
 
@@ -144,17 +136,6 @@ class BipartiteDigraph:
         for function, token in zip(functions[:-1], joints, strict=True):
             vertices += [function, token]
         return tuple(vertices)
-
-
-def _reach(starts: Iterable[str], neighbours: Callable[[str], Iterable[str]]) -> set[str]:
-    found = set(starts)
-    pending = list(found)
-    while pending:
-        for neighbour in neighbours(pending.pop()):
-            if neighbour not in found:
-                found.add(neighbour)
-                pending.append(neighbour)
-    return found
 
 
 def _path(parent: Mapping[str, str], start: str, last: str) -> tuple[str, ...]:

@@ -23,7 +23,7 @@ runner.run(image=np.arange(64 * 64, dtype=np.uint8).reshape(64, 64))
 assert "image/svg+xml" in runner._repr_mimebundle_()
 panel = tune(runner)
 panel["lo"] = 20
-assert panel.wait(30)
+panel.wait(30)
 assert runner["lo"] == 20
 ep.promote(runner, "bundle")
 assert verify("bundle").identical
@@ -83,6 +83,8 @@ def test_the_core_imports_without_any_extra(wheel, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "f(x) -> y" in done.stdout
     assert "pip install 'epypes[notebook]'" in done.stdout
+    done = subprocess.run([str(python.parent / "epypes"), "--help"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
     done = subprocess.run(
         [str(python.parent / "epypes"), "serve", "nowhere"], cwd=tmp_path, capture_output=True, text=True, check=False
     )
