@@ -1,0 +1,71 @@
+"""Does the demo do the main job, and does it fail when it should?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import nbformat
+import numpy as np
+import pytest
+
+import epypes.cli.demo as demo_command
+from epypes.acquisition import read_image, write_image
+from epypes.bundle import verify
+from epypes.errors import ServiceError
+from tests.service.processes import run_cli
+
+ROOT = Path(__file__).parents[2]
+TUTORIAL = ROOT / "notebooks" / "01_edge_detection.ipynb"
+
+pytestmark = pytest.mark.notebook
+
+
+@pytest.fixture(autouse=True)
+def own_runtime_folder(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("run")))
+
+
+@pytest.fixture
+def tutorial(tmp_path):
+    """A copy, since the notebook writes beside itself."""
+    copy = tmp_path / TUTORIAL.name
+    copy.write_bytes(TUTORIAL.read_bytes())
+    return copy
+
+
+def test_the_demo_does_the_main_job_and_says_so(tutorial, tmp_path, straight_edges):
+    out = tmp_path / "out"
+    done = run_cli("demo", tutorial, "--to", out)
+    assert done.returncode == 0, done.stderr
+    for words in ("1/5", "5/5", "identical: 240000 values", "function canny", "graph overhead", "round trip"):
+        assert words in done.stdout
+    assert "promoted" in done.stderr, "a progress display"
+    assert np.array_equal(read_image(out / "edges.png"), straight_edges)
+    assert "<image" in (out / "graph.svg").read_text()
+    assert verify(out / "bundle").identical
+
+
+def test_an_answer_that_differs_ends_the_demo_with_an_error(tutorial, tmp_path, monkeypatch):
+    real_call = demo_command._call
+
+    def spoiled(bundle, images, output, file):
+        answer = real_call(bundle, images, output, file)
+        edges = read_image(file).copy()
+        edges[7, 9] ^= 255
+        write_image(file, edges)
+        return answer
+
+    monkeypatch.setattr(demo_command, "_call", spoiled)
+    with pytest.raises(
+        ServiceError, match=r"differs from the notebook's: 1 of 240000 values differ, first at \[7, 9\]"
+    ):
+        demo_command.demo(tutorial, tmp_path / "out", "runner", "edges")
+
+
+def test_a_notebook_that_cannot_be_promoted_ends_the_demo_with_exit_status_1(tmp_path):
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell("runner = 3")])
+    nbformat.write(notebook, tmp_path / "n.ipynb")
+    done = run_cli("demo", tmp_path / "n.ipynb", "--to", tmp_path / "out")
+    assert done.returncode == 1
+    assert "A int is neither a CompGraphRunner nor a Pipeline" in done.stderr
+    assert "Traceback" not in done.stderr
