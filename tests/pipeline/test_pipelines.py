@@ -374,3 +374,29 @@ def test_an_empty_mailbox_raises_empty_in_time_and_wakes_a_waiting_taker():
 def test_a_mailbox_that_makes_no_sense_is_refused(policy, size):
     with pytest.raises(ValueError, match="policy"):
         ep.Mailbox(policy, size)
+
+
+@pytest.mark.parametrize("on_error", [None, "report", "raise"])
+def test_an_event_loop_lives_on_whatever_its_callback_or_f_in_raise(on_error, caplog):
+    q_in, seen, errors = queue.Queue(), queue.Queue(), []
+
+    def f_in(event):
+        return {"value": 10 / event}
+
+    def callback(value):
+        seen.put(5 / (value - 1))
+
+    def report(event, exception):
+        errors.append((event, type(exception)))
+        if on_error == "raise":
+            raise RuntimeError("on_error")
+
+    loop = ep.EventLoop(q_in, callback, f_in, on_error=report if on_error else None)
+    loop.start()
+    for event in (0, 10, 5):
+        q_in.put(event)
+    assert seen.get(timeout=TIMEOUT_S) == 5
+    loop.stop()
+    assert errors == ([(0, ZeroDivisionError), (10, ZeroDivisionError)] if on_error else [])
+    assert ("an event failed" in caplog.text) == (on_error is None)
+    assert ("on_error itself failed" in caplog.text) == (on_error == "raise")
