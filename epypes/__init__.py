@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from epypes import errors
-    from epypes.bundle import load, load_pipeline, promote
+    from epypes.bundle import load, load_pipeline, promote, verify
     from epypes.graph import CompGraph
     from epypes.hints import Param
     from epypes.pipeline import (
@@ -65,6 +65,7 @@ _HOMES = {
     "load": "epypes.bundle",
     "load_pipeline": "epypes.bundle",
     "promote": "epypes.bundle",
+    "verify": "epypes.bundle",
 }
 
 __version__ = "1.0.0.dev0"
@@ -94,13 +95,15 @@ __all__ = [
     "load_pipeline",
     "promote",
     "unguarded",
+    "verify",
 ]
 
 
 def __getattr__(name: str) -> Any:
     home = _HOMES.get(name)
     if home is None:
-        raise AttributeError(f"module 'epypes' has no attribute {name!r}")
+        way_out = ": from epypes_widgets import tune" if name == "tune" else ""
+        raise AttributeError(f"module 'epypes' has no attribute {name!r}{way_out}")
     value = (
         importlib.import_module("epypes.errors") if name == "errors" else getattr(importlib.import_module(home), name)
     )
@@ -109,4 +112,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return [*__all__, "__version__"]

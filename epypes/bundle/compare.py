@@ -47,14 +47,18 @@ class ReplayReport:
 
     def __str__(self) -> str:
         if self.identical:
-            return f"identical: {self.tokens} tokens of {self.samples} samples"
+            return f"identical: {_count(self.tokens, 'token')} of {_count(self.samples, 'sample')}"
         return "\n".join(map(str, self.differences)) or "nothing was compared: the bundle has no samples"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'s' * (number != 1)}"
 
 
 def first_difference(expected: Any, got: Any, where: str = "") -> str | None:
     """Return where two values first differ, as text, or None if they agree in type and to the last bit."""
     if type(expected) is not type(got):
-        return f"{where}expected a {type(expected).__name__}, got a {type(got).__name__}"
+        return f"{where}expected type {type(expected).__name__}, got {type(got).__name__}"
     if hasattr(expected, "dtype") and hasattr(expected, "shape"):
         return _array_difference(expected, got, where)
     if isinstance(expected, Mapping):

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from epypes.bundle.settings import Settings
 from epypes.bundle.slicer import Slice
 from epypes.graph import CompGraph
 
 
-def emit_module(name: str, cg: CompGraph, needed: Slice, references: Mapping[str, str]) -> str:
+def emit_module(settings: Settings, cg: CompGraph, needed: Slice, references: Mapping[str, str]) -> str:
     """Write ``pipeline.py``: imports, constants, the functions' own source, then the graph.
 
     Parameters
     ----------
-    name
-        The bundle's name.
+    settings
+        The bundle's name and ports.
     cg
         The graph.
     needed
@@ -22,8 +23,8 @@ def emit_module(name: str, cg: CompGraph, needed: Slice, references: Mapping[str
     references
         By function of the graph, the expression that refers to it.
     """
-    ends = f"{', '.join(cg.source_tokens)} -> {', '.join(cg.sink_tokens)}"
-    sections = [f'"""The computational graph {name!r}: {ends}."""\n']
+    ends = f"{', '.join(settings.inputs) or 'nothing'} -> {', '.join(settings.outputs)}"
+    sections = [f'"""The computational graph {settings.name!r}: {ends}."""\n']
     if needed.imports:
         sections.append("\n".join(_ordered_imports(list(needed.imports.values()))) + "\n")
     if needed.constants:

@@ -68,7 +68,7 @@ def failure_event(failure: Failure, source: str, bundle_digest: str) -> Envelope
         function=failure.function,
         tokens=failure.tokens,
         exception=type(failure.exception).__name__,
-        message=str(failure.exception),
+        message=" | ".join([failure.message, *getattr(failure.exception, "__notes__", ())]),
         input_id=failure.event_id,
         attempt=1,
     )

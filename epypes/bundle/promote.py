@@ -26,6 +26,10 @@ from epypes.pipeline import Node, Pipeline
 from epypes.run import CompGraphRunner, Run
 
 REQUIREMENTS: Final = "requirements.txt"
+_NO_RUNNER: Final = (
+    "An object of class {} can't be promoted. Make a runner and run it: "
+    "runner = CompGraphRunner(cg, hparams); runner.run(...)."
+)
 
 
 def promote(
@@ -78,7 +82,7 @@ def _subject(given: object, target: Path) -> tuple[CompGraphRunner, CompGraph]:
         kind = type(given).__name__
         text = f"A {kind} can't be promoted yet. Promote its runner: promote(CompGraphRunner(pipe.cg, hparams), ...)."
         raise PromotionRefused(target, [text])
-    raise PromotionRefused(target, [f"A {type(given).__name__} is neither a CompGraphRunner nor a Pipeline."])
+    raise PromotionRefused(target, [_NO_RUNNER.format(type(given).__name__)])
 
 
 def _write(draft: Path, target: Path, runner: CompGraphRunner, cg: CompGraph, outputs: Sequence[str] | None) -> None:
@@ -93,8 +97,8 @@ def _write(draft: Path, target: Path, runner: CompGraphRunner, cg: CompGraph, ou
     if reasons:
         raise PromotionRefused(target, reasons)
     (draft / SAMPLES).mkdir(parents=True)
-    (draft / MODULE).write_text(emit_module(target.name, cg, needed, references), encoding="utf-8")
     settings = Settings(target.name, runner.free_source_tokens, wanted, runner.hyperparameters)
+    (draft / MODULE).write_text(emit_module(settings, cg, needed, references), encoding="utf-8")
     write_settings(draft / SETTINGS, settings, cg)
     if runner.last is not None:  # as _unready has made sure
         _record(draft / SAMPLES / "000.npz", target, runner.last, runner.free_source_tokens, wanted)
@@ -129,7 +133,10 @@ def _prove(draft: Path, target: Path) -> ReplayReport:
     except BundleError as error:
         raise PromotionRefused(target, [str(error).replace(str(draft.resolve()), str(target))]) from error
     if not report.identical:
-        why = "A function may depend on something that is not a token, such as a counter, the time or random numbers."
+        why = (
+            "A function may depend on something that is not a token, such as a file, the current folder, a counter, "
+            "the time or random numbers. Pass it in as a token."
+        )
         raise PromotionRefused(target, [*map(str, report.differences), why])
     (draft / REQUIREMENTS).write_text("".join(f"{line}\n" for line in report.requirements), encoding="utf-8")
     seal(draft)

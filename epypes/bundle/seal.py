@@ -32,8 +32,7 @@ def check_seal(folder: Path) -> str:
         There is no bundle, or a file was changed, is missing or was added; all of them are named.
     """
     if not (folder / MANIFEST).is_file():
-        what = "is not a bundle: it has no MANIFEST.sha256" if folder.is_dir() else "does not exist"
-        raise BundleError(folder, f"{folder} {what}. Make a bundle with: epypes promote NOTEBOOK --to {folder}")
+        raise BundleError(folder, _no_bundle(folder))
     recorded = _read_manifest(folder)
     present = set(_files(folder))
     findings = [f"{name} is missing" for name in recorded if name not in present]
@@ -45,6 +44,14 @@ def check_seal(folder: Path) -> str:
         text = f"{folder} is not what was promoted: {'; '.join(findings)}. Restore it, or promote again."
         raise BundleError(folder, text)
     return digest(folder)
+
+
+def _no_bundle(folder: Path) -> str:
+    if folder.is_dir():
+        return f"{folder} is not a bundle: it has no {MANIFEST}. Name the folder that epypes promote wrote."
+    if folder.exists():
+        return f"{folder} is a file. Name the folder of a bundle, which epypes promote writes."
+    return f"{folder} does not exist. Make a bundle with: epypes promote NOTEBOOK --to {folder}"
 
 
 def _read_manifest(folder: Path) -> dict[str, str]:

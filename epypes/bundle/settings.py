@@ -43,8 +43,14 @@ def unwritable(hyperparameters: Mapping[str, Any]) -> list[str]:
         f"Hyperparameter {token!r} is a {type(value).__name__}, which pipeline.toml can't hold. "
         "Use a number, string, bool, None, or a tuple or list of them; or unfreeze it and pass it to run()."
         for token, value in hyperparameters.items()
-        if not _fits(value)
+        if not _fits(plain(value))
     ]
+
+
+def plain(value: Any) -> Any:
+    """Return a number of NumPy's as Python's own; whether that computes the same, the replay shows."""
+    is_number = type(value).__module__ == "numpy" and getattr(value, "shape", None) == ()
+    return value.item() if is_number else value
 
 
 def _fits(value: Any) -> bool:
@@ -61,7 +67,11 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
     import tomlkit
 
     document = tomlkit.document()
-    document.add(tomlkit.comment("What the graph in pipeline.py is run with. Change a value, then promote or verify."))
+    document.add(
+        tomlkit.comment(
+            "What the graph in pipeline.py is run with. It is sealed: change a value in the notebook and promote."
+        )
+    )
     bundle = tomlkit.table()
     bundle.add("format", FORMAT)
     bundle.add("name", settings.name)
@@ -73,7 +83,7 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
     document.add("ports", ports)
     hyperparameters = tomlkit.table(is_super_table=True)
     for token, value in settings.hyperparameters.items():
-        hyperparameters.add(token, _entry(value, hint_of(cg, token)))
+        hyperparameters.add(token, _entry(plain(value), hint_of(cg, token)))
     document.add("hyperparameters", hyperparameters)
     path.write_text(tomlkit.dumps(document), encoding="utf-8")
 

@@ -114,17 +114,29 @@ class Slice:
         self._add_definition(helper, f"Function {name!r}, which {what[0].lower()}{what[1:]} calls,")
 
     def _add_constant(self, name: str, value: Any, found: Definition, what: str) -> None:
-        source = repr(value) if _is_data(value) else ""
-        if not source or len(source) > _CONSTANT_CHARACTERS or not _reads_back(source, value):
+        source = self._array_source(value, what) if _is_array(value) else repr(value) if _is_data(value) else ""
+        if not source or len(source) > _CONSTANT_CHARACTERS or not (_is_array(value) or _reads_back(source, value)):
+            kind = f"the class {name!r}" if isinstance(value, type) else f"of type {type(value).__name__}"
             raise Refused(
-                f"{what} is defined in the notebook ({found.place}) and uses {name!r} from it, "
-                f"a {type(value).__name__}. Make {name} a token, or move both into a module."
+                f"{what} is defined in the notebook ({found.place}) and uses {name!r} from it, {kind}. "
+                f"Make {name} a token, make it inside the function, or move both into a module that is installed."
             )
         if self.constants.get(name, source) != source:
             raise Refused(f"{what} uses {name!r}, which has another value elsewhere. Rename one of the two.")
         if name not in self.constants:
             self._claim(name, ("constant", name), what)
             self.constants[name] = source
+
+    def _array_source(self, array: Any, what: str) -> str:
+        """Return a small array of numbers as source that makes it again, to the last bit; "" for any other."""
+        import numpy as np
+
+        if array.dtype.kind not in "biuf" or array.size * 2 > _CONSTANT_CHARACTERS:
+            return ""
+        listed = repr(array.tolist())
+        if "nan" in listed or "inf" in listed or np.array(array.tolist(), array.dtype).shape != array.shape:
+            return ""
+        return f"{self._module_name('numpy', what)}.array({listed}, dtype={str(array.dtype)!r})".replace("'", '"')
 
     def _add_module(self, name: str, module: types.ModuleType, found: Definition, what: str) -> None:
         if module.__name__ == "__main__":
@@ -155,6 +167,10 @@ class Slice:
 def _is_data(value: object) -> bool:
     kinds = (bool, int, float, complex, str, bytes, type(None), tuple, list, dict, set, frozenset)
     return type(value) in kinds
+
+
+def _is_array(value: object) -> bool:
+    return type(value).__module__ == "numpy" and type(value).__name__ == "ndarray"
 
 
 def _reads_back(source: str, value: Any) -> bool:

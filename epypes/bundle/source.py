@@ -128,7 +128,7 @@ def definition(function: Callable[..., Any], what: str) -> Definition:
         It is not a plain function, or its source is not to be had.
     """
     if not isinstance(function, types.FunctionType):
-        raise Refused(f"{what} is {_kind(function)}. Write a plain function (def) that calls it.")
+        raise Refused(f"{what} is {_kind(function)}. Write a plain function (def) that makes the object and calls it.")
     place = place_of(function.__code__)
     if function.__name__ == "<lambda>" or function.__code__.co_name == "<lambda>":
         raise Refused(f"{what} is a lambda ({place}). Write it as a function (def) with a name.")

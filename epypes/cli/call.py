@@ -18,33 +18,37 @@ def call(
     bundle: Annotated[Path, typer.Argument(help="The folder of the bundle that is being served.")],
     images: Annotated[list[str], typer.Argument(help="An image file, or TOKEN=FILE for each input token.")],
     out_file: Annotated[
-        list[str], typer.Option("--out", help="The file for the output token, or TOKEN=FILE; an image or .npy.")
-    ],
+        list[str] | None, typer.Option("--out", help="The file for the output token, or TOKEN=FILE; an image or .npy.")
+    ] = None,
     timeout: Annotated[float, typer.Option(help="How long to wait for the answer, in seconds.", min=0.001)] = 10.0,
     count: Annotated[int, typer.Option(help="How often to send it; the times are those of the fastest.", min=1)] = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print the times as JSON, in nanoseconds.")] = False,
 ) -> None:
-    """Send one image to the service of a bundle and write what comes back."""
+    """Send one image to the service of a bundle, write what comes back to files and print the rest."""
     from epypes.acquisition import read_image
     from epypes.bundle.load import SETTINGS
     from epypes.bundle.seal import check_seal
     from epypes.bundle.settings import read_settings
+    from epypes.display.preview import preview
     from epypes.service import Client
 
     check_seal(bundle)
     settings = read_settings(bundle / SETTINGS)
     files = by_token(images, settings.inputs, "input")
-    targets = by_token(out_file, settings.outputs, "output")
+    targets = by_token(out_file or [], settings.outputs, "output")
     payload = {token: read_image(file) for token, file in files.items()}
     with Client(bundle, timeout_s=timeout) as client:
         answers = [client.call(payload) for _ in range(count)]
     answer = min(answers, key=lambda answer: answer.round_trip_ns)
     for token, file in targets.items():
         _write(file, answer.tokens[token])
+    for token, value in answer.tokens.items():
+        if token not in targets and not as_json:
+            out.print(f"{token} = {preview(value).text}")
     if as_json:
         out.print(json.dumps(asdict(replace(answer, tokens={}))))
     else:
-        print_answer(f"{bundle}: {', '.join(targets.values())}", answer)
+        print_answer(" ".join([f"{bundle}:", *targets.values()]), answer)
 
 
 def by_token(given: Sequence[str], tokens: Sequence[str], kind: str) -> dict[str, str]:
@@ -62,10 +66,10 @@ def by_token(given: Sequence[str], tokens: Sequence[str], kind: str) -> dict[str
         name, equals, file = text.partition("=")
         if equals and name in tokens:
             found[name] = file
+        elif equals and name.isidentifier() and not Path(text).exists():
+            raise UnknownName(f"{kind} token", name, tokens, "in this bundle")
         elif len(tokens) == 1 and len(given) == 1:
             found[tokens[0]] = text
-        elif equals:
-            raise UnknownName(f"{kind} token", name, tokens, "in this bundle")
         else:
             raise ServiceError(
                 text, f"Which {kind} is {text!r}? Write one of: {', '.join(f'{t}=FILE' for t in tokens)}"
@@ -82,9 +86,12 @@ def _write(file: str, value: Any) -> None:
     from epypes.acquisition import write_image
 
     if Path(file).suffix == ".npy":
-        np.save(file, value, allow_pickle=False)
+        try:
+            np.save(file, value, allow_pickle=False)
+        except (OSError, ValueError) as error:
+            raise ServiceError(file, f"{file} can't be written: {error}.") from error
     elif isinstance(value, np.ndarray):
         write_image(file, value)
     else:
         kind = type(value).__name__
-        raise ServiceError(file, f"The answer is a {kind}, not an image. Use a file ending in .npy for numbers.")
+        raise ServiceError(file, f"The answer is of type {kind}, not an image. Leave out --out, and it is printed.")

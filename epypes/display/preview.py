@@ -12,7 +12,7 @@ from epypes.display.raster import Picture, encode_image, is_image, sampled
 
 THUMBNAIL_PX: Final = 128
 _TEXT_WIDTH: Final = 24
-_PLAIN = (int, float, complex, str, bytes, bool, type(None), enum.Enum)
+_PLAIN = (int, float, complex, str, bytes, bool, type(None))
 _CONTAINERS = (tuple, list, dict, set, frozenset)
 
 
@@ -73,6 +73,8 @@ def _range_text(array: Any) -> str:
 def _object_preview(value: Any) -> Preview:
     if isinstance(value, float) and math.isfinite(value):
         return Preview(f"{value:.6g}", f"float {value!r}")
+    if isinstance(value, enum.Enum):
+        return Preview(_cut(f"{type(value).__name__}.{value.name}"), f"{type(value).__name__}.{value.name}")
     if isinstance(value, _PLAIN):
         return Preview(_cut(reprlib.repr(value)), f"{type(value).__name__} {reprlib.repr(value)}")
     kind = type(value).__name__

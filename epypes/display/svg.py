@@ -19,6 +19,7 @@ from epypes.display.view import FunctionView, GraphView, TokenView, duration_tex
 _LINE_PX: Final = 16
 _CHARACTER_PX: Final = 6.9
 _NAME_CHARACTERS: Final = 26
+_MESSAGE_CHARACTERS: Final = 48
 _THUMB_WIDTH: Final = 128
 _THUMB_HEIGHT: Final = 96
 _MARGIN: Final = 6
@@ -100,7 +101,7 @@ def _function_lines(function: FunctionView) -> tuple[str, ...]:
     if function.state == "ran" and function.duration_ns is not None:
         return name, f"{duration_text(function.duration_ns)}, {function.share:.0%}"
     if function.state == "failed":
-        return name, _cut(function.message.partition(":")[2].strip() or "failed")
+        return name, _cut(function.message, _MESSAGE_CHARACTERS)
     return name, function.state
 
 
@@ -129,9 +130,9 @@ def _token_box(token: TokenView) -> Box:
     return Box("ellipse", _width(*lines) * 1.18, _LINE_PX * len(lines) + 16)
 
 
-def _cut(text: str) -> str:
+def _cut(text: str, characters: int = _NAME_CHARACTERS) -> str:
     text = " ".join(text.split())
-    return text if len(text) <= _NAME_CHARACTERS else text[: _NAME_CHARACTERS - 1] + "…"
+    return text if len(text) <= characters else text[: characters - 1] + "…"
 
 
 # -- marks ------------------------------------------------------------------------------------------------------------

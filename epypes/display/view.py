@@ -127,7 +127,12 @@ def _with_run(structure: GraphView, run: Run, hparams: Mapping[str, Any], stale:
 
 def _function_view(name: str, index: int, run: Run, stale: frozenset[str], entry: FunctionTime | None) -> FunctionView:
     if run.failure and run.failure.function == name:
-        return FunctionView(name, "failed", entry.duration_ns if entry else None, message=str(run.failure))
+        return FunctionView(
+            name,
+            "failed",
+            entry.duration_ns if entry else None,
+            message=run.failure.message or type(run.failure.exception).__name__,
+        )
     if name in stale:
         return FunctionView(name, "not run" if run.tokens.used[index] is None else "stale")
     if entry is None or not entry.ran:

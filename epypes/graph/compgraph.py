@@ -128,7 +128,9 @@ class CompGraph:
     def require_token(self, name: str) -> None:
         """Raise UnknownName, with the nearest name, unless there is such a token."""
         if name not in self._digraph.producer and name not in self._digraph.consumers:
-            raise UnknownName("token", name, self._tokens)
+            made = self._digraph.outputs.get(name)
+            where = "in this graph" if made is None else f"in this graph, only a function; it makes {', '.join(made)}"
+            raise UnknownName("token", name, self._tokens, where)
 
     def to_networkx(self) -> nx.DiGraph[tuple[str, str]]:
         """Return a networkx DiGraph; its vertices are ``("function", name)`` and ``("token", name)``."""

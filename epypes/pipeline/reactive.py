@@ -164,7 +164,37 @@ class SinkPipeline(Pipeline):
 
 
 class FullPipeline(SinkPipeline):
-    """A Pipeline that runs for every event on ``q_in`` and puts ``f_out(view)`` on ``q_out``."""
+    """A Pipeline that runs for every event on ``q_in`` and puts ``f_out(view)`` on ``q_out``.
+
+    Parameters
+    ----------
+    name
+        Its name.
+    cg
+        The graph.
+    q_in, q_out
+        Where events come from and answers go: queue.Queue, queue.SimpleQueue, Mailbox.
+    f_in
+        Makes the payload, a mapping by free source token, from an event; called on the loop's thread.
+    f_out
+        Makes an answer from the event's EventView; called on the loop's thread.
+    hparams
+        Values of hyperparameter tokens.
+
+    Notes
+    -----
+    Semeniuta and Falkman 2019, "Reactive pipelines".
+
+    Examples
+    --------
+    >>> import queue
+    >>> cg = CompGraph({"double": lambda x: 2 * x}, {"double": ("x", "y")})
+    >>> q_in, q_out = queue.Queue(), queue.Queue()
+    >>> with FullPipeline("twice", cg, q_in, q_out, lambda event: {"x": event}, lambda view: view["y"]):
+    ...     q_in.put(21)
+    ...     q_out.get(timeout=10)
+    42
+    """
 
     def __init__(
         self,

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from time import perf_counter_ns
-from typing import Any
+from typing import Any, Final
 
 from epypes.errors import OutputArityError
 from epypes.run.failure import Failure
-from epypes.run.guard import explain_write, read_only, writable
+from epypes.run.guard import explain_write, is_array, read_only, writable
 from epypes.run.program import Step
 from epypes.run.tokens import TokenManager, is_same_value
+
+# A note is one line that names the culprit, so a value in it is short.
+_BRIEF: Final = 40
 
 
 class StepFailed(BaseException):
@@ -99,16 +102,26 @@ def _unpack(step: Step, result: Any, manager: TokenManager) -> Sequence[Any]:
     raise OutputArityError(step.name, [manager.program.tokens[slot] for slot in step.outputs], got)
 
 
+def _brief(value: Any) -> str:
+    """Return what a note says of an input: a small value itself, of an array its dtype and shape."""
+    if type(value) in (bool, int, float, type(None)) or (type(value) is str and len(value) <= _BRIEF):
+        return f"={value!r:.{_BRIEF}}"
+    if is_array(value):
+        return f": {value.dtype} {' x '.join(map(str, value.shape))}"
+    return ""
+
+
 def _failure(manager: TokenManager, step: Step, exception: BaseException) -> Failure:
     """Describe what failed, and note on the user's exception which function and tokens it concerns."""
     tokens = manager.program.tokens
     inputs = tuple(tokens[slot] for slot in step.inputs)
     outputs = tuple(tokens[slot] for slot in step.outputs)
-    note = f"In function {step.name!r}: ({', '.join(inputs)}) -> ({', '.join(outputs)})"
+    values = {token: manager.values[slot] for token, slot in zip(inputs, step.inputs, strict=True)}
+    told = ", ".join(f"{token}{_brief(value)}" for token, value in values.items())
+    note = f"In function {step.name!r}: ({told}) -> ({', '.join(outputs)})"
     if step.guarded:
         why = explain_write(step.name, inputs, exception)
         note = f"{note}\n{why}" if why else note
     if note not in getattr(exception, "__notes__", ()):
         exception.add_note(note)
-    values = {tokens[slot]: manager.values[slot] for slot in step.inputs}
     return Failure(step.name, (*inputs, *outputs), values, exception)

@@ -35,7 +35,11 @@ class Failure:
     exception: BaseException
     event_id: str = ""
 
+    @property
+    def message(self) -> str:
+        """What the exception says, without OpenCV's place in its own source."""
+        return _OPENCV_PLACE.sub("", str(self.exception).strip())
+
     def __str__(self) -> str:
-        kind = type(self.exception).__name__
-        text = _OPENCV_PLACE.sub("", str(self.exception).strip())
+        kind, text = type(self.exception).__name__, self.message
         return f"{self.function}: {kind}{': ' + text if text else ''}"

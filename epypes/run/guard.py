@@ -33,24 +33,26 @@ def is_unguarded(function: object) -> bool:
     return bool(getattr(function, _MARK, False))
 
 
+def is_array(value: Any) -> bool:
+    """Whether a value is a NumPy array."""
+    numpy = sys.modules.get("numpy")
+    return numpy is not None and isinstance(value, numpy.ndarray)
+
+
 def read_only(value: Any) -> Any:
     """Return arrays, and arrays in a tuple or list, as read-only views; anything else as it is."""
-    numpy = sys.modules.get("numpy")
-    if numpy is None:
-        return value
-    if isinstance(value, numpy.ndarray):
+    if is_array(value):
         view = value.view()
         view.flags.writeable = False
         return view
-    if type(value) in (tuple, list) and any(isinstance(item, numpy.ndarray) for item in value):
-        return type(value)(read_only(item) if isinstance(item, numpy.ndarray) else item for item in value)
+    if type(value) in (tuple, list) and any(map(is_array, value)):
+        return type(value)(read_only(item) if is_array(item) else item for item in value)
     return value
 
 
 def writable(value: Any) -> Any:
     """Return a writable view of a guarded array, for an unguarded function; a copy where memory is read-only."""
-    numpy = sys.modules.get("numpy")
-    if numpy is not None and isinstance(value, numpy.ndarray):
+    if is_array(value):
         view = value.view()
         try:
             view.flags.writeable = True
@@ -70,5 +72,5 @@ def explain_write(function: str, tokens: Sequence[str], exception: BaseException
     which = ", ".join(map(repr, tokens))
     return (
         f"Inputs are read-only, so that {function!r} can't change {which} for other functions. "
-        "Work on a copy (x = x.copy()), or mark the function with @ep.unguarded if it only reads."
+        "Work on a copy, made with .copy(), or mark the function with @ep.unguarded if it only reads."
     )

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 class Run(Mapping[str, Any]):
     """A run that has ended: a mapping from tokens to values, which does not change any more.
 
-    Reading a token that was not computed raises NotComputed; iterating gives those that were.
+    Reading a token that was not computed raises NotComputed; iterating gives those that were. Arrays are read-only:
+    draw on a copy, ``run["edges"].copy()``.
 
     Attributes
     ----------

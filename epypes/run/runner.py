@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from time import perf_counter_ns
 from typing import Any
 
-from epypes.errors import NotComputed, PayloadError, StaleToken
+from epypes.errors import NotComputed, PayloadError, StaleToken, UnknownName
 from epypes.graph import CompGraph
 from epypes.run.engine import StepFailed, execute
 from epypes.run.failure import Failure
@@ -59,6 +59,9 @@ class CompGraphRunner:
     """
 
     def __init__(self, cg: CompGraph, hparams: Mapping[str, Any] | None = None, *, guard: bool = True) -> None:
+        if not isinstance(cg, CompGraph):
+            kind = type(cg).__name__
+            raise TypeError(f"A CompGraphRunner runs a CompGraph, not {kind!r}: CompGraphRunner(cg, hparams).")
         self.cg = cg
         self.guard = guard
         self.reports: deque[RunReport] = deque(maxlen=_KEPT_REPORTS)
@@ -95,6 +98,7 @@ class CompGraphRunner:
             Whatever a function raises, unchanged, with a note; ``last`` is then the failed run.
         """
         hparams = self._hparams
+        self._check_targets(targets)
         self._check_payload(hparams, payload)
         manager = TokenManager(self._program)
         hparams.apply(manager)
@@ -114,6 +118,7 @@ class CompGraphRunner:
         Exception
             Whatever a function raises, unchanged, with a note.
         """
+        self._check_targets(targets)
         self._set(hparams)
         last = self._last
         if last is None:
@@ -127,6 +132,7 @@ class CompGraphRunner:
 
     def plan(self, /, *targets: str) -> Plan:
         """Return what ``rerun(*targets)`` would do."""
+        self._check_targets(targets)
         return plan(self._current_tokens(), targets)
 
     def _run(self, manager: TokenManager, targets: Sequence[str], hparams: Hyperparameters) -> Run:
@@ -161,9 +167,21 @@ class CompGraphRunner:
             raise failure.exception
         return run
 
+    def _check_targets(self, targets: Sequence[object]) -> None:
+        for token in targets:
+            if not isinstance(token, str):
+                free = self.free_source_tokens
+                call = ", ".join(f"{name}=..." for name in free)
+                text = (
+                    f"A target is the name of a token, not {type(token).__name__!r}. Payload goes by name: run({call})."
+                )
+                raise PayloadError(free, text)
+            self.cg.require_token(token)
+
     def _check_payload(self, hparams: Hyperparameters, payload: Mapping[str, Any]) -> None:
         for token in payload:
-            self.cg.require_token(token)
+            if token not in self._program.slots:
+                raise UnknownName("token", token, hparams.free_source_tokens)
             maker = self.cg.digraph.producer.get(token)
             if maker is not None:
                 text = f"Token {token!r} is made by function {maker!r}; run() takes free source tokens only."

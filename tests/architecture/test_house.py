@@ -43,6 +43,8 @@ def test_every_public_name_can_be_had_and_all_is_sorted():
         assert name in dir(epypes)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = epypes.nothing
+    with pytest.raises(AttributeError, match="from epypes_widgets import tune"):
+        _ = epypes.tune
 
 
 def test_the_version_is_the_packages():

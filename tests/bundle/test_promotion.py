@@ -100,6 +100,9 @@ def test_a_folder_that_is_no_bundle_is_named(tmp_path):
         ep.load(tmp_path / "nothing")
     with pytest.raises(BundleError, match="is not a bundle"):
         ep.load(tmp_path)
+    (tmp_path / "coins.png").touch()
+    with pytest.raises(BundleError, match="is a file. Name the folder of a bundle"):
+        ep.load(tmp_path / "coins.png")
 
 
 def test_a_changed_constant_is_found_by_the_replay_with_its_first_difference(bundle):
@@ -209,6 +212,12 @@ def test_hyperparameters_come_back_with_their_type(tmp_path, value):
     assert back == value
 
 
+def test_a_number_of_numpys_is_written_as_a_number(tmp_path):
+    runner = ep.CompGraphRunner(ep.CompGraph({"add": np.add}, {"add": (("x", "k"), "y")}), {"k": np.float64(1.5)})
+    runner.run(x=np.zeros(3))
+    assert ep.promote(runner, tmp_path / "b").settings.hyperparameters["k"] == 1.5
+
+
 def test_ranges_stand_in_the_settings(runner, tmp_path):
     bundle = ep.promote(runner, tmp_path / "b")
     document = tomllib.loads((bundle.path / "pipeline.toml").read_text())
@@ -259,7 +268,7 @@ def test_a_pipeline_is_promoted_too_and_other_things_are_refused_by_name(runner,
     sink = ep.SinkPipeline("sink", runner.cg, None, lambda event: {}, runner.hyperparameters)
     with pytest.raises(PromotionRefused, match="A SinkPipeline can't be promoted yet"):
         ep.promote(sink, tmp_path / "c")
-    with pytest.raises(PromotionRefused, match="A CompGraph is neither"):
+    with pytest.raises(PromotionRefused, match="class CompGraph can't be promoted. Make a runner and run it"):
         ep.promote(runner.cg, tmp_path / "c")
     with pytest.raises(PromotionRefused, match="f_in and f_out"):
         ep.promote(runner, tmp_path / "c", f_in=dict)
@@ -268,7 +277,7 @@ def test_a_pipeline_is_promoted_too_and_other_things_are_refused_by_name(runner,
 @pytest.mark.parametrize(
     ("left", "right", "words"),
     [
-        (1, 1.0, "expected a int, got a float"),
+        (1, 1.0, "expected type int, got float"),
         (np.zeros(3), np.zeros(4), "expected float64"),
         (np.zeros(3), np.zeros(3, np.float32), "got float32"),
         (np.array([1.0, 2.0]), np.array([1.0, 3.0]), r"1 of 2 values differ, first at \[1\]: expected 2.0, got 3.0"),

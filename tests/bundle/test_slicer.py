@@ -15,10 +15,12 @@ from skimage.filters import gaussian
 
 import epypes as ep
 from epypes.bundle.emit import emit_module
+from epypes.bundle.settings import Settings
 from epypes.bundle.slicer import slice_graph
 from epypes.bundle.source import Importable, importable
 
 _CELLS = 0
+SETTINGS = Settings("case", ("x0",), ("y",), {})
 
 
 def notebook(source: str) -> dict:
@@ -39,7 +41,7 @@ def promoted(source: str, function: str = "f", arity: int = 1):
     inputs = tuple(f"x{index}" for index in range(arity))
     cg = ep.CompGraph({"f": names[function]}, {"f": (inputs, "y")})
     needed, references = slice_graph(cg.functions)
-    return emit_module("case", cg, needed, references), needed.refusals
+    return emit_module(SETTINGS, cg, needed, references), needed.refusals
 
 
 def executed(text: str) -> types.SimpleNamespace:
@@ -55,6 +57,11 @@ SLICED = {
     "tuple constant": ("STEPS = (1, 2.5, 'a', None)\ndef f(x):\n    return x + STEPS[0]\n", 4),
     "helper": ("def g(x):\n    return 2 * x\ndef f(x):\n    return g(x) + 1\n", 7),
     "helper defined later": ("def f(x):\n    return g(x) + 1\ndef g(x):\n    return 2 * x\n", 7),
+    "array constant": ("K = np.eye(2, dtype=np.uint8) * 3\ndef f(x):\n    return int((K * x).sum()) - 6\n", 12),
+    "float32 constant": (
+        "K = np.array([[0.1, 0.7]], np.float32)\ndef f(x):\n    return (K.dtype.itemsize, K.shape)\n",
+        (4, (1, 2)),
+    ),
     "recursion": ("def f(x):\n    return 1 if x < 1 else x * f(x - 1)\n", 6),
     "mutual recursion": ("def g(x):\n    return f(x - 1)\ndef f(x):\n    return 0 if x < 1 else g(x) + 1\n", 3),
     "module under a name": ("def f(x):\n    return int(np.sum([x, x]))\n", 6),
@@ -97,10 +104,15 @@ REFUSED = {
         "class C:\n    def m(self, x):\n        return x\nf = C().m\n",
         "a method of an object of class 'C'",
     ),
-    "global array": ("K = np.zeros(3)\ndef f(x):\n    return x + K\n", r"uses 'K' from it, a ndarray\. Make K a token"),
-    "big constant": ("K = list(range(1000))\ndef f(x):\n    return K[x]\n", "uses 'K' from it, a list"),
-    "infinite constant": ("K = float('inf')\ndef f(x):\n    return K\n", "uses 'K' from it, a float"),
-    "notebook class inside": ("class C: pass\ndef f(x):\n    return C()\n", "uses 'C' from it"),
+    "global array": (
+        "K = np.zeros(999)\ndef f(x):\n    return x + K\n",
+        r"uses 'K' from it, of type ndarray\. Make K a token",
+    ),
+    "array of objects": ("K = np.array([None])\ndef f(x):\n    return K\n", "uses 'K' from it, of type ndarray"),
+    "array with NaN": ("K = np.array([np.nan])\ndef f(x):\n    return K\n", "uses 'K' from it, of type ndarray"),
+    "big constant": ("K = list(range(1000))\ndef f(x):\n    return K[x]\n", "uses 'K' from it, of type list"),
+    "infinite constant": ("K = float('inf')\ndef f(x):\n    return K\n", "uses 'K' from it, of type float"),
+    "notebook class inside": ("class C: pass\ndef f(x):\n    return C()\n", "uses 'C' from it, the class 'C'"),
     "lambda inside": ("g = lambda x: x\ndef f(x):\n    return g(x)\n", "is a lambda"),
     "global write": ("N = 0\ndef f(x):\n    global N\n    N += 1\n    return N\n", "changes the global 'N'"),
     "missing name": ("def f(x):\n    return x + nothing\n", "uses 'nothing', which is not defined"),
@@ -137,7 +149,7 @@ def test_an_old_function_kept_under_a_new_name_keeps_its_own_source():
     names = notebook("def f(x):\n    return 'old'\nkept = f\ndef f(x):\n    return 'new'\n")
     cg = ep.CompGraph({"k": names["kept"]}, {"k": ("x", "y")})
     needed, references = slice_graph(cg.functions)
-    assert executed(emit_module("case", cg, needed, references)).func_dict["k"](0) == "old"
+    assert executed(emit_module(SETTINGS, cg, needed, references)).func_dict["k"](0) == "old"
 
 
 def test_two_functions_of_one_name_are_refused():
@@ -150,7 +162,7 @@ def test_one_function_may_serve_twice():
     names = notebook("def f(x):\n    return x + 1\n")
     cg = ep.CompGraph({"a": names["f"], "b": names["f"]}, {"a": ("x", "y"), "b": ("y", "z")})
     needed, references = slice_graph(cg.functions)
-    text = emit_module("case", cg, needed, references)
+    text = emit_module(SETTINGS, cg, needed, references)
     assert text.count("def f(") == 1
     assert references == {"a": "f", "b": "f"}
 
@@ -177,7 +189,7 @@ def test_a_module_is_imported_once_under_the_notebooks_name():
     io = {"root": ("x", "a"), "f": ("a", "b"), "smooth": ("b", "c"), "canny": (("c", "lo", "hi"), "d")}
     cg = ep.CompGraph(functions, io)
     needed, references = slice_graph(cg.functions)
-    text = emit_module("case", cg, needed, references)
+    text = emit_module(SETTINGS, cg, needed, references)
     assert text.splitlines()[2:5] == ["import cv2", "import numpy as np", "import skimage.filters"]
     assert references["root"] == "np.sqrt"
     assert references["smooth"] == "skimage.filters.gaussian"

@@ -60,6 +60,10 @@ def test_call_writes_the_answer_and_prints_the_times(bundle, photograph, tmp_pat
         assert done.returncode == 0, done.stderr
         assert '"round_trip_ns"' in done.stdout
         assert np.array_equal(np.load(tmp_path / "edges.npy"), cv2.Canny(photograph, 70, 200))
+        done = epypes("call", bundle.path, tmp_path / "photo.png")
+        assert "edges = uint8 400 x 600" in done.stdout, "what goes to no file is printed"
+        said = one_line(epypes("call", bundle.path, tmp_path / "photo.png", "--out", tmp_path / "no" / "e.npy"))
+        assert "can't be written: [Errno 2] No such file" in said
 
 
 def test_an_image_path_that_does_not_exist_is_one_line(bundle):
@@ -75,7 +79,7 @@ def test_calling_where_nothing_serves_is_one_line(bundle, photograph, tmp_path):
 def test_verify_says_identical_or_what_differs(bundle):
     done = epypes("verify", bundle.path)
     assert (done.returncode, done.stderr) == (0, "")
-    assert "identical: 1 tokens of 1 samples" in done.stdout
+    assert "identical: 1 token of 1 sample" in done.stdout
     (bundle.path / "pipeline.py").write_text("")
     assert "pipeline.py was changed" in one_line(epypes("verify", bundle.path))
 
@@ -104,7 +108,10 @@ def test_help_names_every_command():
 
 def test_files_are_given_to_tokens():
     assert by_token(["a.png"], ["image"], "input") == {"image": "a.png"}
-    assert by_token(["a=b.png"], ["image"], "input") == {"image": "a=b.png"}, "a file may be called so"
+    assert by_token(["a-b=c.png"], ["image"], "input") == {"image": "a-b=c.png"}, "a file may be called so"
+    with pytest.raises(UnknownName, match="Did you mean 'image'"):
+        by_token(["imag=a.png"], ["image"], "input")
+    assert by_token([], ["edges"], "output") == {}
     assert by_token(["right=r.png", "left=l.png"], ["left", "right"], "input") == {"right": "r.png", "left": "l.png"}
     with pytest.raises(ServiceError, match="Missing input: right=FILE"):
         by_token(["left=l.png"], ["left", "right"], "input")

@@ -67,5 +67,5 @@ def test_a_notebook_that_cannot_be_promoted_ends_the_demo_with_exit_status_1(tmp
     nbformat.write(notebook, tmp_path / "n.ipynb")
     done = run_cli("demo", tmp_path / "n.ipynb", "--to", tmp_path / "out")
     assert done.returncode == 1
-    assert "A int is neither a CompGraphRunner nor a Pipeline" in done.stderr
+    assert "An object of class int can't be promoted" in done.stderr
     assert "Traceback" not in done.stderr

@@ -3,6 +3,7 @@ from __future__ import annotations
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
+import cv2
 import numpy as np
 import pytest
 
@@ -105,6 +106,46 @@ def test_payload_that_is_none_is_refused_before_anything_runs(chain, payload, er
     with pytest.raises(error, match=words):
         runner.run(**payload)
     assert functions["double"].calls == 0
+
+
+def test_an_image_given_by_position_is_told_from_a_target(edge_runner, photograph):
+    for call in (edge_runner.run, edge_runner.rerun, edge_runner.plan):
+        with pytest.raises(
+            PayloadError, match=r"name of a token, not 'ndarray'\. Payload goes by name: run\(image=\.\.\.\)"
+        ):
+            call(photograph)
+
+
+def test_the_wrong_object_is_refused_by_name(edge_graph):
+    with pytest.raises(TypeError, match=r"runs a CompGraph, not 'dict': CompGraphRunner\(cg, hparams\)"):
+        ep.CompGraphRunner({}, edge_graph)
+
+
+def test_a_function_asked_for_as_a_token_is_told_what_it_makes(edge_runner, photograph):
+    edge_runner.run(image=photograph)
+    with pytest.raises(UnknownName, match="No token 'canny' in this graph, only a function; it makes edges"):
+        edge_runner.rerun("canny")
+
+
+def test_of_a_misspelt_payload_only_the_graphs_input_is_offered(edge_runner, photograph):
+    with pytest.raises(UnknownName, match="Did you mean 'image'"):
+        edge_runner.run(img=photograph)
+    with pytest.raises(UnknownName) as error:
+        edge_runner.run(cany_lo=3)
+    assert error.value.known == ("image",)
+
+
+def test_the_note_shows_small_values_and_the_shape_of_arrays(edge_runner, photograph):
+    with pytest.raises(cv2.error) as error:
+        edge_runner.run(image=None)
+    assert error.value.__notes__ == ["In function 'grayscale': (image=None) -> (image_gray)"]
+    edge_runner["blur_kernel"] = 4
+    with pytest.raises(cv2.error) as error:
+        edge_runner.run(image=photograph)
+    assert error.value.__notes__ == [
+        "In function 'blur': (image_gray: uint8 400 x 600, blur_kernel=4) -> (image_blurred)"
+    ]
+    assert edge_runner.last.failure.message.startswith("(-215:Assertion failed) ksize")
 
 
 def test_an_unknown_target_is_named(chain):
@@ -232,7 +273,7 @@ def test_the_users_exception_stays_the_users_with_a_note():
     runner = ep.CompGraphRunner(failing_graph(), {"n": 3})
     with pytest.raises(ZeroDivisionError, match="three") as error:
         runner.run(x=1)
-    assert error.value.__notes__ == ["In function 'check': (n) -> (c)"]
+    assert error.value.__notes__ == ["In function 'check': (n=3) -> (c)"]
     assert error.traceback[-1].name == "fail_at_3"
     assert runner.last.failure.function == "check"
     assert runner.last.failure.inputs == {"n": 3}

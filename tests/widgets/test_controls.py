@@ -146,3 +146,38 @@ def test_a_value_outside_of_its_hint_is_refused_with_the_way_out(runner: ep.Comp
 
 def test_hints_are_read_as_everywhere() -> None:
     assert as_param((0, 255)) == ep.Param(0, 255)
+
+
+@pytest.mark.parametrize(
+    ("value", "hint", "snapped", "moved"),
+    [
+        (1.5, None, 1.4999999999999998, 1.6),
+        (0.123456, (0.0, 1.0), 0.12, 0.13),
+        (0.001, (0.0, 1.0), 0.0, 0.01),
+        (0.5, ep.Param(0.01, 1, log=True), 0.5011872336272722, 0.6),
+        (72, (0, 255, 5), 70, 75),
+    ],
+)
+def test_a_slider_that_snaps_to_its_steps_when_it_is_shown_was_not_moved(
+    value: Any, hint: Any, snapped: Any, moved: Any
+) -> None:
+    entry, told = made(value, hint), []
+    entry.on_change(lambda name, new: told.append(new))
+    entry.widget.value = snapped
+    assert entry.read() == value
+    assert told == []
+    entry.widget.value = moved
+    assert told == [moved]
+
+
+def test_a_hand_on_a_float_slider_means_round_numbers() -> None:
+    entry = made(0.5, (0.0, 1.0))
+    entry.widget.value = 0.1 + 0.2
+    assert entry.read() == 0.3
+
+
+def test_a_whole_number_is_not_cut_from_another() -> None:
+    entry = made(3, (0, 10))
+    with pytest.raises(ValueError, match=r"whole numbers, not 2\.5"):
+        entry.write(2.5)
+    assert entry.read() == 3

@@ -15,6 +15,7 @@ import traitlets
 
 from epypes.graph import CompGraph
 from epypes.hints import Param
+from epypes.run.tokens import is_same_value
 from epypes_widgets.ranges import allows, described
 
 _WIDE: Final = {"width": "100%"}
@@ -74,8 +75,19 @@ class Control:
         self.place(value)
 
     def on_change(self, callback: Callable[[str, Any], None]) -> None:
-        """Call ``callback(name, value)`` when it was moved, on whichever thread the front end is answered on."""
-        self.widget.observe(lambda change: callback(self.name, self.read()), names=self.trait)
+        """Call ``callback(name, value)`` when it was moved, on whichever thread the front end is answered on.
+
+        A widget that was only shown, and has snapped to its steps, was not moved.
+        """
+        told = [self.read()]
+
+        def moved(change: object) -> None:
+            value = self.read()
+            if value is not told[0] and not is_same_value(told[0], value):
+                told[0] = value
+                callback(self.name, value)
+
+        self.widget.observe(moved, names=self.trait)
 
 
 def control(name: str, value: Any, param: Param | None) -> Control:
@@ -108,6 +120,55 @@ def grouped(cg: CompGraph, controls: Mapping[str, Control]) -> tuple[ipywidgets.
     return column, headings
 
 
+class _Snapping:
+    """A slider that shows the nearest step, while the value that it was given counts to the last bit.
+
+    The front end snaps a slider to its steps as soon as it is shown, and reports that like a move of the hand. So a
+    position within half a step of the given value is that value; any other is the hand's.
+    """
+
+    def __init__(self, slider: Any, value: Any, step: float, kind: Callable[[Any], Any]) -> None:
+        self._slider, self._exact, self._step, self._kind = slider, value, step, kind
+
+    def read(self) -> Any:
+        position = self._slider.value
+        if abs(self._scaled(position) - self._scaled(self._exact)) < self._step / 2:
+            return self._exact
+        return self._kind(position)
+
+    def place(self, new: Any) -> None:
+        self._exact = new
+        self._stretch(self._scaled(new))
+        self._slider.value = new
+
+    def _scaled(self, value: Any) -> float:
+        return float(value)
+
+    def _stretch(self, place: Any) -> None:
+        """Only the soft range is offered at first; code may go to the ends of the hard one."""
+        self._slider.min, self._slider.max = min(self._slider.min, place), max(self._slider.max, place)
+
+
+class _IntSnapping(_Snapping):
+    def place(self, new: Any) -> None:
+        if new != int(new):
+            raise ValueError(f"This takes whole numbers, not {new!r}.")
+        super().place(int(new))
+
+    def _stretch(self, place: Any) -> None:
+        super()._stretch(int(place))
+
+
+class _LogSnapping(_Snapping):
+    def _scaled(self, value: Any) -> float:
+        return math.log10(value)
+
+
+def _without_noise(value: float) -> float:
+    """Return what a hand on a slider means: 0.3, where adding up steps gives 0.30000000000000004."""
+    return float(f"{value:.12g}")
+
+
 def _int_slider(name: str, value: Any, param: Param) -> Control:
     low, high = (int(end) for end in _shown_ends(param, value))
     step = int(param.step or 1)
@@ -117,7 +178,8 @@ def _int_slider(name: str, value: Any, param: Param) -> Control:
     slider = (OddSlider if param.odd else ipywidgets.IntSlider)(
         value=int(value), min=low, max=high, step=step, continuous_update=True, **_labelled(name, param)
     )
-    return Control(name, param, slider, "value", lambda: slider.value, _placer(slider, int))
+    snapping = _IntSnapping(slider, int(value), step, int)
+    return Control(name, param, slider, "value", snapping.read, snapping.place)
 
 
 def _float_slider(name: str, value: Any, param: Param) -> Control:
@@ -132,30 +194,25 @@ def _float_slider(name: str, value: Any, param: Param) -> Control:
         continuous_update=True,
         **_labelled(name, param),
     )
-    return Control(name, param, slider, "value", lambda: slider.value, _placer(slider, float))
+    snapping = _Snapping(slider, value, step, _without_noise)
+    return Control(name, param, slider, "value", snapping.read, snapping.place)
 
 
 def _log_slider(name: str, value: Any, param: Param) -> Control:
     low, high = _shown_ends(param, value)
-    kind = int if _is_integer(value) else float
+    step = max(math.log10(high / low) / 200, 1e-3)
     slider = ipywidgets.FloatLogSlider(
         value=float(value),
         base=10,
         min=math.log10(low),
         max=math.log10(high),
-        step=max(math.log10(high / low) / 200, 1e-3),
+        step=step,
         readout_format=".3g",
         continuous_update=True,
         **_labelled(name, param),
     )
-
-    def read() -> Any:
-        return round(slider.value) if kind is int else slider.value
-
-    def place(new: Any) -> None:
-        slider.value = float(new)
-
-    return Control(name, param, slider, "value", read, place)
+    snapping = _LogSnapping(slider, value, step, round if _is_integer(value) else _without_noise)
+    return Control(name, param, slider, "value", snapping.read, snapping.place)
 
 
 def _dropdown(name: str, value: Any, param: Param) -> Control:
@@ -195,15 +252,6 @@ def _labelled(name: str, param: Param | None) -> dict[str, Any]:
     unit = f" [{param.unit}]" if param is not None and param.unit else ""
     said = f"{name}{unit}: {described(param)}" if param is not None else f"{name}: shown only"
     return {"description": f"{name}{unit}", "tooltip": said, "layout": dict(_WIDE), "style": dict(_STYLE)}
-
-
-def _placer(slider: Any, kind: Callable[[Any], Any]) -> Callable[[Any], None]:
-    def place(new: Any) -> None:
-        # Only the soft range is offered at first; code may go to the ends of the hard one.
-        slider.min, slider.max = min(slider.min, kind(new)), max(slider.max, kind(new))
-        slider.value = kind(new)
-
-    return place
 
 
 def _shown_ends(param: Param, value: Any) -> tuple[float, float]:

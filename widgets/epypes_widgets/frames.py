@@ -104,17 +104,15 @@ def plain(value: Any) -> Any:
 
 
 def showable(run: Run, asked: str | None) -> tuple[str, ...]:
-    """Return the tokens that are images, in graph order; the sink tokens if there is none."""
-    images = tuple(token for token in run if is_image(run[token]))
-    found = images or tuple(token for token in run.cg.sink_tokens if token in run) or tuple(run)
+    """Return the tokens that are images, and the sink tokens whatever they are, in graph order."""
+    found = tuple(token for token in run if is_image(run[token]) or token in run.cg.sink_tokens) or tuple(run)
     return found if asked is None or asked in found else (*found, asked)
 
 
 def best_token(run: Run, tokens: tuple[str, ...]) -> str | None:
-    """Return the last sink token among these, else the last of them; None of none."""
-    sinks = [token for token in tokens if token in run.cg.sink_tokens]
-    ranked = [*tokens, *sinks]
-    return ranked[-1] if ranked else None
+    """Return the last of these that is an image, of sink tokens if there is one; else the last; None of none."""
+    sinks = run.cg.sink_tokens
+    return max(tokens, key=lambda token: (is_image(run[token]), token in sinks, tokens.index(token)), default=None)
 
 
 class FrameSender:

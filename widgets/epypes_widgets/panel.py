@@ -60,6 +60,9 @@ def tune(runner: CompGraphRunner, /, *, token: str | None = None, **hints: Any) 
     >>> panel.code()
     'runner.rerun(y=5)'
     """
+    if not isinstance(runner, CompGraphRunner):
+        kind = type(runner).__name__
+        raise TypeError(f"tune() takes a CompGraphRunner, not {kind!r}: tune(CompGraphRunner(cg, hparams)).")
     if runner.last is None:
         free = runner.free_source_tokens
         call = f"run({', '.join(f'{name}=...' for name in free)})"
@@ -179,9 +182,8 @@ class Panel:
         if self._worker.closed:
             raise RuntimeError("This panel is closed. Make a new one: tune(runner).")
         entry.write(value)
-        if entry.param is None:
-            # A label may read the same for two values, and then tells nobody.
-            self._moved(name, value)
+        # A widget that shows the same for two values (a label, a slider between its steps) tells nobody.
+        self._moved(name, entry.read())
 
     def __repr__(self) -> str:
         state = "closed" if self._worker.closed else "failed" if self._view.error else "up to date"
