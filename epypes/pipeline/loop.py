@@ -51,7 +51,7 @@ class EventLoop:
         callback: Callable[..., Any],
         f_in: Callable[[Any], Mapping[str, Any]],
         *,
-        on_error: Callable[[Any, Exception], None] | None = None,
+        on_error: Callable[[Any, BaseException], None] | None = None,
         name: str = "EventLoop",
         busy: Callable[[], Sequence[str]] = tuple,
     ) -> None:
@@ -59,6 +59,7 @@ class EventLoop:
         self.name, self._busy = name, busy
         self.handled = 0
         self._stop = threading.Event()
+        self._draining = threading.Event()
         self._thread: threading.Thread | None = None
         self._lock = threading.Lock()
 
@@ -68,10 +69,20 @@ class EventLoop:
         return self._thread is not None and self._thread.is_alive()
 
     def start(self) -> None:
-        """Start the thread; does nothing while it runs."""
+        """Start the thread; does nothing while it runs.
+
+        Raises
+        ------
+        StillRunning
+            It was stopped, but a function has not returned yet.
+        """
         with self._lock:
-            if self.is_running and not self._stop.is_set():
-                return
+            if self.is_running:
+                if not self._stop.is_set():
+                    return
+                # Two threads would take from one queue, and an event could be worked on beside the next.
+                raise StillRunning(self.name, self._busy(), 0.0)
+            self._draining.clear()
             self._stop = threading.Event()
             self._thread = threading.Thread(
                 target=self._loop, args=(self._stop,), name=f"epypes {self.name}", daemon=True
@@ -99,11 +110,26 @@ class EventLoop:
         if thread.is_alive():
             raise StillRunning(self.name, self._busy(), timeout_s)
 
+    def drain(self, timeout_s: float = 5.0) -> bool:
+        """Work off what is in the queue, then stop; return whether that was done within ``timeout_s``."""
+        self._draining.set()
+        thread = self._thread
+        if thread is None or thread is threading.current_thread():
+            return True
+        thread.join(timeout_s)
+        return not thread.is_alive()
+
     def _loop(self, stop: threading.Event) -> None:
         while not stop.is_set():
             try:
                 event = self.q_in.get(timeout=POLL_S)
             except queue.Empty:
+                if self._draining.is_set():
+                    return
+                continue
+            except Exception:
+                _log.exception("%s: the queue itself failed", self.name)
+                stop.wait(POLL_S)
                 continue
             self._handle(event)
             self.handled += 1
@@ -111,16 +137,16 @@ class EventLoop:
     def _handle(self, event: Any) -> None:
         try:
             self.callback(**self.f_in(event))
-        except Exception as exception:
+        except BaseException as exception:  # a function's SystemExit must not end the thread in silence
             self._report(event, exception)
 
-    def _report(self, event: Any, exception: Exception) -> None:
+    def _report(self, event: Any, exception: BaseException) -> None:
         if self.on_error is None:
             _log.error("%s: an event failed", self.name, exc_info=exception)
             return
         try:
             self.on_error(event, exception)
-        except Exception:
+        except BaseException:
             _log.exception("%s: on_error itself failed", self.name)
 
     def __repr__(self) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 from collections import Counter, deque
+from collections.abc import Callable
 from time import monotonic
 from typing import Any, Final, Literal, get_args
 
@@ -24,6 +25,8 @@ class Mailbox:
         ``"fault"``: put raises MailboxOverflow.
     size
         How many items it holds; 1 for ``"latest"``.
+    on_drop
+        Called with each item that was dropped, on the thread that put the newer one.
 
     Attributes
     ----------
@@ -43,12 +46,14 @@ class Mailbox:
     (2, {'superseded': 1})
     """
 
-    def __init__(self, policy: Policy = "latest", size: int = 1) -> None:
+    def __init__(
+        self, policy: Policy = "latest", size: int = 1, *, on_drop: Callable[[Any], None] | None = None
+    ) -> None:
         if policy not in _POLICIES:
             raise ValueError(f"No policy {policy!r}. There are: {', '.join(_POLICIES)}.")
         if size < 1 or (policy == "latest" and size != 1):
             raise ValueError(f"A mailbox with policy {policy!r} can't have size {size}.")
-        self.policy, self.size = policy, size
+        self.policy, self.size, self._on_drop = policy, size, on_drop
         self.dropped: Counter[str] = Counter()
         self._items: deque[Any] = deque()
         self._changed = threading.Condition()
@@ -64,21 +69,24 @@ class Mailbox:
             The policy is ``"fault"`` and there was no room.
         """
         with self._changed:
-            if len(self._items) >= self.size:
-                self._make_room(block, timeout)
+            dropped = self._make_room(block, timeout) if len(self._items) >= self.size else []
             self._items.append(item)
             self._changed.notify_all()
+        if self._on_drop is not None:
+            for old in dropped:
+                self._on_drop(old)
 
-    def _make_room(self, block: bool, timeout: float | None) -> None:
+    def _make_room(self, block: bool, timeout: float | None) -> list[Any]:
+        """Make room for one item; return what was dropped for it."""
         if self.policy == "fault":
             raise MailboxOverflow(self.size)
         if self.policy == "block":
             wait_s = timeout if block else 0.0
             if not self._changed.wait_for(lambda: len(self._items) < self.size, wait_s):
                 raise queue.Full
-            return
-        self._items.popleft()
+            return []
         self.dropped["superseded" if self.policy == "latest" else "oldest"] += 1
+        return [self._items.popleft()]
 
     def get(self, block: bool = True, timeout: float | None = None) -> Any:
         """Take the oldest item; raises queue.Empty if there is none within ``timeout`` seconds."""

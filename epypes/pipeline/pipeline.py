@@ -51,7 +51,7 @@ class Pipeline(Node):
         """The graph as it was given, with the user's own functions."""
         return self.source_cg
 
-    def run(self, **payload: Any) -> Run:
+    def run(self, /, **payload: Any) -> Run:
         """Run the graph on a payload; see ``CompGraphRunner.run``. It counts as a call of the node."""
         run: Run = Node.__call__(self, payload)
         return run

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, Self
 
 from epypes.errors import EpypesError
@@ -45,7 +46,7 @@ class SourcePipeline(Pipeline):
         super().__init__(name, cg, hparams)
         self.q_out, self.f_out = q_out, f_out
 
-    def run(self, **payload: Any) -> Run:
+    def run(self, /, **payload: Any) -> Run:
         """Run the graph on a payload and put the result on q_out."""
         run = super().run(**payload)
         _emit(self, self.f_out, self.q_out, None, run)
@@ -83,22 +84,27 @@ class SinkPipeline(Pipeline):
         self.q_in, self.f_in = q_in, f_in
         self.on_error: Callable[[Failure], None] | None = None
         self.failed = 0
-        self.loop = EventLoop(
-            q_in, self.handle, lambda event: {"event": event}, name=name, busy=lambda: self.network.running
-        )
+        self._stage = ""
+        self.loop = EventLoop(q_in, self.handle, lambda event: {"event": event}, name=name, busy=self._busy)
 
     def handle(self, event: Any) -> None:
         """Work on one event; every failure is reported, none is raised. The hook for subclasses."""
         try:
+            self._stage = "f_in"
             payload = self._payload(event)
             run = self.run(**payload)
-        except Exception as exception:
+        except BaseException as exception:  # a function's SystemExit is a failure of this event, not the loop's end
             self._fail(event, self._failure_of(exception, "f_in", {"event": event}))
             return
         try:
+            self._stage = "f_out"
             self.emit(event, run)
-        except Exception as exception:
+        except BaseException as exception:
             self._fail(event, Failure("f_out", self.cg.sink_tokens, dict(run), exception))
+
+    def _busy(self) -> tuple[str, ...]:
+        """Return what has not returned: functions of the graph, or f_in, or f_out with its put on q_out."""
+        return self.network.running or (self._stage,)
 
     def emit(self, event: Any, run: Run) -> None:
         """Do something with an event's run; a SinkPipeline does nothing. The hook for subclasses."""
@@ -110,7 +116,7 @@ class SinkPipeline(Pipeline):
             raise TypeError(text)
         return payload
 
-    def _failure_of(self, exception: Exception, otherwise: str, inputs: Mapping[str, Any]) -> Failure:
+    def _failure_of(self, exception: BaseException, otherwise: str, inputs: Mapping[str, Any]) -> Failure:
         """Return the failure of the graph if that is where the exception is from."""
         last = self.runner.last
         if last is not None and last.failure is not None and last.failure.exception is exception:
@@ -119,14 +125,7 @@ class SinkPipeline(Pipeline):
 
     def _fail(self, event: Any, failure: Failure) -> None:
         self.failed += 1
-        event_id = getattr(event, "id", "")
-        failure = Failure(
-            failure.function,
-            failure.tokens,
-            failure.inputs,
-            failure.exception,
-            event_id if isinstance(event_id, str) else "",
-        )
+        failure = replace(failure, event_id=_event_id(event))
         if self.on_error is None:
             expected = isinstance(failure.exception, EpypesError)
             _log.error(
@@ -138,7 +137,7 @@ class SinkPipeline(Pipeline):
             return
         try:
             self.on_error(failure)
-        except Exception:
+        except BaseException:
             _log.exception("%s: on_error itself failed", self.name)
 
     def listen(self) -> None:
@@ -212,6 +211,15 @@ class FullPipeline(SinkPipeline):
     def emit(self, event: Any, run: Run) -> None:
         """Put what f_out makes of the event's run on q_out."""
         _emit(self, self.f_out, self.q_out, event, run)
+
+
+def _event_id(event: Any) -> str:
+    """Return an event's id, if it has one that is a string."""
+    try:
+        event_id = event.id
+    except Exception:  # any object can be an event, whatever its attributes do
+        return ""
+    return event_id if isinstance(event_id, str) else ""
 
 
 def _emit(pipeline: Pipeline, f_out: FOut, q_out: Any, event: Any, run: Run) -> None:

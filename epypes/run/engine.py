@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from time import perf_counter_ns
 from typing import Any, Final
@@ -56,49 +57,48 @@ def execute(
         given = tuple([versions[slot] for slot in step.inputs])
         if used[index] == given:
             continue
-        args = [values[slot] for slot in step.inputs]
+        originals = args = [values[slot] for slot in step.inputs]
         if not step.guarded:
             args = [writable(value) for value in args]
+        elif guard:
+            # A view for this call alone: even its shape, which no flag protects, is not another function's.
+            args = [read_only(value) for value in args]
         start_ns = perf_counter_ns()
         try:
             result = step.function(*args)
             durations_ns[step.name] = perf_counter_ns() - start_ns
-            made = (result,) if step.single else _unpack(step, result, manager)
+            for slot, value in zip(step.outputs, _unpack(step, result, manager), strict=True):
+                kept = _guarded(value, args, originals) if guard else value
+                # The same guarded array has the same content; of other objects only small immutable ones are compared.
+                if not (guard and is_array(kept) and kept is values[slot]) and not is_same_value(values[slot], kept):
+                    values[slot], versions[slot] = kept, next_version()
         except BaseException as exception:
             durations_ns.setdefault(step.name, perf_counter_ns() - start_ns)
             raise StepFailed(_failure(manager, step, exception), step) from None
-        for slot, value in zip(step.outputs, made, strict=True):
-            _store(manager, slot, value, args, next_version, guard)
         used[index] = given
 
 
-def _store(
-    manager: TokenManager,
-    slot: int,
-    value: Any,
-    args: Sequence[Any],
-    next_version: Callable[[], int],
-    guard: bool,
-) -> None:
-    """Put an output; keep its version if it is cheaply known to be what it was."""
-    old = manager.values[slot]
-    passed_through = guard and any(value is arg for arg in args)
-    if (passed_through and value is old) or is_same_value(old, value):
-        return
-    manager.values[slot] = read_only(value) if guard and not passed_through else value
-    manager.versions[slot] = next_version()
+def _guarded(value: Any, args: Sequence[Any], originals: Sequence[Any]) -> Any:
+    """Return an output as it is stored: an input that was passed through as the very array that it was."""
+    for arg, original in zip(args, originals, strict=True):
+        if value is arg and is_array(arg):
+            layout = (arg.shape, arg.strides, arg.dtype)
+            return original if layout == (original.shape, original.strides, original.dtype) else read_only(arg)
+    return read_only(value)
 
 
 def _unpack(step: Step, result: Any, manager: TokenManager) -> Sequence[Any]:
     """Return a result as one value per output token; a string or an array is not split."""
+    if step.single:
+        return (result,)
     if not step.outputs:
         return ()
-    if isinstance(result, tuple | list) and len(result) == len(step.outputs):
-        return result
+    got = f"one {type(result).__name__}"
     if isinstance(result, tuple | list):
-        got = f"{type(result).__name__} of {len(result)}"
-    else:
-        got = f"one {type(result).__name__}"
+        found = tuple(result)
+        if len(found) == len(step.outputs):
+            return found
+        got = f"{type(result).__name__} of {len(found)}"
     raise OutputArityError(step.name, [manager.program.tokens[slot] for slot in step.outputs], got)
 
 
@@ -119,9 +119,11 @@ def _failure(manager: TokenManager, step: Step, exception: BaseException) -> Fai
     values = {token: manager.values[slot] for token, slot in zip(inputs, step.inputs, strict=True)}
     told = ", ".join(f"{token}{_brief(value)}" for token, value in values.items())
     note = f"In function {step.name!r}: ({told}) -> ({', '.join(outputs)})"
-    if step.guarded:
-        why = explain_write(step.name, inputs, exception)
+    # Whatever the exception's own methods do, the failure is told.
+    with contextlib.suppress(Exception):
+        why = explain_write(step.name, inputs, exception) if step.guarded else None
         note = f"{note}\n{why}" if why else note
-    if note not in getattr(exception, "__notes__", ()):
-        exception.add_note(note)
+    with contextlib.suppress(Exception):
+        if note not in getattr(exception, "__notes__", ()):
+            exception.add_note(note)
     return Failure(step.name, (*inputs, *outputs), values, exception)

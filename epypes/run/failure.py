@@ -38,7 +38,11 @@ class Failure:
     @property
     def message(self) -> str:
         """What the exception says, without OpenCV's place in its own source."""
-        return _OPENCV_PLACE.sub("", str(self.exception).strip())
+        try:
+            text = str(self.exception).strip()
+        except Exception:  # an exception's own __str__ may raise
+            text = "(its message can't be had)"
+        return _OPENCV_PLACE.sub("", text)
 
     def __str__(self) -> str:
         kind, text = type(self.exception).__name__, self.message

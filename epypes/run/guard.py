@@ -36,18 +36,27 @@ def is_unguarded(function: object) -> bool:
 def is_array(value: Any) -> bool:
     """Whether a value is a NumPy array."""
     numpy = sys.modules.get("numpy")
-    return numpy is not None and isinstance(value, numpy.ndarray)
+    # By type: isinstance would ask the value itself for its class, which hostile objects answer as they like.
+    return numpy is not None and issubclass(type(value), numpy.ndarray)
 
 
 def read_only(value: Any) -> Any:
-    """Return arrays, and arrays in a tuple or list, as read-only views; anything else as it is."""
+    """Return arrays, and arrays in a tuple, named tuple or list, as read-only views; anything else as it is.
+
+    A masked array is copied, since its mask can be changed through any view.
+    """
     if is_array(value):
-        view = value.view()
+        view = value.copy() if hasattr(value, "mask") else value.view()
         view.flags.writeable = False
         return view
-    if type(value) in (tuple, list) and any(map(is_array, value)):
-        return type(value)(read_only(item) if is_array(item) else item for item in value)
+    if (type(value) in (tuple, list) or _is_named_tuple(value)) and any(map(is_array, value)):
+        make = getattr(type(value), "_make", type(value))
+        return make(read_only(item) if is_array(item) else item for item in value)
     return value
+
+
+def _is_named_tuple(value: Any) -> bool:
+    return issubclass(type(value), tuple) and hasattr(type(value), "_make")
 
 
 def writable(value: Any) -> Any:

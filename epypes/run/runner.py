@@ -16,7 +16,7 @@ from epypes.run.failure import Failure
 from epypes.run.guard import read_only
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.plan import Plan, missing_sources, needed_steps, plan
-from epypes.run.program import compile_graph
+from epypes.run.program import Program, compile_graph
 from epypes.run.record import Run
 from epypes.run.report import FunctionTime, RunReport
 from epypes.run.tokens import TokenManager
@@ -119,13 +119,12 @@ class CompGraphRunner:
             Whatever a function raises, unchanged, with a note.
         """
         self._check_targets(targets)
-        self._set(hparams)
+        current = self._set(hparams)
         last = self._last
         if last is None:
             free = self.free_source_tokens
             call = f"run({', '.join(f'{token}=...' for token in free)})"
             raise PayloadError(free, f"Nothing has been run yet, so there is no payload. Call {call} first.")
-        current = self._hparams
         manager = last.tokens.copy()
         current.apply(manager)
         return self._run(manager, targets, current)
@@ -133,7 +132,7 @@ class CompGraphRunner:
     def plan(self, /, *targets: str) -> Plan:
         """Return what ``rerun(*targets)`` would do."""
         self._check_targets(targets)
-        return plan(self._current_tokens(), targets)
+        return plan(_tokens_now(self._program, self._last, self._hparams), targets)
 
     def _run(self, manager: TokenManager, targets: Sequence[str], hparams: Hyperparameters) -> Run:
         start_ns = perf_counter_ns()
@@ -215,11 +214,12 @@ class CompGraphRunner:
     def __setitem__(self, token: str, value: Any) -> None:
         self._set({token: value})
 
-    def _set(self, values: Mapping[str, Any]) -> None:
+    def _set(self, values: Mapping[str, Any]) -> Hyperparameters:
         with self._lock:
             for token in values:
                 self._hparams.require(token)
             self._hparams = self._hparams.frozen(values, self._next_version, self.guard)
+            return self._hparams
 
     # -- reading ------------------------------------------------------------------------------------------------
 
@@ -231,13 +231,16 @@ class CompGraphRunner:
     @property
     def stale(self) -> tuple[str, ...]:
         """The functions that ``rerun()`` would run, in run order."""
-        return plan(self._current_tokens(), ()).order
+        return self._stale_since(self._last, self._hparams)
 
-    def _current_tokens(self) -> TokenManager:
-        """Return the last run's tokens with today's hyperparameters."""
-        manager = self._last.tokens.copy() if self._last else TokenManager(self._program)
-        self._hparams.apply(manager)
-        return manager
+    def _stale_since(self, last: Run | None, hparams: Hyperparameters) -> tuple[str, ...]:
+        """Return the functions that these hyperparameters make stale in this run.
+
+        Both are given, so that what is read beside a rerun in another thread is decided from one state.
+        """
+        if last is not None and last.revision == hparams.revision and not last.tokens.stale and not last.failure:
+            return ()
+        return plan(_tokens_now(self._program, last, hparams), ()).order
 
     def __getitem__(self, token: str) -> Any:
         hparams, last = self._hparams, self._last
@@ -249,8 +252,7 @@ class CompGraphRunner:
             text = f"Token {token!r} has not been computed: nothing has been run. Call run({call})."
             raise NotComputed(token, text)
         value = last[token]
-        maker = self.cg.digraph.producer.get(token)
-        if last.revision != hparams.revision and maker in self.stale:
+        if self.cg.digraph.producer.get(token) in self._stale_since(last, hparams):
             raise StaleToken(token)
         return value
 
@@ -266,7 +268,7 @@ class CompGraphRunner:
     def keys(self) -> tuple[str, ...]:
         """Return the tokens that can be read now, in graph order."""
         hparams, last = self._hparams, self._last
-        stale = set(self.stale) if last is not None and last.revision != hparams.revision else ()
+        stale = self._stale_since(last, hparams)
         producer = self.cg.digraph.producer
         readable = set(last or ()) | set(hparams.values)
         return tuple(token for token in self.cg.tokens if token in readable and producer.get(token) not in stale)
@@ -286,3 +288,10 @@ class CompGraphRunner:
         from epypes.display import mimebundle
 
         return mimebundle(self)
+
+
+def _tokens_now(program: Program, last: Run | None, hparams: Hyperparameters) -> TokenManager:
+    """Return a run's tokens with these hyperparameters."""
+    manager = TokenManager(program) if last is None else last.tokens.copy()
+    hparams.apply(manager)
+    return manager

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import statistics
 from typing import Any
 
+import nbformat
 import pytest
 
 from tests.browser.conftest import ROOT, TUTORIAL
-from tests.browser.jupyter import Notebook
+from tests.browser.jupyter import JupyterLab, Notebook
 
 pytestmark = pytest.mark.browser
 
@@ -178,6 +180,54 @@ def test_another_token_can_be_chosen(panel: PanelOnScreen) -> None:
     assert panel.digest != digest
     panel.choose("edges")
     assert panel.digest == digest
+
+
+def test_showing_a_panel_changes_no_value(browser: Any, lab: JupyterLab) -> None:
+    cells = (
+        "import numpy as np, epypes as ep\nfrom epypes_widgets import tune\n"
+        "cg = ep.CompGraph({'f': lambda im, a, b, c: im + a + b + c}, {'f': (('im', 'a', 'b', 'c'), 'y')})\n"
+        "runner = ep.CompGraphRunner(cg, {'a': 1.5, 'b': 0.123456, 'c': 0.0375})\n"
+        "_ = runner.run(im=np.zeros((64, 64)))",
+        "panel = tune(runner, b=(0.0, 1.0), c=ep.Param(0.001, 10, log=True))\npanel",
+    )
+    nbformat.write(
+        nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in cells]), lab.root / "f.ipynb"
+    )
+    notebook = Notebook(browser, lab, "f.ipynb")
+    try:
+        notebook.run_all()
+        panel = PanelOnScreen(notebook)
+        panel.focus("a")
+        said = notebook.execute("panel.wait(10); print(dict(runner.hyperparameters), panel.code())").strip()
+        assert said == "{'a': 1.5, 'b': 0.123456, 'c': 0.0375} runner.rerun()"
+        notebook.page.keyboard.press("ArrowRight")
+        panel.wait_for("a", 1.51)
+        assert panel.values == {"a": 1.51, "b": 0.123456, "c": 0.0375}
+    finally:
+        notebook.close()
+
+
+def test_a_notebook_that_is_not_trusted_shows_its_pictures(browser: Any, lab: JupyterLab, theme: str) -> None:
+    copy = lab.root / "untrusted.ipynb"
+    copy.write_bytes(TUTORIAL.read_bytes())
+    notebook = Notebook(browser, lab, copy.name)
+    try:
+        picture = notebook.page.locator("figure img[alt^='Computational graph']").first
+        picture.scroll_into_view_if_needed()
+        assert picture.evaluate("async img => { await img.decode(); return img.naturalWidth; }") > 100
+        assert notebook.page.locator("figure svg").count() == 0
+        notebook.screenshot(SCREENSHOTS / f"untrusted-{theme}.png")
+    finally:
+        notebook.close()
+
+
+def test_graphs_take_the_colours_of_the_theme(notebook: Notebook, theme: str) -> None:
+    colours = notebook.page.evaluate(
+        "() => { const svg = document.querySelector('figure svg.epypes-graph');"
+        " return [getComputedStyle(svg.querySelector('text')).fill, getComputedStyle(svg.querySelector('.shape')).fill]; }"
+    )
+    text, shape = (sum(int(part) for part in re.findall(r"\d+", colour)[:3]) for colour in colours)
+    assert (text < shape) == (theme == "light"), "dark text on light shapes, or the other way round"
 
 
 def test_the_notebook_can_be_looked_at(notebook: Notebook, panel: PanelOnScreen, theme: str) -> None:

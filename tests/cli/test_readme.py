@@ -36,7 +36,8 @@ def test_the_epypes_commands_run_in_order(tmp_path, monkeypatch, photograph, str
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     shutil.copytree(ROOT / "notebooks", tmp_path / "notebooks", ignore=shutil.ignore_patterns("edge_service"))
-    write_image("photo.png", photograph)
+    Path("demo-output").mkdir()
+    write_image("demo-output/image.png", photograph)
     lines = [line for block in blocks("sh") for line in block.splitlines() if line.startswith("epypes ")]
     assert [line.split()[1] for line in lines] == ["promote", "verify", "serve", "call"]
     promote, verify, serve, call = (shlex.split(line)[1:] for line in lines)
