@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 
 from epypes.bundle.settings import Settings
@@ -24,7 +25,7 @@ def emit_module(settings: Settings, cg: CompGraph, needed: Slice, references: Ma
         By function of the graph, the expression that refers to it.
     """
     ends = f"{', '.join(settings.inputs) or 'nothing'} -> {', '.join(settings.outputs)}"
-    sections = [f'"""The computational graph {settings.name!r}: {ends}."""\n']
+    sections = [f'"""{_escaped(f"The computational graph {settings.name}: {ends}.")}"""\n']
     if needed.imports:
         sections.append("\n".join(_ordered_imports(list(needed.imports.values()))) + "\n")
     if needed.constants:
@@ -37,6 +38,11 @@ def emit_module(settings: Settings, cg: CompGraph, needed: Slice, references: Ma
         f"    {quoted(function)}: ({_side(given)}, {_side(made)}),\n" for function, (given, made) in cg.func_io.items()
     )
     return f"{body}\n\nfunc_dict = {{\n{functions}}}\n\nfunc_io = {{\n{io}}}\n"
+
+
+def _escaped(text: str) -> str:
+    """Return text as it may stand between triple quotes: names are data, whatever they hold."""
+    return json.dumps(text)[1:-1]
 
 
 def _ordered_imports(statements: Sequence[str]) -> list[str]:

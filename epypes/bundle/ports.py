@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 from epypes.errors import MessageError
 from epypes.pipeline import EventView
 from epypes.run import Failure
+from epypes.run.guard import is_array
 
 if TYPE_CHECKING:
     from epypes.wire import Envelope
@@ -40,14 +41,18 @@ def payload_of(inputs: Sequence[str]) -> Callable[[Any], Mapping[str, Any]]:
 
 
 def answer_with(outputs: Sequence[str], bundle_digest: str) -> Callable[[EventView], Envelope]:
-    """Return an f_out: an Envelope with the output tokens and the times, which answers the event by its id."""
+    """Return an f_out: an Envelope with the output tokens and the times, which answers the event by its id.
+
+    The arrays are copies, since a function may use the memory of its result again for the next event before this one
+    is sent. What can't be sent raises MessageError here, where it becomes the event's failure.
+    """
 
     def f_out(view: EventView) -> Envelope:
-        from epypes.wire import Envelope
+        from epypes.wire import Envelope, encode
 
-        return Envelope(
+        answer = Envelope(
             type=RESULT,
-            parts={token: view[token] for token in outputs},
+            parts={token: detached(view[token]) for token in outputs},
             source=view.name,
             correlation_id=view.event.id,
             acquired_ns=view.event.acquired_ns,
@@ -56,8 +61,21 @@ def answer_with(outputs: Sequence[str], bundle_digest: str) -> Callable[[EventVi
             attributes={**view.attributes, "total_ns": view.report.total_ns, "overhead_ns": view.report.overhead_ns},
             timings=view.report.durations_ns,
         )
+        encode(answer)
+        return answer
 
     return f_out
+
+
+def detached(value: Any) -> Any:
+    """Return a value whose arrays, also in tuples, lists and dicts, are copies."""
+    if is_array(value):
+        return value.copy()
+    if type(value) in (tuple, list):
+        return type(value)(map(detached, value))
+    if type(value) is dict:
+        return {key: detached(item) for key, item in value.items()}
+    return value
 
 
 def failure_event(failure: Failure, source: str, bundle_digest: str) -> Envelope:

@@ -7,7 +7,8 @@ bundle that passed them all takes the place of an older one.
 
 from __future__ import annotations
 
-import shutil
+import ctypes
+import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -20,12 +21,15 @@ from epypes.bundle.replay import replay_isolated
 from epypes.bundle.seal import MANIFEST, seal
 from epypes.bundle.settings import Settings, unwritable, write_settings
 from epypes.bundle.slicer import slice_graph
-from epypes.errors import BundleError, MessageError, PromotionRefused
+from epypes.errors import BundleError, EpypesError, MessageError, PromotionRefused
 from epypes.graph import CompGraph
 from epypes.pipeline import Node, Pipeline
 from epypes.run import CompGraphRunner, Run
 
 REQUIREMENTS: Final = "requirements.txt"
+# From Linux's fcntl.h and fs.h.
+_AT_FDCWD: Final = -100
+_RENAME_EXCHANGE: Final = 2
 _NO_RUNNER: Final = (
     "An object of class {} can't be promoted. Make a runner and run it: "
     "runner = CompGraphRunner(cg, hparams); runner.run(...)."
@@ -58,19 +62,35 @@ def promote(
         With every reason: no run to record, a function or value that can't be promoted, or a replay in a fresh
         process that computes something else.
     """
-    target = Path(to)
+    # A link that names the current version goes on naming it; what it points to is replaced.
+    target = Path(to).resolve()
     runner, cg = _subject(runner_or_pipeline, target)
     if f_in is not None or f_out is not None:
         raise PromotionRefused(target, ["f_in and f_out can't be promoted yet. Leave them out."])
+    try:
+        _check_place(target)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{target.name[:40]}-", dir=target.parent) as scratch:
+            draft = Path(scratch) / target.name
+            _write(draft, target, runner, cg, outputs)
+            _prove(draft, target)
+            _replace(draft, target)
+    except (OSError, UnicodeError) as error:
+        if isinstance(error, EpypesError):
+            raise
+        raise PromotionRefused(target, [f"{target} can't be written: {error}. Name another folder."]) from error
+    return read_bundle(target)
+
+
+def _check_place(target: Path) -> None:
+    """Refuse to write over what is not a bundle, or into one."""
     if target.exists() and not (target / MANIFEST).is_file() and (not target.is_dir() or any(target.iterdir())):
         raise PromotionRefused(target, [f"{target} exists and is not a bundle. Name another folder, or remove it."])
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{target.name}-", dir=target.parent) as scratch:
-        draft = Path(scratch) / target.name
-        _write(draft, target, runner, cg, outputs)
-        _prove(draft, target)
-        _replace(draft, target)
-    return read_bundle(target)
+    around = next((parent for parent in target.parents if (parent / MANIFEST).is_file()), None)
+    if around is not None:
+        raise PromotionRefused(
+            target, [f"{target} is inside the bundle {around}, which is sealed. Name another folder."]
+        )
 
 
 def _subject(given: object, target: Path) -> tuple[CompGraphRunner, CompGraph]:
@@ -144,14 +164,21 @@ def _prove(draft: Path, target: Path) -> ReplayReport:
 
 
 def _replace(draft: Path, target: Path) -> None:
-    """Put the new bundle in the place of the old one, which is deleted only when that is done."""
-    old = draft.parent / "old"
+    """Put the new bundle in the place of the old one; at every moment one of the two is there."""
     if target.exists():
-        target.rename(old)
-    try:
+        # The old one is then in the scratch folder, and goes with it.
+        _exchange(draft, target)
+    else:
         draft.rename(target)
-    except OSError:
-        if old.exists():
-            old.rename(target)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
+
+
+def _exchange(left: Path, right: Path) -> None:
+    """Exchange two folders in one step, which Python has no call for; rename by rename where the system has none."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    exchange = getattr(libc, "renameat2", None)
+    if exchange and exchange(_AT_FDCWD, os.fsencode(left), _AT_FDCWD, os.fsencode(right), _RENAME_EXCHANGE) == 0:
+        return
+    aside = left.with_name("old")
+    right.rename(aside)
+    left.rename(right)
+    aside.rename(left)

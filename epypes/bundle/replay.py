@@ -83,6 +83,10 @@ def replay(bundle: Bundle) -> ReplayReport:
     tokens = 0
     for path in bundle.samples:
         inputs, outputs = load_sample(path)
+        if (set(inputs), set(outputs)) != (set(bundle.settings.inputs), set(bundle.settings.outputs)):
+            ports = f"{', '.join(inputs) or 'nothing'} -> {', '.join(outputs)}"
+            why = f"its ports are {ports}, those of pipeline.toml are not"
+            differences.append(Difference(path.stem, ", ".join(bundle.settings.outputs), why))
         run = CompGraphRunner(bundle.cg, bundle.settings.hyperparameters).run(**inputs)
         for token, expected in outputs.items():
             tokens += 1

@@ -66,12 +66,21 @@ def _read_manifest(folder: Path) -> dict[str, str]:
 
 
 def _files(folder: Path) -> list[str]:
-    """Return every file but the manifest; bytecode, which is never read, does not count."""
-    return sorted(
-        path.relative_to(folder).as_posix()
-        for path in folder.rglob("*")
-        if path.is_file() and path.name != MANIFEST and "__pycache__" not in path.parts
-    )
+    """Return everything but folders and the manifest; bytecode, which is never read, does not count.
+
+    Raises
+    ------
+    BundleError
+        There is a link, or something else that is neither a file nor a folder.
+    """
+    found = []
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.is_symlink() or not (path.is_file() or path.is_dir()):
+            raise BundleError(folder, f"{folder} holds {name}, which is not a plain file. Remove it.")
+        if path.is_file() and name != MANIFEST and "__pycache__" not in path.relative_to(folder).parts:
+            found.append(name)
+    return found
 
 
 def _hash(path: Path) -> str:

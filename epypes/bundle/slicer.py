@@ -114,7 +114,7 @@ class Slice:
         self._add_definition(helper, f"Function {name!r}, which {what[0].lower()}{what[1:]} calls,")
 
     def _add_constant(self, name: str, value: Any, found: Definition, what: str) -> None:
-        source = self._array_source(value, what) if _is_array(value) else repr(value) if _is_data(value) else ""
+        source = self._array_source(value, what) if _is_array(value) else _literal(value) if _is_data(value) else ""
         if not source or len(source) > _CONSTANT_CHARACTERS or not (_is_array(value) or _reads_back(source, value)):
             kind = f"the class {name!r}" if isinstance(value, type) else f"of type {type(value).__name__}"
             raise Refused(
@@ -167,6 +167,19 @@ class Slice:
 def _is_data(value: object) -> bool:
     kinds = (bool, int, float, complex, str, bytes, type(None), tuple, list, dict, set, frozenset)
     return type(value) in kinds
+
+
+def _literal(value: Any) -> str:
+    """Return the source of a constant: as repr, but with sets sorted, whose order changes from process to process."""
+    if type(value) is set and value:
+        return "{" + ", ".join(sorted(map(_literal, value))) + "}"
+    if type(value) is dict:
+        return "{" + ", ".join(f"{_literal(key)}: {_literal(item)}" for key, item in value.items()) + "}"
+    if type(value) is list:
+        return "[" + ", ".join(map(_literal, value)) + "]"
+    if type(value) is tuple and len(value) != 1:
+        return "(" + ", ".join(map(_literal, value)) + ")"
+    return repr(value)
 
 
 def _is_array(value: object) -> bool:

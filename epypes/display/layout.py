@@ -47,7 +47,7 @@ class Layout:
     centres
         By vertex.
     splines
-        By edge: the control points of a cubic Bézier spline, then the tip of the arrow.
+        By edge: the control points of a cubic Bézier spline, then the tip of the arrow; none in a dense graph.
     """
 
     width: float
@@ -57,30 +57,35 @@ class Layout:
 
 
 @functools.lru_cache(maxsize=128)
-def lay_out(boxes: tuple[Box, ...], edges: tuple[tuple[int, int], ...]) -> Layout:
+def lay_out(boxes: tuple[Box, ...], edges: tuple[tuple[int, int], ...], is_dense: bool = False) -> Layout:
     """Place vertices and edges from top to bottom.
+
+    Parameters
+    ----------
+    boxes, edges
+        The vertices, and pairs of their indices.
+    is_dense
+        Whether the edges are too many to be followed: they are not routed, and the search for few crossings is cut
+        short, which would otherwise take minutes.
 
     Raises
     ------
     LayoutUnavailable
         No engine answered.
     """
-    return _read(json.loads(_run_engine(_dot_source(boxes, edges))), len(boxes), edges)
+    drawn = json.loads(_run_engine(_dot_source(boxes, edges, is_dense)))
+    return _read(drawn, len(boxes), () if is_dense else edges)
 
 
-def _dot_source(boxes: Sequence[Box], edges: Sequence[tuple[int, int]]) -> str:
+def _dot_source(boxes: Sequence[Box], edges: Sequence[tuple[int, int]], is_dense: bool) -> str:
     try:
         import graphviz
     except ImportError as error:
         raise LayoutUnavailable([f"graphviz ({error})"]) from error
+    spacing = {"rankdir": "TB", "nodesep": "0.22", "ranksep": "0.28", "margin": "0"}
+    hurry = {"splines": "none", "mclimit": "0.05", "nslimit": "0.5", "nslimit1": "0.5"} if is_dense else {}
     dot = graphviz.Digraph(
-        graph_attr={
-            "rankdir": "TB",
-            "nodesep": "0.22",
-            "ranksep": "0.28",
-            "margin": "0",
-            "outputorder": "nodesfirst",
-        },
+        graph_attr={**spacing, **hurry},
         # Labels are painted later: without them no font is looked for, and no layout depends on the machine's fonts.
         node_attr={"label": "", "fixedsize": "true"},
     )
@@ -138,9 +143,8 @@ def _read(drawn: dict[str, Any], vertices: int, edges: Sequence[tuple[int, int]]
         x, y = map(float, node["pos"].split(","))
         centres[index] = (x, height - y)
         number[node["_gvid"]] = index
-    found = {
-        (number[edge["tail"]], number[edge["head"]]): _spline(edge["pos"], height) for edge in drawn.get("edges", ())
-    }
+    drawn_edges = drawn.get("edges", ()) if edges else ()
+    found = {(number[edge["tail"]], number[edge["head"]]): _spline(edge["pos"], height) for edge in drawn_edges}
     return Layout(width, height, tuple(centres), tuple(found[edge] for edge in edges))
 
 

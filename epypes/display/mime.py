@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from html import escape
 from typing import Any, Final
 from urllib.parse import quote
 
+from epypes.display.markup import escape
 from epypes.display.svg import alt_text, paint_svg
 from epypes.display.text import paint_text
 from epypes.display.view import GraphView, duration_text, view

@@ -12,6 +12,7 @@ from epypes.display.raster import Picture, encode_image, is_image, sampled
 
 THUMBNAIL_PX: Final = 128
 _TEXT_WIDTH: Final = 24
+_LOOKED_AT: Final = 200
 _PLAIN = (int, float, complex, str, bytes, bool, type(None))
 _CONTAINERS = (tuple, list, dict, set, frozenset)
 
@@ -76,7 +77,9 @@ def _object_preview(value: Any) -> Preview:
     if isinstance(value, enum.Enum):
         return Preview(_cut(f"{type(value).__name__}.{value.name}"), f"{type(value).__name__}.{value.name}")
     if isinstance(value, _PLAIN):
-        return Preview(_cut(reprlib.repr(value)), f"{type(value).__name__} {reprlib.repr(value)}")
+        # reprlib cuts a text only after it has made all of it.
+        short = value[:_LOOKED_AT] if isinstance(value, str | bytes) else value
+        return Preview(_cut(reprlib.repr(short)), f"{type(value).__name__} {reprlib.repr(short)}")
     kind = type(value).__name__
     if isinstance(value, _CONTAINERS):
         return Preview(f"{kind} of {len(value)}", f"{kind} of {len(value)}")

@@ -9,17 +9,23 @@ from __future__ import annotations
 import base64
 import math
 import re
+import zlib
 from collections.abc import Iterable
-from html import escape
 from typing import Final
 
 from epypes.display.layout import Box, Layout, Point, lay_out
+from epypes.display.markup import escape
 from epypes.display.view import FunctionView, GraphView, TokenView, duration_text
 
 _LINE_PX: Final = 16
 _CHARACTER_PX: Final = 6.9
 _NAME_CHARACTERS: Final = 26
 _MESSAGE_CHARACTERS: Final = 48
+_ID_CHARACTERS: Final = 40
+# Beyond this many edges, and this many for each vertex, curves and arrows can't be followed by the eye, would take
+# Graphviz minutes and would fill the picture.
+_MANY_EDGES: Final = 150
+_DENSE: Final = 1.6
 _THUMB_WIDTH: Final = 128
 _THUMB_HEIGHT: Final = 96
 _MARGIN: Final = 6
@@ -40,6 +46,7 @@ STYLE: Final = """
 .epypes-graph .stale .shape,.epypes-graph .not-computed .shape,.epypes-graph .not-run .shape{stroke-dasharray:2 3}
 .epypes-graph .stale image{opacity:.35}
 .epypes-graph .edge{fill:none;stroke:#80868f}
+.epypes-graph .dense{stroke-width:.5}
 .epypes-graph .tip{fill:#80868f}
 """.replace("\n", "")
 
@@ -58,7 +65,8 @@ def paint_svg(graph: GraphView) -> str:
         (functions + token, function) if taken else (function, functions + token)
         for function, token, taken in graph.edges
     )
-    layout = lay_out(boxes, edges)
+    is_dense = len(edges) > max(_MANY_EDGES, _DENSE * len(boxes))
+    layout = lay_out(boxes, edges, is_dense)
     size = f"{layout.width + 2 * _MARGIN:.0f}", f"{layout.height + 2 * _MARGIN:.0f}"
     box = f"{-_MARGIN} {-_MARGIN} {size[0]} {size[1]}"
     head = (
@@ -66,7 +74,7 @@ def paint_svg(graph: GraphView) -> str:
         f'aria-label="{escape(alt_text(graph))}" width="{size[0]}" height="{size[1]}" viewBox="{box}">'
     )
     parts = [head, f"<style>{STYLE}</style>"]
-    parts += map(_paint_edge, layout.splines)
+    parts.append(_paint_lines(layout, edges) if is_dense else _paint_splines(layout))
     parts += _paint_vertices(graph, boxes, layout)
     parts.append("</svg>")
     return "\n".join(parts)
@@ -74,7 +82,7 @@ def paint_svg(graph: GraphView) -> str:
 
 def alt_text(graph: GraphView) -> str:
     """Return the graph in one sentence, for screen readers."""
-    order = ", ".join(function.name for function in graph.functions[:12])
+    order = ", ".join(_cut(function.name) for function in graph.functions[:12])
     more = ", ..." if len(graph.functions) > 12 else ""
     return f"Computational graph of {len(graph.functions)} functions: {order}{more}. {graph.caption}".strip()
 
@@ -140,7 +148,10 @@ def _cut(text: str, characters: int = _NAME_CHARACTERS) -> str:
 
 def vertex_id(kind: str, name: str) -> str:
     """Return the id of a vertex's element, made from its name so that the same graph has the same ids."""
-    return f"{kind}-{re.sub(r'[^A-Za-z0-9_.-]', lambda match: f':{ord(match[0]):x}:', name)}"
+    plain = re.sub(r"[^A-Za-z0-9_.-]", lambda match: f":{ord(match[0]):x}:", name[:_ID_CHARACTERS])
+    if len(name) > _ID_CHARACTERS:
+        plain += f":{zlib.crc32(name.encode(errors='surrogatepass')):x}"
+    return f"{kind}-{plain}"
 
 
 def _group(kind: str, name: str, states: tuple[str, ...], title: str, body: str) -> str:
@@ -223,12 +234,21 @@ def _thumbnail(token: TokenView, x: float, y: float) -> str:
     )
 
 
-def _paint_edge(points: tuple[Point, ...]) -> str:
-    *spline, tip = points
-    start, *controls = spline
-    path = f"M{start[0]:.1f},{start[1]:.1f}C" + " ".join(f"{x:.1f},{y:.1f}" for x, y in controls)
-    end = controls[-1] if controls else start
-    return f'<path class="edge" d="{path}"/><polygon class="tip" points="{_arrow(end, tip)}"/>'
+def _paint_splines(layout: Layout) -> str:
+    """Paint edges as one path of curves and one of their tips."""
+    curves, tips = [], []
+    for *spline, tip in layout.splines:
+        start, *controls = spline
+        curves.append(f"M{start[0]:.1f},{start[1]:.1f}C" + " ".join(f"{x:.1f},{y:.1f}" for x, y in controls))
+        tips.append(f"M{_arrow(controls[-1] if controls else start, tip)}Z")
+    return f'<path class="edge" d="{"".join(curves)}"/><path class="tip" d="{"".join(tips)}"/>'
+
+
+def _paint_lines(layout: Layout, edges: Iterable[tuple[int, int]]) -> str:
+    """Paint edges as one path of straight lines between centres, under the vertices."""
+    at = layout.centres
+    lines = (f"M{at[a][0]:.0f},{at[a][1]:.0f}L{at[b][0]:.0f},{at[b][1]:.0f}" for a, b in edges)
+    return f'<path class="edge dense" d="{"".join(lines)}"/>'
 
 
 def _arrow(end: Point, tip: Point) -> str:
@@ -237,4 +257,4 @@ def _arrow(end: Point, tip: Point) -> str:
     length = math.hypot(dx, dy) or 1.0
     across = (-dy / length * 3.5, dx / length * 3.5)
     corners = (tip, (end[0] + across[0], end[1] + across[1]), (end[0] - across[0], end[1] - across[1]))
-    return " ".join(f"{x:.1f},{y:.1f}" for x, y in corners)
+    return "L".join(f"{x:.1f},{y:.1f}" for x, y in corners)

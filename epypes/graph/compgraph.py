@@ -57,6 +57,10 @@ class CompGraph:
     __slots__ = ("__weakref__", "_digraph", "_func_io", "_functions", "_tokens")
 
     def __init__(self, func_dict: Mapping[str, Callable[..., Any]], func_io: FuncIO) -> None:
+        for what, given in (("func_dict", func_dict), ("func_io", func_io)):
+            if not isinstance(given, Mapping):
+                kind = type(given).__name__
+                raise TypeError(f"{what} must be a mapping by function name, such as a dict, not {kind!r}.")
         findings: list[Finding] = []
         digraph = read_io(func_io, findings)
         findings += check_pairing(func_dict, func_io)
@@ -168,5 +172,5 @@ def _as_tuples(io: tuple[Tokens, Tokens | None]) -> tuple[Tokens, Tokens | None]
 
 def _some(tokens: tuple[str, ...], width: int = 18) -> str:
     """Join names, cut to ``width`` characters so that a repr stays one short line."""
-    text = ", ".join(tokens) or "nothing"
+    text = " ".join(", ".join(tokens).split()) or "nothing"
     return text if len(text) <= width else text[: width - 3] + "..."

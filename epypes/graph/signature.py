@@ -13,7 +13,7 @@ def signature_of(function: Callable[..., Any]) -> inspect.Signature | None:
     """Return the signature, or None where there is none (``cv2.Canny`` and other C functions)."""
     try:
         return inspect.signature(function)
-    except (TypeError, ValueError):
+    except Exception:  # inspect's own errors, and whatever an object's __signature__ or __getattr__ raises
         return None
 
 

@@ -24,7 +24,11 @@ def unguarded(function: F) -> F:
     ... def smooth(image):
     ...     return image
     """
-    setattr(function, _MARK, True)
+    try:
+        setattr(function, _MARK, True)
+    except (AttributeError, TypeError) as error:
+        name = getattr(function, "__name__", function)
+        raise TypeError(f"{name!r} can't be marked. Write a function (def) that calls it, and mark that.") from error
     return function
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,7 +46,7 @@ class Answer:
 
 
 class Client:
-    """A connection to the service of a bundle; use it in a ``with`` statement.
+    """A connection to the service of a bundle; use it in a ``with`` statement. Threads that share one take turns.
 
     Parameters
     ----------
@@ -62,6 +63,7 @@ class Client:
 
     def __init__(self, path: str | Path, *, timeout_s: float = 10.0) -> None:
         self.path, self.timeout_s = path, timeout_s
+        self._turn = threading.Lock()
         state = _running(path)
         self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -104,6 +106,12 @@ class Client:
         from epypes.wire import Envelope
 
         request = Envelope(type=REQUEST, parts=payload, source="epypes call")
+        with self._turn:
+            return self._exchange(request)
+
+    def _exchange(self, request: Envelope) -> Answer:
+        from epypes.wire import Envelope
+
         deadline = monotonic() + self.timeout_s
         start_ns = perf_counter_ns()
         self._requests.put(request)

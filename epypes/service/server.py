@@ -18,7 +18,7 @@ from typing import Any, Self
 from epypes.bundle.load import pipeline_of, read_bundle
 from epypes.bundle.ports import failure_event
 from epypes.bundle.replay import replay
-from epypes.errors import ReplayDiffers
+from epypes.errors import MessageError, ReplayDiffers
 from epypes.pipeline import Mailbox
 from epypes.run import Failure
 from epypes.service.state import ServiceState, StateLock
@@ -26,6 +26,8 @@ from epypes.transport import ZMQPublisher, ZMQSubscriber
 
 # How many events wait while one is computed; the oldest is dropped, and counted, when another comes.
 MAILBOX_SIZE = 8
+# Answers kept for a subscriber that does not read; images are large, so this bounds the memory that one can cost.
+_KEPT_ANSWERS = 32
 DRAIN_TIMEOUT_S = 5.0
 _CONNECT = "connect:"
 
@@ -60,14 +62,15 @@ class Service:
         report = replay(self.bundle)
         if not report.identical:
             raise ReplayDiffers(path, report)
-        self.mailbox = Mailbox("drop_oldest", MAILBOX_SIZE)
+        self.mailbox = Mailbox("drop_oldest", MAILBOX_SIZE, on_drop=self._refuse)
         answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self.pipeline = pipeline_of(self.bundle, self.mailbox, answers)
         self.pipeline.on_error = self._report
         self._answers = answers
         self._sub, self._pub = sub, pub
         self.subscriber = ZMQSubscriber(*_endpoint(sub, self.mailbox), insecure=insecure)
-        self.publisher = ZMQPublisher(*_endpoint(pub, answers), insecure=insecure)
+        self.publisher = ZMQPublisher(*_endpoint(pub, answers), insecure=insecure, high_water_mark=_KEPT_ANSWERS)
+        self._unanswered = 0
 
     def start(self) -> ServiceState:
         """Bind the sockets and begin to answer; return what is to be known of the service."""
@@ -82,10 +85,21 @@ class Service:
         return ServiceState(os.getpid(), sub, pub, self.bundle.digest)
 
     def stop(self, timeout_s: float = DRAIN_TIMEOUT_S) -> None:
-        """Take no more events, end the one under way, send what was answered; bounded by ``timeout_s`` for each."""
+        """Take no more events, work off those that wait, send the answers; each bounded by ``timeout_s``.
+
+        What could not be worked off in time is answered with a failure.
+
+        Raises
+        ------
+        StillRunning
+            A function did not return; it is named.
+        """
         self.subscriber.stop(timeout_s)
         try:
-            self.pipeline.stop(timeout_s)
+            if not self.pipeline.loop.drain(timeout_s):
+                while not self.mailbox.empty():
+                    self._refuse(self.mailbox.get_nowait(), "the service stops")
+            self.pipeline.stop(0.0)
         finally:
             self.publisher.stop(timeout_s)
 
@@ -95,9 +109,15 @@ class Service:
             "received": self.subscriber.received,
             "answered": self.publisher.sent,
             "failed": self.pipeline.failed,
-            "dropped": self.mailbox.dropped.total(),
+            "dropped": self._unanswered,
             "rejected": sum(self.subscriber.rejected.values()),
         }
+
+    def _refuse(self, event: Any, why: str = "it has more events than it can answer") -> None:
+        """Answer an event that is not worked on."""
+        self._unanswered += 1
+        refusal = MessageError("dropped", f"The service dropped this event: {why}. Send it again later.")
+        self._report(Failure("mailbox", (), {}, refusal, getattr(event, "id", "")))
 
     def _report(self, failure: Failure) -> None:
         _log.warning("event %s failed in %s", failure.event_id or "without id", failure)

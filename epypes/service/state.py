@@ -114,9 +114,17 @@ def read_state(bundle: str | Path) -> ServiceState | None:
             if _can_lock(file.fileno()):
                 return None
             text = file.read()
-        return ServiceState(**json.loads(text)) if text else None
+        return _state(json.loads(text)) if text else None
     except (FileNotFoundError, ValueError, TypeError):
         return None
+
+
+def _state(entries: dict[str, object]) -> ServiceState:
+    """Return a state; raise TypeError for anything else that somebody may have written into the file."""
+    pid, *texts = (entries.get(key) for key in ("pid", "sub", "pub", "digest"))
+    if not isinstance(pid, int) or not all(isinstance(text, str) for text in texts):
+        raise TypeError
+    return ServiceState(pid, *map(str, texts))
 
 
 def _can_lock(descriptor: int) -> bool:

@@ -202,7 +202,7 @@ def test_the_module_reads_like_one_that_a_colleague_wrote():
         "# Weighs the channels.\ndef weigh(im):\n    return im * GAIN\nGAIN = 1.5\ndef f(im):\n    return weigh(im)\n"
     )
     assert text == (
-        '"""The computational graph \'case\': x0 -> y."""\n\nGAIN = 1.5\n\n\n# Weighs the channels.\n'
+        '"""The computational graph case: x0 -> y."""\n\nGAIN = 1.5\n\n\n# Weighs the channels.\n'
         "def weigh(im):\n    return im * GAIN\n\n\ndef f(im):\n    return weigh(im)\n\n\n"
         'func_dict = {\n    "f": f,\n}\n\nfunc_io = {\n    "f": (("x0",), "y"),\n}\n'
     )

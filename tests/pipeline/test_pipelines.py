@@ -400,3 +400,109 @@ def test_an_event_loop_lives_on_whatever_its_callback_or_f_in_raise(on_error, ca
     assert errors == ([(0, ZeroDivisionError), (10, ZeroDivisionError)] if on_error else [])
     assert ("an event failed" in caplog.text) == (on_error is None)
     assert ("on_error itself failed" in caplog.text) == (on_error == "raise")
+
+
+@pytest.mark.parametrize("where", ["f_in", "function", "f_out", "on_error"])
+def test_an_exit_in_an_event_does_not_end_the_loop(where):
+    failures, q_in, q_out = queue.Queue(), queue.Queue(), queue.Queue()
+
+    def leave(here, value):
+        if where == here and value == "leave":
+            raise SystemExit(3)
+        return value
+
+    def on_error(failure):
+        failures.put(failure)
+        leave("on_error", "leave")
+
+    cg = ep.CompGraph({"f": lambda x: leave("function", x)}, {"f": ("x", "y")})
+    pipe = ep.FullPipeline(
+        "exit", cg, q_in, q_out, lambda event: {"x": leave("f_in", event)}, lambda view: leave("f_out", view["y"])
+    )
+    pipe.on_error = on_error
+    with pipe:
+        q_in.put("leave")
+        q_in.put("stay")
+        assert "stay" in {q_out.get(timeout=TIMEOUT_S) for _ in range(2 if where == "on_error" else 1)}
+    if where != "on_error":
+        assert isinstance(failures.get_nowait().exception, SystemExit)
+
+
+def test_a_queue_that_fails_does_not_end_the_loop(caplog):
+    class Failing(queue.Queue):
+        failed = False
+
+        def get(self, *args, **kwargs):
+            if not self.failed:
+                self.failed = True
+                raise OSError("queue")
+            return super().get(*args, **kwargs)
+
+    pipe, q_in, q_out = full_pipeline(q_in=Failing())
+    with pipe:
+        q_in.put(2)
+        assert q_out.get(timeout=TIMEOUT_S) == 5
+    assert "the queue itself failed" in caplog.text
+
+
+def test_draining_works_off_what_is_in_the_queue():
+    pipe, q_in, q_out = full_pipeline()
+    for x in range(50):
+        q_in.put(x)
+    pipe.listen()
+    assert pipe.loop.drain(TIMEOUT_S)
+    assert q_out.qsize() == 50
+    assert not pipe.loop.is_running
+    pipe.listen()
+    q_in.put(100)
+    assert 10001 in {q_out.get(timeout=TIMEOUT_S) for _ in range(51)}
+    pipe.stop()
+
+
+def test_a_loop_that_has_not_ended_is_not_started_beside_itself():
+    started, release = threading.Event(), threading.Event()
+
+    def hold(x):
+        started.set()
+        release.wait(TIMEOUT_S)
+
+    q_in = queue.Queue()
+    cg = ep.CompGraph({"hold": hold}, {"hold": ("x", None)})
+    pipe = ep.SinkPipeline("hold", cg, q_in, lambda event: {"x": event})
+    pipe.listen()
+    q_in.put(1)
+    assert started.wait(TIMEOUT_S)
+    with pytest.raises(StillRunning):
+        pipe.stop(timeout_s=0.01)
+    with pytest.raises(StillRunning, match="still in 'hold'"):
+        pipe.listen()
+    release.set()
+    pipe.stop()
+
+
+def test_a_full_output_queue_is_named_when_it_holds_up_the_stop():
+    q_in, q_out = queue.Queue(), queue.Queue(1)
+    q_out.put("full")
+    reached = threading.Event()
+    cg = ep.CompGraph({"f": lambda x: x}, {"f": ("x", "y")})
+    pipe = ep.FullPipeline("full", cg, q_in, q_out, lambda event: {"x": event}, lambda view: reached.set())
+    pipe.listen()
+    q_in.put(1)
+    assert reached.wait(TIMEOUT_S)
+    with pytest.raises(StillRunning, match="still in 'f_out'"):
+        pipe.stop(timeout_s=0.05)
+    q_out.get()
+    pipe.stop()
+
+
+def test_a_mailbox_tells_what_it_dropped():
+    dropped = []
+    mailbox = ep.Mailbox("drop_oldest", 2, on_drop=dropped.append)
+    for item in range(5):
+        mailbox.put(item)
+    assert dropped == [0, 1, 2]
+
+
+def test_a_token_may_be_called_self():
+    cg = ep.CompGraph({"f": lambda x: x}, {"f": ("self", "y")})
+    assert ep.Pipeline("p", cg).run(self=3)["y"] == 3

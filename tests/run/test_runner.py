@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import contextlib
 import threading
+import warnings
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -423,3 +426,121 @@ def test_reprs_are_short_and_without_times(state):
     for thing in shown:
         assert len(repr(thing)) < 100
         assert " ms" not in repr(thing)
+
+
+def test_what_is_read_beside_a_rerun_in_another_thread_is_never_an_old_value():
+    cg = ep.CompGraph({"a": lambda x, h: (x, h), "b": lambda a: a}, {"a": (("x", "h"), "A"), "b": ("A", "B")})
+    runner, done = ep.CompGraphRunner(cg, {"h": 0}), threading.Event()
+    runner.run(x=0)
+
+    def rerun_until_done():
+        while not done.is_set():
+            runner.rerun()
+
+    rerunning = threading.Thread(target=rerun_until_done)
+    rerunning.start()
+    try:
+        for value in range(1, 3000):
+            runner["h"] = value
+            with contextlib.suppress(StaleToken):
+                assert runner["B"][1] == value
+            assert {"x", "h"} <= set(runner)
+    finally:
+        done.set()
+        rerunning.join()
+
+
+def test_a_mutable_object_that_is_passed_through_counts_as_new():
+    points = [1, 2]
+    cg = ep.CompGraph({"keep": lambda p: p, "total": sum}, {"keep": ("points", "p"), "total": ("p", "s")})
+    runner = ep.CompGraphRunner(cg, {"points": points})
+    assert runner.run()["s"] == 3
+    points.append(10)
+    runner["points"] = points
+    assert runner.rerun()["s"] == 13
+
+
+def test_an_array_that_is_passed_through_keeps_what_depends_on_it_fresh():
+    later = Counting(lambda image: image.sum())
+    cg = ep.CompGraph({"choose": lambda a, k: a, "later": later}, {"choose": (("a", "k"), "b"), "later": ("b", "c")})
+    runner = ep.CompGraphRunner(cg, {"k": 0})
+    runner.run(a=np.ones(5))
+    runner.rerun(k=1)
+    assert later.calls == 1
+
+
+class Unsayable(Exception):
+    def __str__(self):
+        raise RuntimeError("no text")
+
+
+class Unnotable(Exception):
+    __notes__ = None
+
+
+class Liar(list):
+    def __iter__(self):
+        return iter((1, 2, 3))
+
+
+def raising(error):
+    def fail(x):
+        if x == 2:
+            raise error
+        return x, x
+
+    return fail
+
+
+@pytest.mark.parametrize(
+    ("function", "error"),
+    [
+        (raising(Unsayable()), Unsayable),
+        (raising(Unnotable()), Unnotable),
+        (lambda x: Liar((x, x)) if x == 2 else (x, x), OutputArityError),
+    ],
+)
+def test_however_a_function_fails_the_failure_is_kept_and_old_values_are_not(function, error):
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": function}, {"f": ("x", ("y", "z"))}))
+    runner.run(x=1)
+    with pytest.raises(error):
+        runner.run(x=2)
+    assert runner.last.failure.function == "f"
+    assert isinstance(str(runner.last.failure), str)
+    for token in ("y", "z"):
+        with pytest.raises(NotComputed):
+            runner[token]
+
+
+class Pair(NamedTuple):
+    image: np.ndarray
+    name: str
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda pair, masked, plain: pair.image.__setitem__(0, 9),
+        lambda pair, masked, plain: masked.__setitem__(0, 9),
+        lambda pair, masked, plain: masked.__setitem__(0, np.ma.masked),
+        lambda pair, masked, plain: setattr(masked, "mask", [True, True, True]),
+        lambda pair, masked, plain: setattr(plain, "strides", (0,)),
+    ],
+)
+def test_whatever_a_function_does_to_its_input_the_next_function_does_not_see_it(spoil):
+    seen = []
+
+    def spoiling(*args):
+        with contextlib.suppress(Exception), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            spoil(*args)
+
+    def look(pair, masked, plain):
+        seen.extend([pair.image.tolist(), masked.filled(-1).tolist(), plain.tolist()])
+
+    inputs = ("pair", "masked", "plain")
+    cg = ep.CompGraph({"spoiling": spoiling, "look": look}, {"spoiling": (inputs, None), "look": (inputs, None)})
+    masked = np.ma.array([1, 2, 3])
+    ep.CompGraphRunner(cg).run(pair=Pair(np.arange(3), "n"), masked=masked, plain=np.arange(3))
+    assert seen == [[0, 1, 2], [1, 2, 3], [0, 1, 2]]
+    assert masked.filled(-1).tolist() == [1, 2, 3]

@@ -1,0 +1,15 @@
+"""How does any text become text of a page?"""
+
+from __future__ import annotations
+
+import html
+import re
+from typing import Final
+
+# What XML 1.0 allows; a control character or half a surrogate pair in a name would make the whole picture unreadable.
+_NOT_XML: Final = re.compile("[^\\t\\n\\r\\x20-\\ud7ff\\ue000-\\ufffd\\U00010000-\\U0010ffff]")
+
+
+def escape(text: str) -> str:
+    """Return text for SVG and HTML, elements and attributes alike; what XML forbids shows as a replacement mark."""
+    return html.escape(_NOT_XML.sub("\ufffd", text))
