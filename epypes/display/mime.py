@@ -20,6 +20,7 @@ _INLINE: Final = (
     "const d=new DOMParser().parseFromString(t,'image/svg+xml').documentElement;"
     "if(d.tagName==='svg')i.replaceWith(document.importNode(d,true))})()"
 )
+_CELL_CHARACTERS: Final = 200
 _HIDDEN: Final = "position:absolute;width:1px;height:1px;overflow:hidden;clip-path:inset(50%);white-space:nowrap"
 
 
@@ -81,9 +82,11 @@ def _figure(svg: str, graph: GraphView) -> str:
 def _table_twin(graph: GraphView) -> str:
     """Return the graph as a table for screen readers; it also stays where a page strips the picture."""
     rows = "".join(
-        f"<tr><td>{escape(function.name)}</td><td>{escape(', '.join(inputs))}</td>"
-        f"<td>{escape(', '.join(outputs))}</td><td>{escape(function.state)}</td></tr>"
-        for (inputs, outputs), function in zip(graph.io(), graph.functions, strict=True)
+        "<tr>" + "".join(f"<td>{escape(cell[:_CELL_CHARACTERS])}</td>" for cell in cells) + "</tr>"
+        for cells in (
+            (function.name, ", ".join(inputs), ", ".join(outputs), function.state)
+            for (inputs, outputs), function in zip(graph.io(), graph.functions, strict=True)
+        )
     )
     return (
         f'<table style="{_HIDDEN}"><caption>{escape(alt_text(graph))}</caption>'

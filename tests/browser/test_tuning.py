@@ -190,9 +190,12 @@ def test_showing_a_panel_changes_no_value(browser: Any, lab: JupyterLab) -> None
         "_ = runner.run(im=np.zeros((64, 64)))",
         "panel = tune(runner, b=(0.0, 1.0), c=ep.Param(0.001, 10, log=True))\npanel",
     )
-    nbformat.write(
-        nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in cells]), lab.root / "f.ipynb"
+    document = nbformat.v4.new_notebook(
+        cells=[nbformat.v4.new_code_cell(cell) for cell in cells],
+        # Without a kernel named, JupyterLab would ask for one.
+        metadata={"kernelspec": {"name": "python3", "display_name": "Python 3"}},
     )
+    nbformat.write(document, lab.root / "f.ipynb")
     notebook = Notebook(browser, lab, "f.ipynb")
     try:
         notebook.run_all()

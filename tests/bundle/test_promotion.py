@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import ast
+import contextlib
+import importlib
 import os
 import py_compile
 import re
@@ -18,6 +20,8 @@ from epypes.bundle.compare import first_difference
 from epypes.bundle.notebook import promote_notebook
 from epypes.bundle.seal import seal
 from epypes.errors import BundleError, PromotionRefused, ReplayDiffers, UnknownName
+
+promote_module = importlib.import_module("epypes.bundle.promote")
 
 # Functions of a test module are importable names of it, which a bundle can't have: OpenCV's own serve.
 FUNCTIONS = {"split": cv2.split, "canny": cv2.Canny}
@@ -368,3 +372,69 @@ def test_no_pickle_is_imported_on_the_way_of_a_value(path):
         elif isinstance(node, ast.ImportFrom):
             imported.add(node.module or "")
     assert not {name.partition(".")[0] for name in imported} & PICKLERS
+
+
+def test_names_are_data_even_in_the_docstring(tmp_path):
+    evil = f'x"""; open({str(tmp_path / "pwned")!r}, "w"); """\\'
+    runner = ep.CompGraphRunner(ep.CompGraph({"keep": repr}, {"keep": (evil, "y\n\ud800")}))
+    runner.run(**{evil: 1})
+    with contextlib.suppress(PromotionRefused):
+        ep.promote(runner, tmp_path / 'b"""')
+    assert not (tmp_path / "pwned").exists()
+
+
+def test_a_link_to_the_current_version_goes_on_naming_it(runner, tmp_path):
+    ep.promote(runner, tmp_path / "v1")
+    (tmp_path / "current").symlink_to(tmp_path / "v1")
+    runner.rerun(lo=10)
+    ep.promote(runner, tmp_path / "current")
+    assert (tmp_path / "current").is_symlink()
+    assert ep.load(tmp_path / "v1").hyperparameters["lo"] == 10
+
+
+def test_a_place_inside_a_bundle_or_under_a_file_is_refused(bundle, runner, tmp_path):
+    with pytest.raises(PromotionRefused, match="is inside the bundle"):
+        ep.promote(runner, bundle.path / "inner")
+    assert verify(bundle.path).identical
+    (tmp_path / "file").touch()
+    with pytest.raises(PromotionRefused, match="can't be written"):
+        ep.promote(runner, tmp_path / "file" / "b")
+
+
+def test_links_in_a_bundle_are_refused(bundle, tmp_path):
+    (bundle.path / "etc").symlink_to("/etc")
+    with pytest.raises(BundleError, match="holds etc, which is not a plain file"):
+        ep.load(bundle.path)
+
+
+def test_the_seal_covers_a_manifest_within(bundle):
+    (bundle.path / "samples" / "MANIFEST.sha256").touch()
+    with pytest.raises(BundleError, match="was added"):
+        ep.load(bundle.path)
+
+
+@pytest.mark.parametrize(("port", "value"), [("outputs", '["smoothed"]'), ("inputs", '["image", "lo"]')])
+def test_ports_that_are_not_those_of_the_sample_are_found(bundle, port, value):
+    settings = bundle.path / "pipeline.toml"
+    settings.write_text(re.sub(rf"{port} = .*", f"{port} = {value}", settings.read_text()))
+    seal(bundle.path)
+    with pytest.raises(BundleError, match="its ports are image -> edges"):
+        verify(bundle.path)
+
+
+def test_the_old_bundle_is_there_until_the_new_one_is(runner, tmp_path, monkeypatch):
+    target = tmp_path / "edges"
+    ep.promote(runner, target)
+    seen = []
+    exchange = promote_module._exchange
+
+    def looking(left, right):
+        seen.append((left / "MANIFEST.sha256").is_file() and (right / "MANIFEST.sha256").is_file())
+        exchange(left, right)
+        seen.append((left / "MANIFEST.sha256").is_file() and (right / "MANIFEST.sha256").is_file())
+
+    monkeypatch.setattr(promote_module, "_exchange", looking)
+    runner.rerun(lo=10)
+    ep.promote(runner, target)
+    assert seen == [True, True]
+    assert ep.load(target).hyperparameters["lo"] == 10

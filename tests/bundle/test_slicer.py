@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import functools
 import linecache
+import os
 import re
+import subprocess
+import sys
 import types
 
 import cv2
@@ -181,6 +184,17 @@ def test_one_function_may_serve_twice():
 )
 def test_library_functions_have_a_public_name(value, expected):
     assert importable(value) == expected
+
+
+def test_a_set_has_the_same_source_under_any_hash_seed():
+    code = "from epypes.bundle.slicer import _literal; print(_literal({'a': ({'x', 'y', 'z', 'w'}, [1], (2,), ())}))"
+    texts = {
+        subprocess.run(
+            [sys.executable, "-c", code], env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, check=True
+        ).stdout
+        for seed in "0123"
+    }
+    assert texts == {b"{'a': ({'w', 'x', 'y', 'z'}, [1], (2,), ())}\n"}
 
 
 def test_a_module_is_imported_once_under_the_notebooks_name():

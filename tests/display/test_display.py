@@ -270,3 +270,42 @@ def test_looking_computes_nothing(edge_graph, photograph):
     cg = ep.CompGraph({"f": lambda x: calls.append(x)}, {"f": ("x", None)})
     mimebundle(ep.CompGraphRunner(cg, {"x": 1}))
     assert calls == []
+
+
+@pytest.mark.parametrize("name", ["\ud800", "a\0b", "a\x1b[31mb", "two\nlines", "x" * 100_000, "数え", " "])
+def test_any_name_can_be_shown(name):
+    cg = ep.CompGraph({name: lambda x: x}, {name: ("x", name)})
+    runner = ep.CompGraphRunner(cg)
+    runner.run(x=1)
+    for shown in (cg, runner, runner.last):
+        bundle = mimebundle(shown)
+        ET.fromstring(bundle["image/svg+xml"])
+        bundle["text/html"].encode()
+        assert len(bundle["text/html"]) < 40_000
+        assert "\n" not in bundle["text/plain"]
+        assert len(bundle["text/plain"]) < 100
+
+
+@pytest.mark.parametrize(("functions", "inputs"), [(30, 16), (60, 16), (200, 4)])
+def test_dense_graphs_are_drawn_within_the_limits(functions, inputs):
+    tokens, io = [f"s{index}" for index in range(inputs)], {}
+    for index in range(functions):
+        # A stride that is prime to the number of tokens spreads the inputs.
+        io[f"f{index}"] = (tuple(tokens[(7 * index + 5 * place) % len(tokens)] for place in range(inputs)), f"t{index}")
+        tokens.append(f"t{index}")
+    cg = ep.CompGraph(dict.fromkeys(io, lambda *xs: 1), io)
+    bundle = mimebundle(cg)
+    limit = 20_000 + 600 * (functions + len(cg.tokens))
+    assert 0 < len(bundle["image/svg+xml"]) <= limit
+    assert 0 < len(bundle["text/html"]) <= limit
+
+
+def test_a_value_whose_class_lies_can_be_run_and_shown():
+    class Lies:
+        @property
+        def __class__(self):
+            raise RuntimeError("no class")
+
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": lambda x: x}, {"f": ("x", "y")}))
+    runner.run(x=Lies())
+    assert "image/svg+xml" in mimebundle(runner)

@@ -198,3 +198,19 @@ def test_the_repr_is_one_short_line(edge_graph):
     names = [f"token_with_a_long_name_{index}" for index in range(50)]
     wide = ep.CompGraph({"f": lambda *xs: xs}, {"f": (names[:25], names[25:])})
     assert len(repr(wide)) < 100
+
+
+@pytest.mark.parametrize(("functions", "io"), [([len], {}), ({}, None), (None, None), ({}, [("x", "y")])])
+def test_what_is_no_mapping_is_refused_by_name(functions, io):
+    with pytest.raises(TypeError, match="must be a mapping by function name"):
+        ep.CompGraph(functions, io)
+
+
+def test_an_object_whose_signature_raises_is_taken_for_one_without():
+    class Hostile:
+        __signature__ = property(lambda self: 1 / 0)
+
+        def __call__(self, x):
+            return x
+
+    assert ep.CompGraphRunner(ep.CompGraph({"f": Hostile()}, {"f": ("x", "y")})).run(x=1)["y"] == 1

@@ -6,6 +6,8 @@ import re
 import shutil
 import signal
 import socket
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -204,3 +206,113 @@ def test_load_pipeline_gives_the_pipeline_that_serve_runs(edge_bundle, photograp
     assert answer.correlation_id == request.id
     assert answer.bundle_digest == edge_bundle.digest
     assert np.array_equal(answer.parts["edges"], cv2.Canny(cv2.medianBlur(photograph, 5), 70, 200))
+
+
+@pytest.fixture
+def serving(tmp_path):
+    """Serve a graph of one function in this process; returns a function that starts it and gives the service."""
+    started = []
+
+    def serve(function, name="f"):
+        cg = ep.CompGraph({name: np.copy}, {name: ("image", "out")})
+        runner = ep.CompGraphRunner(cg)
+        runner.run(image=np.zeros((4, 4), np.uint8))
+        bundle = ep.promote(runner, tmp_path / "b")
+        lock = StateLock(bundle.path)
+        service = Service(bundle.path, ANY, ANY)
+        # What a bundle can't be made of here, a function of this test, takes the place of its own.
+        service.pipeline.network.nodes[name].func = function
+        lock.publish(service.start())
+        started.append((service, lock))
+        return bundle.path, service
+
+    yield serve
+    for service, lock in started:
+        service.stop()
+        lock.__exit__(None, None, None)
+
+
+def test_a_function_that_uses_its_buffer_again_does_not_change_answers_on_their_way(serving):
+    buffer = np.zeros((1000, 1000), np.uint8)
+
+    def reuse(image):
+        np.add(image, 1, out=buffer)
+        return buffer
+
+    path, _ = serving(reuse)
+
+    def calls(value):
+        image = np.full((1000, 1000), value, np.uint8)
+        with Client(path, timeout_s=TIMEOUT_S) as client:
+            return all((client.call({"image": image}).tokens["out"] == value + 1).all() for _ in range(15))
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(calls, range(4)))
+
+
+def test_threads_that_share_a_client_each_get_their_own_answer(serving):
+    path, _ = serving(np.copy)
+    with Client(path, timeout_s=TIMEOUT_S) as client, ThreadPoolExecutor(4) as pool:
+        images = [np.full((9, 9), value, np.uint8) for value in range(40)]
+        answers = list(pool.map(lambda image: client.call({"image": image}).tokens["out"], images))
+    assert all(np.array_equal(image, answer) for image, answer in zip(images, answers, strict=True))
+
+
+def test_a_value_that_cannot_be_sent_is_answered_with_a_failure(serving):
+    path, service = serving(lambda image: object())
+    with pytest.raises(RemoteFailure, match="Function 'f_out' failed in the service: MessageError"):
+        call(path, {"image": np.zeros((9, 9), np.uint8)}, timeout_s=TIMEOUT_S)
+    assert service.counts()["failed"] == 1
+
+
+def test_a_function_that_exits_is_a_failure_and_the_service_goes_on(serving):
+    def leave(image):
+        if image[0, 0]:
+            raise SystemExit(0)
+        return image
+
+    path, _ = serving(leave)
+    with pytest.raises(RemoteFailure, match="SystemExit"):
+        call(path, {"image": np.ones((9, 9), np.uint8)}, timeout_s=TIMEOUT_S)
+    assert call(path, {"image": np.zeros((9, 9), np.uint8)}, timeout_s=TIMEOUT_S).tokens["out"].shape == (9, 9)
+
+
+def test_every_event_is_answered_dropped_ones_and_those_that_wait_at_the_stop_too(serving):
+    started, release = threading.Event(), threading.Event()
+
+    def hold(image):
+        started.set()
+        release.wait(TIMEOUT_S)
+        return image
+
+    _, service = serving(hold)
+    count, requests, answers = 30, queue.Queue(), queue.Queue()
+    with (
+        ep.ZMQSubscriber(service.publisher.address, answers) as subscriber,
+        ep.ZMQPublisher(service.subscriber.address, requests, bind=False) as publisher,
+    ):
+        assert subscriber.wait_joined(TIMEOUT_S)
+        assert publisher.wait_for_subscriber(TIMEOUT_S)
+        sent = [Envelope(type="x", parts={"image": np.zeros((9, 9), np.uint8)}) for _ in range(count)]
+        requests.put(sent[0])
+        assert started.wait(TIMEOUT_S)
+        for request in sent[1:]:
+            requests.put(request)
+        dropped = [answers.get(timeout=TIMEOUT_S) for _ in range(count - 1 - service.mailbox.size)]
+        assert {answer.failure.exception for answer in dropped} == {"MessageError"}
+        assert "Send it again later" in dropped[0].failure.message
+        stopping = threading.Thread(target=service.stop)
+        stopping.start()
+        release.set()
+        stopping.join()
+        rest = [answers.get(timeout=TIMEOUT_S) for _ in range(1 + service.mailbox.size)]
+    assert {answer.correlation_id for answer in dropped + rest} == {request.id for request in sent}
+    assert all(answer.failure is None for answer in rest)
+    assert service.counts() == {"received": 30, "answered": 30, "failed": 0, "dropped": 21, "rejected": 0}
+
+
+def test_a_state_file_that_somebody_wrote_into_is_not_believed(edge_bundle, photograph):
+    with StateLock(edge_bundle.path):
+        state_file(edge_bundle.path).write_text('{"pid": "x", "sub": 1, "pub": 2, "digest": 3}')
+        with pytest.raises(ServiceError, match="No service runs"):
+            call(edge_bundle.path, {"image": photograph})
