@@ -18,7 +18,7 @@ from typing import Any, Self
 from epypes.bundle.load import pipeline_of, read_bundle
 from epypes.bundle.ports import failure_event
 from epypes.bundle.replay import replay
-from epypes.errors import MessageError, ReplayDiffers
+from epypes.errors import MessageError, ReplayDiffers, StillRunning
 from epypes.pipeline import Mailbox
 from epypes.run import Failure
 from epypes.service.state import ServiceState, StateLock
@@ -96,12 +96,20 @@ class Service:
         """
         self.subscriber.stop(timeout_s)
         try:
-            if not self.pipeline.loop.drain(timeout_s):
-                while not self.mailbox.empty():
-                    self._refuse(self.mailbox.get_nowait(), "the service stops")
-            self.pipeline.stop(0.0)
+            self._drain(timeout_s)
         finally:
             self.publisher.stop(timeout_s)
+
+    def _drain(self, timeout_s: float) -> None:
+        if self.pipeline.loop.drain(timeout_s):
+            self.pipeline.stop()
+            return
+        while not self.mailbox.empty():
+            self._refuse(self.mailbox.get_nowait(), "the service stops")
+        try:
+            self.pipeline.stop(0.0)
+        except StillRunning as error:
+            raise StillRunning(error.name, error.functions, timeout_s) from None
 
     def counts(self) -> dict[str, int]:
         """Return how many events were received, answered, failed, dropped and rejected."""

@@ -16,7 +16,7 @@ import zmq
 
 import epypes as ep
 from epypes.bundle.seal import seal
-from epypes.errors import AddressError, BundleError, RemoteFailure, ReplayDiffers, ServiceError
+from epypes.errors import AddressError, BundleError, RemoteFailure, ReplayDiffers, ServiceError, StillRunning
 from epypes.service import Client, Service, call
 from epypes.service.state import StateLock, read_state, state_file
 from epypes.wire import Envelope, encode
@@ -316,3 +316,34 @@ def test_a_state_file_that_somebody_wrote_into_is_not_believed(edge_bundle, phot
         state_file(edge_bundle.path).write_text('{"pid": "x", "sub": 1, "pub": 2, "digest": 3}')
         with pytest.raises(ServiceError, match="No service runs"):
             call(edge_bundle.path, {"image": photograph})
+
+
+def test_a_function_that_does_not_return_is_named_at_the_stop_and_what_waited_is_answered(serving):
+    started, release = threading.Event(), threading.Event()
+
+    def endless(image):
+        started.set()
+        release.wait(TIMEOUT_S)
+        return image
+
+    _, service = serving(endless)
+    requests, answers = queue.Queue(), queue.Queue()
+    with (
+        ep.ZMQSubscriber(service.publisher.address, answers) as subscriber,
+        ep.ZMQPublisher(service.subscriber.address, requests, bind=False) as publisher,
+    ):
+        assert subscriber.wait_joined(TIMEOUT_S)
+        assert publisher.wait_for_subscriber(TIMEOUT_S)
+        sent = [Envelope(type="x", parts={"image": np.zeros((9, 9), np.uint8)}) for _ in range(3)]
+        requests.put(sent[0])
+        assert started.wait(TIMEOUT_S)
+        for request in sent[1:]:
+            requests.put(request)
+        while service.mailbox.qsize() < 2:
+            started.wait(0.01)
+        with pytest.raises(StillRunning, match=r"within 0\.2 s: still in 'f'"):
+            service.stop(0.2)
+        refused = [answers.get(timeout=TIMEOUT_S) for _ in range(2)]
+        release.set()
+    assert {answer.correlation_id for answer in refused} == {request.id for request in sent[1:]}
+    assert all("the service stops" in answer.failure.message for answer in refused)
