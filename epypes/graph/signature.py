@@ -36,8 +36,3 @@ def keyword_only_required(signature: inspect.Signature) -> tuple[str, ...]:
         for parameter in signature.parameters.values()
         if parameter.kind is inspect.Parameter.KEYWORD_ONLY and parameter.default is inspect.Parameter.empty
     )
-
-
-def positional_parameters(signature: inspect.Signature) -> tuple[inspect.Parameter, ...]:
-    """Return the parameters that inputs reach by position, in order."""
-    return tuple(parameter for parameter in signature.parameters.values() if parameter.kind in _POSITIONAL)

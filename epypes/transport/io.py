@@ -25,7 +25,6 @@ from epypes.transport.addresses import address_error, check_port
 T = TypeVar("T")
 Socket = zmq.Socket[bytes]
 Reader = Callable[[], None]
-Options = Sequence[tuple[int, int | bytes]]
 
 log = logging.getLogger("epypes.transport")
 
