@@ -80,10 +80,11 @@ def execute(
 
 def _guarded(value: Any, args: Sequence[Any], originals: Sequence[Any]) -> Any:
     """Return an output as it is stored: an input that was passed through as the very array that it was."""
-    for arg, original in zip(args, originals, strict=True):
-        if value is arg and is_array(arg):
-            layout = (arg.shape, arg.strides, arg.dtype)
-            return original if layout == (original.shape, original.strides, original.dtype) else read_only(arg)
+    if is_array(value):
+        for arg, original in zip(args, originals, strict=True):
+            if value is arg:
+                layout = (arg.shape, arg.strides, arg.dtype)
+                return original if layout == (original.shape, original.strides, original.dtype) else read_only(arg)
     return read_only(value)
 
 

@@ -13,6 +13,8 @@ from typing import Any, TypeVar
 F = TypeVar("F", bound=Callable[..., Any])
 
 _MARK = "__epypes_unguarded__"
+# What holds no array, known at a glance: most values of a graph are looked at several times per run.
+_ARRAYLESS = frozenset({int, float, bool, str, bytes, complex, type(None)})
 
 
 def unguarded(function: F) -> F:
@@ -49,6 +51,8 @@ def read_only(value: Any) -> Any:
 
     A masked array is copied, since its mask can be changed through any view.
     """
+    if type(value) in _ARRAYLESS:
+        return value
     if is_array(value):
         view = value.copy() if hasattr(value, "mask") else value.view()
         view.flags.writeable = False
