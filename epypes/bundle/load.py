@@ -50,9 +50,19 @@ def read_bundle(path: str | Path, *, sealed: bool = True) -> Bundle:
         The graph in its module is not valid.
     """
     folder = Path(path).resolve()
-    digest = check_seal(folder) if sealed else ""
-    settings = read_settings(folder / SETTINGS)
-    module = _execute(folder / MODULE)
+    while True:
+        before = _identity(folder)
+        try:
+            digest = check_seal(folder) if sealed else ""
+            settings, source = read_settings(folder / SETTINGS), (folder / MODULE).read_bytes()
+        except (BundleError, OSError):
+            if _identity(folder) == before:
+                raise
+            continue
+        # A promotion puts another folder in this one's place: then what was read may be of both.
+        if _identity(folder) == before:
+            break
+    module = _execute(folder / MODULE, source)
     try:
         cg = CompGraph(module.func_dict, module.func_io)
     except AttributeError as error:
@@ -61,11 +71,20 @@ def read_bundle(path: str | Path, *, sealed: bool = True) -> Bundle:
     return Bundle(folder, cg, settings, digest)
 
 
-def _execute(path: Path) -> Any:
+def _identity(folder: Path) -> tuple[int, int] | None:
+    """Return what tells a folder from another one of its name, also from one that was there before."""
+    try:
+        found = folder.stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_ctime_ns
+
+
+def _execute(path: Path, source: bytes) -> Any:
     """Execute the module's source as it was checked; a cached .pyc, which the seal does not cover, is not looked at."""
     module = types.ModuleType(f"epypes_bundle_{path.parent.name}")
     module.__file__ = str(path)
-    exec(compile(path.read_bytes(), str(path), "exec"), module.__dict__)  # noqa: S102 - loading code is its purpose
+    exec(compile(source, str(path), "exec"), module.__dict__)  # noqa: S102 - loading code is its purpose
     return module
 
 

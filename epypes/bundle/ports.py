@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 REQUEST: Final = "epypes.request"
 RESULT: Final = "epypes.result"
 FAILURE: Final = "epypes.failure"
+_MESSAGE_CHARACTERS: Final = 2_000
 
 
 def payload_of(inputs: Sequence[str]) -> Callable[[Any], Mapping[str, Any]]:
@@ -67,6 +68,11 @@ def answer_with(outputs: Sequence[str], bundle_digest: str) -> Callable[[EventVi
     return f_out
 
 
+def _sendable(text: str) -> str:
+    """Return text cut to what a report needs, without halves of surrogate pairs, which no message can hold."""
+    return text[:_MESSAGE_CHARACTERS].encode("utf-8", "replace").decode("utf-8")
+
+
 def detached(value: Any) -> Any:
     """Return a value whose arrays, also in tuples, lists and dicts, are copies."""
     if is_array(value):
@@ -82,11 +88,13 @@ def failure_event(failure: Failure, source: str, bundle_digest: str) -> Envelope
     """Return the Envelope that reports a failure."""
     from epypes.wire import Envelope, FailureRecord
 
+    notes = getattr(failure.exception, "__notes__", None)
+    said = [failure.message, *(notes if isinstance(notes, list) else ())]
     record = FailureRecord(
-        function=failure.function,
-        tokens=failure.tokens,
-        exception=type(failure.exception).__name__,
-        message=" | ".join([failure.message, *getattr(failure.exception, "__notes__", ())]),
+        function=_sendable(failure.function),
+        tokens=tuple(map(_sendable, failure.tokens)),
+        exception=_sendable(type(failure.exception).__name__),
+        message=_sendable(" | ".join(text for text in said if isinstance(text, str))),
         input_id=failure.event_id,
         attempt=1,
     )

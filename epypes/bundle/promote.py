@@ -63,7 +63,10 @@ def promote(
         process that computes something else.
     """
     # A link that names the current version goes on naming it; what it points to is replaced.
-    target = Path(to).resolve()
+    try:
+        target = Path(to).resolve()
+    except (OSError, RuntimeError) as error:
+        raise PromotionRefused(to, [f"{to} is no place to write to: {error}. Name another folder."]) from error
     runner, cg = _subject(runner_or_pipeline, target)
     if f_in is not None or f_out is not None:
         raise PromotionRefused(target, ["f_in and f_out can't be promoted yet. Leave them out."])

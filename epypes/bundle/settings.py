@@ -144,6 +144,8 @@ def read_settings(path: Path) -> Settings:
 def _strings(values: Sequence[Any]) -> tuple[str, ...]:
     if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
         raise TypeError(f"{values!r} is not a list of token names")
+    if len(set(values)) < len(values):
+        raise TypeError(f"{values!r} names a token twice")
     return tuple(values)
 
 

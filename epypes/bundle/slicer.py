@@ -131,7 +131,7 @@ class Slice:
         """Return a small array of numbers as source that makes it again, to the last bit; "" for any other."""
         import numpy as np
 
-        if array.dtype.kind not in "biuf" or array.size * 2 > _CONSTANT_CHARACTERS:
+        if array.dtype.kind not in "biuf" or array.dtype.itemsize > 8 or array.size * 2 > _CONSTANT_CHARACTERS:
             return ""
         listed = repr(array.tolist())
         if "nan" in listed or "inf" in listed or np.array(array.tolist(), array.dtype).shape != array.shape:
@@ -192,7 +192,8 @@ def _reads_back(source: str, value: Any) -> bool:
         read = ast.literal_eval(source)
     except (ValueError, SyntaxError):
         return False
-    return type(read) is type(value) and bool(read == value)
+    # By source: 0j == -0j, but they are not the same.
+    return type(read) is type(value) and _literal(read) == source
 
 
 def _check_defaults(found: Definition, what: str) -> None:

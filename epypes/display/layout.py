@@ -22,6 +22,7 @@ Shape = Literal["box", "ellipse", "hexagon"]
 Point = tuple[float, float]
 
 _POINTS_PER_INCH: Final = 72.0
+_GAP_PX: Final = 14.0
 _DOT_TIMEOUT_S: Final = 30.0
 # Graphviz keeps global state, so only one thread may be in it.
 _engine_lock = threading.Lock()
@@ -65,27 +66,47 @@ def lay_out(boxes: tuple[Box, ...], edges: tuple[tuple[int, int], ...], is_dense
     boxes, edges
         The vertices, and pairs of their indices.
     is_dense
-        Whether the edges are too many to be followed: they are not routed, and the search for few crossings is cut
-        short, which would otherwise take minutes.
+        Whether the edges are too many to be followed. Then they are not routed, and the vertices stand in rows: a
+        search for few crossings would take Graphviz minutes.
 
     Raises
     ------
     LayoutUnavailable
         No engine answered.
     """
-    drawn = json.loads(_run_engine(_dot_source(boxes, edges, is_dense)))
-    return _read(drawn, len(boxes), () if is_dense else edges)
+    if is_dense:
+        return _in_rows(boxes, edges)
+    return _read(json.loads(_run_engine(_dot_source(boxes, edges))), len(boxes), edges)
 
 
-def _dot_source(boxes: Sequence[Box], edges: Sequence[tuple[int, int]], is_dense: bool) -> str:
+def _in_rows(boxes: Sequence[Box], edges: Sequence[tuple[int, int]]) -> Layout:
+    """Place vertices in rows, each below all that lead to it, without any search."""
+    rank = [0] * len(boxes)
+    # Functions come in run order, so going over their edges in that order settles each before it is used.
+    for tail, head in edges:
+        rank[head] = max(rank[head], rank[tail] + 1)
+    rows: dict[int, list[int]] = {}
+    for vertex, row in enumerate(rank):
+        rows.setdefault(row, []).append(vertex)
+    widths = {row: sum(boxes[vertex].width + _GAP_PX for vertex in vertices) for row, vertices in rows.items()}
+    width, y = max(widths.values(), default=0.0), 0.0
+    centres: dict[int, Point] = {}
+    for row in sorted(rows):
+        x, height = (width - widths[row]) / 2, max(boxes[vertex].height for vertex in rows[row])
+        for vertex in rows[row]:
+            centres[vertex] = (x + boxes[vertex].width / 2, y + height / 2)
+            x += boxes[vertex].width + _GAP_PX
+        y += height + 3 * _GAP_PX
+    return Layout(width, y, tuple(centres[vertex] for vertex in range(len(boxes))), ())
+
+
+def _dot_source(boxes: Sequence[Box], edges: Sequence[tuple[int, int]]) -> str:
     try:
         import graphviz
     except ImportError as error:
         raise LayoutUnavailable([f"graphviz ({error})"]) from error
-    spacing = {"rankdir": "TB", "nodesep": "0.22", "ranksep": "0.28", "margin": "0"}
-    hurry = {"splines": "none", "mclimit": "0.05", "nslimit": "0.5", "nslimit1": "0.5"} if is_dense else {}
     dot = graphviz.Digraph(
-        graph_attr={**spacing, **hurry},
+        graph_attr={"rankdir": "TB", "nodesep": "0.22", "ranksep": "0.28", "margin": "0"},
         # Labels are painted later: without them no font is looked for, and no layout depends on the machine's fonts.
         node_attr={"label": "", "fixedsize": "true"},
     )
@@ -143,8 +164,9 @@ def _read(drawn: dict[str, Any], vertices: int, edges: Sequence[tuple[int, int]]
         x, y = map(float, node["pos"].split(","))
         centres[index] = (x, height - y)
         number[node["_gvid"]] = index
-    drawn_edges = drawn.get("edges", ()) if edges else ()
-    found = {(number[edge["tail"]], number[edge["head"]]): _spline(edge["pos"], height) for edge in drawn_edges}
+    found = {
+        (number[edge["tail"]], number[edge["head"]]): _spline(edge["pos"], height) for edge in drawn.get("edges", ())
+    }
     return Layout(width, height, tuple(centres), tuple(found[edge] for edge in edges))
 
 

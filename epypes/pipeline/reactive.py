@@ -70,6 +70,8 @@ class SinkPipeline(Pipeline):
         failures are logged. The loop goes on.
     failed
         How many events failed.
+    working_on
+        The event under way; None between events.
     """
 
     def __init__(
@@ -84,11 +86,17 @@ class SinkPipeline(Pipeline):
         self.q_in, self.f_in = q_in, f_in
         self.on_error: Callable[[Failure], None] | None = None
         self.failed = 0
+        self.working_on: Any = None
         self._stage = ""
         self.loop = EventLoop(q_in, self.handle, lambda event: {"event": event}, name=name, busy=self._busy)
 
     def handle(self, event: Any) -> None:
         """Work on one event; every failure is reported, none is raised. The hook for subclasses."""
+        self.working_on = event
+        self._work_on(event)
+        self.working_on = None
+
+    def _work_on(self, event: Any) -> None:
         try:
             self._stage = "f_in"
             payload = self._payload(event)

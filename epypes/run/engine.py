@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from epypes.errors import OutputArityError
 from epypes.run.failure import Failure
-from epypes.run.guard import explain_write, is_array, read_only, writable
+from epypes.run.guard import explain_write, is_array, is_plain_array, read_only, writable
 from epypes.run.program import Step
 from epypes.run.tokens import TokenManager, is_same_value
 
@@ -82,7 +82,8 @@ def _guarded(value: Any, args: Sequence[Any], originals: Sequence[Any]) -> Any:
     """Return an output as it is stored: an input that was passed through as the very array that it was."""
     if is_array(value):
         for arg, original in zip(args, originals, strict=True):
-            if value is arg:
+            # Of a subclass, more may have changed than can be seen here: a mask, a name, a unit.
+            if value is arg and is_plain_array(arg):
                 layout = (arg.shape, arg.strides, arg.dtype)
                 return original if layout == (original.shape, original.strides, original.dtype) else read_only(arg)
     return read_only(value)
@@ -121,10 +122,10 @@ def _failure(manager: TokenManager, step: Step, exception: BaseException) -> Fai
     told = ", ".join(f"{token}{_brief(value)}" for token, value in values.items())
     note = f"In function {step.name!r}: ({told}) -> ({', '.join(outputs)})"
     # Whatever the exception's own methods do, the failure is told.
-    with contextlib.suppress(Exception):
+    with contextlib.suppress(BaseException):
         why = explain_write(step.name, inputs, exception) if step.guarded else None
         note = f"{note}\n{why}" if why else note
-    with contextlib.suppress(Exception):
+    with contextlib.suppress(BaseException):
         if note not in getattr(exception, "__notes__", ()):
             exception.add_note(note)
     return Failure(step.name, (*inputs, *outputs), values, exception)

@@ -40,7 +40,7 @@ class Failure:
         """What the exception says, without OpenCV's place in its own source."""
         try:
             text = str(self.exception).strip()
-        except Exception:  # an exception's own __str__ may raise
+        except BaseException:  # an exception's own __str__ may raise
             text = "(its message can't be had)"
         return _OPENCV_PLACE.sub("", text)
 

@@ -46,6 +46,19 @@ def is_array(value: Any) -> bool:
     return numpy is not None and issubclass(type(value), numpy.ndarray)
 
 
+def is_plain_array(value: Any) -> bool:
+    """Whether a value is a NumPy array, and not of a subclass."""
+    numpy = sys.modules.get("numpy")
+    return numpy is not None and type(value) is numpy.ndarray
+
+
+def own_view(value: Any) -> Any:
+    """Return an array as a view for the reader alone, whose shape may be changed; anything else as it is."""
+    if not is_array(value):
+        return value
+    return value.copy() if hasattr(value, "mask") else value.view()
+
+
 def read_only(value: Any) -> Any:
     """Return arrays, and arrays in a tuple, named tuple or list, as read-only views; anything else as it is.
 
@@ -54,7 +67,7 @@ def read_only(value: Any) -> Any:
     if type(value) in _ARRAYLESS:
         return value
     if is_array(value):
-        view = value.copy() if hasattr(value, "mask") else value.view()
+        view = own_view(value)
         view.flags.writeable = False
         return view
     if (type(value) in (tuple, list) or _is_named_tuple(value)) and any(map(is_array, value)):
@@ -76,8 +89,8 @@ def writable(value: Any) -> Any:
         except ValueError:
             return value.copy()
         return view
-    if type(value) in (tuple, list):
-        return type(value)(writable(item) for item in value)
+    if type(value) in (tuple, list) or _is_named_tuple(value):
+        return getattr(type(value), "_make", type(value))(writable(item) for item in value)
     return value
 
 

@@ -13,7 +13,7 @@ from epypes.errors import NotComputed, PayloadError, StaleToken, UnknownName
 from epypes.graph import CompGraph
 from epypes.run.engine import StepFailed, execute
 from epypes.run.failure import Failure
-from epypes.run.guard import read_only
+from epypes.run.guard import own_view, read_only
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.plan import Plan, missing_sources, needed_steps, plan
 from epypes.run.program import Program, compile_graph
@@ -245,7 +245,7 @@ class CompGraphRunner:
     def __getitem__(self, token: str) -> Any:
         hparams, last = self._hparams, self._last
         if token in hparams.values:
-            return hparams.values[token]
+            return own_view(hparams.values[token])
         if last is None:
             self.cg.require_token(token)
             call = ", ".join(f"{name}=..." for name in hparams.free_source_tokens)

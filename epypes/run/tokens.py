@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from typing import Any, Final
 
 from epypes.errors import NotComputed, StaleToken
+from epypes.run.guard import own_view
 from epypes.run.program import Program
 
 _SCALARS = (int, float, complex, str, bytes, bool, type(None))
@@ -99,7 +100,7 @@ class TokenManager:
         value = self.values[self.program.slots[token]]
         if value is NOT_COMPUTED:
             raise NotComputed(token, f"Token {token!r} has not been computed. {self._way_out(token)}")
-        return value
+        return own_view(value)
 
     def _way_out(self, token: str) -> str:
         return (

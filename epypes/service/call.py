@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -113,20 +114,23 @@ class Client:
         from epypes.wire import Envelope
 
         deadline = monotonic() + self.timeout_s
+        refused, lost = self._publisher.rejected, sum(self._subscriber.lost.values())
         start_ns = perf_counter_ns()
         self._requests.put(request)
         while (left_s := deadline - monotonic()) > 0:
             try:
                 answer = self._answers.get(timeout=min(_LOOK_S, left_s))
             except queue.Empty:
-                self._check_alive()
+                self._check_alive(refused)
                 continue
             if isinstance(answer, Envelope) and answer.correlation_id == request.id:
                 return _read(self.path, answer, perf_counter_ns() - start_ns)
-        raise ServiceError(self.path, f"The service of {self.path} did not answer within {self.timeout_s:g} s.")
+        text = f"The service of {self.path} did not answer within {self.timeout_s:g} s."
+        lost = sum(self._subscriber.lost.values()) - lost
+        raise ServiceError(self.path, f"{text} {lost} answers were lost on the way meanwhile." if lost else text)
 
-    def _check_alive(self) -> None:
-        refused = self._publisher.rejected
+    def _check_alive(self, refused_before: Counter[str]) -> None:
+        refused = self._publisher.rejected - refused_before
         if refused:
             raise ServiceError(self.path, f"The event could not be sent: {', '.join(refused)}.")
         if read_state(self.path) is None:

@@ -5,6 +5,7 @@ One process so far: the I/O thread owns the sockets, the event loop's thread com
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import queue
@@ -27,8 +28,9 @@ from epypes.transport import ZMQPublisher, ZMQSubscriber
 # How many events wait while one is computed; the oldest is dropped, and counted, when another comes.
 MAILBOX_SIZE = 8
 # Answers kept for a subscriber that does not read; images are large, so this bounds the memory that one can cost.
-_KEPT_ANSWERS = 32
+_KEPT_ANSWERS = 256
 DRAIN_TIMEOUT_S = 5.0
+_DRAIN_SHARE = 0.6
 _CONNECT = "connect:"
 
 _log = logging.getLogger("epypes.service")
@@ -101,14 +103,15 @@ class Service:
             self.publisher.stop(timeout_s)
 
     def _drain(self, timeout_s: float) -> None:
-        if self.pipeline.loop.drain(timeout_s):
-            self.pipeline.stop()
-            return
-        while not self.mailbox.empty():
-            self._refuse(self.mailbox.get_nowait(), "the service stops")
+        """Work off what waits for part of the time; then refuse the rest, so that the event under way can end."""
+        if not self.pipeline.loop.drain(timeout_s * _DRAIN_SHARE):
+            with contextlib.suppress(queue.Empty):
+                while True:
+                    self._refuse(self.mailbox.get_nowait(), "the service stops")
         try:
-            self.pipeline.stop(0.0)
+            self.pipeline.stop(timeout_s * (1 - _DRAIN_SHARE))
         except StillRunning as error:
+            self._refuse(self.pipeline.working_on, f"the service stops while it is in {', '.join(error.functions)}")
             raise StillRunning(error.name, error.functions, timeout_s) from None
 
     def counts(self) -> dict[str, int]:

@@ -123,21 +123,25 @@ def grouped(cg: CompGraph, controls: Mapping[str, Control]) -> tuple[ipywidgets.
 class _Snapping:
     """A slider that shows the nearest step, while the value that it was given counts to the last bit.
 
-    The front end snaps a slider to its steps as soon as it is shown, and reports that like a move of the hand. So a
-    position within half a step of the given value is that value; any other is the hand's.
+    The front end snaps a slider to its steps as soon as it is shown, and reports that like a move of the hand. So the
+    first position within half a step of the given value means that value; any other is the hand's.
     """
 
     def __init__(self, slider: Any, value: Any, step: float, kind: Callable[[Any], Any]) -> None:
         self._slider, self._exact, self._step, self._kind = slider, value, step, kind
+        self._snapped: float | None = None
 
     def read(self) -> Any:
         position = self._slider.value
-        if abs(self._scaled(position) - self._scaled(self._exact)) < self._step / 2:
+        if position == self._exact:
             return self._exact
-        return self._kind(position)
+        distance = abs(self._scaled(position) - self._scaled(self._exact))
+        if self._snapped is None and distance <= self._step / 2 * (1 + 1e-9):
+            self._snapped = position
+        return self._exact if position == self._snapped else self._kind(position)
 
     def place(self, new: Any) -> None:
-        self._exact = new
+        self._exact, self._snapped = new, None
         self._stretch(self._scaled(new))
         self._slider.value = new
 

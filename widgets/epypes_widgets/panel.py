@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import threading
 from collections.abc import Mapping
 from itertools import count
 from typing import Any, Final
@@ -97,6 +98,7 @@ class Panel:
         self._initial = {name: entry.read() for name, entry in controls.items()}
         self._asked = token
         self._seq = count(1).__next__
+        self._moving = threading.RLock()
         self._result: Run | None = None
         self._failed: set[str] = set()
         self._worker = Worker(self._compute)
@@ -181,9 +183,10 @@ class Panel:
         entry = self._control(name)
         if self._worker.closed:
             raise RuntimeError("This panel is closed. Make a new one: tune(runner).")
-        entry.write(value)
-        # A widget that shows the same for two values (a label, a slider between its steps) tells nobody.
-        self._moved(name, entry.read())
+        with self._moving:
+            entry.write(value)
+            # A widget that shows the same for two values (a label, a slider between its steps) tells nobody.
+            self._moved(name, value)
 
     def __repr__(self) -> str:
         state = "closed" if self._worker.closed else "failed" if self._view.error else "up to date"
@@ -202,8 +205,10 @@ class Panel:
             raise UnknownName("hyperparameter", name, self._controls, "of this panel")
         return self._controls[name]
 
-    def _moved(self, name: str, value: Any) -> None:
-        self._worker.submit({name: value})
+    def _moved(self, name: str, _value: Any) -> None:
+        # Read and submitted in one step, so that of two threads the one whose value stands submits last.
+        with self._moving:
+            self._worker.submit({name: self._controls[name].read()})
 
     def _chosen(self, _change: object) -> None:
         self._worker.submit({})
