@@ -6,6 +6,7 @@ import importlib
 import os
 import py_compile
 import re
+import threading
 import tomllib
 from pathlib import Path
 
@@ -17,6 +18,7 @@ import pytest
 import epypes as ep
 from epypes.bundle import verify
 from epypes.bundle.compare import first_difference
+from epypes.bundle.load import read_bundle
 from epypes.bundle.notebook import promote_notebook
 from epypes.bundle.seal import seal
 from epypes.errors import BundleError, PromotionRefused, ReplayDiffers, UnknownName
@@ -438,3 +440,27 @@ def test_the_old_bundle_is_there_until_the_new_one_is(runner, tmp_path, monkeypa
     ep.promote(runner, target)
     assert seen == [True, True]
     assert ep.load(target).hyperparameters["lo"] == 10
+
+
+def test_a_bundle_that_is_replaced_while_it_is_read_is_never_mixed_with_the_next(tmp_path):
+    digests = {}
+    for function, k in ((np.add, 1), (np.multiply, 2)):
+        runner = ep.CompGraphRunner(ep.CompGraph({"f": function}, {"f": (("x", "k"), "y")}), {"k": k})
+        runner.run(x=np.ones(2))
+        digests[ep.promote(runner, tmp_path / str(k) / "b").digest] = (function, k)
+    done, here, there = threading.Event(), tmp_path / "1" / "b", tmp_path / "2" / "b"
+
+    def exchanging():
+        while not done.is_set():
+            promote_module._exchange(here, there)
+            done.wait(0.001)
+
+    thread = threading.Thread(target=exchanging)
+    thread.start()
+    try:
+        for _ in range(500):
+            bundle = read_bundle(here)
+            assert (bundle.cg.functions["f"], bundle.settings.hyperparameters["k"]) == digests[bundle.digest]
+    finally:
+        done.set()
+        thread.join()

@@ -309,3 +309,12 @@ def test_a_value_whose_class_lies_can_be_run_and_shown():
     runner = ep.CompGraphRunner(ep.CompGraph({"f": lambda x: x}, {"f": ("x", "y")}))
     runner.run(x=Lies())
     assert "image/svg+xml" in mimebundle(runner)
+
+
+def test_graphviz_is_not_asked_for_what_would_take_it_minutes(monkeypatch):
+    monkeypatch.setattr("epypes.display.layout._run_engine", lambda source: pytest.fail("asked"))
+    sources = tuple(f"s{index}" for index in range(100))
+    io = {f"f{index}": (sources, f"t{index}") for index in range(100)}
+    svg = to_svg(ep.CompGraph(dict.fromkeys(io, lambda *xs: 1), io))
+    assert len(vertices(svg)) == 300
+    assert len(svg) <= 20_000 + 600 * 300 + THUMBNAIL_CHARACTERS

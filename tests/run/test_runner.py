@@ -544,3 +544,27 @@ def test_whatever_a_function_does_to_its_input_the_next_function_does_not_see_it
     ep.CompGraphRunner(cg).run(pair=Pair(np.arange(3), "n"), masked=masked, plain=np.arange(3))
     assert seen == [[0, 1, 2], [1, 2, 3], [0, 1, 2]]
     assert masked.filled(-1).tolist() == [1, 2, 3]
+
+
+def test_a_masked_array_that_a_function_changes_and_returns_is_kept_as_returned():
+    def mask_first(x):
+        x[0] = np.ma.masked
+        return x
+
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": mask_first}, {"f": ("x", "y")}), guard=True)
+    with contextlib.suppress(ValueError):
+        run = runner.run(x=np.ma.array([0.0, 1.0, 2.0], mask=[False] * 3))
+        assert run["y"].mask.tolist() == [True, False, False]
+        assert run["x"].mask.tolist() == [False, False, False]
+
+
+def test_what_a_reader_does_to_an_array_changes_no_later_run():
+    cg = ep.CompGraph({"f": lambda x: x + 1, "g": lambda y, k: y.shape}, {"f": ("x", "y"), "g": (("y", "k"), "z")})
+    runner = ep.CompGraphRunner(cg, {"k": np.zeros(4)})
+    run = runner.run(x=np.zeros(4))
+    for array in (run["y"], runner["y"], runner["k"]):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            array.shape = (2, 2)
+    assert runner.rerun(k=np.ones(4))["z"] == (4,)
+    assert run["y"].shape == (4,)

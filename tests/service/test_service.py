@@ -347,3 +347,53 @@ def test_a_function_that_does_not_return_is_named_at_the_stop_and_what_waited_is
         release.set()
     assert {answer.correlation_id for answer in refused} == {request.id for request in sent[1:]}
     assert all("the service stops" in answer.failure.message for answer in refused)
+
+
+@pytest.mark.parametrize("notes", [None, [1], ["note " * 10_000]])
+@pytest.mark.parametrize("text", ["\ud800 bad", "x" * 10**7, ""])
+def test_a_failure_is_answered_whatever_the_exception_says(serving, text, notes):
+    def fail(image):
+        error = ValueError(text)
+        error.__notes__ = notes
+        raise error
+
+    path, _ = serving(fail)
+    with pytest.raises(RemoteFailure, match="Function 'f' failed in the service: ValueError"):
+        call(path, {"image": np.zeros((9, 9), np.uint8)}, timeout_s=TIMEOUT_S)
+
+
+def test_an_event_that_cannot_be_sent_spoils_no_later_one(serving):
+    started = threading.Event()
+    path, _ = serving(lambda image: started.wait(0.5) or image)
+    with Client(path, timeout_s=TIMEOUT_S) as client:
+        with pytest.raises(ServiceError, match="could not be sent: no codec"):
+            client.call({"image": object()})
+        assert client.call({"image": np.ones((9, 9), np.uint8)}).tokens["out"].all()
+
+
+def test_the_event_under_way_is_answered_too_when_the_service_must_stop(serving):
+    started, release = threading.Event(), threading.Event()
+
+    def endless(image):
+        started.set()
+        release.wait(TIMEOUT_S)
+        return image
+
+    path, service = serving(endless)
+    said = queue.Queue()
+
+    def calling():
+        with Client(path, timeout_s=TIMEOUT_S) as client:
+            try:
+                client.call({"image": np.zeros((9, 9), np.uint8)})
+            except RemoteFailure as failure:
+                said.put(str(failure))
+
+    caller = threading.Thread(target=calling)
+    caller.start()
+    assert started.wait(TIMEOUT_S)
+    with pytest.raises(StillRunning):
+        service.stop(0.3)
+    release.set()
+    assert "the service stops while it is in f" in said.get(timeout=TIMEOUT_S)
+    caller.join()

@@ -181,3 +181,20 @@ def test_a_whole_number_is_not_cut_from_another() -> None:
     with pytest.raises(ValueError, match=r"whole numbers, not 2\.5"):
         entry.write(2.5)
     assert entry.read() == 3
+
+
+@pytest.mark.parametrize(
+    ("value", "hint", "snapped", "moved"),
+    [(5, (0, 10, 2), 6, 4), (0.25, (0.0, 1.0, 0.5), 0.5, 0.0), (5, (0, 10, 2), 4, 6)],
+)
+def test_a_value_half_way_between_two_steps_is_kept_too_and_the_hand_still_moves_it(
+    value: Any, hint: Any, snapped: Any, moved: Any
+) -> None:
+    entry, told = made(value, hint), []
+    entry.on_change(lambda name, new: told.append(new))
+    entry.widget.value = snapped
+    assert entry.read() == value
+    entry.widget.value = moved
+    assert told == [moved]
+    entry.widget.value = snapped
+    assert told == [moved, value]

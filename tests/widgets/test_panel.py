@@ -254,3 +254,24 @@ def test_the_interpreter_ends_while_a_panel_is_open() -> None:
         "r.run(x=2); p = tune(r); p['y'] = 2; p.wait(10); assert p.result['z'] == 4"
     )
     subprocess.run([sys.executable, "-W", "error", "-c", code], check=True, timeout=30)
+
+
+def test_values_set_from_many_threads_leave_panel_and_runner_agreed(runner: ep.CompGraphRunner) -> None:
+    panel = tune(runner)
+    name = next(name for name, value in runner.hyperparameters.items() if isinstance(value, int))
+    for _ in range(20):
+        start = threading.Barrier(4)
+
+        def move(values: range, start: threading.Barrier = start) -> None:
+            start.wait(10)
+            for value in values:
+                panel[name] = value
+
+        threads = [threading.Thread(target=move, args=(range(first, 11, 4),)) for first in range(1, 5)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        panel.wait(10)
+        assert runner[name] == panel[name]
+    panel.close()
