@@ -6,6 +6,7 @@ import importlib
 import os
 import py_compile
 import re
+import shutil
 import threading
 import tomllib
 from pathlib import Path
@@ -29,8 +30,7 @@ promote_module = importlib.import_module("epypes.bundle.promote")
 FUNCTIONS = {"split": cv2.split, "canny": cv2.Canny}
 
 
-@pytest.fixture
-def runner(photograph):
+def edges_runner(photograph):
     cg = ep.CompGraph(
         {"smooth": cv2.medianBlur, "canny": cv2.Canny},
         {"smooth": (("image", "side"), "smoothed"), "canny": (("smoothed", "lo", "hi"), "edges")},
@@ -41,8 +41,20 @@ def runner(photograph):
 
 
 @pytest.fixture
-def bundle(runner, tmp_path):
-    return ep.promote(runner, tmp_path / "edges", outputs=["edges"])
+def runner(photograph):
+    return edges_runner(photograph)
+
+
+@pytest.fixture(scope="module")
+def promoted(photograph, tmp_path_factory):
+    """The bundle of the runner below, promoted once."""
+    return ep.promote(edges_runner(photograph), tmp_path_factory.mktemp("bundles") / "edges", outputs=["edges"])
+
+
+@pytest.fixture
+def bundle(promoted, tmp_path):
+    """A copy of it that a test may spoil."""
+    return read_bundle(shutil.copytree(promoted.path, tmp_path / "edges"))
 
 
 def contents(folder):

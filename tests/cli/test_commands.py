@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 
@@ -9,6 +10,7 @@ import pytest
 
 import epypes as ep
 from epypes.acquisition import read_image, write_image
+from epypes.bundle.load import read_bundle
 from epypes.cli.call import by_token
 from epypes.errors import ServiceError, UnknownName
 from epypes.service import Service
@@ -22,13 +24,18 @@ def own_runtime_folder(tmp_path_factory, monkeypatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("run")))
 
 
-@pytest.fixture
-def bundle(photograph, tmp_path):
-    runner = ep.CompGraphRunner(
-        ep.CompGraph({"canny": cv2.Canny}, {"canny": (("image", "lo", "hi"), "edges")}), {"lo": 70, "hi": 200}
-    )
+@pytest.fixture(scope="module")
+def promoted(photograph, tmp_path_factory):
+    cg = ep.CompGraph({"canny": cv2.Canny}, {"canny": (("image", "lo", "hi"), "edges")})
+    runner = ep.CompGraphRunner(cg, {"lo": 70, "hi": 200})
     runner.run(image=photograph)
-    return ep.promote(runner, tmp_path / "edges")
+    return ep.promote(runner, tmp_path_factory.mktemp("bundles") / "edges")
+
+
+@pytest.fixture
+def bundle(promoted, tmp_path):
+    """A copy that a test may spoil."""
+    return read_bundle(shutil.copytree(promoted.path, tmp_path / "edges"))
 
 
 def epypes(*arguments, **options):

@@ -208,23 +208,27 @@ def test_load_pipeline_gives_the_pipeline_that_serve_runs(edge_bundle, photograp
     assert np.array_equal(answer.parts["edges"], cv2.Canny(cv2.medianBlur(photograph, 5), 70, 200))
 
 
+@pytest.fixture(scope="module")
+def copy_bundle(tmp_path_factory):
+    """A bundle of one function ``f``, which copies its image."""
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": np.copy}, {"f": ("image", "out")}))
+    runner.run(image=np.zeros((4, 4), np.uint8))
+    return ep.promote(runner, tmp_path_factory.mktemp("bundles") / "copy")
+
+
 @pytest.fixture
-def serving(tmp_path):
+def serving(copy_bundle):
     """Serve a graph of one function in this process; returns a function that starts it and gives the service."""
     started = []
 
-    def serve(function, name="f"):
-        cg = ep.CompGraph({name: np.copy}, {name: ("image", "out")})
-        runner = ep.CompGraphRunner(cg)
-        runner.run(image=np.zeros((4, 4), np.uint8))
-        bundle = ep.promote(runner, tmp_path / "b")
-        lock = StateLock(bundle.path)
-        service = Service(bundle.path, ANY, ANY)
+    def serve(function):
+        lock = StateLock(copy_bundle.path)
+        service = Service(copy_bundle.path, ANY, ANY)
         # What a bundle can't be made of here, a function of this test, takes the place of its own.
-        service.pipeline.network.nodes[name].func = function
+        service.pipeline.network.nodes["f"].func = function
         lock.publish(service.start())
         started.append((service, lock))
-        return bundle.path, service
+        return copy_bundle.path, service
 
     yield serve
     for service, lock in started:
