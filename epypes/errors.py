@@ -104,6 +104,11 @@ class StaleToken(NotComputed):
         super().__init__(token, f"Token {token!r} is stale: something it depends on has changed. Call rerun() first.")
 
 
+def run_call(tokens: Iterable[str]) -> str:
+    """Return the call that gives these tokens as payload, for the way out of an error: ``run(image=...)``."""
+    return f"run({', '.join(f'{token}=...' for token in tokens)})"
+
+
 class PayloadError(EpypesError, TypeError):
     """``run()`` was called with missing or with wrong tokens; ``tokens`` names them."""
 

@@ -14,14 +14,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from epypes.bundle.compare import ReplayReport
 from epypes.bundle.emit import emit_module
 from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
 from epypes.bundle.replay import replay_isolated
 from epypes.bundle.seal import MANIFEST, seal
 from epypes.bundle.settings import Settings, unwritable, write_settings
 from epypes.bundle.slicer import slice_graph
-from epypes.errors import BundleError, EpypesError, MessageError, PromotionRefused
+from epypes.errors import BundleError, EpypesError, MessageError, PromotionRefused, run_call
 from epypes.graph import CompGraph
 from epypes.pipeline import Node, Pipeline
 from epypes.run import CompGraphRunner, Run
@@ -129,7 +128,7 @@ def _write(draft: Path, target: Path, runner: CompGraphRunner, cg: CompGraph, ou
 
 def _unready(runner: CompGraphRunner, outputs: Sequence[str]) -> list[str]:
     """Return why the last run can't serve as a sample."""
-    call = f"run({', '.join(f'{token}=...' for token in runner.free_source_tokens)})"
+    call = run_call(runner.free_source_tokens)
     if not outputs:
         return ["The graph has no output: name at least one token as output."]
     if runner.last is None:
@@ -150,7 +149,7 @@ def _record(path: Path, target: Path, run: Run, inputs: Sequence[str], outputs: 
         raise PromotionRefused(target, [str(error)]) from error
 
 
-def _prove(draft: Path, target: Path) -> ReplayReport:
+def _prove(draft: Path, target: Path) -> None:
     try:
         report = replay_isolated(draft, sealed=False)
     except BundleError as error:
@@ -163,7 +162,6 @@ def _prove(draft: Path, target: Path) -> ReplayReport:
         raise PromotionRefused(target, [*map(str, report.differences), why])
     (draft / REQUIREMENTS).write_text("".join(f"{line}\n" for line in report.requirements), encoding="utf-8")
     seal(draft)
-    return report
 
 
 def _replace(draft: Path, target: Path) -> None:

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from epypes.errors import BundleError
-from epypes.graph import CompGraph
-from epypes.hints import Param, annotated_param
+from epypes.graph import CompGraph, annotated_params
+from epypes.hints import Param
 
 FORMAT: Final = 1
 
@@ -83,7 +83,7 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
     document.add("ports", ports)
     hyperparameters = tomlkit.table(is_super_table=True)
     for token, value in settings.hyperparameters.items():
-        hyperparameters.add(token, _entry(plain(value), hint_of(cg, token)))
+        hyperparameters.add(token, _entry(plain(value), next(annotated_params(cg, token), None)))
     document.add("hyperparameters", hyperparameters)
     path.write_text(tomlkit.dumps(document), encoding="utf-8")
 
@@ -105,15 +105,6 @@ def _entry(value: Any, hint: Param | None) -> Any:
     if hint and hint.choices and all(_fits(choice) and choice is not None for choice in hint.choices):
         table.add("choices", list(hint.choices))
     return table
-
-
-def hint_of(cg: CompGraph, token: str) -> Param | None:
-    """Return the hint in the annotation of the first function that takes the token."""
-    for name in cg.digraph.consumers.get(token, ()):
-        hint = annotated_param(cg.functions[name], cg.func_inputs(name).index(token))
-        if hint is not None:
-            return hint
-    return None
 
 
 def read_settings(path: Path) -> Settings:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final
 
 from epypes.bundle.source import Definition, Importable, Refused, definition, importable
+from epypes.run.guard import is_plain_array
 
 _CONSTANT_CHARACTERS: Final = 400
 RESERVED: Final = frozenset({"func_dict", "func_io"})
@@ -114,8 +115,8 @@ class Slice:
         self._add_definition(helper, f"Function {name!r}, which {what[0].lower()}{what[1:]} calls,")
 
     def _add_constant(self, name: str, value: Any, found: Definition, what: str) -> None:
-        source = self._array_source(value, what) if _is_array(value) else _literal(value) if _is_data(value) else ""
-        if not source or len(source) > _CONSTANT_CHARACTERS or not (_is_array(value) or _reads_back(source, value)):
+        source = self._array_source(value, what) if is_plain_array(value) else _literal_source(value)
+        if not source or len(source) > _CONSTANT_CHARACTERS:
             kind = f"the class {name!r}" if isinstance(value, type) else f"of type {type(value).__name__}"
             raise Refused(
                 f"{what} is defined in the notebook ({found.place}) and uses {name!r} from it, {kind}. "
@@ -182,18 +183,15 @@ def _literal(value: Any) -> str:
     return repr(value)
 
 
-def _is_array(value: object) -> bool:
-    return type(value).__module__ == "numpy" and type(value).__name__ == "ndarray"
-
-
-def _reads_back(source: str, value: Any) -> bool:
-    """Whether source is a literal of this very value."""
+def _literal_source(value: Any) -> str:
+    """Return the literal of this very value; "" if there is none."""
+    source = _literal(value) if _is_data(value) else ""
     try:
         read = ast.literal_eval(source)
     except (ValueError, SyntaxError):
-        return False
+        return ""
     # By source: 0j == -0j, but they are not the same.
-    return type(read) is type(value) and _literal(read) == source
+    return source if type(read) is type(value) and _literal(read) == source else ""
 
 
 def _check_defaults(found: Definition, what: str) -> None:

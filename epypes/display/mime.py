@@ -71,7 +71,7 @@ def _figure(svg: str, graph: GraphView) -> str:
     A page that does not trust the notebook strips the script and would strip inline SVG down to its loose words, but
     keeps the image. Where the script runs, the picture takes the page's colours and its vertices tell their titles.
     """
-    source = quote(svg, safe=" <>/=:;,.()#&!?+*'@|^~-_{}[]$").replace("#", "%23").replace("&", "%26")
+    source = quote(svg, safe=" <>/=:;,.()!?+*'@|^~-_{}[]$")
     return (
         f'<figure style="margin:0"><img src="{_SVG_URI}{source}" alt="{escape(alt_text(graph))}" '
         f'style="max-width:100%"><script>{_INLINE}</script>'

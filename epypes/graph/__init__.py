@@ -1,5 +1,6 @@
 """What is connected to what: computational graphs, pure and static."""
 
 from epypes.graph.compgraph import CompGraph
+from epypes.graph.hinted import annotated_params
 
-__all__ = ["CompGraph"]
+__all__ = ["CompGraph", "annotated_params"]

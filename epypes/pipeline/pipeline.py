@@ -44,7 +44,7 @@ class Pipeline(Node):
         self.runner = CompGraphRunner(self.network.cg, hparams)
         self.source_cg = cg
         self.attributes: dict[str, Any] = {}
-        super().__init__(name, self._run_positional)
+        super().__init__(name, self.__call__)
 
     @property
     def cg(self) -> CompGraph:
@@ -66,9 +66,6 @@ class Pipeline(Node):
         """Run the graph on one payload, a mapping by token; the hook for subclasses."""
         (payload,) = args
         return self.runner.run(**payload)
-
-    def _run_positional(self, *args: Any) -> Any:
-        return self(*args)
 
     def _by_name(self, args: tuple[Any, ...]) -> dict[str, Any]:
         free = self.runner.free_source_tokens

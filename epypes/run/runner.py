@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from time import perf_counter_ns
 from typing import Any
 
-from epypes.errors import NotComputed, PayloadError, StaleToken, UnknownName
+from epypes.errors import NotComputed, PayloadError, StaleToken, UnknownName, run_call
 from epypes.graph import CompGraph
 from epypes.run.engine import StepFailed, execute
 from epypes.run.failure import Failure
@@ -123,8 +123,8 @@ class CompGraphRunner:
         last = self._last
         if last is None:
             free = self.free_source_tokens
-            call = f"run({', '.join(f'{token}=...' for token in free)})"
-            raise PayloadError(free, f"Nothing has been run yet, so there is no payload. Call {call} first.")
+            text = f"Nothing has been run yet, so there is no payload. Call {run_call(free)} first."
+            raise PayloadError(free, text)
         manager = last.tokens.copy()
         current.apply(manager)
         return self._run(manager, targets, current)
@@ -140,8 +140,7 @@ class CompGraphRunner:
         missing = missing_sources(manager, order)
         if missing:
             listed = ", ".join(map(repr, missing))
-            call = ", ".join(f"{token}=..." for token in missing)
-            raise PayloadError(missing, f"Missing payload: {listed}. Call run({call}).")
+            raise PayloadError(missing, f"Missing payload: {listed}. Call {run_call(missing)}.")
         durations_ns: dict[str, int] = {}
         failure: Failure | None = None
         try:
@@ -170,10 +169,8 @@ class CompGraphRunner:
         for token in targets:
             if not isinstance(token, str):
                 free = self.free_source_tokens
-                call = ", ".join(f"{name}=..." for name in free)
-                text = (
-                    f"A target is the name of a token, not {type(token).__name__!r}. Payload goes by name: run({call})."
-                )
+                kind = type(token).__name__
+                text = f"A target is the name of a token, not {kind!r}. Payload goes by name: {run_call(free)}."
                 raise PayloadError(free, text)
             self.cg.require_token(token)
 
@@ -248,8 +245,8 @@ class CompGraphRunner:
             return own_view(hparams.values[token])
         if last is None:
             self.cg.require_token(token)
-            call = ", ".join(f"{name}=..." for name in hparams.free_source_tokens)
-            text = f"Token {token!r} has not been computed: nothing has been run. Call run({call})."
+            call = run_call(hparams.free_source_tokens)
+            text = f"Token {token!r} has not been computed: nothing has been run. Call {call}."
             raise NotComputed(token, text)
         value = last[token]
         if self.cg.digraph.producer.get(token) in self._stale_since(last, hparams):

@@ -8,6 +8,7 @@ import signal
 import socket
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 
 import cv2
 import numpy as np
@@ -236,6 +237,31 @@ def serving(copy_bundle):
         lock.__exit__(None, None, None)
 
 
+@contextmanager
+def peer_of(service):
+    """Join a service from outside; gives a queue of requests and one of answers."""
+    requests, answers = queue.Queue(), queue.Queue()
+    with (
+        ep.ZMQSubscriber(service.publisher.address, answers) as subscriber,
+        ep.ZMQPublisher(service.subscriber.address, requests, bind=False) as publisher,
+    ):
+        assert subscriber.wait_joined(TIMEOUT_S)
+        assert publisher.wait_for_subscriber(TIMEOUT_S)
+        yield requests, answers
+
+
+def held():
+    """Return a function that says when it was called and does not return until it is released."""
+    started, release = threading.Event(), threading.Event()
+
+    def hold(image):
+        started.set()
+        release.wait(TIMEOUT_S)
+        return image
+
+    return hold, started, release
+
+
 def test_a_function_that_uses_its_buffer_again_does_not_change_answers_on_their_way(serving):
     buffer = np.zeros((1000, 1000), np.uint8)
 
@@ -282,21 +308,10 @@ def test_a_function_that_exits_is_a_failure_and_the_service_goes_on(serving):
 
 
 def test_every_event_is_answered_dropped_ones_and_those_that_wait_at_the_stop_too(serving):
-    started, release = threading.Event(), threading.Event()
-
-    def hold(image):
-        started.set()
-        release.wait(TIMEOUT_S)
-        return image
-
+    hold, started, release = held()
     _, service = serving(hold)
-    count, requests, answers = 30, queue.Queue(), queue.Queue()
-    with (
-        ep.ZMQSubscriber(service.publisher.address, answers) as subscriber,
-        ep.ZMQPublisher(service.subscriber.address, requests, bind=False) as publisher,
-    ):
-        assert subscriber.wait_joined(TIMEOUT_S)
-        assert publisher.wait_for_subscriber(TIMEOUT_S)
+    count = 30
+    with peer_of(service) as (requests, answers):
         sent = [Envelope(type="x", parts={"image": np.zeros((9, 9), np.uint8)}) for _ in range(count)]
         requests.put(sent[0])
         assert started.wait(TIMEOUT_S)
@@ -323,28 +338,16 @@ def test_a_state_file_that_somebody_wrote_into_is_not_believed(edge_bundle, phot
 
 
 def test_a_function_that_does_not_return_is_named_at_the_stop_and_what_waited_is_answered(serving):
-    started, release = threading.Event(), threading.Event()
-
-    def endless(image):
-        started.set()
-        release.wait(TIMEOUT_S)
-        return image
-
+    endless, started, release = held()
     _, service = serving(endless)
-    requests, answers = queue.Queue(), queue.Queue()
-    with (
-        ep.ZMQSubscriber(service.publisher.address, answers) as subscriber,
-        ep.ZMQPublisher(service.subscriber.address, requests, bind=False) as publisher,
-    ):
-        assert subscriber.wait_joined(TIMEOUT_S)
-        assert publisher.wait_for_subscriber(TIMEOUT_S)
+    with peer_of(service) as (requests, answers):
         sent = [Envelope(type="x", parts={"image": np.zeros((9, 9), np.uint8)}) for _ in range(3)]
         requests.put(sent[0])
         assert started.wait(TIMEOUT_S)
         for request in sent[1:]:
             requests.put(request)
-        while service.mailbox.qsize() < 2:
-            started.wait(0.01)
+        with service.mailbox._changed:
+            assert service.mailbox._changed.wait_for(lambda: service.mailbox.qsize() == 2, TIMEOUT_S)
         with pytest.raises(StillRunning, match=r"within 0\.2 s: still in 'f'"):
             service.stop(0.2)
         refused = [answers.get(timeout=TIMEOUT_S) for _ in range(2)]
@@ -376,13 +379,7 @@ def test_an_event_that_cannot_be_sent_spoils_no_later_one(serving):
 
 
 def test_the_event_under_way_is_answered_too_when_the_service_must_stop(serving):
-    started, release = threading.Event(), threading.Event()
-
-    def endless(image):
-        started.set()
-        release.wait(TIMEOUT_S)
-        return image
-
+    endless, started, release = held()
     path, service = serving(endless)
     said = queue.Queue()
 

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import ipywidgets
 
-from epypes.errors import NotComputed, PayloadError, UnknownName
+from epypes.errors import NotComputed, PayloadError, UnknownName, run_call
 from epypes.run import CompGraphRunner, Run
 from epypes_widgets.controls import Control, control, grouped
 from epypes_widgets.frames import best_token, make_frame, showable
@@ -66,8 +66,8 @@ def tune(runner: CompGraphRunner, /, *, token: str | None = None, **hints: Any) 
         raise TypeError(f"tune() takes a CompGraphRunner, not {kind!r}: tune(CompGraphRunner(cg, hparams)).")
     if runner.last is None:
         free = runner.free_source_tokens
-        call = f"run({', '.join(f'{name}=...' for name in free)})"
-        raise PayloadError(free, f"Nothing has been run yet, so there is nothing to tune on. Call {call} first.")
+        text = f"Nothing has been run yet, so there is nothing to tune on. Call {run_call(free)} first."
+        raise PayloadError(free, text)
     if token is not None:
         runner.cg.require_token(token)
     params = ranges(runner, hints)

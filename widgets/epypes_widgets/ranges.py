@@ -13,8 +13,8 @@ from dataclasses import replace
 from typing import Any
 
 from epypes.errors import UnknownName
-from epypes.graph import CompGraph
-from epypes.hints import Param, annotated_param, as_param, param_from_value
+from epypes.graph import CompGraph, annotated_params
+from epypes.hints import Param, as_param, param_from_value
 from epypes.run import CompGraphRunner
 
 
@@ -107,12 +107,8 @@ def _read(name: str, hint: Any, value: Any) -> Param:
 
 def _guess(cg: CompGraph, token: str, value: Any) -> Param | None:
     """Return what the annotations say, if it fits the value, else what the value says."""
-    for function, inputs in cg.digraph.inputs.items():
-        if token in inputs:
-            found = annotated_param(cg.functions[function], inputs.index(token))
-            if found is not None and allows(found, value):
-                return found
-    return param_from_value(_plain(value))
+    fitting = (param for param in annotated_params(cg, token) if allows(param, value))
+    return next(fitting, None) or param_from_value(_plain(value))
 
 
 def _plain(value: Any) -> Any:
