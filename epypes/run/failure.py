@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from epypes.run.draft import Draft
+from epypes.run.guard import explain_write, is_array, lend
+
+# A note is one line that names the culprit, so a value in it is short.
+_BRIEF: Final = 40
 # OpenCV begins its messages with its version and the place in its own source; what went wrong comes after.
 _OPENCV_PLACE: Final = re.compile(r"^OpenCV\([^)]*\) \S+ error: ")
 
@@ -47,3 +53,30 @@ class Failure:
     def __str__(self) -> str:
         kind, text = type(self.exception).__name__, self.message
         return f"{self.function}: {kind}{': ' + text if text else ''}"
+
+
+def failure_of(draft: Draft, index: int, exception: BaseException) -> Failure:
+    """Describe what failed, and note on the user's exception which function and tokens it concerns."""
+    tokens, step = draft.program.tokens, draft.program.steps[index]
+    inputs = tuple(tokens[slot] for slot in step.inputs)
+    outputs = tuple(tokens[slot] for slot in step.outputs)
+    values = {token: lend(draft.values[slot]) for token, slot in zip(inputs, step.inputs, strict=True)}
+    told = ", ".join(f"{token}{_brief(value)}" for token, value in values.items())
+    note = f"In function {step.name!r}: ({told}) -> ({', '.join(outputs)})"
+    # Whatever the exception's own methods do, the failure is told.
+    with contextlib.suppress(BaseException):
+        why = None if step.unguarded else explain_write(step.name, inputs, exception)
+        note = f"{note}\n{why}" if why else note
+    with contextlib.suppress(BaseException):
+        if note not in getattr(exception, "__notes__", ()):
+            exception.add_note(note)
+    return Failure(step.name, (*inputs, *outputs), values, exception)
+
+
+def _brief(value: Any) -> str:
+    """Return what a note says of an input: a small value itself, of an array its dtype and shape."""
+    if type(value) in (bool, int, float, type(None)) or (type(value) is str and len(value) <= _BRIEF):
+        return f"={value!r:.{_BRIEF}}"
+    if is_array(value):
+        return f": {value.dtype} {' x '.join(map(str, value.shape))}"
+    return ""

@@ -8,13 +8,18 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from itertools import islice
+from sys import getrefcount
+from typing import Any, Final, TypeVar
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 _MARK = "__epypes_unguarded__"
 # What holds no array, known at a glance: most values of a graph are looked at several times per run.
-_ARRAYLESS = frozenset({int, float, bool, str, bytes, complex, type(None)})
+ARRAYLESS: Final = frozenset({int, float, bool, str, bytes, complex, type(None)})
+# So many items of one type, none of them an array, tell that a long list holds none. Looking at each of 500
+# keypoints would take 10 us at every call.
+_TELLING_ITEMS: Final = 32
 
 
 def unguarded(function: F) -> F:
@@ -39,17 +44,28 @@ def is_unguarded(function: object) -> bool:
     return bool(getattr(function, _MARK, False))
 
 
+# numpy's array type as soon as it has been seen: looking it up costs as much as a view.
+_ndarray: Any = None
+
+
+def _array_type() -> Any:
+    """Return numpy's array type, or None as long as nobody has imported numpy."""
+    global _ndarray
+    if _ndarray is None:
+        _ndarray = getattr(sys.modules.get("numpy"), "ndarray", None)
+    return _ndarray
+
+
 def is_array(value: Any) -> bool:
     """Whether a value is a NumPy array."""
-    numpy = sys.modules.get("numpy")
+    kind = _array_type()
     # By type: isinstance would ask the value itself for its class, which hostile objects answer as they like.
-    return numpy is not None and issubclass(type(value), numpy.ndarray)
+    return kind is not None and issubclass(type(value), kind)
 
 
 def is_plain_array(value: Any) -> bool:
     """Whether a value is a NumPy array, and not of a subclass."""
-    numpy = sys.modules.get("numpy")
-    return numpy is not None and type(value) is numpy.ndarray
+    return type(value) is _array_type()
 
 
 def own_view(value: Any) -> Any:
@@ -59,21 +75,82 @@ def own_view(value: Any) -> Any:
     return value.copy() if hasattr(value, "mask") else value.view()
 
 
-def read_only(value: Any) -> Any:
-    """Return arrays, and arrays in a tuple, named tuple or list, as read-only views; anything else as it is.
+def lend(value: Any) -> Any:
+    """Return a value as a function or a reader gets it: arrays as read-only views of its own.
 
-    A masked array is copied, since its mask can be changed through any view.
+    Of tuples, named tuples and lists, the arrays in them count. A masked array is copied, since its mask can be
+    changed through any view.
     """
-    if type(value) in _ARRAYLESS:
+    kind = type(value)
+    if kind in ARRAYLESS:
+        return value
+    if kind is (_ndarray or _array_type()):
+        view = value.view()
+        view.setflags(write=False)
+        return view
+    if is_array(value):
+        return _locked(own_view(value))
+    if _holds_arrays(value):
+        return _make(kind)(lend(item) if is_array(item) else item for item in value)
+    return value
+
+
+def _locked(array: Any) -> Any:
+    array.flags.writeable = False
+    return array
+
+
+def keep(value: Any, fresh_count: int) -> Any:
+    """Return what a function returned as it is stored: arrays locked, and copied where others could write to them.
+
+    A function that goes on using the memory of its result would change a value that has been handed out. So an
+    array to which somebody else holds a reference is copied; a new one, the usual case, is locked as it is.
+
+    Parameters
+    ----------
+    value
+        What was returned.
+    fresh_count
+        The reference count, seen from here, of an array that nobody else knows.
+    """
+    kind = type(value)
+    if kind in ARRAYLESS:
+        return value
+    if kind is (_ndarray or _array_type()):
+        owner = value.base
+        if owner is None:
+            known_elsewhere = getrefcount(value) > fresh_count
+        else:
+            known_elsewhere = type(owner) is kind and getrefcount(owner) > _FRESH_OWNER
+        if (known_elsewhere or owner is not None) and not value.flags.writeable:
+            return value
+        if known_elsewhere:
+            value = value.copy(order="K")
+        elif owner is not None and type(owner) is not kind:
+            value = value.view()  # memory of another library's object: whether it is used again can't be seen
+        value.setflags(write=False)
         return value
     if is_array(value):
-        view = own_view(value)
-        view.flags.writeable = False
-        return view
-    if (type(value) in (tuple, list) or _is_named_tuple(value)) and any(map(is_array, value)):
-        make = getattr(type(value), "_make", type(value))
-        return make(read_only(item) if is_array(item) else item for item in value)
+        return _locked(own_view(value))
+    if _holds_arrays(value):
+        return _make(kind)(keep(item, fresh_count + 1) if is_array(item) else item for item in value)
     return value
+
+
+def _holds_arrays(value: Any) -> bool:
+    """Whether a tuple, named tuple or list has an array among its items."""
+    kind = type(value)
+    if not (kind is tuple or kind is list or _is_named_tuple(value)):
+        return False
+    kinds = set(map(type, islice(value, _TELLING_ITEMS)))
+    if len(value) > _TELLING_ITEMS and (len(kinds) > 1 or type(None) in kinds):
+        kinds = set(map(type, value))
+    array = _array_type()
+    return array is not None and any(issubclass(kind, array) for kind in kinds)
+
+
+def _make(kind: type) -> Any:
+    return getattr(kind, "_make", kind)
 
 
 def _is_named_tuple(value: Any) -> bool:
@@ -83,15 +160,51 @@ def _is_named_tuple(value: Any) -> bool:
 def writable(value: Any) -> Any:
     """Return a writable view of a guarded array, for an unguarded function; a copy where memory is read-only."""
     if is_array(value):
-        view = value.view()
         try:
+            view = value.view()
             view.flags.writeable = True
         except ValueError:
-            return value.copy()
+            view = _view_of_locked(value)
         return view
-    if type(value) in (tuple, list) or _is_named_tuple(value):
-        return getattr(type(value), "_make", type(value))(writable(item) for item in value)
+    if _holds_arrays(value):
+        return _make(type(value))(writable(item) for item in value)
     return value
+
+
+def _view_of_locked(array: Any) -> Any:
+    """Return a writable view of an array that ``keep`` has locked; a copy of one whose memory is read-only for good."""
+    if array.base is not None or not array.flags.owndata:
+        return array.copy()
+    array.setflags(write=True)
+    try:
+        return array.view()
+    finally:
+        array.setflags(write=False)
+
+
+def is_same_guarded_array(old: Any, new: Any, given: Sequence[Any]) -> bool:
+    """Whether a function returned the very memory that it returned before, and that nobody has written to.
+
+    Parameters
+    ----------
+    old, new
+        What it returned before and now, both as ``keep`` gave them.
+    given
+        The values that the function read, as they are stored.
+    """
+    if old is new:
+        return True
+    owner = new.base
+    if owner is None or owner is not old.base or new.flags.writeable:
+        return False
+    if new.shape != old.shape or new.strides != old.strides or new.dtype != old.dtype:
+        return False
+    if new.__array_interface__["data"] != old.__array_interface__["data"]:
+        return False
+    # Memory that can be written to has kept its content only if it is an input's, which counts as unchanged.
+    return not getattr(owner, "flags", owner).writeable or any(
+        owner is value or owner is getattr(value, "base", None) for value in given
+    )
 
 
 def explain_write(function: str, tokens: Sequence[str], exception: BaseException) -> str | None:
@@ -104,3 +217,26 @@ def explain_write(function: str, tokens: Sequence[str], exception: BaseException
         f"Inputs are read-only, so that {function!r} can't change {which} for other functions. "
         "Work on a copy, made with .copy(), or mark the function with @ep.unguarded if it only reads."
     )
+
+
+class _Holder:
+    __slots__ = ("base",)
+
+
+def _count(value: Any, unused: int) -> int:
+    return getrefcount(value)
+
+
+def _measure_fresh() -> tuple[int, int]:
+    """Return the reference counts that ``keep`` sees of an object that nobody else knows, and of a fresh owner.
+
+    Measured, since interpreters differ in which references they count.
+    """
+    holder = _Holder()
+    holder.base = object()
+    owner = holder.base
+    result = object()
+    return _count(result, 0), getrefcount(owner)
+
+
+FRESH, _FRESH_OWNER = _measure_fresh()

@@ -1,16 +1,19 @@
-"""Which functions would run, which would be reused, and what is missing?"""
+"""Which functions would run and why, which would be reused, and what is missing?"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
 
+from epypes.graph import CompGraph
+from epypes.run.need import missing_sources, needed_placeholders, wanted_steps
 from epypes.run.tokens import NOT_COMPUTED, TokenManager
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What a run of ``targets`` would do.
+    """What a run of ``targets`` would do; shows itself as a table and on the graph.
 
     Attributes
     ----------
@@ -23,40 +26,75 @@ class Plan:
         The functions that are needed and up to date.
     missing
         The source tokens without value that are needed.
+    placeholders
+        The functions that are needed and still to be written.
+    left_out
+        The functions that are not needed: for these targets, or since a switch has chosen another branch.
+    why
+        By function of ``order``, the reason why it would run.
+    cg
+        The graph.
     """
 
     targets: tuple[str, ...]
     order: tuple[str, ...]
     reused: tuple[str, ...]
     missing: tuple[str, ...]
+    placeholders: tuple[str, ...]
+    left_out: tuple[str, ...]
+    why: Mapping[str, str]
+    cg: CompGraph = field(repr=False, compare=False)
+
+    def __repr__(self) -> str:
+        missing = f", {len(self.missing) + len(self.placeholders)} missing" * bool(self.missing or self.placeholders)
+        return f"<Plan: {len(self.order)} functions to run, {len(self.reused)} reused{missing}>"
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
+        from epypes.display import mimebundle
+
+        return mimebundle(self)
 
 
-def needed_steps(manager: TokenManager, targets: Sequence[str]) -> tuple[int, ...]:
-    """Return the steps that the targets, tokens of the graph, need, in run order; every step without targets."""
+def plan(manager: TokenManager, targets: Sequence[str], changed: Collection[str]) -> Plan:
+    """Plan a run that starts from these token values; changes nothing.
+
+    Parameters
+    ----------
+    manager
+        The values as they are now.
+    targets
+        Tokens of the graph; empty for all.
+    changed
+        The hyperparameters that have changed since the last run; for the reasons.
+    """
     program = manager.program
-    return program.needed(targets) if targets else tuple(range(len(program.steps)))
-
-
-def missing_sources(manager: TokenManager, steps: Sequence[int]) -> tuple[str, ...]:
-    """Return the source tokens that these steps read and that have no value, in graph order."""
-    program = manager.program
-    slots = {slot for index in steps for slot in program.steps[index].inputs}
-    return tuple(
-        program.tokens[slot]
-        for slot in sorted(slots)
-        if slot not in program.makers and manager.values[slot] is NOT_COMPUTED
-    )
-
-
-def plan(manager: TokenManager, targets: Sequence[str]) -> Plan:
-    """Plan a run that starts from these token values; changes nothing."""
-    steps = needed_steps(manager, targets)
-    stale = manager.stale_steps(steps)
-    running = set(stale)
-    names = [step.name for step in manager.program.steps]
+    wanted = wanted_steps(program, manager.values, targets)
+    needed = [step for step in program.steps if wanted is None or wanted[step.index]]
+    stale = manager.stale
     return Plan(
         targets=tuple(targets),
-        order=tuple(names[index] for index in stale),
-        reused=tuple(names[index] for index in steps if index not in running),
-        missing=missing_sources(manager, steps),
+        order=tuple(step.name for step in needed if step.index in stale),
+        reused=tuple(step.name for step in needed if step.index not in stale),
+        missing=missing_sources(program, manager.values, wanted),
+        placeholders=needed_placeholders(program, wanted),
+        left_out=tuple(step.name for step in program.steps if wanted is not None and not wanted[step.index]),
+        why=MappingProxyType(
+            {step.name: _reason(manager, step.index, changed) for step in needed if step.index in stale}
+        ),
+        cg=program.cg,
     )
+
+
+def _reason(manager: TokenManager, index: int, changed: Collection[str]) -> str:
+    """Return why a stale step would run."""
+    program, step = manager.program, manager.program.steps[index]
+    if step.outputs and all(manager.values[slot] is NOT_COMPUTED for slot in step.outputs):
+        return "not computed yet"
+    read = program.read_by(step, manager.values)
+    new = [repr(program.tokens[slot]) for slot in dict.fromkeys(read) if program.tokens[slot] in changed]
+    if new:
+        return f"{', '.join(new)} changed"
+    remade = [repr(program.tokens[slot]) for slot in dict.fromkeys(read) if program.makers[slot] in manager.stale]
+    if remade:
+        return f"takes {', '.join(remade)}, made anew"
+    return "an input has changed since it ran" if manager.dirty[index] and step.outputs else "not run yet"

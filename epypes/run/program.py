@@ -5,16 +5,19 @@ A graph is compiled once: tokens become slot numbers, functions become steps in 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from types import BuiltinFunctionType
+from typing import Any, NamedTuple
 
 from epypes.graph import CompGraph
+from epypes.graph.placeholder import is_placeholder
+from epypes.graph.switch import Switch
+from typing import Any as Contracts
+def contracts_of(*a): return None
 from epypes.run.guard import is_unguarded
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(NamedTuple):
     """One function of a program.
 
     Attributes
@@ -25,10 +28,14 @@ class Step:
         The slots it reads and writes.
     single
         Whether its value is one token as it is, not a sequence of tokens.
-    upstream
-        The steps that make its inputs.
-    guarded
-        Whether it gets its arrays read-only.
+    unguarded
+        Whether it gets its arrays writable.
+    is_builtin
+        Whether it is a C function, which can write into an array but has no means to change its shape.
+    switch
+        The switch that it is, if it is one.
+    contracts
+        What its annotations say of its images, if they say anything.
     """
 
     index: int
@@ -37,58 +44,107 @@ class Step:
     inputs: tuple[int, ...]
     outputs: tuple[int, ...]
     single: bool
-    upstream: tuple[int, ...]
-    guarded: bool
+    unguarded: bool
+    is_builtin: bool
+    switch: Switch | None
+    contracts: Contracts | None
 
 
-@dataclass(frozen=True, slots=True)
 class Program:
-    """A compiled graph: tokens by slot, steps in run order."""
+    """A compiled graph; nothing in it changes.
 
-    cg: CompGraph
-    tokens: tuple[str, ...]
-    slots: Mapping[str, int]
-    steps: tuple[Step, ...]
-    makers: Mapping[int, int]
+    Attributes
+    ----------
+    cg
+        The graph.
+    guard
+        Whether functions get arrays as read-only views.
+    tokens
+        The tokens by slot.
+    slots
+        The slots by token.
+    steps
+        The functions, in run order.
+    makers
+        By slot, the step that writes it, or -1 for a source token.
+    consumers
+        By slot, the steps that read it, in run order.
+    switches, placeholders
+        The steps that are one.
+    selectors
+        By the selector's token, the switches that it selects for.
+    """
 
-    def needed(self, targets: Iterable[str]) -> tuple[int, ...]:
-        """Return the steps that these tokens depend on, in run order; all of them without targets."""
-        wanted = {self.makers[self.slots[token]] for token in targets if self.slots[token] in self.makers}
-        pending = list(wanted)
-        while pending:
-            for step in self.steps[pending.pop()].upstream:
-                if step not in wanted:
-                    wanted.add(step)
-                    pending.append(step)
-        return tuple(sorted(wanted))
+    __slots__ = (
+        "cg",
+        "consumers",
+        "guard",
+        "makers",
+        "placeholders",
+        "selectors",
+        "slots",
+        "steps",
+        "switches",
+        "tokens",
+    )
 
-    def downstream(self, starts: Iterable[int]) -> set[int]:
-        """Return these steps and every step that depends on one of them."""
-        found = set(starts)
+    def __init__(self, cg: CompGraph, guard: bool) -> None:
+        self.cg, self.guard, self.tokens = cg, guard, cg.tokens
+        self.slots = slots = {token: slot for slot, token in enumerate(cg.tokens)}
+        self.steps = tuple(_steps(cg, slots))
+        self.makers = [-1] * len(slots)
+        consumers: list[list[int]] = [[] for _ in slots]
         for step in self.steps:
-            if step.index not in found and not found.isdisjoint(step.upstream):
-                found.add(step.index)
+            for slot in step.outputs:
+                self.makers[slot] = step.index
+            for slot in step.inputs:
+                if not consumers[slot] or consumers[slot][-1] != step.index:
+                    consumers[slot].append(step.index)
+        self.consumers: Sequence[Sequence[int]] = consumers
+        self.switches = tuple(step.index for step in self.steps if step.switch is not None)
+        self.placeholders = frozenset(step.index for step in self.steps if is_placeholder(step.function))
+        self.selectors: dict[str, list[Switch]] = {}
+        for index in self.switches:
+            step = self.steps[index]
+            if step.switch is not None:
+                self.selectors.setdefault(self.tokens[step.inputs[0]], []).append(step.switch)
+
+    def read_by(self, step: Step, values: Sequence[Any]) -> tuple[int, ...]:
+        """Return the slots that a step reads with these values: of a switch, the selector and the chosen branch."""
+        if step.switch is None:
+            return step.inputs
+        try:
+            branch = step.switch.branch_index(values[step.inputs[0]])
+        except LookupError:
+            return step.inputs  # the selector has no value, or one that is refused when the step runs
+        return step.inputs[0], step.inputs[1 + branch]
+
+    def downstream(self, starts: Iterable[int], values: Sequence[Any]) -> set[int]:
+        """Return these steps and every step that, with these values, depends on one of them."""
+        found = set(starts)
+        pending = list(found)
+        while pending:
+            for slot in self.steps[pending.pop()].outputs:
+                for index in self.consumers[slot]:
+                    if index not in found and slot in self.read_by(self.steps[index], values):
+                        found.add(index)
+                        pending.append(index)
         return found
 
 
-def compile_graph(cg: CompGraph) -> Program:
-    """Compile a graph; costs time in proportion to its size."""
-    slots = {token: slot for slot, token in enumerate(cg.tokens)}
-    position = {name: index for index, name in enumerate(cg.functions)}
-    steps: list[Step] = []
+def _steps(cg: CompGraph, slots: dict[str, int]) -> Iterable[Step]:
+    inputs, outputs, of = cg.digraph.inputs, cg.digraph.outputs, slots.__getitem__
     for index, (name, function) in enumerate(cg.functions.items()):
-        upstream = {position[producer] for producer in cg.digraph.predecessors(name)}
-        steps.append(
-            Step(
-                index=index,
-                name=name,
-                function=function,
-                inputs=tuple(slots[token] for token in cg.digraph.inputs[name]),
-                outputs=tuple(slots[token] for token in cg.digraph.outputs[name]),
-                single=cg.has_single_output(name),
-                upstream=tuple(sorted(upstream)),
-                guarded=not is_unguarded(function),
-            )
+        read, written = tuple(map(of, inputs[name])), tuple(map(of, outputs[name]))
+        yield Step(
+            index,
+            name,
+            function,
+            read,
+            written,
+            type(cg.func_io[name][1]) is str,
+            is_unguarded(function),
+            type(function) is BuiltinFunctionType,
+            function if isinstance(function, Switch) else None,
+            contracts_of(function, len(read), len(written)),
         )
-    makers = {slot: step.index for step in steps for slot in step.outputs}
-    return Program(cg, cg.tokens, slots, tuple(steps), makers)

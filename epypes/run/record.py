@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from epypes.errors import NotComputed, StaleToken
 from epypes.run.failure import Failure
+from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.report import RunReport
 from epypes.run.tokens import TokenManager
 
@@ -19,47 +20,39 @@ class Run(Mapping[str, Any]):
 
     Reading a token that was not computed raises NotComputed; iterating gives those that were. Arrays are read-only:
     draw on a copy, ``run["edges"].copy()``.
-
-    Attributes
-    ----------
-    report
-        The times of the run.
-    failure
-        None, or the function that failed; the tokens that were computed before keep their values.
-    hyperparameters
-        The values that the run was computed with.
-    revision
-        The runner's count of hyperparameter changes when the run began.
     """
 
-    __slots__ = ("__weakref__", "_manager", "failure", "hyperparameters", "report", "revision")
+    __slots__ = ("__weakref__", "_failure", "_hparams", "_manager", "_report")
 
     def __init__(
-        self,
-        manager: TokenManager,
-        report: RunReport,
-        failure: Failure | None,
-        hyperparameters: Mapping[str, Any],
-        revision: int,
+        self, manager: TokenManager, report: RunReport, failure: Failure | None, hparams: Hyperparameters
     ) -> None:
-        for name, value in (
-            ("_manager", manager),
-            ("report", report),
-            ("failure", failure),
-            ("hyperparameters", hyperparameters),
-            ("revision", revision),
-        ):
-            object.__setattr__(self, name, value)
+        self._manager, self._report, self._failure, self._hparams = manager, report, failure, hparams
 
-    if TYPE_CHECKING:
-        _manager: TokenManager
-        report: RunReport
-        failure: Failure | None
-        hyperparameters: Mapping[str, Any]
-        revision: int
+    @property
+    def report(self) -> RunReport:
+        """The times of the run."""
+        return self._report
 
-    def __setattr__(self, name: str, value: object) -> None:
-        raise AttributeError(f"A Run does not change; {name!r} can't be set. Use the runner.")
+    @property
+    def failure(self) -> Failure | None:
+        """None, or the function that failed; the tokens that were computed before keep their values."""
+        return self._failure
+
+    @property
+    def hparams(self) -> Hyperparameters:
+        """The hyperparameters that the run was computed with, and their versions."""
+        return self._hparams
+
+    @property
+    def hyperparameters(self) -> Mapping[str, Any]:
+        """The values that the run was computed with."""
+        return self._hparams.values
+
+    @property
+    def revision(self) -> int:
+        """The runner's count of hyperparameter changes when the run began."""
+        return self._hparams.revision
 
     @property
     def cg(self) -> CompGraph:

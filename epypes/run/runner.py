@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import threading
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,14 +10,14 @@ from typing import Any
 
 from epypes.errors import NotComputed, PayloadError, StaleToken, UnknownName, run_call
 from epypes.graph import CompGraph
-from epypes.run.engine import StepFailed, execute
-from epypes.run.failure import Failure
-from epypes.run.guard import own_view, read_only
+from epypes.run.attempt import Attempts, Outcome
+from epypes.run.draft import Draft
+from epypes.run.guard import lend
 from epypes.run.hyperparameters import Hyperparameters
-from epypes.run.plan import Plan, missing_sources, needed_steps, plan
-from epypes.run.program import Program, compile_graph
+from epypes.run.plan import Plan, plan
+from epypes.run.program import Program
 from epypes.run.record import Run
-from epypes.run.report import FunctionTime, RunReport
+from epypes.run.report import RunReport
 from epypes.run.tokens import TokenManager
 
 _KEPT_REPORTS = 1000
@@ -65,11 +64,12 @@ class CompGraphRunner:
         self.cg = cg
         self.guard = guard
         self.reports: deque[RunReport] = deque(maxlen=_KEPT_REPORTS)
-        self._program = compile_graph(cg)
-        self._next_version = itertools.count(1).__next__
+        self._program = Program(cg, guard)
+        self._attempts = Attempts(self._program)
         self._lock = threading.Lock()
         self._last: Run | None = None
-        self._hparams = Hyperparameters(cg, {}, {}, 0).frozen(hparams or {}, self._next_version, guard)
+        given = {**cg.defaults, **(hparams or {})}
+        self._hparams = Hyperparameters(self._program, {}, None, 0).frozen(given)
 
     # -- running ------------------------------------------------------------------------------------------------
 
@@ -92,19 +92,27 @@ class CompGraphRunner:
         ------
         PayloadError
             A free source token that is needed is missing, or a token is given that is not one.
+        PlaceholderNeeded
+            Functions that are needed are still to be written.
         UnknownName
-            A name is not a token of the graph.
+            A name is not a token of the graph, or not a branch of a switch.
         Exception
             Whatever a function raises, unchanged, with a note; ``last`` is then the failed run.
         """
-        hparams = self._hparams
-        self._check_targets(targets)
-        self._check_payload(hparams, payload)
-        manager = TokenManager(self._program)
-        hparams.apply(manager)
+        start_ns = perf_counter_ns()
+        if targets:
+            self._check_targets(targets)
+        hparams, program = self._hparams, self._program
+        values, free = hparams.base.copy(), hparams.free_slots
         for token, value in payload.items():
-            manager.put(token, read_only(value) if self.guard else value, self._next_version())
-        return self._run(manager, targets, hparams)
+            slot = free.get(token)
+            if slot is None:
+                raise self._wrong_payload(hparams, token)
+            values[slot] = value
+        if program.selectors:
+            for token in payload:
+                hparams.require_branch(token, payload[token])
+        return self._ended(hparams, self._attempts.whole(values, len(payload) == len(free), targets, start_ns))
 
     def rerun(self, /, *targets: str, **hparams: Any) -> Run:
         """Set hyperparameters, all or none of them, then run the stale functions on the last payload.
@@ -113,57 +121,44 @@ class CompGraphRunner:
         ------
         PayloadError
             Nothing has been run yet.
+        PlaceholderNeeded
+            Functions that are needed are still to be written.
         HyperparameterError, UnknownName
             A name is not a hyperparameter; nothing is set then.
         Exception
             Whatever a function raises, unchanged, with a note.
         """
-        self._check_targets(targets)
+        start_ns = perf_counter_ns()
+        if targets:
+            self._check_targets(targets)
         current = self._set(hparams)
         last = self._last
         if last is None:
             free = self.free_source_tokens
             text = f"Nothing has been run yet, so there is no payload. Call {run_call(free)} first."
             raise PayloadError(free, text)
-        manager = last.tokens.copy()
-        current.apply(manager)
-        return self._run(manager, targets, current)
+        outcome = None
+        if last.tokens.freshness.is_clean and not targets:
+            outcome = self._attempts.changed(last.tokens, current.changes_since(last.hparams), start_ns)
+        if outcome is None:
+            outcome = self._attempts.stale(self._draft(last, current), targets, start_ns)
+        return self._ended(current, outcome)
 
-    def plan(self, /, *targets: str) -> Plan:
-        """Return what ``rerun(*targets)`` would do."""
-        self._check_targets(targets)
-        return plan(_tokens_now(self._program, self._last, self._hparams), targets)
-
-    def _run(self, manager: TokenManager, targets: Sequence[str], hparams: Hyperparameters) -> Run:
-        start_ns = perf_counter_ns()
-        order = needed_steps(manager, targets)
-        missing = missing_sources(manager, order)
-        if missing:
-            listed = ", ".join(map(repr, missing))
-            raise PayloadError(missing, f"Missing payload: {listed}. Call {run_call(missing)}.")
-        durations_ns: dict[str, int] = {}
-        failure: Failure | None = None
-        try:
-            execute(manager, order, self._next_version, self.guard, durations_ns)
-        except StepFailed as failed:
-            failure = failed.failure
-            manager.forget(self._program.downstream([failed.step.index]))
-        partial = failure is not None or len(order) < len(self._program.steps)
-        manager.stale = frozenset(manager.stale_steps(range(len(self._program.steps)))) if partial else frozenset()
-        report = RunReport(
-            tuple(
-                FunctionTime(name, durations_ns.get(name, 0), name in durations_ns)
-                for name in (self._program.steps[index].name for index in order)
-            ),
-            perf_counter_ns() - start_ns,
-        )
-        run = Run(manager, report, failure, hparams.values, hparams.revision)
-        with self._lock:
-            self._last = run
-            self.reports.append(report)
+    def _ended(self, hparams: Hyperparameters, outcome: Outcome) -> Run:
+        """Make what was run the last Run; raise the user's exception if a function failed."""
+        manager, report, failure = outcome
+        run = self._last = Run(manager, report, failure, hparams)
+        self.reports.append(report)
         if failure is not None:
             raise failure.exception
         return run
+
+    def plan(self, /, *targets: str) -> Plan:
+        """Return what ``rerun(*targets)`` would do, and why."""
+        self._check_targets(targets)
+        last, hparams = self._last, self._hparams
+        changed = () if last is None else tuple(hparams.changes_since(last.hparams))
+        return plan(self._now(last, hparams), targets, changed)
 
     def _check_targets(self, targets: Sequence[object]) -> None:
         for token in targets:
@@ -174,17 +169,16 @@ class CompGraphRunner:
                 raise PayloadError(free, text)
             self.cg.require_token(token)
 
-    def _check_payload(self, hparams: Hyperparameters, payload: Mapping[str, Any]) -> None:
-        for token in payload:
-            if token not in self._program.slots:
-                raise UnknownName("token", token, hparams.free_source_tokens)
-            maker = self.cg.digraph.producer.get(token)
-            if maker is not None:
-                text = f"Token {token!r} is made by function {maker!r}; run() takes free source tokens only."
-                raise PayloadError((token,), text)
-            if token in hparams.values:
-                text = f"Token {token!r} is a hyperparameter. Set runner[{token!r}], or call unfreeze({token!r})."
-                raise PayloadError((token,), text)
+    def _wrong_payload(self, hparams: Hyperparameters, token: str) -> Exception:
+        """Return the error that says why this token can't be given to ``run``."""
+        if token not in self._program.slots:
+            return UnknownName("token", token, hparams.free_slots)
+        maker = self.cg.digraph.producer.get(token)
+        if maker is not None:
+            text = f"Token {token!r} is made by function {maker!r}; run() takes free source tokens only."
+        else:
+            text = f"Token {token!r} is a hyperparameter. Set runner[{token!r}], or call unfreeze({token!r})."
+        return PayloadError((token,), text)
 
     # -- hyperparameters ----------------------------------------------------------------------------------------
 
@@ -196,12 +190,12 @@ class CompGraphRunner:
     @property
     def free_source_tokens(self) -> tuple[str, ...]:
         """The source tokens that ``run`` takes, in order of first appearance in func_io."""
-        return self._hparams.free_source_tokens
+        return tuple(self._hparams.free_slots)
 
     def freeze(self, /, **values: Any) -> None:
         """Make source tokens hyperparameters, all or none of them."""
         with self._lock:
-            self._hparams = self._hparams.frozen(values, self._next_version, self.guard)
+            self._hparams = self._hparams.frozen(values)
 
     def unfreeze(self, token: str) -> None:
         """Make a hyperparameter a free source token again."""
@@ -215,8 +209,8 @@ class CompGraphRunner:
         with self._lock:
             for token in values:
                 self._hparams.require(token)
-            self._hparams = self._hparams.frozen(values, self._next_version, self.guard)
-            return self._hparams
+            hparams = self._hparams = self._hparams.frozen(values)
+            return hparams
 
     # -- reading ------------------------------------------------------------------------------------------------
 
@@ -228,28 +222,38 @@ class CompGraphRunner:
     @property
     def stale(self) -> tuple[str, ...]:
         """The functions that ``rerun()`` would run, in run order."""
-        return self._stale_since(self._last, self._hparams)
+        return plan(self._now(self._last, self._hparams), (), ()).order
 
-    def _stale_since(self, last: Run | None, hparams: Hyperparameters) -> tuple[str, ...]:
-        """Return the functions that these hyperparameters make stale in this run.
+    def _draft(self, last: Run | None, hparams: Hyperparameters) -> Draft:
+        """Return a run's tokens with these hyperparameters, to go on from.
 
         Both are given, so that what is read beside a rerun in another thread is decided from one state.
         """
-        if last is not None and last.revision == hparams.revision and not last.tokens.stale and not last.failure:
-            return ()
-        return plan(_tokens_now(self._program, last, hparams), ()).order
+        if last is None:
+            return Draft.of_sources(self._program, hparams.base.copy(), not hparams.free_slots)
+        draft = Draft.after(last.tokens)
+        for token, value in hparams.changes_since(last.hparams).items():
+            draft.change(token, value)
+        return draft
+
+    def _now(self, last: Run | None, hparams: Hyperparameters) -> TokenManager:
+        """Return a run's tokens as they are to be read with these hyperparameters."""
+        if last is not None and last.hparams is hparams:
+            return last.tokens
+        return self._draft(last, hparams).ended()
 
     def __getitem__(self, token: str) -> Any:
         hparams, last = self._hparams, self._last
-        if token in hparams.values:
-            return own_view(hparams.values[token])
+        if token in hparams.entries:
+            value = hparams.entries[token][0]
+            return lend(value) if self.guard else value
         if last is None:
             self.cg.require_token(token)
-            call = run_call(hparams.free_source_tokens)
+            call = run_call(hparams.free_slots)
             text = f"Token {token!r} has not been computed: nothing has been run. Call {call}."
             raise NotComputed(token, text)
         value = last[token]
-        if self.cg.digraph.producer.get(token) in self._stale_since(last, hparams):
+        if self._now(last, hparams).is_stale(token):
             raise StaleToken(token)
         return value
 
@@ -265,10 +269,10 @@ class CompGraphRunner:
     def keys(self) -> tuple[str, ...]:
         """Return the tokens that can be read now, in graph order."""
         hparams, last = self._hparams, self._last
-        stale = self._stale_since(last, hparams)
-        producer = self.cg.digraph.producer
-        readable = set(last or ()) | set(hparams.values)
-        return tuple(token for token in self.cg.tokens if token in readable and producer.get(token) not in stale)
+        now = self._now(last, hparams)
+        return tuple(
+            token for token in self.cg.tokens if token in hparams.entries or (now.is_computed(token) and not now.is_stale(token))
+        )
 
     def __repr__(self) -> str:
         if self._last is None:
@@ -285,10 +289,3 @@ class CompGraphRunner:
         from epypes.display import mimebundle
 
         return mimebundle(self)
-
-
-def _tokens_now(program: Program, last: Run | None, hparams: Hyperparameters) -> TokenManager:
-    """Return a run's tokens with these hyperparameters."""
-    manager = TokenManager(program) if last is None else last.tokens.copy()
-    hparams.apply(manager)
-    return manager

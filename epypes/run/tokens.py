@@ -1,21 +1,23 @@
-"""Which values do the tokens have, and are they up to date?
+"""Which values do the tokens have after a run, and are they up to date?
 
-Staleness goes by version, never by looking at data: each value that is put gets a version number, and a step is
-up to date while the versions of its inputs are those it was last run with. The cost does not depend on the size
-of the values.
+Staleness never looks at data: a step is dirty when something that it reads has got a new version since it last ran.
+The cost does not depend on the size of the values.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Any, Final
 
 from epypes.errors import NotComputed, StaleToken
-from epypes.run.guard import own_view
+from epypes.run.guard import lend
 from epypes.run.program import Program
 
-_SCALARS = (int, float, complex, str, bytes, bool, type(None))
-_SMALL_TUPLE = 16
+_SCALARS: Final = frozenset({int, float, complex, bool, type(None)})
+_TEXTS: Final = frozenset({str, bytes})
+_SMALL_TUPLE: Final = 16
+# Longer texts (an encoded image) are taken for new unless they are the same object.
+_SHORT_TEXT: Final = 1_000
 
 
 class _NotComputed:
@@ -30,48 +32,61 @@ class _NotComputed:
 NOT_COMPUTED: Final = _NotComputed()
 
 
-class TokenManager:
-    """The token values of one run.
-
-    A run works on its own TokenManager, so concurrent runs never see each other's values.
+class Freshness:
+    """Which steps of a run are up to date; runs that are wholly up to date share one.
 
     Attributes
     ----------
-    values, versions
-        By slot.
-    used
-        By step, the versions of the inputs that it was last run with, or None.
-    stale
-        The steps whose outputs are out of date.
+    program
+        What was run.
+    dirty
+        By step, 1 if it has to run before its outputs can be read: it never ran, failed, or one of its inputs has a
+        new value.
+    has_payload
+        Whether every source token has a value; if not, each run has to see whether it needs one that has none.
+    is_clean
+        Whether every step is up to date and every source token has a value.
     """
 
-    __slots__ = ("program", "stale", "used", "values", "versions")
+    __slots__ = ("dirty", "has_payload", "is_clean", "program")
 
-    def __init__(self, program: Program) -> None:
-        self.program = program
-        self.values: list[Any] = [NOT_COMPUTED] * len(program.tokens)
-        self.versions: list[int] = [0] * len(program.tokens)
-        self.used: list[tuple[int, ...] | None] = [None] * len(program.steps)
-        self.stale: frozenset[int] = frozenset()
+    def __init__(self, program: Program, dirty: bytes, has_payload: bool) -> None:
+        self.program, self.dirty, self.has_payload = program, dirty, has_payload
+        self.is_clean = has_payload and 1 not in dirty
 
-    def copy(self) -> TokenManager:
-        """Return a copy that can change without changing this one; the values are shared."""
-        twin = TokenManager.__new__(TokenManager)
-        twin.program, twin.stale = self.program, self.stale
-        twin.values, twin.versions, twin.used = self.values.copy(), self.versions.copy(), self.used.copy()
-        return twin
 
-    def put(self, token: str, value: Any, version: int) -> None:
-        """Give a token a value."""
-        slot = self.program.slots[token]
-        self.values[slot], self.versions[slot] = value, version
+class TokenManager:
+    """The token values of one run, which do not change any more.
 
-    def forget(self, steps: Iterable[int]) -> None:
-        """Make the outputs of these steps read as not computed."""
-        for index in steps:
-            self.used[index] = None
-            for slot in self.program.steps[index].outputs:
-                self.values[slot] = NOT_COMPUTED
+    A run works on values of its own, so concurrent runs never see each other's.
+
+    Attributes
+    ----------
+    values
+        By slot.
+    freshness
+        Which of them are up to date.
+    """
+
+    __slots__ = ("_stale", "freshness", "values")
+
+    def __init__(self, values: Sequence[Any], freshness: Freshness) -> None:
+        self.values, self.freshness = values, freshness
+        self._stale: set[int] | None = None
+
+    @property
+    def program(self) -> Program:
+        """What was run."""
+        return self.freshness.program
+
+    @property
+    def stale(self) -> set[int]:
+        """The steps whose outputs are out of date: the dirty ones and what depends on them."""
+        if self._stale is None:
+            dirty = self.freshness.dirty
+            starts = [index for index, is_dirty in enumerate(dirty) if is_dirty] if 1 in dirty else ()
+            self._stale = self.program.downstream(starts, self.values)
+        return self._stale
 
     def is_computed(self, token: str) -> bool:
         """Whether the token has a value, be it stale."""
@@ -80,10 +95,10 @@ class TokenManager:
     def is_stale(self, token: str) -> bool:
         """Whether the token has a value that is out of date."""
         slot = self.program.slots[token]
-        return self.program.makers.get(slot) in self.stale and self.values[slot] is not NOT_COMPUTED
+        return self.program.makers[slot] in self.stale and self.values[slot] is not NOT_COMPUTED
 
     def read(self, token: str) -> Any:
-        """Return a token's value.
+        """Return a token's value, arrays as read-only views.
 
         Raises
         ------
@@ -100,31 +115,18 @@ class TokenManager:
         value = self.values[self.program.slots[token]]
         if value is NOT_COMPUTED:
             raise NotComputed(token, f"Token {token!r} has not been computed. {self._way_out(token)}")
-        return own_view(value)
+        return lend(value) if self.program.guard else value
 
     def _way_out(self, token: str) -> str:
         return (
-            f"Call rerun({token!r}), or run() with the graph's payload."
-            if self.program.slots[token] in self.program.makers
-            else f"Pass it: run({token}=...)."
+            f"Pass it: run({token}=...)."
+            if self.program.makers[self.program.slots[token]] < 0
+            else f"Call rerun({token!r}), or run() with the graph's payload."
         )
-
-    def stale_steps(self, steps: Iterable[int]) -> list[int]:
-        """Return which of these steps (in run order, with all they depend on) are out of date."""
-        found: list[int] = []
-        seen: set[int] = set()
-        for index in steps:
-            step = self.program.steps[index]
-            if self.used[index] != tuple(self.versions[slot] for slot in step.inputs) or not seen.isdisjoint(
-                step.upstream
-            ):
-                seen.add(index)
-                found.append(index)
-        return found
 
 
 def is_same_value(old: Any, new: Any) -> bool:
-    """Whether two immutable values are cheaply known to be equal: numbers, strings and small tuples of them.
+    """Whether two immutable values are cheaply known to be equal: numbers, short texts and small tuples of them.
 
     The types must agree, so that True is not 1 and 1 is not 1.0; NaN is not equal to itself, so it counts as new.
     Arrays are never compared.
@@ -135,6 +137,8 @@ def is_same_value(old: Any, new: Any) -> bool:
     if kind in _SCALARS:
         # 0.0 == -0.0, but they do not always compute the same: the sign is in the repr.
         return bool(old == new) and (kind not in (float, complex) or repr(old) == repr(new))
+    if kind in _TEXTS:
+        return old is new or (len(old) == len(new) <= _SHORT_TEXT and bool(old == new))
     if kind is tuple:
         return len(old) == len(new) <= _SMALL_TUPLE and all(map(is_same_value, old, new))
     return False

@@ -408,7 +408,7 @@ def test_a_plan_says_what_would_run_and_what_is_missing(chain):
 def test_a_run_does_not_change(chain):
     runner, _ = chain
     run = runner.run(x=1)
-    with pytest.raises(AttributeError, match="does not change"):
+    with pytest.raises(AttributeError):
         run.report = None
 
 

@@ -1,0 +1,84 @@
+"""How is one function called, with its inputs lent, its outputs kept and its time measured?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from time import perf_counter_ns
+from typing import Any
+
+from epypes.errors import OutputArityError
+from epypes.run.guard import ARRAYLESS, FRESH, keep, lend, writable
+from epypes.run.program import Program, Step
+
+
+class StepFailed(BaseException):
+    """A step raised: which one, what, and after how many nanoseconds.
+
+    Carries the user's exception through the engine to the runner, which raises that one.
+    """
+
+    def __init__(self, index: int, exception: BaseException, duration_ns: int) -> None:
+        self.index, self.exception, self.duration_ns = index, exception, duration_ns
+
+
+def call(program: Program, step: Step, values: Sequence[Any]) -> tuple[Sequence[Any], int]:
+    """Call a step's function on the values of its inputs.
+
+    Returns
+    -------
+    tuple
+        One value per output token, guarded, and the function's time in nanoseconds.
+
+    Raises
+    ------
+    StepFailed
+        The function raised, or returned the wrong number of values, or a contract was broken.
+    """
+    start_ns = perf_counter_ns()
+    try:
+        if step.switch is not None:
+            branch = step.switch.branch_index(values[step.inputs[0]])
+            return (values[step.inputs[1 + branch]],), perf_counter_ns() - start_ns
+        args = [values[slot] for slot in step.inputs]
+        if program.guard:
+            args = [arg if type(arg) in ARRAYLESS else _given(step, arg) for arg in args]
+        if step.contracts is not None:
+            step.contracts.check_inputs(step.name, [program.tokens[slot] for slot in step.inputs], args)
+        start_ns = perf_counter_ns()
+        result = step.function(*args)
+        duration_ns = perf_counter_ns() - start_ns
+        if not step.single:
+            made = unpack(program, step, result)
+        elif program.guard:
+            made = (result if type(result) in ARRAYLESS else keep(result, FRESH),)
+        else:
+            made = (result,)
+        if step.contracts is not None:
+            step.contracts.check_outputs(step.name, [program.tokens[slot] for slot in step.outputs], made)
+    except BaseException as exception:
+        raise StepFailed(step.index, exception, perf_counter_ns() - start_ns) from None
+    return made, duration_ns
+
+
+def _given(step: Step, value: Any) -> Any:
+    return writable(value) if step.unguarded else lend(value)
+
+
+def unpack(program: Program, step: Step, result: Any) -> list[Any]:
+    """Return a result as one value per output token, guarded; a string or an array is not split.
+
+    Raises
+    ------
+    OutputArityError
+        It is not a tuple or list of as many values as there are output tokens.
+    """
+    if not step.outputs:
+        return []
+    got = f"one {type(result).__name__}"
+    if isinstance(result, tuple | list):
+        found = list(result)
+        if len(found) == len(step.outputs):
+            # The result, the list and the loop each hold a reference to an item; _FRESH counts one of them.
+            return [keep(item, FRESH + 2) for item in found] if program.guard else found
+        got = f"{type(result).__name__} of {len(found)}"
+    raise OutputArityError(step.name, [program.tokens[slot] for slot in step.outputs], got)

@@ -1,0 +1,82 @@
+"""What changes while functions run?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from epypes.run.guard import is_plain_array, is_same_guarded_array
+from epypes.run.program import Program
+from epypes.run.tokens import NOT_COMPUTED, Freshness, TokenManager, is_same_value
+
+
+class Draft:
+    """The tokens of a run under way; becomes a TokenManager when it ends.
+
+    Attributes
+    ----------
+    values, dirty
+        As in TokenManager and Freshness.
+    """
+
+    __slots__ = ("dirty", "has_payload", "program", "values")
+
+    def __init__(self, program: Program, values: list[Any], dirty: bytearray, has_payload: bool) -> None:
+        self.program, self.values, self.dirty, self.has_payload = program, values, dirty, has_payload
+
+    @classmethod
+    def of_sources(cls, program: Program, values: list[Any], has_payload: bool) -> Draft:
+        """Begin with values of source tokens only."""
+        return cls(program, values, bytearray(b"\1") * len(program.steps), has_payload)
+
+    @classmethod
+    def after(cls, manager: TokenManager) -> Draft:
+        """Begin with what another run has left; the values are shared."""
+        freshness = manager.freshness
+        return cls(freshness.program, [*manager.values], bytearray(freshness.dirty), freshness.has_payload)
+
+    def change(self, token: str, value: Any) -> None:
+        """Give a source token a value."""
+        self.store(self.program.slots[token], value, ())
+
+    def store(self, slot: int, value: Any, given: Sequence[Any]) -> None:
+        """Store a value; if it is new, the steps that read it become dirty.
+
+        Parameters
+        ----------
+        slot
+            Where.
+        value
+            Guarded, if the program is.
+        given
+            The values that its function read.
+        """
+        if is_unchanged(self.values[slot], value, given, self.program.guard):
+            return
+        self.values[slot] = value
+        for index in self.program.consumers[slot]:
+            step = self.program.steps[index]
+            if step.switch is None or slot in self.program.read_by(step, self.values):
+                self.dirty[index] = 1
+
+    def forget(self, steps: Iterable[int]) -> None:
+        """Make the outputs of these steps read as not computed."""
+        for index in steps:
+            self.dirty[index] = 1
+            for slot in self.program.steps[index].outputs:
+                self.values[slot] = NOT_COMPUTED
+
+    def ended(self) -> TokenManager:
+        """Return the tokens as they are now, for good."""
+        return TokenManager(self.values, Freshness(self.program, bytes(self.dirty), self.has_payload))
+
+
+def is_unchanged(old: Any, new: Any, given: Sequence[Any], guard: bool) -> bool:
+    """Whether a function's new value is cheaply known to be what it was.
+
+    ``given`` are the values that the function read. A guarded array that was passed through is known to be unchanged;
+    of other values small immutable ones are compared.
+    """
+    if is_same_value(old, new):
+        return True
+    return guard and is_plain_array(new) and is_plain_array(old) and is_same_guarded_array(old, new, given)

@@ -1,0 +1,87 @@
+"""Which functions does a run need?
+
+Without targets every function, except what a switch makes superfluous: a function is left out when all that it makes
+goes to branches that are not chosen. With targets, what they depend on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from epypes.errors import PayloadError, PlaceholderNeeded, run_call
+from epypes.run.program import Program
+from epypes.run.tokens import NOT_COMPUTED
+
+
+def wanted_steps(program: Program, values: Sequence[Any], targets: Iterable[str]) -> bytes | None:
+    """Return 1 for each step that is needed, by step; None if all are.
+
+    Parameters
+    ----------
+    values
+        By slot; those of the switches' selectors decide.
+    targets
+        Tokens of the graph; empty for all.
+    """
+    if targets:
+        return _upstream(program, values, targets)
+    return _without_superfluous(program, values) if program.switches else None
+
+
+def _upstream(program: Program, values: Sequence[Any], targets: Iterable[str]) -> bytes:
+    wanted = bytearray(len(program.steps))
+    pending = [program.slots[token] for token in targets]
+    while pending:
+        index = program.makers[pending.pop()]
+        if index >= 0 and not wanted[index]:
+            wanted[index] = 1
+            pending.extend(program.read_by(program.steps[index], values))
+    return bytes(wanted)
+
+
+def _without_superfluous(program: Program, values: Sequence[Any]) -> bytes:
+    """Leave out what is read by somebody, but only by branches that are not chosen and by what is left out itself."""
+    wanted = bytearray(b"\1") * len(program.steps)
+    read = {index: program.read_by(program.steps[index], values) for index in program.switches}
+    for step in reversed(program.steps):
+        readers = [(index, slot) for slot in step.outputs for index in program.consumers[slot]]
+        if readers and not any(wanted[index] and slot in read.get(index, (slot,)) for index, slot in readers):
+            wanted[step.index] = 0
+    return bytes(wanted)
+
+
+def missing_sources(program: Program, values: Sequence[Any], wanted: bytes | None) -> tuple[str, ...]:
+    """Return the source tokens that the wanted steps read and that have no value, in graph order."""
+    slots = {
+        slot
+        for step in program.steps
+        if wanted is None or wanted[step.index]
+        for slot in program.read_by(step, values)
+        if program.makers[slot] < 0 and values[slot] is NOT_COMPUTED
+    }
+    return tuple(program.tokens[slot] for slot in sorted(slots))
+
+
+def needed_placeholders(program: Program, wanted: bytes | None) -> tuple[str, ...]:
+    """Return the placeholders among the wanted steps, in run order."""
+    return tuple(program.steps[index].name for index in sorted(program.placeholders) if wanted is None or wanted[index])
+
+
+def check_ready(program: Program, values: Sequence[Any], wanted: bytes | None) -> None:
+    """Raise unless the wanted steps have all the payload and functions they need.
+
+    Raises
+    ------
+    PlaceholderNeeded
+        Functions are still to be written; all of them are listed.
+    PayloadError
+        Source tokens have no value; all of them are listed.
+    """
+    placeholders = needed_placeholders(program, wanted)
+    if placeholders:
+        raise PlaceholderNeeded(placeholders)
+    missing = missing_sources(program, values, wanted)
+    if missing:
+        listed = ", ".join(map(repr, missing))
+        raise PayloadError(missing, f"Missing payload: {listed}. Call {run_call(missing)}.")
