@@ -21,7 +21,9 @@ from epypes.graph.checks import (
 from epypes.graph.declared import read_functions
 from epypes.graph.parts import Default, Parts, check_defaults
 from epypes.graph.placeholder import is_placeholder
+from epypes.graph.redefined import redefined
 from epypes.graph.switch import as_switch
+from epypes.graph.typecheck import check_types
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -131,6 +133,8 @@ class CompGraph:
             findings += check_cycle(digraph)
         findings += check_arity(func_dict, digraph)
         findings += check_selectors(func_dict, digraph)
+        if types:
+            findings += check_types(func_dict, digraph, written)
         kept = [default for default in defaults if _is_source(digraph, default.token)]
         findings += check_defaults(kept)
         if findings:
@@ -153,7 +157,7 @@ class CompGraph:
         self._tokens = tuple(dict.fromkeys(itertools.chain.from_iterable(sides)))
         self._sources = tuple([token for token in self._tokens if token not in digraph.producer])
         self._sinks = tuple([token for token in self._tokens if token not in digraph.consumers])
-        special = [item for item in self._functions.items() if type(item[1]) is not FunctionType or item[1].__dict__]
+        special = [item for item in self._functions.items() if type(item[1]) is not FunctionType]
         self._placeholders = tuple(name for name, function in special if is_placeholder(function))
         self._switches = tuple(name for name, function in special if as_switch(function))
 
@@ -260,8 +264,10 @@ class CompGraph:
 
     def __repr__(self) -> str:
         count = len(self._functions)
-        ends = f"{_some(self.source_tokens)} -> {_some(self.sink_tokens)}"
-        return f"<CompGraph: {count} function{'s' * (count != 1)}, {len(self._tokens)} tokens; {ends}>"
+        start = f"<CompGraph: {count} function{'s' * (count != 1)}, {len(self._tokens)} tokens; "
+        end = _redefined_text(redefined(self)) + ">"
+        width = min(18, (95 - len(start) - len(end)) // 2)
+        return f"{start}{_some(self._sources, width)} -> {_some(self._sinks, width)}{end}"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         from epypes.display import mimebundle
@@ -273,7 +279,13 @@ def _is_source(digraph: BipartiteDigraph, token: str) -> bool:
     return token in digraph.consumers and token not in digraph.producer
 
 
-def _some(tokens: tuple[str, ...], width: int = 18) -> str:
+def _redefined_text(names: tuple[str, ...]) -> str:
+    if not names:
+        return ""
+    return f"; {_some(names, 18)!r} was redefined" if len(names) == 1 else f"; {len(names)} functions were redefined"
+
+
+def _some(tokens: tuple[str, ...], width: int) -> str:
     """Join names, cut to ``width`` characters so that a repr stays one short line."""
     text = " ".join(", ".join(tokens).split()) or "nothing"
     return text if len(text) <= width else text[: width - 3] + "..."

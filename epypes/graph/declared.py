@@ -36,7 +36,8 @@ def _name(function: Any, findings: list[Finding]) -> str | None:
     name = getattr(function, "__name__", None)
     if isinstance(name, str) and name.isidentifier():
         return name
-    text = f"{function!r:.60} has no name. Write it as a function (def), or {_BY_HAND}."
+    what = "A lambda" if name == "<lambda>" else f"{function!r:.60}"
+    text = f"{what} has no name that could be its token's. Write it as a function (def), or {_BY_HAND}."
     findings.append(Finding("no name", text, ()))
     return None
 
