@@ -78,12 +78,19 @@ def _merge(merged: Parts, part: Parts) -> None:
     for name, function in part.functions.items():
         if name not in merged.functions:
             merged.functions[name], merged.func_io[name] = function, part.func_io[name]
-        elif not _is_same(merged.functions[name], function) or merged.func_io[name] != part.func_io[name]:
+        elif not _is_same(merged.functions[name], function) or not _is_same_io(
+            merged.func_io[name], part.func_io[name]
+        ):
             text = (
                 f"Two graphs have a function {name!r}, with another callable or io. "
                 "Rename one of them with ep.rename(), or give union() suffixes."
             )
             merged.findings.append(Finding("two functions", text, (name,)))
+
+
+def _is_same_io(left: Any, right: Any) -> bool:
+    # ("x", "y") and (("x",), "y") are one io; "y" and ("y",) are not one output.
+    return names_of("inputs", left[0]) == names_of("inputs", right[0]) and bool(left[1] == right[1])
 
 
 def _is_same(left: Any, right: Any) -> bool:

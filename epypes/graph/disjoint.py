@@ -59,7 +59,7 @@ def _pair_is_disjoint(left: Any, right: Any) -> bool:
         return _pair_is_disjoint(right, left)
     one, other = typing.get_origin(left) or left, typing.get_origin(right) or right
     if not isinstance(one, type) or not isinstance(other, type):
-        return False  # Any, a TypeVar, a NewType ...
+        return False  # a TypeVar, a NewType ...
     if one is other:
         return _dtypes_differ(left, right)
     return _classes_are_disjoint(one, other)
@@ -73,14 +73,19 @@ def _excludes(hint: Any, value: Any) -> bool:
 
 
 def _classes_are_disjoint(left: type, right: type) -> bool:
-    if isinstance(left, ABCMeta) or isinstance(right, ABCMeta):
-        return False  # an abstract class or a protocol: other classes may satisfy it without saying so
+    if _is_open(left) or _is_open(right):
+        return False
     try:
         if issubclass(left, right) or issubclass(right, left):
             return False
         return not (_are_exchanged(left, right) or _have_a_common_subclass(left, right))
     except Exception:  # a TypedDict, or a metaclass that raises
         return False
+
+
+def _is_open(kind: type) -> bool:
+    """Whether classes may satisfy this one without saying so: abstract classes, protocols, Any and its subclasses."""
+    return isinstance(kind, ABCMeta) or Any in kind.__mro__
 
 
 def _are_exchanged(left: type, right: type) -> bool:
