@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from epypes import errors
     from epypes.bundle import load, load_pipeline, promote, verify
-    from epypes.graph import CompGraph
+    from epypes.graph import CompGraph, Placeholder, extend, outputs, rename, subgraph, suffix, switch, union
     from epypes.hints import Param
     from epypes.pipeline import (
         EventLoop,
@@ -43,6 +43,14 @@ if TYPE_CHECKING:
 _HOMES = {
     "errors": "epypes",
     "CompGraph": "epypes.graph",
+    "Placeholder": "epypes.graph",
+    "extend": "epypes.graph",
+    "outputs": "epypes.graph",
+    "rename": "epypes.graph",
+    "subgraph": "epypes.graph",
+    "suffix": "epypes.graph",
+    "switch": "epypes.graph",
+    "union": "epypes.graph",
     "CompGraphRunner": "epypes.run",
     "Failure": "epypes.run",
     "Plan": "epypes.run",
@@ -82,6 +90,7 @@ __all__ = [
     "NodeBasedCompGraph",
     "Param",
     "Pipeline",
+    "Placeholder",
     "Plan",
     "Run",
     "RunReport",
@@ -91,10 +100,17 @@ __all__ = [
     "ZMQPublisher",
     "ZMQSubscriber",
     "errors",
+    "extend",
     "load",
     "load_pipeline",
+    "outputs",
     "promote",
+    "rename",
+    "subgraph",
+    "suffix",
+    "switch",
     "unguarded",
+    "union",
     "verify",
 ]
 

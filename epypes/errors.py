@@ -9,6 +9,7 @@ Everything an error's text mentions is an attribute of it::
     |   +-- StaleToken          a token's value is out of date; .token
     +-- PayloadError            run() was given too little or the wrong tokens; .tokens
     +-- HyperparameterError     a token can't be set, frozen or unfrozen; .token
+    +-- PlaceholderNeeded       a function is still to be written; .functions
     +-- OutputArityError        a function returned another number of values; .function
     +-- StillRunning            something did not stop in time; .name, .functions, .timeout_s
     +-- MailboxOverflow         a mailbox with policy "fault" is full; .size
@@ -51,8 +52,10 @@ class Finding:
     Attributes
     ----------
     kind
-        ``"cycle"``, ``"two producers"``, ``"no io"``, ``"no function"``, ``"bad io"``, ``"arity"`` or
-        ``"not callable"``.
+        ``"cycle"``, ``"two producers"``, ``"no io"``, ``"no function"``, ``"bad io"``, ``"arity"``,
+        ``"not callable"``, ``"selector"`` or ``"types"``; where a graph is made of functions or of graphs also
+        ``"no name"``, ``"no signature"``, ``"two functions"``, ``"one name"``, ``"defaults"`` or
+        ``"not a placeholder"``.
     text
         What is wrong and the way out, as a sentence.
     names
@@ -123,6 +126,24 @@ class HyperparameterError(EpypesError, TypeError):
     def __init__(self, token: str, text: str) -> None:
         self.token = token
         super().__init__(text)
+
+
+class PlaceholderNeeded(EpypesError, NotImplementedError):
+    """Functions that are placeholders would have to run; ``functions`` names them."""
+
+    def __init__(self, functions: Iterable[str]) -> None:
+        self.functions = tuple(functions)
+        names = ", ".join(map(repr, self.functions))
+        if len(self.functions) == 1:
+            text = f"Function {names} is a placeholder. Give it: "
+        else:
+            text = (
+                f"Functions {names} are placeholders. Give them: "
+                if names
+                else "A placeholder can't be called. Give it: "
+            )
+        first = repr(self.functions[0]) if self.functions else "name"
+        super().__init__(f"{text}ep.extend(cg, {{{first}: ...}}).")
 
 
 class OutputArityError(EpypesError, ValueError):

@@ -1,6 +1,26 @@
 """What is connected to what: computational graphs, pure and static."""
 
+from epypes.graph.algebra import extend, subgraph, union, with_functions
 from epypes.graph.compgraph import CompGraph
 from epypes.graph.hinted import annotated_params
+from epypes.graph.outputs import outputs
+from epypes.graph.placeholder import Placeholder, is_placeholder
+from epypes.graph.renaming import rename, suffix
+from epypes.graph.switch import Switch, as_switch, switch
 
-__all__ = ["CompGraph", "annotated_params"]
+__all__ = [
+    "CompGraph",
+    "Placeholder",
+    "Switch",
+    "annotated_params",
+    "as_switch",
+    "extend",
+    "is_placeholder",
+    "outputs",
+    "rename",
+    "subgraph",
+    "suffix",
+    "switch",
+    "union",
+    "with_functions",
+]

@@ -37,10 +37,14 @@ class BipartiteDigraph:
         consumers: dict[str, list[str]] = {}
         for function, tokens in self.outputs.items():
             for token in tokens:
-                producer.setdefault(token, function)
+                if token not in producer:
+                    producer[token] = function
         for function, tokens in self.inputs.items():
-            for token in dict.fromkeys(tokens):
-                consumers.setdefault(token, []).append(function)
+            for token in tokens if len(tokens) < 2 else dict.fromkeys(tokens):
+                if token in consumers:
+                    consumers[token].append(function)
+                else:
+                    consumers[token] = [function]
         object.__setattr__(self, "producer", producer)
         object.__setattr__(self, "consumers", consumers)
 
@@ -62,19 +66,34 @@ class BipartiteDigraph:
 
         Functions on a cycle, and those behind one, are left out.
         """
-        position = {function: index for index, function in enumerate(self.inputs)}
-        names = tuple(position)
-        waiting = {function: len(tuple(self.predecessors(function))) for function in names}
-        ready = [position[function] for function, count in waiting.items() if not count]
+        if self._is_in_order():
+            return tuple(self.inputs)
+        names = tuple(self.inputs)
+        position = {function: index for index, function in enumerate(names)}
+        producer, consumers, outputs = self.producer, self.consumers, self.outputs
+        waiting = [len(producer.keys() & tokens) for tokens in self.inputs.values()]
+        ready = [index for index, count in enumerate(waiting) if not count]
         order: list[str] = []
         while ready:
             function = names[heapq.heappop(ready)]
             order.append(function)
-            for successor in self.successors(function):
-                waiting[successor] -= 1
-                if not waiting[successor]:
-                    heapq.heappush(ready, position[successor])
+            # In a faulty graph a token may have a second producer, or be made twice by one.
+            made = {token for token in outputs[function] if producer[token] == function}
+            for consumer in itertools.chain.from_iterable(consumers.get(token, ()) for token in made):
+                index = position[consumer]
+                waiting[index] -= 1
+                if not waiting[index]:
+                    heapq.heappush(ready, index)
         return tuple(order)
+
+    def _is_in_order(self) -> bool:
+        """Whether every function is defined after those that it needs, which is the usual case."""
+        to_come = set(self.producer)
+        for function, tokens in self.inputs.items():
+            if not to_come.isdisjoint(tokens):
+                return False
+            to_come.difference_update(self.outputs[function])
+        return True
 
     def shortest_cycle(self) -> tuple[str, ...]:
         """Return the vertices of a shortest cycle, tokens and functions in turn, beginning and ending with one token.

@@ -6,16 +6,18 @@ Every check adds findings; none stops the others (rule 2 of the design: a graph 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from types import FunctionType
 from typing import Any
 
 from epypes.errors import Finding
 from epypes.graph.bipartite import BipartiteDigraph
-from epypes.graph.signature import accepted_inputs, keyword_only_required, signature_of
+from epypes.graph.signature import Parameters, is_plain, parameters_of, signature_of
+from epypes.graph.switch import as_switch
 
 _SHAPES = "(x, y), ((x1, ..., xm), y), (x, (y1, ..., yn)) or ((x1, ..., xm), (y1, ..., yn))"
 
 
-def read_io(func_io: Mapping[str, Any], findings: list[Finding]) -> BipartiteDigraph:
+def read_io(func_io: Mapping[str, Any], findings: list[Finding]) -> tuple[BipartiteDigraph, dict[str, Any]]:
     """Read the paper's func_io; what can't be read becomes a finding and is left out.
 
     Parameters
@@ -25,25 +27,46 @@ def read_io(func_io: Mapping[str, Any], findings: list[Finding]) -> BipartiteDig
         the outputs None for "no output".
     findings
         Is added to.
+
+    Returns
+    -------
+    tuple
+        The digraph, and the io by function name as it was written, lists as tuples.
     """
     inputs: dict[str, tuple[str, ...]] = {}
     outputs: dict[str, tuple[str, ...]] = {}
+    written: dict[str, Any] = {}
     for name, io in func_io.items():
+        if type(io) is tuple and len(io) == 2 and type(io[0]) is type(io[1]) is str and io[0] and io[1]:
+            # The usual case, first, so that large graphs are read fast.
+            inputs[name], outputs[name], written[name] = (io[0],), (io[1],), io
+            continue
         try:
             given, made = io if isinstance(io, tuple | list) else (None, 0)
-            inputs[name], outputs[name] = _tokens(given), () if made is None else _tokens(made)
+            taken, returned = _tokens(given), () if made is None else _tokens(made)
         except (TypeError, ValueError):
-            inputs.pop(name, None)
             text = f"The io of function {name!r} is {io!r}; write {_SHAPES}, with None for no output."
             findings.append(Finding("bad io", text, (str(name),)))
-    return BipartiteDigraph(inputs, outputs)
+            continue
+        inputs[name], outputs[name] = taken, returned
+        written[name] = (_as_tuple(given), _as_tuple(made))
+    return BipartiteDigraph(inputs, outputs), written
 
 
-def _tokens(given: object) -> tuple[str, ...]:
+def _tokens(given: Any) -> tuple[str, ...]:
+    if type(given) is str and given:
+        return (given,)
     names = (given,) if isinstance(given, str) else given
-    if not isinstance(names, tuple | list) or not all(isinstance(name, str) and name for name in names):
+    if not isinstance(names, tuple | list):
         raise TypeError
+    for name in names:
+        if not isinstance(name, str) or not name:
+            raise TypeError
     return tuple(names)
+
+
+def _as_tuple(side: Any) -> Any:
+    return tuple(side) if type(side) is list else side
 
 
 def is_single(io_side: object) -> bool:
@@ -53,6 +76,8 @@ def is_single(io_side: object) -> bool:
 
 def check_pairing(functions: Mapping[str, Any], func_io: Mapping[str, Any]) -> Iterable[Finding]:
     """Find functions without io, io without function, and what can't be called."""
+    if functions.keys() == func_io.keys() and all(map(callable, functions.values())) and _are_names(functions):
+        return
     for name, function in functions.items():
         if not isinstance(name, str) or not name:
             text = f"A function's name must be a string that is not empty, not {name!r}."
@@ -69,8 +94,14 @@ def check_pairing(functions: Mapping[str, Any], func_io: Mapping[str, Any]) -> I
             yield Finding("no function", text, (str(name),))
 
 
+def _are_names(functions: Mapping[Any, Any]) -> bool:
+    return set(map(type, functions)) <= {str} and "" not in functions
+
+
 def check_producers(graph: BipartiteDigraph) -> Iterable[Finding]:
     """Find tokens that are made twice."""
+    if len(graph.producer) == sum(map(len, graph.outputs.values())):
+        return
     makers: dict[str, list[str]] = {}
     for function, tokens in graph.outputs.items():
         for token in tokens:
@@ -95,23 +126,54 @@ def check_cycle(graph: BipartiteDigraph) -> Iterable[Finding]:
 
 def check_arity(functions: Mapping[str, Callable[..., Any]], graph: BipartiteDigraph) -> Iterable[Finding]:
     """Find functions that can't be called with as many inputs as their io names."""
+    known: dict[int, Parameters | None] = {}
     for name, tokens in graph.inputs.items():
         function = functions.get(name)
-        signature = signature_of(function) if callable(function) else None
-        if signature is None:
+        if function is None or _takes_exactly(function, len(tokens)) or not callable(function):
             continue
-        least, most = accepted_inputs(signature)
-        required = keyword_only_required(signature)
-        if not least <= len(tokens) <= most:
-            takes = f"{least}" if least == most else f"{least} to {most:g}"
+        if id(function) not in known:
+            known[id(function)] = parameters_of(function)
+        parameters = known[id(function)]
+        if parameters is not None:
+            yield from _arity_findings(name, function, tokens, parameters)
+
+
+def _takes_exactly(function: object, count: int) -> bool:
+    """Whether a plain function has as many parameters as inputs: the usual case, seen without asking more."""
+    if type(function) is not FunctionType:
+        return False
+    code = function.__code__
+    return code.co_argcount == count and not code.co_kwonlyargcount and is_plain(function)
+
+
+def _arity_findings(
+    name: str, function: Callable[..., Any], tokens: tuple[str, ...], parameters: Parameters
+) -> Iterable[Finding]:
+    least, most, required = parameters.least, parameters.most, parameters.required_by_keyword
+    if not least <= len(tokens) <= most:
+        takes = f"{least}" if least == most else f"{least} to {most:g}"
+        text = (
+            f"Function {name!r} takes {takes} inputs {signature_of(function)}, "
+            f"but its io names {len(tokens)}: ({', '.join(tokens)})."
+        )
+        yield Finding("arity", text, (name, *tokens))
+    elif required:
+        text = (
+            f"Function {name!r} needs {', '.join(map(repr, required))} by keyword; "
+            "tokens are given by position. Wrap it in a function that takes them by position."
+        )
+        yield Finding("arity", text, (name, *required))
+
+
+def check_selectors(functions: Mapping[str, Any], graph: BipartiteDigraph) -> Iterable[Finding]:
+    """Find switches whose selector is made by a function: which branch to run must be known before anything runs."""
+    for name in [name for name, function in functions.items() if type(function) is not FunctionType]:
+        tokens = graph.inputs.get(name)
+        maker = graph.producer.get(tokens[0]) if tokens else None
+        if tokens and maker is not None and as_switch(functions[name]) is not None:
             text = (
-                f"Function {name!r} takes {takes} inputs {signature}, "
-                f"but its io names {len(tokens)}: ({', '.join(tokens)})."
+                f"Token {tokens[0]!r} selects the branch of switch {name!r}, but function {maker!r} makes it. "
+                f"The branch must be known before anything runs: leave {tokens[0]!r} a source token, "
+                "or choose between the values in a function."
             )
-            yield Finding("arity", text, (name, *tokens))
-        elif required:
-            text = (
-                f"Function {name!r} needs {', '.join(map(repr, required))} by keyword; "
-                "tokens are given by position. Wrap it in a function that takes them by position."
-            )
-            yield Finding("arity", text, (name, *required))
+            yield Finding("selector", text, (name, tokens[0], maker))

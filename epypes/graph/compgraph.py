@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from types import MappingProxyType
+import itertools
+from collections.abc import Callable, Iterable, Mapping
+from types import FunctionType, MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from epypes.errors import Finding, GraphError, UnknownName
@@ -13,9 +14,16 @@ from epypes.graph.checks import (
     check_cycle,
     check_pairing,
     check_producers,
+    check_selectors,
     is_single,
     read_io,
 )
+from epypes.graph.declared import read_functions
+from epypes.graph.parts import Default, Parts, check_defaults
+from epypes.graph.placeholder import is_placeholder
+from epypes.graph.redefined import redefined
+from epypes.graph.switch import as_switch
+from epypes.graph.typecheck import check_types
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -36,12 +44,16 @@ class CompGraph:
         ``(x, y)``, ``((x1, ..., xm), y)``, ``(x, (y1, ..., yn))`` or ``((x1, ..., xm), (y1, ..., yn))``.
         Outputs are None for a function without output; ``()`` is allowed for one without inputs.
         A single output token takes the value as it is, a tuple of n tokens a sequence of n values.
+    types
+        Whether annotations are compared: a token that is made as one type and taken as another, so that no value is
+        both, is a problem.
 
     Raises
     ------
     GraphError
         With every problem as a finding: a cycle, two producers of a token, a function without io, io without
-        a function, an io of another shape, a number of inputs that the signature does not take.
+        a function, an io of another shape, a number of inputs that the signature does not take, types that exclude
+        each other, a switch whose selector is computed.
 
     Notes
     -----
@@ -54,30 +66,100 @@ class CompGraph:
     <CompGraph: 1 function, 2 tokens; x -> y>
     """
 
-    __slots__ = ("__weakref__", "_digraph", "_func_io", "_functions", "_tokens")
+    __slots__ = (
+        "__weakref__", "_defaults", "_digraph", "_func_io", "_functions", "_placeholders", "_sinks", "_sources",
+        "_switches", "_tokens", "_types",
+    )  # fmt: skip
 
-    def __init__(self, func_dict: Mapping[str, Callable[..., Any]], func_io: FuncIO) -> None:
+    def __init__(self, func_dict: Mapping[str, Callable[..., Any]], func_io: FuncIO, *, types: bool = True) -> None:
         for what, given in (("func_dict", func_dict), ("func_io", func_io)):
             if not isinstance(given, Mapping):
                 kind = type(given).__name__
                 raise TypeError(f"{what} must be a mapping by function name, such as a dict, not {kind!r}.")
-        findings: list[Finding] = []
-        digraph = read_io(func_io, findings)
+        self._build(func_dict, func_io, (), [], types)
+
+    @classmethod
+    def from_functions(cls, *functions: Callable[..., Any], types: bool = True) -> CompGraph:
+        """Make a graph of functions, joined by the names of their parameters.
+
+        A function takes the tokens that its positional parameters are called, and makes the token that it is called
+        itself, or those named by ``@ep.outputs``. The default of a parameter that is a source token is kept in
+        ``defaults``.
+
+        Parameters
+        ----------
+        functions
+            Functions with a name and a signature.
+        types
+            As for CompGraph.
+
+        Raises
+        ------
+        GraphError
+            With every problem: what CompGraph finds, functions without name or signature, two of one name, a token
+            with two defaults.
+
+        Examples
+        --------
+        >>> def gray(image): ...
+        >>> def edges(gray, threshold=70): ...
+        >>> cg = CompGraph.from_functions(gray, edges)
+        >>> cg, dict(cg.defaults)
+        (<CompGraph: 2 functions, 4 tokens; image, threshold -> edges>, {'threshold': 70})
+        """
+        return cls._assemble(read_functions(functions), types)
+
+    @classmethod
+    def _assemble(cls, parts: Parts, types: bool) -> CompGraph:
+        """Make a graph of parts, whose findings are reported with its own; for this package."""
+        self = cls.__new__(cls)
+        self._build(parts.functions, parts.func_io, parts.defaults, parts.findings, types)
+        return self
+
+    def _build(
+        self,
+        func_dict: Mapping[str, Callable[..., Any]],
+        func_io: FuncIO,
+        defaults: Iterable[Default],
+        found: Iterable[Finding],
+        types: bool,
+    ) -> None:
+        findings = list(found)
+        digraph, written = read_io(func_io, findings)
         findings += check_pairing(func_dict, func_io)
         findings += check_producers(digraph)
-        findings += check_cycle(digraph)
+        order = digraph.run_order()
+        if len(order) < len(digraph.inputs):
+            findings += check_cycle(digraph)
         findings += check_arity(func_dict, digraph)
+        findings += check_selectors(func_dict, digraph)
+        if types:
+            findings += check_types(func_dict, digraph, written)
+        kept = [default for default in defaults if _is_source(digraph, default.token)]
+        findings += check_defaults(kept)
         if findings:
             raise GraphError(findings)
-        order = digraph.run_order()
-        self._digraph = BipartiteDigraph(
-            {name: digraph.inputs[name] for name in order}, {name: digraph.outputs[name] for name in order}
-        )
+        if order != tuple(digraph.inputs):
+            inputs, outputs = digraph.inputs, digraph.outputs
+            digraph = BipartiteDigraph({name: inputs[name] for name in order}, {name: outputs[name] for name in order})
+            written = {name: written[name] for name in order}
+        self._digraph, self._types = digraph, types
         self._functions = MappingProxyType({name: func_dict[name] for name in order})
-        self._func_io = MappingProxyType({name: _as_tuples(func_io[name]) for name in order})
-        self._tokens = tuple(
-            dict.fromkeys(token for name in order for token in (*digraph.inputs[name], *digraph.outputs[name]))
-        )
+        self._func_io = MappingProxyType(written)
+        self._look_up()
+        values = {default.token: default.value for default in reversed(kept)}
+        self._defaults = MappingProxyType({token: values[token] for token in self._sources if token in values})
+
+    def _look_up(self) -> None:
+        """Note what is often asked for."""
+        digraph = self._digraph
+        sides = itertools.chain.from_iterable(zip(digraph.inputs.values(), digraph.outputs.values(), strict=True))
+        self._tokens = tuple(dict.fromkeys(itertools.chain.from_iterable(sides)))
+        self._sources = tuple([token for token in self._tokens if token not in digraph.producer])
+        self._sinks = tuple([token for token in self._tokens if token not in digraph.consumers])
+        special = [item for item in self._functions.items() if type(item[1]) is not FunctionType]
+        self._placeholders = tuple(name for name, function in special if is_placeholder(function))
+        self._switches = tuple(name for name, function in special if as_switch(function))
 
     @property
     def functions(self) -> Mapping[str, Callable[..., Any]]:
@@ -102,12 +184,32 @@ class CompGraph:
     @property
     def source_tokens(self) -> tuple[str, ...]:
         """The tokens that no function makes, in graph order."""
-        return tuple(token for token in self._tokens if token not in self._digraph.producer)
+        return self._sources
 
     @property
     def sink_tokens(self) -> tuple[str, ...]:
         """The tokens that no function takes, in graph order."""
-        return tuple(token for token in self._tokens if token not in self._digraph.consumers)
+        return self._sinks
+
+    @property
+    def defaults(self) -> Mapping[str, Any]:
+        """The default values of source tokens, in graph order; only ``from_functions`` finds any."""
+        return self._defaults
+
+    @property
+    def placeholders(self) -> tuple[str, ...]:
+        """The names of the functions that are still to be written, in run order."""
+        return self._placeholders
+
+    @property
+    def switches(self) -> tuple[str, ...]:
+        """The names of the functions that are switches, in run order; the first input of each is its selector."""
+        return self._switches
+
+    @property
+    def types(self) -> bool:
+        """Whether annotations were compared; what is made from this graph does it the same way."""
+        return self._types
 
     def func_inputs(self, name: str) -> tuple[str, ...]:
         """Return the input tokens of a function."""
@@ -124,6 +226,10 @@ class CompGraph:
         self.require_function(name)
         return is_single(self._func_io[name][1])
 
+    def has_token(self, name: str) -> bool:
+        """Whether there is such a token."""
+        return name in self._digraph.producer or name in self._digraph.consumers
+
     def require_function(self, name: str) -> None:
         """Raise UnknownName, with the nearest name, unless there is such a function."""
         if name not in self._functions:
@@ -131,10 +237,15 @@ class CompGraph:
 
     def require_token(self, name: str) -> None:
         """Raise UnknownName, with the nearest name, unless there is such a token."""
-        if name not in self._digraph.producer and name not in self._digraph.consumers:
+        if not self.has_token(name):
             made = self._digraph.outputs.get(name)
             where = "in this graph" if made is None else f"in this graph, only a function; it makes {', '.join(made)}"
             raise UnknownName("token", name, self._tokens, where)
+
+    def __or__(self, other: object) -> CompGraph:
+        from epypes.graph.algebra import union
+
+        return union(self, other) if isinstance(other, CompGraph) else NotImplemented
 
     def to_networkx(self) -> nx.DiGraph[tuple[str, str]]:
         """Return a networkx DiGraph; its vertices are ``("function", name)`` and ``("token", name)``."""
@@ -153,8 +264,10 @@ class CompGraph:
 
     def __repr__(self) -> str:
         count = len(self._functions)
-        ends = f"{_some(self.source_tokens)} -> {_some(self.sink_tokens)}"
-        return f"<CompGraph: {count} function{'s' * (count != 1)}, {len(self._tokens)} tokens; {ends}>"
+        start = f"<CompGraph: {count} function{'s' * (count != 1)}, {len(self._tokens)} tokens; "
+        end = _redefined_text(redefined(self)) + ">"
+        width = min(18, (95 - len(start) - len(end)) // 2)
+        return f"{start}{_some(self._sources, width)} -> {_some(self._sinks, width)}{end}"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         from epypes.display import mimebundle
@@ -162,15 +275,17 @@ class CompGraph:
         return mimebundle(self)
 
 
-def _as_tuples(io: tuple[Tokens, Tokens | None]) -> tuple[Tokens, Tokens | None]:
-    given, made = io
-    return (
-        given if isinstance(given, str) else tuple(given),
-        made if made is None or isinstance(made, str) else tuple(made),
-    )
+def _is_source(digraph: BipartiteDigraph, token: str) -> bool:
+    return token in digraph.consumers and token not in digraph.producer
 
 
-def _some(tokens: tuple[str, ...], width: int = 18) -> str:
+def _redefined_text(names: tuple[str, ...]) -> str:
+    if not names:
+        return ""
+    return f"; {_some(names, 18)!r} was redefined" if len(names) == 1 else f"; {len(names)} functions were redefined"
+
+
+def _some(tokens: tuple[str, ...], width: int) -> str:
     """Join names, cut to ``width`` characters so that a repr stays one short line."""
     text = " ".join(", ".join(tokens).split()) or "nothing"
     return text if len(text) <= width else text[: width - 3] + "..."

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from epypes.graph import CompGraph
+from epypes.graph import CompGraph, with_functions
 from epypes.pipeline.node import Node
 
 
@@ -32,7 +32,7 @@ class NodeBasedCompGraph:
                 for name, function in cg.functions.items()
             }
         )
-        self.cg = CompGraph(self.nodes, cg.func_io)
+        self.cg = with_functions(cg, self.nodes)
 
     def traverse_time(self) -> tuple[Any, ...]:
         """Return the nodes' ``traverse_time()``, in run order."""

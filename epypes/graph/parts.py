@@ -1,0 +1,80 @@
+"""Of what is a graph put together, before it is checked?"""
+
+from __future__ import annotations
+
+import reprlib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from epypes.errors import Finding
+
+if TYPE_CHECKING:
+    from epypes.graph.compgraph import CompGraph
+
+
+class Default(NamedTuple):
+    """A token's default value, and a function that gives it."""
+
+    token: str
+    value: Any
+    function: str
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """Functions, their io and defaults, with what is already known to be wrong; not a graph yet.
+
+    Attributes
+    ----------
+    functions, func_io
+        As a CompGraph takes them, in order of definition.
+    defaults
+        Every default, several for one token included.
+    findings
+        What is wrong.
+    """
+
+    functions: dict[str, Callable[..., Any]] = field(default_factory=dict)
+    func_io: dict[str, Any] = field(default_factory=dict)
+    defaults: list[Default] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, cg: CompGraph) -> Parts:
+        """Return the parts of a graph."""
+        return cls(dict(cg.functions), dict(cg.func_io), defaults_of(cg))
+
+
+def defaults_of(cg: CompGraph) -> list[Default]:
+    """Return the defaults of a graph, each with the first function that takes its token."""
+    return [Default(token, value, cg.digraph.consumers[token][0]) for token, value in cg.defaults.items()]
+
+
+def check_defaults(defaults: Iterable[Default]) -> Iterable[Finding]:
+    """Find tokens with two different defaults."""
+    first: dict[str, Default] = {}
+    for default in defaults:
+        other = first.setdefault(default.token, default)
+        if not _is_equal(other.value, default.value):
+            text = (
+                f"Token {default.token!r} has the default {reprlib.repr(other.value)} in {other.function!r} "
+                f"and {reprlib.repr(default.value)} in {default.function!r}. "
+                "Make them equal, or rename one of the tokens."
+            )
+            yield Finding("defaults", text, (default.token, other.function, default.function))
+
+
+_SIMPLE: Final = frozenset({int, bool, str, bytes})
+
+
+def _is_equal(left: Any, right: Any) -> bool:
+    """Whether two defaults are the same object or equal simple values; others are not asked, they may be arrays."""
+    kind = type(left)
+    if left is right or kind is not type(right):
+        return left is right
+    if kind is tuple:
+        return len(left) == len(right) and all(map(_is_equal, left, right))
+    if kind in (float, complex):  # NaN equals NaN here, and 0.0 is not -0.0
+        return repr(left) == repr(right)
+    return kind in _SIMPLE and bool(left == right)

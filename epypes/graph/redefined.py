@@ -1,0 +1,82 @@
+"""Which functions of a graph are no longer what their name says, since their cell was run again?"""
+
+from __future__ import annotations
+
+import sys
+from types import CodeType, FunctionType
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from epypes.graph.compgraph import CompGraph
+
+# A wrapper may wrap itself by mistake; nobody wraps this deep on purpose.
+_DEEPEST: Final = 100
+
+
+def redefined(cg: CompGraph) -> tuple[str, ...]:
+    """Return the functions whose module now binds their name to another function, in run order.
+
+    A function that was defined again in the same words counts as the same. Never raises.
+
+    Examples
+    --------
+    >>> from epypes.graph.compgraph import CompGraph
+    >>> redefined(CompGraph({"f": lambda x: x}, {"f": ("x", "y")}))
+    ()
+    """
+    return tuple(name for name, function in cg.functions.items() if _is_redefined(function))
+
+
+def _is_redefined(function: Any) -> bool:
+    try:
+        old = _unwrapped(function)
+        if not isinstance(old, FunctionType):
+            return False
+        new = _unwrapped(_bound_now(old.__module__, old.__qualname__))
+        return isinstance(new, FunctionType) and new is not old and not _is_same(old, new)
+    except Exception:  # a repr shows this; whatever odd objects do, it must not fail
+        return False
+
+
+def _unwrapped(function: Any) -> Any:
+    """Return the Python function in a decorated one, a node, a partial or a method."""
+    for _ in range(_DEEPEST):
+        if type(function) is FunctionType and not function.__dict__:
+            break
+        inner = next(
+            (found for name in ("__wrapped__", "__func__", "func") if (found := _attribute(function, name))), None
+        )
+        if inner is None:
+            break
+        function = inner
+    return function
+
+
+def _attribute(function: Any, name: str) -> Any:
+    found = getattr(function, name, None)
+    return found if callable(found) else None
+
+
+def _bound_now(module: str, qualname: str) -> Any:
+    """Return what the module binds to the name, without asking anything that runs code; None if there is nothing."""
+    found: Any = sys.modules.get(module)
+    for part in qualname.split("."):
+        if found is None or part == "<locals>":
+            return None
+        found = vars(found).get(part)
+    return found
+
+
+def _is_same(old: FunctionType, new: FunctionType) -> bool:
+    """Whether two functions were defined in the same words and depend on nothing around them."""
+    if old.__closure__ or new.__closure__:
+        return False
+    if (old.__defaults__, old.__kwdefaults__) != (new.__defaults__, new.__kwdefaults__):
+        return False
+    return old.__code__ == new.__code__ or _at_line_one(old.__code__) == _at_line_one(new.__code__)
+
+
+def _at_line_one(code: CodeType) -> CodeType:
+    """Return the code as if it were defined in the first line: a line more above it in the cell changes nothing."""
+    constants = tuple(_at_line_one(item) if isinstance(item, CodeType) else item for item in code.co_consts)
+    return code.replace(co_firstlineno=1, co_consts=constants)
