@@ -104,7 +104,8 @@ class StaleToken(NotComputed):
     """A token whose value is out of date, since something it depends on has changed."""
 
     def __init__(self, token: str) -> None:
-        super().__init__(token, f"Token {token!r} is stale: something it depends on has changed. Call rerun() first.")
+        text = f"Token {token!r} is stale: something it depends on has changed."
+        super().__init__(token, f"{text} Call rerun() first, or rerun({token!r}) for it alone.")
 
 
 def run_call(tokens: Iterable[str]) -> str:

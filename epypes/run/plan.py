@@ -97,4 +97,4 @@ def _reason(manager: TokenManager, index: int, changed: Collection[str]) -> str:
     remade = [repr(program.tokens[slot]) for slot in dict.fromkeys(read) if program.makers[slot] in manager.stale]
     if remade:
         return f"takes {', '.join(remade)}, made anew"
-    return "an input has changed since it ran" if manager.dirty[index] and step.outputs else "not run yet"
+    return "an input has changed since it ran" if step.outputs else "not run yet"
