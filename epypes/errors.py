@@ -10,6 +10,7 @@ Everything an error's text mentions is an attribute of it::
     +-- PayloadError            run() was given too little or the wrong tokens; .tokens
     +-- HyperparameterError     a token can't be set, frozen or unfrozen; .token
     +-- OutputArityError        a function returned another number of values; .function
+    +-- ContractBroken          a value is not the image that an annotation says; .function, .token
     +-- StillRunning            something did not stop in time; .name, .functions, .timeout_s
     +-- MailboxOverflow         a mailbox with policy "fault" is full; .size
     +-- LayoutUnavailable       no Graphviz engine answers; .tried
@@ -34,6 +35,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from epypes.bundle.compare import ReplayReport
+    from epypes.images import Image
 
 
 class EpypesError(Exception):
@@ -51,8 +53,8 @@ class Finding:
     Attributes
     ----------
     kind
-        ``"cycle"``, ``"two producers"``, ``"no io"``, ``"no function"``, ``"bad io"``, ``"arity"`` or
-        ``"not callable"``.
+        ``"cycle"``, ``"two producers"``, ``"no io"``, ``"no function"``, ``"bad io"``, ``"arity"``,
+        ``"not callable"`` or ``"colour"``.
     text
         What is wrong and the way out, as a sentence.
     names
@@ -132,6 +134,18 @@ class OutputArityError(EpypesError, ValueError):
         self.function, self.outputs, self.got = function, tuple(outputs), got
         wanted = f"{len(self.outputs)} value{'s' if len(self.outputs) != 1 else ''} ({', '.join(self.outputs)})"
         super().__init__(f"Function {function!r} must return a tuple or list of {wanted}, but it returned {got}.")
+
+
+class ContractBroken(EpypesError, ValueError):
+    """A value is not the image that the annotation of a function says; ``made`` tells an output from an input."""
+
+    def __init__(self, function: str, token: str, contract: Image, found: str, *, made: bool = False) -> None:
+        self.function, self.token, self.contract, self.found, self.made = function, token, contract, found, made
+        verb = "makes" if made else "takes"
+        super().__init__(
+            f"Function {function!r} {verb} token {token!r} as {contract}, but it is {found}. "
+            "Convert it, or change the annotation."
+        )
 
 
 class StillRunning(EpypesError, TimeoutError):

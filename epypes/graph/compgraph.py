@@ -16,6 +16,7 @@ from epypes.graph.checks import (
     is_single,
     read_io,
 )
+from epypes.graph.colours import check_colours
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -41,7 +42,8 @@ class CompGraph:
     ------
     GraphError
         With every problem as a finding: a cycle, two producers of a token, a function without io, io without
-        a function, an io of another shape, a number of inputs that the signature does not take.
+        a function, an io of another shape, a number of inputs that the signature does not take, annotations that
+        give the colours of a token in two orders.
 
     Notes
     -----
@@ -67,6 +69,7 @@ class CompGraph:
         findings += check_producers(digraph)
         findings += check_cycle(digraph)
         findings += check_arity(func_dict, digraph)
+        findings += check_colours(func_dict, digraph)
         if findings:
             raise GraphError(findings)
         order = digraph.run_order()
