@@ -11,6 +11,7 @@ import inspect
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from inspect import unwrap
 from types import FunctionType, MethodType
 from typing import Annotated, Any, Final, Literal, get_args, get_origin, get_type_hints
 from weakref import WeakKeyDictionary
@@ -180,6 +181,13 @@ def _fits(dtype: Any, ends: tuple[float, float]) -> bool:
     return dtype.kind in "uib" and ends[0] <= least and largest <= ends[1]
 
 
+def swapped(image: Any) -> Any:
+    """Return a copy of an array (y, x, 3) or (y, x, 4) with red and blue exchanged: BGR as RGB, and back."""
+    copy = image.copy()
+    copy[..., 0], copy[..., 2] = image[..., 2], image[..., 0]
+    return copy
+
+
 Contracts = tuple[tuple[Image | None, ...], tuple[Image | None, ...]]
 # Weak, so that a function of a notebook that was defined again can go; reading annotations evaluates their text.
 _READ: WeakKeyDictionary[FunctionType, tuple[inspect.Signature, dict[str, Any]] | None] = WeakKeyDictionary()
@@ -228,14 +236,23 @@ def contracts_of(function: Callable[..., Any], inputs: int, outputs: int) -> Con
 
 def _read(function: Callable[..., Any]) -> tuple[inspect.Signature, dict[str, Any]] | None:
     """Return signature and resolved annotations of a function that has a mark."""
-    plain = function.__func__ if isinstance(function, MethodType) else function
-    if not isinstance(plain, FunctionType) or not getattr(plain, "__annotations__", None):
+    plain = _unwrapped(function)
+    if not getattr(plain, "__annotations__", None):
         return None
-    if plain is not function:
-        return _resolved(function)
+    if not isinstance(plain, FunctionType):
+        return _resolved(plain) if isinstance(plain, MethodType) else None
     if plain not in _READ:
         _READ[plain] = _resolved(plain)
     return _READ[plain]
+
+
+def _unwrapped(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return what a decorated function, or a Node, stands for."""
+    try:
+        is_wrapper = not isinstance(function, MethodType) and hasattr(function, "__wrapped__")
+        return unwrap(function) if is_wrapper else function
+    except Exception:  # whatever an object's __getattr__ raises
+        return function
 
 
 def _resolved(function: Callable[..., Any]) -> tuple[inspect.Signature, dict[str, Any]] | None:

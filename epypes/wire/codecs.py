@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from epypes.errors import MessageError
+from epypes.images import Order, swapped
 from epypes.wire.limits import DEFAULT_LIMITS, Limits
 from epypes.wire.schema import message_class
 
@@ -242,6 +243,7 @@ class Reader:
         self._frames, self._limits = frames, limits
         self._count = 0
         self._seen: set[int] = set()
+        self._order: Order | None = None
         self.used: list[int] = []
 
     def read(self, message: Any, path: Path) -> Any:
@@ -255,6 +257,14 @@ class Reader:
         if kind is None:
             raise MessageError("unknown value", f"{spoken(path)} has no value, or one of a newer kind.")
         return _READ[kind](self, getattr(message, kind), path)
+
+    def read_part(self, message: Any, path: Path) -> tuple[Any, Order | None]:
+        """Return the value of a message, and the order of the colours in it; None if there are none.
+
+        A part has one order: an image of another order than the first one in it is converted.
+        """
+        self._order = None
+        return self.read(message, path), self._order
 
     def check_all_used(self) -> None:
         """Raise MessageError if a frame belongs to no value."""
@@ -293,10 +303,15 @@ class Reader:
         return result
 
     def _image(self, content: Any, path: Path) -> AnyArray:
-        from epypes.wire.arrays import read_image
+        from epypes.wire.arrays import frozen, read_image
 
         data = self._data(content, path)
-        return read_image(content.width, content.height, content.encoding, content.step, data, spoken(path))
+        image = read_image(content.width, content.height, content.encoding, content.step, data, spoken(path))
+        if image.ndim == 2:
+            return image
+        order: Order = "rgb" if content.encoding.startswith("rgb") else "bgr"
+        self._order = self._order or order
+        return image if order == self._order else frozen(swapped(image))
 
     def _tensor(self, content: Any, path: Path) -> Any:
         from epypes.wire.arrays import read_dtype, read_tensor
