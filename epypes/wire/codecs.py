@@ -237,18 +237,28 @@ class Reader:
         The payload frames, each a one-dimensional memoryview of bytes.
     limits
         What is accepted.
+
+    Attributes
+    ----------
+    order
+        That of the colours in the named value that was read last, None if there are none in it. A value has one order:
+        an image of another order than the first one in it is converted.
+    used
+        The indices of the frames that were read.
     """
 
     def __init__(self, frames: Sequence[memoryview], limits: Limits = DEFAULT_LIMITS) -> None:
         self._frames, self._limits = frames, limits
         self._count = 0
         self._seen: set[int] = set()
-        self._order: Order | None = None
+        self.order: Order | None = None
         self.used: list[int] = []
 
     def read(self, message: Any, path: Path) -> Any:
         """Return the value of a message; raise MessageError if there is none in it."""
         self._count += 1
+        if len(path) == 1:
+            self.order = None
         if self._count > self._limits.values:
             raise MessageError("too many values", f"The message holds more than {self._limits.values:,} values.")
         if len(path) - 1 > self._limits.depth:
@@ -257,14 +267,6 @@ class Reader:
         if kind is None:
             raise MessageError("unknown value", f"{spoken(path)} has no value, or one of a newer kind.")
         return _READ[kind](self, getattr(message, kind), path)
-
-    def read_part(self, message: Any, path: Path) -> tuple[Any, Order | None]:
-        """Return the value of a message, and the order of the colours in it; None if there are none.
-
-        A part has one order: an image of another order than the first one in it is converted.
-        """
-        self._order = None
-        return self.read(message, path), self._order
 
     def check_all_used(self) -> None:
         """Raise MessageError if a frame belongs to no value."""
@@ -310,8 +312,8 @@ class Reader:
         if image.ndim == 2:
             return image
         order: Order = "rgb" if content.encoding.startswith("rgb") else "bgr"
-        self._order = self._order or order
-        return image if order == self._order else frozen(swapped(image))
+        self.order = self.order or order
+        return image if order == self.order else frozen(swapped(image))
 
     def _tensor(self, content: Any, path: Path) -> Any:
         from epypes.wire.arrays import read_dtype, read_tensor

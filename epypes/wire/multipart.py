@@ -162,8 +162,8 @@ def decode(frames: Sequence[bytes | bytearray | memoryview], limits: Limits = DE
     rgb: set[str] = set()
 
     def read_part(entry: Any) -> Any:
-        value, order = reader.read_part(entry.value, (entry.name,))
-        if order == "rgb":
+        value = reader.read(entry.value, (entry.name,))
+        if reader.order == "rgb":
             rgb.add(entry.name)
         return value
 

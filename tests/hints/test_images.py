@@ -124,6 +124,9 @@ def test_methods_and_wrapped_functions_keep_their_contracts():
 
     assert contracts_of(Camera().shown, 1, 0) == ((RGB,), ())
     assert contracts_of(wrapped, 1, 1) == ((RGB,), (GRAY,))
+    assert contracts_of(ep.Node("gray", gray), 1, 1) == ((RGB,), (GRAY,))
+    Camera.wrapped = functools.wraps(gray)(lambda self, *args: gray(*args))
+    assert contracts_of(Camera().wrapped, 1, 1)[1] == (GRAY,)
 
 
 @pytest.mark.parametrize("function", [len, int, lambda x: x, lost, functools.partial(gray), object(), ep.Image])
