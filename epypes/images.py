@@ -11,7 +11,6 @@ import inspect
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from inspect import unwrap
 from types import FunctionType, MethodType
 from typing import Annotated, Any, Final, Literal, get_args, get_origin, get_type_hints
 from weakref import WeakKeyDictionary
@@ -81,11 +80,11 @@ class Image:
         dtype, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
         if not hasattr(dtype, "kind") or not isinstance(shape, tuple):
             return f"of type {type(value).__name__!r}"
-        kind = f"{dtype} {' x '.join(map(str, shape)) or 'without axes'}"
-        if not self._allows_dtype(dtype) or not self._allows_shape(shape):
-            return kind
-        outside = self._outside(value)
-        return f"{kind} {outside}" if outside else None
+        allowed = self._allows_dtype(dtype) and self._allows_shape(shape)
+        outside = self._outside(value) if allowed else ""
+        if allowed and not outside:
+            return None
+        return f"{dtype} {' x '.join(map(str, shape)) or 'without axes'} {outside}".rstrip()
 
     def findings(self, value: Any) -> str | None:
         """Return what is wrong with a value, ``"float64 480 x 640, expected uint8 (h, w, 3)"``, or None."""
@@ -250,7 +249,7 @@ def _unwrapped(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return what a decorated function, or a Node, stands for."""
     try:
         is_wrapper = not isinstance(function, MethodType) and hasattr(function, "__wrapped__")
-        return unwrap(function) if is_wrapper else function
+        return inspect.unwrap(function) if is_wrapper else function
     except Exception:  # whatever an object's __getattr__ raises
         return function
 
