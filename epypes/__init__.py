@@ -3,7 +3,7 @@
 The rooms, from the bottom up; imports point downwards only (checked by ``lint-imports``):
 
 - ``errors``: every error EPypes raises
-- ``hints``: which values a hyperparameter may take
+- ``hints``: which values a hyperparameter may take; ``images``: which arrays a function takes as images
 - ``graph``: what is connected to what
 - ``run``: which functions must run, and running them
 - ``pipeline``: the paper's ladder of nodes and pipelines; ``acquisition``: where images come from;
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from epypes.bundle import load, load_pipeline, promote, verify
     from epypes.graph import CompGraph, Placeholder, extend, outputs, rename, subgraph, suffix, switch, union
     from epypes.hints import Param
+    from epypes.images import Image
     from epypes.pipeline import (
         EventLoop,
         EventView,
@@ -61,6 +62,7 @@ _HOMES = {
     "EventLoop": "epypes.pipeline",
     "EventView": "epypes.pipeline",
     "FullPipeline": "epypes.pipeline",
+    "Image": "epypes.images",
     "Mailbox": "epypes.pipeline",
     "Node": "epypes.pipeline",
     "NodeBasedCompGraph": "epypes.pipeline",
@@ -85,6 +87,7 @@ __all__ = [
     "EventView",
     "Failure",
     "FullPipeline",
+    "Image",
     "Mailbox",
     "Node",
     "NodeBasedCompGraph",

@@ -11,6 +11,7 @@ Everything an error's text mentions is an attribute of it::
     +-- HyperparameterError     a token can't be set, frozen or unfrozen; .token
     +-- PlaceholderNeeded       a function is still to be written; .functions
     +-- OutputArityError        a function returned another number of values; .function
+    +-- ContractBroken          a value is not the image that an annotation says; .function, .token
     +-- StillRunning            something did not stop in time; .name, .functions, .timeout_s
     +-- MailboxOverflow         a mailbox with policy "fault" is full; .size
     +-- LayoutUnavailable       no Graphviz engine answers; .tried
@@ -35,6 +36,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from epypes.bundle.compare import ReplayReport
+    from epypes.images import Image
 
 
 class EpypesError(Exception):
@@ -53,7 +55,7 @@ class Finding:
     ----------
     kind
         ``"cycle"``, ``"two producers"``, ``"no io"``, ``"no function"``, ``"bad io"``, ``"arity"``,
-        ``"not callable"``, ``"selector"`` or ``"types"``; where a graph is made of functions or of graphs also
+        ``"not callable"``, ``"selector"``, ``"types"`` or ``"colour"``; where a graph is made of functions or of graphs also
         ``"no name"``, ``"no signature"``, ``"two functions"``, ``"one name"``, ``"defaults"`` or
         ``"not a placeholder"``.
     text
@@ -154,6 +156,18 @@ class OutputArityError(EpypesError, ValueError):
         self.function, self.outputs, self.got = function, tuple(outputs), got
         wanted = f"{len(self.outputs)} value{'s' if len(self.outputs) != 1 else ''} ({', '.join(self.outputs)})"
         super().__init__(f"Function {function!r} must return a tuple or list of {wanted}, but it returned {got}.")
+
+
+class ContractBroken(EpypesError, ValueError):
+    """A value is not the image that the annotation of a function says; ``made`` tells an output from an input."""
+
+    def __init__(self, function: str, token: str, contract: Image, found: str, *, made: bool = False) -> None:
+        self.function, self.token, self.contract, self.found, self.made = function, token, contract, found, made
+        verb = "makes" if made else "takes"
+        super().__init__(
+            f"Function {function!r} {verb} token {token!r} as {contract}, but it is {found}. "
+            "Convert it, or change the annotation."
+        )
 
 
 class StillRunning(EpypesError, TimeoutError):

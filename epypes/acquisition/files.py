@@ -6,14 +6,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from epypes.errors import ImageFileError
+from epypes.images import swapped
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
+    from epypes.images import Order
 
-def read_image(path: str | Path) -> npt.NDArray[np.uint8 | np.uint16]:
+
+def read_image(path: str | Path, order: Order = "bgr") -> npt.NDArray[np.uint8 | np.uint16]:
     """Read an image file as OpenCV does, unchanged: (y, x), (y, x, 3) BGR or (y, x, 4) BGRA, uint8 or uint16.
+
+    With ``order="rgb"``, RGB and RGBA.
 
     Raises
     ------
@@ -38,10 +43,10 @@ def read_image(path: str | Path) -> npt.NDArray[np.uint8 | np.uint16]:
     if image is None:
         text = f"{str(path)!r} is not an image that OpenCV can read. Use PNG, JPEG, TIFF, BMP or WebP."
         raise ImageFileError(str(path), text)
-    return image  # type: ignore[no-any-return]
+    return image if order == "bgr" else _in_other_order(image)  # type: ignore[no-any-return]
 
 
-def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
+def write_image(path: str | Path, image: npt.NDArray[Any], order: Order = "bgr") -> None:
     """Write an array as an image file, by its ending; ``.png`` keeps every value.
 
     Parameters
@@ -49,7 +54,9 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
     path
         The file.
     image
-        bool, uint8 or uint16; (y, x), (y, x, 3) BGR or (y, x, 4) BGRA.
+        bool, uint8 or uint16; (y, x), (y, x, 3) or (y, x, 4).
+    order
+        ``"bgr"`` or ``"rgb"``: what three and four channels are.
 
     Raises
     ------
@@ -64,7 +71,7 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
         kind = f"{image.dtype} {image.shape}"
         raise ImageFileError(str(path), f"An array of {kind} can't be written as an image. Use a file ending in .npy.")
     try:
-        done, data = cv2.imencode(Path(path).suffix, shown)
+        done, data = cv2.imencode(Path(path).suffix, shown if order == "bgr" else _in_other_order(shown))
         if not done:
             raise ImageFileError(str(path), f"OpenCV could not encode {path}. Use .png.")
         Path(path).write_bytes(data.tobytes())
@@ -75,3 +82,7 @@ def write_image(path: str | Path, image: npt.NDArray[Any]) -> None:
         if isinstance(error, ImageFileError):
             raise
         raise ImageFileError(str(path), f"{str(path)!r} can't be written: {error.strerror}.") from error
+
+
+def _in_other_order(image: Any) -> Any:
+    return swapped(image) if image.ndim == 3 and image.shape[2] in (3, 4) else image

@@ -128,7 +128,7 @@ def pipeline_of(bundle: Bundle, q_in: Any, q_out: Any) -> FullPipeline:
         bundle.cg,
         q_in,
         q_out,
-        payload_of(settings.inputs),
-        answer_with(settings.outputs, bundle.digest),
+        payload_of(settings.inputs, settings.rgb),
+        answer_with(settings.outputs, bundle.digest, settings.rgb),
         settings.hyperparameters,
     )

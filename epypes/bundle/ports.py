@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import MessageError
@@ -19,9 +19,10 @@ FAILURE: Final = "epypes.failure"
 _MESSAGE_CHARACTERS: Final = 2_000
 
 
-def payload_of(inputs: Sequence[str]) -> Callable[[Any], Mapping[str, Any]]:
+def payload_of(inputs: Sequence[str], rgb: Collection[str] = ()) -> Callable[[Any], Mapping[str, Any]]:
     """Return an f_in: it takes the parts of an Envelope that are named like the input tokens.
 
+    Images arrive in the order of their tokens' colours: RGB for those named in ``rgb``, BGR for all others.
     The f_in raises MessageError for anything but an Envelope, and for one whose parts are not the inputs.
     """
 
@@ -36,16 +37,29 @@ def payload_of(inputs: Sequence[str]) -> Callable[[Any], Mapping[str, Any]]:
             got = ", ".join(map(repr, event.parts)) or "none"
             text = f"The event must have the parts {', '.join(map(repr, inputs))}; it has {got}."
             raise MessageError("wrong parts", text)
-        return dict(event.parts)
+        return in_order(event, rgb)
 
     return f_in
 
 
-def answer_with(outputs: Sequence[str], bundle_digest: str) -> Callable[[EventView], Envelope]:
+def in_order(envelope: Envelope, rgb: Collection[str]) -> dict[str, Any]:
+    """Return the parts of an envelope; images that came in another order than their token's are converted, once."""
+    from epypes.wire.arrays import recoloured
+
+    return {
+        token: value if (token in envelope.rgb) == (token in rgb) else recoloured(value)
+        for token, value in envelope.parts.items()
+    }
+
+
+def answer_with(
+    outputs: Sequence[str], bundle_digest: str, rgb: Collection[str] = ()
+) -> Callable[[EventView], Envelope]:
     """Return an f_out: an Envelope with the output tokens and the times, which answers the event by its id.
 
     The arrays are copies, since a function may use the memory of its result again for the next event before this one
-    is sent. What can't be sent raises MessageError here, where it becomes the event's failure.
+    is sent. Images of the tokens named in ``rgb`` are sent as RGB. What can't be sent raises MessageError here, where
+    it becomes the event's failure.
     """
 
     def f_out(view: EventView) -> Envelope:
@@ -61,6 +75,7 @@ def answer_with(outputs: Sequence[str], bundle_digest: str) -> Callable[[EventVi
             bundle_digest=bundle_digest,
             attributes={**view.attributes, "total_ns": view.report.total_ns, "overhead_ns": view.report.overhead_ns},
             timings=view.report.durations_ns,
+            rgb=[token for token in outputs if token in rgb],
         )
         encode(answer)
         return answer

@@ -21,7 +21,7 @@ from epypes.bundle.seal import MANIFEST, seal
 from epypes.bundle.settings import Settings, unwritable, write_settings
 from epypes.bundle.slicer import slice_graph
 from epypes.errors import BundleError, EpypesError, MessageError, PromotionRefused, run_call
-from epypes.graph import CompGraph
+from epypes.graph import CompGraph, colour_order
 from epypes.pipeline import Node, Pipeline
 from epypes.run import CompGraphRunner, Run
 
@@ -119,11 +119,13 @@ def _write(draft: Path, target: Path, runner: CompGraphRunner, cg: CompGraph, ou
     if reasons:
         raise PromotionRefused(target, reasons)
     (draft / SAMPLES).mkdir(parents=True)
-    settings = Settings(target.name, runner.free_source_tokens, wanted, runner.hyperparameters)
+    free = runner.free_source_tokens
+    rgb = tuple(token for token in dict.fromkeys((*free, *wanted)) if colour_order(cg, token) == "rgb")
+    settings = Settings(target.name, free, wanted, runner.hyperparameters, rgb)
     (draft / MODULE).write_text(emit_module(settings, cg, needed, references), encoding="utf-8")
     write_settings(draft / SETTINGS, settings, cg)
     if runner.last is not None:  # as _unready has made sure
-        _record(draft / SAMPLES / "000.npz", target, runner.last, runner.free_source_tokens, wanted)
+        _record(draft / SAMPLES / "000.npz", target, runner.last, settings)
 
 
 def _unready(runner: CompGraphRunner, outputs: Sequence[str]) -> list[str]:
@@ -140,11 +142,12 @@ def _unready(runner: CompGraphRunner, outputs: Sequence[str]) -> list[str]:
     return []
 
 
-def _record(path: Path, target: Path, run: Run, inputs: Sequence[str], outputs: Sequence[str]) -> None:
+def _record(path: Path, target: Path, run: Run, settings: Settings) -> None:
     from epypes.wire.samples import save_sample
 
     try:
-        save_sample(path, {token: run[token] for token in inputs}, {token: run[token] for token in outputs})
+        inputs, outputs = ({token: run[token] for token in side} for side in (settings.inputs, settings.outputs))
+        save_sample(path, inputs, outputs, rgb=settings.rgb)
     except MessageError as error:
         raise PromotionRefused(target, [str(error)]) from error
 

@@ -11,6 +11,7 @@ from typing import Any, Final
 from epypes.errors import BundleError
 from epypes.graph import CompGraph, annotated_params
 from epypes.hints import Param
+from epypes.images import Order
 
 FORMAT: Final = 1
 
@@ -29,12 +30,19 @@ class Settings:
         The tokens that an answer carries.
     hyperparameters
         Values by token.
+    rgb
+        Of the inputs and outputs, those whose three or four channels are RGB.
     """
 
     name: str
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     hyperparameters: Mapping[str, Any]
+    rgb: tuple[str, ...] = ()
+
+    def order(self, token: str) -> Order:
+        """Return the order of a token's colours."""
+        return "rgb" if token in self.rgb else "bgr"
 
 
 def unwritable(hyperparameters: Mapping[str, Any]) -> list[str]:
@@ -80,6 +88,9 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
     ports.add(tomlkit.comment("The tokens that an event brings, and those that its answer carries."))
     ports.add("inputs", list(settings.inputs))
     ports.add("outputs", list(settings.outputs))
+    if settings.rgb:
+        ports.add(tomlkit.comment("Their three or four channels are RGB; those of all others are BGR."))
+        ports.add("rgb", list(settings.rgb))
     document.add("ports", ports)
     hyperparameters = tomlkit.table(is_super_table=True)
     for token, value in settings.hyperparameters.items():
@@ -125,6 +136,7 @@ def read_settings(path: Path) -> Settings:
             _strings(ports["inputs"]),
             _strings(ports["outputs"]),
             {token: _value(entry) for token, entry in document.get("hyperparameters", {}).items()},
+            _strings(ports.get("rgb", [])),
         )
     except KeyError as error:
         raise BundleError(path, f"{path} lacks {error.args[0]!r}. Promote the graph again.") from error

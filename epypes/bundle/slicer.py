@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import ast
 import builtins
+import dataclasses
 import dis
 import types
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Final
+from typing import Annotated, Any, Final, get_origin
 
 from epypes.bundle.source import Definition, Importable, Refused, definition, importable
+from epypes.hints import Param
+from epypes.images import Image
 from epypes.run.guard import is_plain_array
 
 _CONSTANT_CHARACTERS: Final = 400
@@ -115,7 +118,10 @@ class Slice:
         self._add_definition(helper, f"Function {name!r}, which {what[0].lower()}{what[1:]} calls,")
 
     def _add_constant(self, name: str, value: Any, found: Definition, what: str) -> None:
-        source = self._array_source(value, what) if is_plain_array(value) else _literal_source(value)
+        if is_plain_array(value):
+            source = self._array_source(value, what)
+        else:
+            source = self._annotation_source(value, what) or _literal_source(value)
         if not source or len(source) > _CONSTANT_CHARACTERS:
             kind = f"the class {name!r}" if isinstance(value, type) else f"of type {type(value).__name__}"
             raise Refused(
@@ -127,6 +133,24 @@ class Slice:
         if name not in self.constants:
             self._claim(name, ("constant", name), what)
             self.constants[name] = source
+
+    def _annotation_source(self, value: Any, what: str) -> str:
+        """Return the source of a mark, or of ``Annotated`` with marks, as annotations use them; "" for any other."""
+        if isinstance(value, Image | Param):
+            given = [(field.name, getattr(value, field.name), field.default) for field in dataclasses.fields(value)]
+            words = [(name, _literal_source(setting)) for name, setting, default in given if setting != default]
+            if not all(source for _, source in words):
+                return ""
+            listed = ", ".join(f"{name}={source}" for name, source in words)
+            return f"{self._module_name('epypes', what)}.{type(value).__name__}({listed})"
+        home = importable(value.__origin__) if get_origin(value) is Annotated else None
+        parts = [self._annotation_source(mark, what) for mark in value.__metadata__] if home else [""]
+        if home is None or not all(parts):
+            return ""
+        plain = (
+            home.qualname if home.module == "builtins" else f"{self._module_name(home.module, what)}.{home.qualname}"
+        )
+        return f"{self._module_name('typing', what)}.Annotated[{plain}, {', '.join(parts)}]"
 
     def _array_source(self, array: Any, what: str) -> str:
         """Return a small array of numbers as source that makes it again, to the last bit; "" for any other."""

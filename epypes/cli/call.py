@@ -12,6 +12,7 @@ import typer
 
 from epypes.cli.terminal import out, print_answer
 from epypes.errors import ServiceError, UnknownName
+from epypes.images import Order
 
 
 def call(
@@ -36,12 +37,12 @@ def call(
     settings = read_settings(bundle / SETTINGS)
     files = by_token(images, settings.inputs, "input")
     targets = by_token(out_file or [], settings.outputs, "output")
-    payload = {token: read_image(file) for token, file in files.items()}
+    payload = {token: read_image(file, settings.order(token)) for token, file in files.items()}
     with Client(bundle, timeout_s=timeout) as client:
         answers = [client.call(payload) for _ in range(count)]
     answer = min(answers, key=lambda answer: answer.round_trip_ns)
     for token, file in targets.items():
-        _write(file, answer.tokens[token])
+        _write(file, answer.tokens[token], settings.order(token))
     for token, value in answer.tokens.items():
         if token not in targets and not as_json:
             out.print(f"{token} = {preview(value).text}")
@@ -80,7 +81,7 @@ def by_token(given: Sequence[str], tokens: Sequence[str], kind: str) -> dict[str
     return found
 
 
-def _write(file: str, value: Any) -> None:
+def _write(file: str, value: Any, order: Order) -> None:
     import numpy as np
 
     from epypes.acquisition import write_image
@@ -91,7 +92,7 @@ def _write(file: str, value: Any) -> None:
         except (OSError, ValueError) as error:
             raise ServiceError(file, f"{file} can't be written: {error}.") from error
     elif isinstance(value, np.ndarray):
-        write_image(file, value)
+        write_image(file, value, order)
     else:
         kind = type(value).__name__
         raise ServiceError(file, f"The answer is of type {kind}, not an image. Leave out --out, and it is printed.")

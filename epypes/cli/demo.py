@@ -36,7 +36,8 @@ def demo(
     from epypes.acquisition import read_image, write_image
     from epypes.bundle import verify
     from epypes.bundle.compare import first_difference
-    from epypes.bundle.load import SAMPLES
+    from epypes.bundle.load import SAMPLES, SETTINGS
+    from epypes.bundle.settings import read_settings
     from epypes.wire.samples import load_sample
 
     to.mkdir(parents=True, exist_ok=True)
@@ -46,17 +47,18 @@ def demo(
     _step(2, "Verify: replay the recorded sample in a fresh isolated process")
     report = verify(bundle)
     out.print(f"   {report}")
+    settings = read_settings(bundle / SETTINGS)
     inputs, outputs = load_sample(bundle / SAMPLES / "000.npz")
     images = {token: to / f"{token}.png" for token in inputs}
     for token, file in images.items():
-        write_image(file, inputs[token])
+        write_image(file, inputs[token], settings.order(token))
     _draw(bundle, inputs, to / "graph.svg")
     _step(3, "Serve the bundle in a second process")
     with _service(bundle) as ready:
         out.print(f"   {ready}")
         _step(4, f"Call it from a third process, {_CALLS} times, with {', '.join(map(str, images.values()))}")
         answer = _call(bundle, images, output, answer_file)
-    difference = first_difference(outputs[output], read_image(answer_file))
+    difference = first_difference(outputs[output], read_image(answer_file, settings.order(output)))
     _step(5, f"Compare {answer_file} with what the notebook computed")
     if difference:
         raise ServiceError(answer_file, f"The service's {output!r} differs from the notebook's: {difference}")

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from epypes.display.raster import Picture, encode_image, is_image, sampled
+from epypes.images import Order
 
 THUMBNAIL_PX: Final = 128
 _TEXT_WIDTH: Final = 24
@@ -36,10 +37,13 @@ class Preview:
     picture: Picture | None = None
 
 
-def preview(value: Any) -> Preview:
-    """Look at a value; never raises, and never calls the ``__repr__`` of an object that is not Python's own."""
+def preview(value: Any, order: Order = "bgr") -> Preview:
+    """Look at a value; never raises, and never calls the ``__repr__`` of an object that is not Python's own.
+
+    ``order`` is that of its colours, if it is an image.
+    """
     try:
-        return _array_preview(value) if _is_array(value) else _object_preview(value)
+        return _array_preview(value, order) if _is_array(value) else _object_preview(value)
     except Exception as error:
         reason = f"no preview: {type(error).__name__}"
         return Preview(reason, f"{type(value).__name__}, {reason}")
@@ -49,12 +53,14 @@ def _is_array(value: Any) -> bool:
     return type(value).__module__.startswith("numpy") and hasattr(value, "dtype") and hasattr(value, "shape")
 
 
-def _array_preview(array: Any) -> Preview:
+def _array_preview(array: Any, order: Order) -> Preview:
     if not array.shape:
         return Preview(_cut(str(array.item())), f"{array.dtype} {array.item()!s:.60}")
     text = f"{array.dtype} {' x '.join(map(str, array.shape))}"
-    detail = text + _range_text(array)
-    return Preview(text, detail, encode_image(array, THUMBNAIL_PX) if is_image(array) else None)
+    if not is_image(array):
+        return Preview(text, text + _range_text(array))
+    colours = f" {order}" if order != "bgr" and array.ndim == 3 and array.shape[2] > 1 else ""
+    return Preview(text, text + colours + _range_text(array), encode_image(array, THUMBNAIL_PX, order))
 
 
 def _range_text(array: Any) -> str:

@@ -1,7 +1,8 @@
 """How does an array become the bytes of a JPEG or PNG?
 
 Pillow encodes: it comes with every notebook that has matplotlib, and unlike OpenCV's it has one wheel, so no OpenCV
-build is forced on anybody. Three channels are BGR, as in OpenCV.
+build is forced on anybody. Three channels are BGR, as in OpenCV, unless the caller
+says rgb.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
     from PIL import Image
+
+    from epypes.images import Order
 
     Array = npt.NDArray[np.generic]
 
@@ -44,7 +47,7 @@ class Picture:
 
 
 def is_image(value: Any) -> bool:
-    """Whether a value can be seen as an image: (y, x), (y, x, 3) BGR or (y, x, 4) BGRA, at least 8 x 8 pixels."""
+    """Whether a value can be seen as an image: (y, x), (y, x, 3) or (y, x, 4), at least 8 x 8 pixels."""
     shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
     if not isinstance(shape, tuple) or getattr(dtype, "kind", "") not in ("b", "u", "i", "f"):
         return False
@@ -52,7 +55,7 @@ def is_image(value: Any) -> bool:
     return len(shape) in (2, 3) and channels in (1, 3, 4) and min(shape[:2]) >= SMALLEST_SIDE_PX
 
 
-def encode_image(array: Array, max_side_px: int | None = None) -> Picture:
+def encode_image(array: Array, max_side_px: int | None = None, order: Order = "bgr") -> Picture:
     """Encode an image: masks as 1-bit PNG without loss, pictures with alpha as PNG, all others as JPEG.
 
     Parameters
@@ -61,6 +64,8 @@ def encode_image(array: Array, max_side_px: int | None = None) -> Picture:
         An image as ``is_image`` has it; dtype bool, integer or float.
     max_side_px
         The longer side of the result at most; None keeps the size.
+    order
+        ``"bgr"`` or ``"rgb"``: what three and four channels are.
 
     Notes
     -----
@@ -70,7 +75,7 @@ def encode_image(array: Array, max_side_px: int | None = None) -> Picture:
     image = array[:, :, 0] if array.ndim == 3 and array.shape[2] == 1 else array
     if is_mask(image):
         return _save(_mask_picture(image, max_side_px), "PNG")
-    picture = _resized(_pillow(_as_bytes(_strided(image, max_side_px))), max_side_px)
+    picture = _resized(_pillow(_as_bytes(_strided(image, max_side_px)), order), max_side_px)
     return _save(picture, "PNG" if picture.mode == "RGBA" else "JPEG")
 
 
@@ -130,15 +135,15 @@ def _display_range(values: npt.NDArray[np.float32]) -> tuple[float, float]:
     return low, high if high > low else low + 1.0
 
 
-def _pillow(image: npt.NDArray[np.uint8]) -> Image.Image:
+def _pillow(image: npt.NDArray[np.uint8], order: Order) -> Image.Image:
     from PIL import Image
 
     size = (image.shape[1], image.shape[0])
     if image.ndim == 2:
         return Image.frombuffer("L", size, image, "raw", "L", 0, 1)
     if image.shape[2] == 3:
-        return Image.frombuffer("RGB", size, image, "raw", "BGR", 0, 1)
-    return Image.frombuffer("RGBA", size, image, "raw", "BGRA", 0, 1)
+        return Image.frombuffer("RGB", size, image, "raw", order.upper(), 0, 1)
+    return Image.frombuffer("RGBA", size, image, "raw", f"{order.upper()}A", 0, 1)
 
 
 def _resized(picture: Image.Image, max_side_px: int | None) -> Image.Image:

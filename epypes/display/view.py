@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
 from epypes.display.preview import Preview, preview
-from epypes.graph import CompGraph
+from epypes.graph import CompGraph, colour_order
+from epypes.images import Order
 from epypes.run import CompGraphRunner, FunctionTime, Run
 
 TokenRole = Literal["payload", "hyperparameter"]
@@ -23,12 +24,13 @@ THUMBNAIL_CHARACTERS: Final = 80_000
 
 @dataclass(frozen=True, slots=True)
 class TokenView:
-    """What is to be seen of a token; ``preview`` is None if it has no value."""
+    """What is to be seen of a token; ``preview`` is None if it has no value, ``order`` is that of its colours."""
 
     name: str
     role: TokenRole
     state: TokenState
     preview: Preview | None = None
+    order: Order = "bgr"
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +90,7 @@ def _structure(cg: CompGraph) -> GraphView:
     ]
     return GraphView(
         tuple(FunctionView(name, "static") for name in cg.functions),
-        tuple(TokenView(token, "payload", "static") for token in cg.tokens),
+        tuple(TokenView(token, "payload", "static", order=colour_order(cg, token)) for token in cg.tokens),
         tuple(edges),
     )
 
@@ -104,8 +106,12 @@ def _runner_view(runner: CompGraphRunner) -> GraphView:
 
 def _unrun_token(token: TokenView, hparams: Mapping[str, Any]) -> TokenView:
     if token.name in hparams:
-        return TokenView(token.name, "hyperparameter", "fresh", preview(hparams[token.name]))
+        return _hyperparameter_view(token, hparams[token.name])
     return replace(token, state="not computed")
+
+
+def _hyperparameter_view(token: TokenView, value: Any) -> TokenView:
+    return replace(token, role="hyperparameter", state="fresh", preview=preview(value, token.order))
 
 
 def _with_run(structure: GraphView, run: Run, hparams: Mapping[str, Any], stale: frozenset[str]) -> GraphView:
@@ -142,12 +148,12 @@ def _function_view(name: str, index: int, run: Run, stale: frozenset[str], entry
 
 def _token_view(token: TokenView, run: Run, hparams: Mapping[str, Any], stale: frozenset[str]) -> TokenView:
     if token.name in hparams:
-        return TokenView(token.name, "hyperparameter", "fresh", preview(hparams[token.name]))
+        return _hyperparameter_view(token, hparams[token.name])
     if not run.tokens.is_computed(token.name):
         return replace(token, state="not computed")
     value = run.tokens.values[run.tokens.program.slots[token.name]]
     is_old = run.cg.digraph.producer.get(token.name) in stale
-    return TokenView(token.name, "payload", "stale" if is_old else "fresh", preview(value))
+    return replace(token, state="stale" if is_old else "fresh", preview=preview(value, token.order))
 
 
 def within_budget(tokens: list[TokenView], first: Iterable[str]) -> tuple[tuple[TokenView, ...], int]:

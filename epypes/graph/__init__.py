@@ -2,7 +2,7 @@
 
 from epypes.graph.algebra import extend, subgraph, union, with_functions
 from epypes.graph.compgraph import CompGraph
-from epypes.graph.hinted import annotated_params
+from epypes.graph.hinted import annotated_params, colour_order, image_hint
 from epypes.graph.outputs import outputs
 from epypes.graph.placeholder import Placeholder, is_placeholder
 from epypes.graph.renaming import rename, suffix
@@ -14,7 +14,9 @@ __all__ = [
     "Switch",
     "annotated_params",
     "as_switch",
+    "colour_order",
     "extend",
+    "image_hint",
     "is_placeholder",
     "outputs",
     "rename",

@@ -18,6 +18,7 @@ from epypes.graph.checks import (
     is_single,
     read_io,
 )
+from epypes.graph.colours import check_colours
 from epypes.graph.declared import read_functions
 from epypes.graph.parts import Default, Parts, check_defaults
 from epypes.graph.placeholder import is_placeholder
@@ -53,7 +54,7 @@ class CompGraph:
     GraphError
         With every problem as a finding: a cycle, two producers of a token, a function without io, io without
         a function, an io of another shape, a number of inputs that the signature does not take, types that exclude
-        each other, a switch whose selector is computed.
+        each other, a token in two orders of colours, a switch whose selector is computed.
 
     Notes
     -----
@@ -132,6 +133,7 @@ class CompGraph:
         if len(order) < len(digraph.inputs):
             findings += check_cycle(digraph)
         findings += check_arity(func_dict, digraph)
+        findings += check_colours(func_dict, digraph)
         findings += check_selectors(func_dict, digraph)
         if types:
             findings += check_types(func_dict, digraph, written)

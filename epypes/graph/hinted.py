@@ -1,4 +1,4 @@
-"""Which values do the annotations of a graph's functions allow for a token?"""
+"""What do the annotations of a graph's functions say of a token?"""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from epypes.graph.compgraph import CompGraph
 from epypes.hints import Param, annotated_param
+from epypes.images import Image, Order, contracts_of
 
 
 def annotated_params(cg: CompGraph, token: str) -> Iterator[Param]:
@@ -14,3 +15,38 @@ def annotated_params(cg: CompGraph, token: str) -> Iterator[Param]:
         found = annotated_param(cg.functions[function], cg.func_inputs(function).index(token))
         if found is not None:
             yield found
+
+
+def image_hint(cg: CompGraph, token: str) -> Image | None:
+    """Return what is said of a token as an image.
+
+    It is the mark on the output of the function that makes it, else the first one with an order on an input of those
+    that take it.
+    """
+    cg.require_token(token)
+    made = _made_as(cg, token)
+    if made is not None and made.order is not None:
+        return made
+    return next((mark for mark in _taken_as(cg, token) if mark.order is not None), made)
+
+
+def colour_order(cg: CompGraph, token: str) -> Order:
+    """Return what three and four channels of a token are: BGR, unless an annotation says otherwise."""
+    hint = image_hint(cg, token)
+    return (hint and hint.order) or "bgr"
+
+
+def _made_as(cg: CompGraph, token: str) -> Image | None:
+    function = cg.digraph.producer.get(token)
+    if function is None:
+        return None
+    tokens = cg.func_outputs(function)
+    _, made = contracts_of(cg.functions[function], len(cg.func_inputs(function)), len(tokens))
+    return made[tokens.index(token)] if made else None
+
+
+def _taken_as(cg: CompGraph, token: str) -> Iterator[Image]:
+    for function in cg.digraph.consumers.get(token, ()):
+        tokens = cg.func_inputs(function)
+        taken, _ = contracts_of(cg.functions[function], len(tokens), len(cg.func_outputs(function)))
+        yield from (mark for name, mark in zip(tokens, taken, strict=False) if name == token and mark is not None)

@@ -5,13 +5,15 @@ from __future__ import annotations
 import queue
 import threading
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic, perf_counter_ns
 from typing import TYPE_CHECKING, Any, Self
 
-from epypes.bundle.ports import REQUEST
+from epypes.bundle.load import SETTINGS
+from epypes.bundle.ports import REQUEST, in_order
+from epypes.bundle.settings import read_settings
 from epypes.errors import RemoteFailure, ServiceError
 from epypes.service.state import ServiceState, read_state
 from epypes.transport import ZMQPublisher, ZMQSubscriber
@@ -66,6 +68,7 @@ class Client:
         self.path, self.timeout_s = path, timeout_s
         self._turn = threading.Lock()
         state = _running(path)
+        self._rgb = read_settings(Path(path) / SETTINGS).rgb
         self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._subscriber = ZMQSubscriber(state.pub, self._answers)
@@ -95,7 +98,7 @@ class Client:
         Parameters
         ----------
         payload
-            The input tokens by name.
+            The input tokens by name, images in the order of their token's colours.
 
         Raises
         ------
@@ -106,7 +109,7 @@ class Client:
         """
         from epypes.wire import Envelope
 
-        request = Envelope(type=REQUEST, parts=payload, source="epypes call")
+        request = Envelope(type=REQUEST, parts=payload, source="epypes call", rgb=self._rgb)
         with self._turn:
             return self._exchange(request)
 
@@ -124,7 +127,7 @@ class Client:
                 self._check_alive(refused)
                 continue
             if isinstance(answer, Envelope) and answer.correlation_id == request.id:
-                return _read(self.path, answer, perf_counter_ns() - start_ns)
+                return _read(self.path, answer, perf_counter_ns() - start_ns, self._rgb)
         text = f"The service of {self.path} did not answer within {self.timeout_s:g} s."
         lost = sum(self._subscriber.lost.values()) - lost
         raise ServiceError(self.path, f"{text} {lost} answers were lost on the way meanwhile." if lost else text)
@@ -154,12 +157,12 @@ def _running(path: str | Path) -> ServiceState:
     return state
 
 
-def _read(path: str | Path, answer: Envelope, round_trip_ns: int) -> Answer:
+def _read(path: str | Path, answer: Envelope, round_trip_ns: int, rgb: Collection[str]) -> Answer:
     if answer.failure is not None:
         failure = answer.failure
         raise RemoteFailure(path, failure.function, failure.exception, failure.message)
     return Answer(
-        dict(answer.parts),
+        in_order(answer, rgb),
         dict(answer.timings),
         int(answer.attributes["total_ns"]),
         int(answer.attributes["overhead_ns"]),

@@ -10,6 +10,7 @@ import re
 from typing import TYPE_CHECKING, Any
 
 from epypes.errors import MessageError
+from epypes.images import swapped
 
 if TYPE_CHECKING:
     import numpy as np
@@ -49,6 +50,16 @@ def image_encoding(array: AnyArray, order: str = "bgr") -> str | None:
     channels = 1 if array.ndim == 2 else array.shape[2]
     colours = {3: order, 4: f"{order}a"}.get(channels) if array.ndim == 3 else "mono"
     return None if colours is None else f"{colours}{bits}"
+
+
+def recoloured(value: Any) -> Any:
+    """Return a value whose coloured images, also in tuples, lists and dicts, have red and blue exchanged."""
+    if type(value) in (tuple, list):
+        return type(value)(map(recoloured, value))
+    if type(value) is dict:
+        return {key: recoloured(item) for key, item in value.items()}
+    is_coloured = getattr(value, "ndim", 0) == 3 and image_encoding(value) is not None
+    return swapped(value) if is_coloured else value
 
 
 def flat_bytes(array: AnyArray) -> memoryview:

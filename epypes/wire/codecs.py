@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from epypes.errors import MessageError
+from epypes.images import Order, swapped
 from epypes.wire.limits import DEFAULT_LIMITS, Limits
 from epypes.wire.schema import message_class
 
@@ -236,17 +237,28 @@ class Reader:
         The payload frames, each a one-dimensional memoryview of bytes.
     limits
         What is accepted.
+
+    Attributes
+    ----------
+    order
+        That of the colours in the named value that was read last, None if there are none in it. A value has one order:
+        an image of another order than the first one in it is converted.
+    used
+        The indices of the frames that were read.
     """
 
     def __init__(self, frames: Sequence[memoryview], limits: Limits = DEFAULT_LIMITS) -> None:
         self._frames, self._limits = frames, limits
         self._count = 0
         self._seen: set[int] = set()
+        self.order: Order | None = None
         self.used: list[int] = []
 
     def read(self, message: Any, path: Path) -> Any:
         """Return the value of a message; raise MessageError if there is none in it."""
         self._count += 1
+        if len(path) == 1:
+            self.order = None
         if self._count > self._limits.values:
             raise MessageError("too many values", f"The message holds more than {self._limits.values:,} values.")
         if len(path) - 1 > self._limits.depth:
@@ -293,10 +305,15 @@ class Reader:
         return result
 
     def _image(self, content: Any, path: Path) -> AnyArray:
-        from epypes.wire.arrays import read_image
+        from epypes.wire.arrays import frozen, read_image
 
         data = self._data(content, path)
-        return read_image(content.width, content.height, content.encoding, content.step, data, spoken(path))
+        image = read_image(content.width, content.height, content.encoding, content.step, data, spoken(path))
+        if image.ndim == 2:
+            return image
+        order: Order = "rgb" if content.encoding.startswith("rgb") else "bgr"
+        self.order = self.order or order
+        return image if order == self.order else frozen(swapped(image))
 
     def _tensor(self, content: Any, path: Path) -> Any:
         from epypes.wire.arrays import read_dtype, read_tensor

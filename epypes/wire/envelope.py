@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
@@ -72,6 +72,8 @@ class Envelope:
         Durations by function name, in nanoseconds.
     failure
         None, or what failed.
+    rgb
+        Names of the parts whose images have three or four channels in RGB order; those of all others are BGR.
     """
 
     type: str
@@ -88,10 +90,12 @@ class Envelope:
     attributes: Mapping[str, Any] = field(default_factory=dict)
     timings: Mapping[str, int] = field(default_factory=dict)
     failure: FailureRecord | None = None
+    rgb: Collection[str] = frozenset()
 
     def __post_init__(self) -> None:
         for name in ("parts", "attributes", "timings"):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+        object.__setattr__(self, "rgb", frozenset((self.rgb,) if isinstance(self.rgb, str) else self.rgb))
 
     def __repr__(self) -> str:
         number = f" #{self.sequence}" if self.sequence else ""

@@ -48,7 +48,7 @@ def encode(
     inline_below
         Arrays and bytes of fewer bytes ride inside the header.
     rgb
-        Names of the parts whose three or four channels are in RGB order; those of all others are BGR.
+        Names of parts in RGB order, beside those that the envelope names itself.
     limits
         What the receiver will accept.
 
@@ -65,12 +65,13 @@ def encode(
     """
     header = message_class("epypes.v1.Envelope")()
     payloads: list[Payload] = []
+    marked = {*rgb, *envelope.rgb}
 
     def add_values(entries: Any, values: Mapping[str, Any], what: str) -> None:
         if len(values) > limits.parts:
             raise MessageError(f"too many {what}", f"{len(values)} {what}, but the limit is {limits.parts}.")
         for name, value in values.items():
-            order = "rgb" if name in rgb else "bgr"
+            order = "rgb" if what == "parts" and name in marked else "bgr"
             message, more = to_value(
                 value,
                 str(name),
@@ -158,13 +159,22 @@ def decode(frames: Sequence[bytes | bytearray | memoryview], limits: Limits = DE
     _check_topic(views[0])
     header = _parse(views[1])
     reader = Reader(views[2:], limits)
+    rgb: set[str] = set()
+
+    def read_part(entry: Any) -> Any:
+        value = reader.read(entry.value, (entry.name,))
+        if reader.order == "rgb":
+            rgb.add(entry.name)
+        return value
+
     try:
         envelope = Envelope(
             **{name: getattr(header, name) for name in _PLAIN_FIELDS},
-            parts=_read_unique(header.parts, "parts", limits, lambda e: reader.read(e.value, (e.name,))),
+            parts=_read_unique(header.parts, "parts", limits, read_part),
             attributes=_read_unique(header.attributes, "attributes", limits, lambda e: reader.read(e.value, (e.name,))),
             timings=_read_unique(header.timings, "timings", limits, lambda e: e.duration_ns, lambda e: e.function),
             failure=_read_failure(header.failure) if header.HasField("failure") else None,
+            rgb=rgb,
         )
     except MessageError:
         raise

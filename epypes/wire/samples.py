@@ -12,7 +12,7 @@ import json
 import re
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,7 +45,9 @@ _BROKEN = (
 )
 
 
-def save_sample(path: str | Path, inputs: Mapping[str, Any], outputs: Mapping[str, Any]) -> None:
+def save_sample(
+    path: str | Path, inputs: Mapping[str, Any], outputs: Mapping[str, Any], *, rgb: Collection[str] = ()
+) -> None:
     """Write the values of one run to an .npz file.
 
     Parameters
@@ -54,6 +56,8 @@ def save_sample(path: str | Path, inputs: Mapping[str, Any], outputs: Mapping[st
         The file, with its suffix; one that exists is replaced.
     inputs, outputs
         Values by token name, of the types that `epypes.wire.encode` takes.
+    rgb
+        Names of the tokens whose images are in RGB order; those of all others are BGR.
 
     Raises
     ------
@@ -69,7 +73,10 @@ def save_sample(path: str | Path, inputs: Mapping[str, Any], outputs: Mapping[st
     for side, values in (("inputs", inputs), ("outputs", outputs)):
         described[side] = []
         for name, value in values.items():
-            message, payloads = to_value(value, name, inline_below=0, first_frame=len(entries), limits=_LIMITS)
+            order = "rgb" if name in rgb else "bgr"
+            message, payloads = to_value(
+                value, name, inline_below=0, order=order, first_frame=len(entries), limits=_LIMITS
+            )
             described[side].append([name, MessageToDict(message, preserving_proto_field_name=True)])
             for payload in payloads:
                 entries[_entry_name(side, payload, entries)] = _as_array(payload)

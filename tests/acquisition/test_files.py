@@ -43,3 +43,15 @@ def test_a_file_that_is_no_image_is_named_without_noise(tmp_path, content, capfd
 def test_what_cannot_be_written_is_refused_with_a_way_out(tmp_path, name, image):
     with pytest.raises(ImageFileError):
         write_image(tmp_path / name, image)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_a_file_holds_the_colours_and_the_caller_says_their_order(tmp_path, channels):
+    rgb = np.zeros((4, 5, channels), np.uint16)
+    rgb[..., 0] = 700
+    image = rgb[:, :, 0] if channels == 1 else rgb
+    write_image(tmp_path / "red.png", image, "rgb")
+    assert np.array_equal(read_image(tmp_path / "red.png", "rgb"), image)
+    as_opencv = read_image(tmp_path / "red.png")
+    assert (as_opencv if channels == 1 else as_opencv[:, :, 2]).max() == 700
+    assert (as_opencv if channels == 1 else as_opencv[:, :, 2]).min() == 700

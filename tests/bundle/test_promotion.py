@@ -21,8 +21,12 @@ from epypes.bundle import verify
 from epypes.bundle.compare import first_difference
 from epypes.bundle.load import read_bundle
 from epypes.bundle.notebook import promote_notebook
+from epypes.bundle.ports import payload_of
 from epypes.bundle.seal import seal
 from epypes.errors import BundleError, PromotionRefused, ReplayDiffers, UnknownName
+from epypes.graph import colour_order
+from epypes.wire import Envelope
+from tests.colours import red_image, red_runner
 
 promote_module = importlib.import_module("epypes.bundle.promote")
 
@@ -476,3 +480,38 @@ def test_a_bundle_that_is_replaced_while_it_is_read_is_never_mixed_with_the_next
     finally:
         done.set()
         thread.join()
+
+
+def test_marks_are_promoted_and_the_bundle_says_which_ports_are_rgb(tmp_path):
+    runner = red_runner()
+    runner.run(image=red_image())
+    bundle = ep.promote(runner, tmp_path / "red", outputs=["red", "unsaid"])
+    assert verify(bundle.path).identical
+    source, ports = bundle.path / "pipeline.py", tomllib.loads((bundle.path / "pipeline.toml").read_text())["ports"]
+    assert "RGB = epypes.Image(dtype=('uint8',), shape=(None, None, 3), order='rgb')" in source.read_text()
+    assert ports == {"inputs": ["image"], "outputs": ["red", "unsaid"], "rgb": ["image", "red"]}
+    assert bundle.settings.rgb == ("image", "red")
+    assert [colour_order(ep.load(bundle.path).cg, token) for token in ("image", "red", "unsaid")] == [
+        "rgb",
+        "rgb",
+        "bgr",
+    ]
+
+
+def test_a_bundle_without_marks_says_nothing_of_colours(bundle):
+    assert "rgb" not in (bundle.path / "pipeline.toml").read_text()
+    assert bundle.settings.rgb == ()
+
+
+@pytest.mark.parametrize("marked", [True, False])
+@pytest.mark.parametrize("wanted", [True, False])
+def test_an_event_in_another_order_than_the_tokens_is_converted_once(marked, wanted):
+    image, plane, points = red_image(), np.zeros((9, 9), np.uint8), np.zeros((4, 5, 3))
+    event = Envelope("", {"image": image, "more": [image, plane, {"points": points}]}, rgb=["image", "more"] * marked)
+    given = payload_of(("image", "more"), ["image", "more"] * wanted)(event)
+    expected = image if marked == wanted else image[..., ::-1]
+    assert np.array_equal(given["image"], expected)
+    assert np.array_equal(given["more"][0], expected)
+    assert given["more"][1] is plane
+    assert given["more"][2]["points"] is points, "only what travels as an image has an order"
+    assert (given["image"] is image) == (marked == wanted), "nothing is copied that need not be"

@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 import types
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -33,7 +34,7 @@ def notebook(source: str) -> dict:
     name = f"<cell {_CELLS}>"
     linecache.cache[name] = (len(source), None, source.splitlines(keepends=True), name)
     names = {"__name__": "__main__", "np": np, "cv2": cv2, "skimage": skimage, "gaussian": gaussian, "ep": ep,
-             "functools": functools}  # fmt: skip
+             "functools": functools, "Annotated": Annotated}  # fmt: skip
     exec(compile(source, name, "exec"), names)
     return names
 
@@ -54,6 +55,19 @@ def executed(text: str) -> types.SimpleNamespace:
 
 
 SLICED = {
+    "mark": ("def f(x: Annotated[int, ep.Param(1, 9)]):\n    return x + 1\n", 4),
+    "mark as constant": (
+        'RGB = ep.Image("uint8", order="rgb")\ndef f(x: Annotated[np.ndarray, RGB]):\n    return x + 1\n',
+        4,
+    ),
+    "annotation as constant": (
+        'Rgb = Annotated[np.ndarray, ep.Image("uint8", ("h", None, 3), (0, 9), "rgb")]\ndef f(x: Rgb) -> Rgb:\n    return x + 1\n',
+        4,
+    ),
+    "annotation of a number": (
+        'K = Annotated[int, ep.Param(1, 31, odd=True, unit="\'")]\ndef f(x: K):\n    return x + 1\n',
+        4,
+    ),
     "plain": ("def f(x):\n    return x + 1\n", 4),
     "comment above": ("# Adds one.\ndef f(x):\n    return x + 1  # really\n", 4),
     "constant": ("STEP = 2\ndef f(x):\n    return x + STEP\n", 5),

@@ -15,6 +15,7 @@ from epypes.cli.call import by_token
 from epypes.errors import ServiceError, UnknownName
 from epypes.service import Service
 from epypes.service.state import StateLock
+from tests.colours import red_image, red_runner
 
 ANY = "tcp://127.0.0.1:*"
 
@@ -141,3 +142,17 @@ def test_a_module_that_an_extra_brings_is_named():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 1
     assert done.stderr.strip() == "epypes: module 'tomlkit' is missing. Run: pip install 'epypes[all]'"
+
+
+def test_files_have_the_right_colours_whatever_the_order_of_the_tokens(tmp_path):
+    runner = red_runner()
+    runner.run(image=red_image())
+    bundle = ep.promote(runner, tmp_path / "red", outputs=["red", "unsaid"])
+    write_image(tmp_path / "photo.png", red_image(), "rgb")
+    with StateLock(bundle.path) as lock, Service(bundle.path, ANY, ANY) as service:
+        lock.publish(service.start())
+        outs = [word for name in ("red", "unsaid") for word in ("--out", f"{name}={tmp_path}/{name}.png")]
+        done = epypes("call", bundle.path, tmp_path / "photo.png", *outs)
+    assert done.returncode == 0, done.stderr
+    assert cv2.imread(str(tmp_path / "red.png"))[5, 5].tolist() == [0, 0, 200], "OpenCV reads BGR: it is red"
+    assert cv2.imread(str(tmp_path / "unsaid.png"))[5, 5].tolist() == [200, 0, 0], "unmarked is BGR"

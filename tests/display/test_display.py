@@ -20,6 +20,7 @@ from epypes.display import encode_image, is_image, mimebundle, to_svg, view
 from epypes.display.layout import lay_out
 from epypes.display.preview import preview
 from epypes.display.view import THUMBNAIL_CHARACTERS
+from tests.colours import red_image, red_runner
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -318,3 +319,37 @@ def test_graphviz_is_not_asked_for_what_would_take_it_minutes(monkeypatch):
     svg = to_svg(ep.CompGraph(dict.fromkeys(io, lambda *xs: 1), io))
     assert len(vertices(svg)) == 300
     assert len(svg) <= 20_000 + 600 * 300 + THUMBNAIL_CHARACTERS
+
+
+def colour_of(data: bytes) -> str:
+    """Return which channel of an encoded picture is the strongest."""
+    pixel = np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).reshape(-1, 3).mean(axis=0)
+    return ("red", "green", "blue")[int(pixel.argmax())]
+
+
+@pytest.mark.parametrize("wrapped", [False, True], ids=["functions", "nodes"])
+def test_a_token_that_is_marked_rgb_shows_its_colours_and_any_other_is_bgr(wrapped):
+    runner = red_runner()
+    shown = ep.Pipeline("red", runner.cg).runner if wrapped else runner
+    tokens = {token.name: token for token in view(shown.run(image=red_image())).tokens}
+    colours = {name: colour_of(token.preview.picture.data) for name, token in tokens.items()}
+    assert colours == {"image": "red", "red": "red", "unsaid": "blue"}
+    assert tokens["red"].preview.detail == "uint8 64 x 64 x 3 rgb, 0 to 200"
+    assert "rgb" not in tokens["unsaid"].preview.detail
+    found = vertices(to_svg(shown))
+    links = [found[f"token-{name}"].find(f"{SVG}image").get("href") for name in ("image", "unsaid")]
+    assert [colour_of(base64.b64decode(link.partition(",")[2])) for link in links] == ["red", "blue"]
+
+
+def test_a_hyperparameter_that_is_an_image_shows_its_colours():
+    runner = ep.CompGraphRunner(red_runner().cg, {"image": red_image()})
+    for shown in (runner, runner.run()):
+        image = next(token for token in view(shown).tokens if token.name == "image")
+        assert (image.role, colour_of(image.preview.picture.data)) == ("hyperparameter", "red")
+
+
+def test_alpha_stays_where_it_is_in_both_orders():
+    image = np.full((16, 16, 4), (200, 20, 10, 90), np.uint8)
+    for order, pixel in (("rgb", (200, 20, 10, 90)), ("bgr", (10, 20, 200, 90))):
+        picture = Image.open(io.BytesIO(encode_image(image, order=order).data))
+        assert picture.getpixel((5, 5)) == pixel

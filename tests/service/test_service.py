@@ -21,6 +21,7 @@ from epypes.errors import AddressError, BundleError, RemoteFailure, ReplayDiffer
 from epypes.service import Client, Service, call
 from epypes.service.state import StateLock, read_state, state_file
 from epypes.wire import Envelope, encode
+from tests.colours import red_image, red_runner
 from tests.service.processes import run_cli, running
 
 TIMEOUT_S = 20.0
@@ -398,3 +399,25 @@ def test_the_event_under_way_is_answered_too_when_the_service_must_stop(serving)
     release.set()
     assert "the service stops while it is in f" in said.get(timeout=TIMEOUT_S)
     caller.join()
+
+
+def test_the_colours_of_rgb_tokens_survive_the_way_through_a_service(tmp_path):
+    runner, image = red_runner(), red_image(200)
+    runner.run(image=image)
+    bundle = ep.promote(runner, tmp_path / "red", outputs=["red", "unsaid"])
+    answers: queue.SimpleQueue = queue.SimpleQueue()
+    with StateLock(bundle.path) as lock, Service(bundle.path, ANY, ANY) as service:
+        lock.publish(service.start())
+        with Client(bundle.path, timeout_s=TIMEOUT_S) as client:
+            assert np.array_equal(client.call({"image": image}).tokens["red"], runner["red"])
+        requests: queue.SimpleQueue = queue.SimpleQueue()
+        with (
+            ep.ZMQSubscriber(service.publisher.address, answers) as subscriber,
+            ep.ZMQPublisher(service.subscriber.address, requests, bind=False) as publisher,
+        ):
+            assert subscriber.wait_joined(TIMEOUT_S)
+            assert publisher.wait_for_subscriber(TIMEOUT_S)
+            requests.put(Envelope(type="x", parts={"image": image[..., ::-1].copy()}))
+            answer = answers.get(timeout=TIMEOUT_S)
+    assert answer.rgb == {"red"}
+    assert np.array_equal(answer.parts["red"], runner["red"]), "what came as BGR was converted"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import threading
 from collections.abc import Sequence
@@ -11,9 +12,11 @@ from typing import Any
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 import epypes as ep
 from epypes_widgets.frames import Frame, FrameSender, make_frame, plain
+from tests.colours import red_image, red_runner
 
 
 def frame(seq: int) -> Frame:
@@ -149,3 +152,12 @@ def test_a_token_that_is_no_image_goes_as_short_text() -> None:
 def test_values_can_always_be_written_as_json() -> None:
     values = [1, np.int64(2), 0.5, float("nan"), float("inf"), None, True, "a", (1, 2), object(), np.zeros(3)]
     assert json.loads(json.dumps([plain(value) for value in values], allow_nan=False))[:3] == [1, 2, 0.5]
+
+
+def test_the_big_picture_has_the_colours_that_the_annotations_say() -> None:
+    run = red_runner().run(image=red_image())
+    strongest = {}
+    for token in run:
+        picture = np.asarray(Image.open(io.BytesIO(make_frame(run, token, 1).data)))
+        strongest[token] = int(picture.reshape(-1, 3).mean(axis=0).argmax())
+    assert strongest == {"image": 0, "red": 0, "unsaid": 2}

@@ -39,6 +39,7 @@ def full_envelope() -> Envelope:
         revision=3,
         bundle_digest="sha256:00",
         attributes={"exposure": 0.5},
+        rgb={"image"},
         timings={"blur": 100},
         failure=FailureRecord("canny", ("a", "b"), "ValueError", "no", "id", 2),
     )

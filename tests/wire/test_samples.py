@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 import zipfile
 
@@ -82,3 +83,15 @@ def test_a_missing_file_and_a_pickle_are_refused(tmp_path):
     (tmp_path / "p.npz").write_bytes(pickle.dumps({"a": 1}))
     with pytest.raises(MessageError):
         load_sample(tmp_path / "p.npz")
+
+
+def test_a_sample_says_which_tokens_are_rgb_and_gives_them_as_they_were(tmp_path):
+    image = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)
+    save_sample(tmp_path / "s.npz", {"left": image}, {"right": image}, rgb=["right"])
+    with np.load(tmp_path / "s.npz", allow_pickle=False) as archive:
+        described = json.loads(str(archive["description"]))
+    encodings = [described[side][0][1]["image"]["encoding"] for side in ("inputs", "outputs")]
+    assert encodings == ["bgr8", "rgb8"]
+    (inputs, outputs) = load_sample(tmp_path / "s.npz")
+    assert np.array_equal(inputs["left"], image)
+    assert np.array_equal(outputs["right"], image)

@@ -116,6 +116,29 @@ def test_an_image_travels_with_its_colour_order():
     image = np.zeros((2, 2, 3), np.uint8)
     assert b"bgr8" in encode(Envelope("", {"image": image}))[1]
     assert b"rgb8" in encode(Envelope("", {"image": image}), rgb=["image"])[1]
+    assert b"rgb8" in encode(Envelope("", {"image": image}, rgb="image"))[1]
+
+
+@pytest.mark.parametrize("inline_below", [0, 8192])
+def test_the_receiver_is_told_which_parts_are_rgb_and_nothing_is_converted(inline_below):
+    image = np.arange(2 * 3 * 4, dtype=np.uint16).reshape(2, 3, 4)
+    parts = {"left": image, "right": image, "both": [image, {"mask": image[:, :, 0]}], "depth": image[:, :, 0]}
+    sent = Envelope("", parts, attributes={"right": image}, rgb=["left", "both", "depth"])
+    back = decode(encode(sent, inline_below=inline_below))
+    assert back.rgb == {"left", "both"}, "a part without colours has no order"
+    assert same(dict(back.parts), parts)
+    assert same(back.attributes["right"], image)
+
+
+def test_a_part_with_images_of_both_orders_is_brought_to_that_of_the_first():
+    image = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)
+    topic, header = encode(Envelope("", {"pair": (image, image)}, rgb=["pair"]))
+    first = header.index(b"rgb8")
+    mixed = decode([topic, header[: first + 4] + header[first + 4 :].replace(b"rgb8", b"bgr8")])
+    assert mixed.rgb == {"pair"}
+    assert np.array_equal(mixed.parts["pair"][0], image)
+    assert np.array_equal(mixed.parts["pair"][1], image[:, :, ::-1])
+    assert not mixed.parts["pair"][1].flags.writeable
 
 
 class Point(NamedTuple):

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from epypes.display.raster import encode_image, is_image
+from epypes.graph import colour_order
 from epypes.run import Run
 
 # Wider than the box on a usual screen; a JPEG of this size is about 150 kB and takes 5 ms to encode.
@@ -68,7 +69,7 @@ def make_frame(run: Run, token: str, seq: int, changed_ns: int = 0, *, stale: bo
     if not is_image(value):
         content |= {"media_type": "text/plain", "text": text_of(value)}
         return Frame(seq, content, b"", changed_ns)
-    picture = encode_image(value, max_side_px=MAX_SIDE_PX)
+    picture = encode_image(value, MAX_SIDE_PX, colour_order(run.cg, token))
     content |= {
         "media_type": picture.media_type,
         "width": picture.width,

@@ -1,0 +1,48 @@
+"""Do the functions of a graph agree on the order of a token's colours?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
+
+from epypes.errors import Finding
+from epypes.graph.bipartite import BipartiteDigraph
+from epypes.images import Image, Order, contracts_of
+
+
+def check_colours(functions: Mapping[str, Callable[..., Any]], graph: BipartiteDigraph) -> Iterable[Finding]:
+    """Find tokens that two functions want in different orders of colours."""
+    said: dict[str, tuple[str, str, Order]] = {}
+    for name, token, mark, verb in marks(functions, graph):
+        if mark.order is None:
+            continue
+        other, other_verb, order = said.setdefault(token, (name, verb, mark.order))
+        if order != mark.order:
+            yield _disagreement(token, (other, other_verb, order), (name, verb, mark.order))
+
+
+def marks(
+    functions: Mapping[str, Callable[..., Any]], graph: BipartiteDigraph
+) -> Iterator[tuple[str, str, Image, str]]:
+    """Give every mark of a graph's annotations: function, token, mark and ``"makes"`` or ``"takes"``, makers first."""
+    read = {
+        name: contracts_of(functions[name], len(tokens), len(graph.outputs[name]))
+        for name, tokens in graph.inputs.items()
+        if name in functions
+    }
+    for side, (verb, tokens_of) in ((1, ("makes", graph.outputs)), (0, ("takes", graph.inputs))):
+        for name, contracts in read.items():
+            for token, mark in zip(tokens_of[name], contracts[side], strict=False):
+                if mark is not None:
+                    yield name, token, mark, verb
+
+
+def _disagreement(token: str, one: tuple[str, str, Order], two: tuple[str, str, Order]) -> Finding:
+    (first, first_verb, first_order), (second, second_verb, second_order) = one, two
+    place = "between them" if first_verb == "makes" else f"before {second!r}"
+    text = (
+        f"Function {first!r} {first_verb} token {token!r} as {first_order}, but {second!r} {second_verb} it as "
+        f"{second_order}. Convert it in a function {place}: "
+        f"cv2.cvtColor({token}, cv2.COLOR_{first_order.upper()}2{second_order.upper()})."
+    )
+    return Finding("colour", text, (token, first, second))

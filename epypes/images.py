@@ -1,0 +1,277 @@
+"""Which arrays does a function take as images, and in which order are their colours?
+
+The mark stands in the function's annotation: ``Annotated[np.ndarray, Image("uint8", (None, None, 3), order="rgb")]``.
+It is read without numpy: a value that is an array brings what is asked of it.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from types import FunctionType, MethodType
+from typing import Annotated, Any, Final, Literal, get_args, get_origin, get_type_hints
+from weakref import WeakKeyDictionary
+
+Order = Literal["bgr", "rgb"]
+
+ORDERS: Final[tuple[Order, ...]] = ("bgr", "rgb")
+_DTYPES: Final = (
+    "bool",
+    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
+    *("float16", "float32", "float64", "complex64", "complex128"),
+)
+# Python's own types, as numpy reads them.
+_PYTHON: Final = {bool: "bool", int: "int64", float: "float64", complex: "complex128"}
+_AXES: Final = ("h", "w", "c")
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """What an image must be: the contract of an input or output, and the order of its colours.
+
+    Only what is given is checked.
+
+    Attributes
+    ----------
+    dtype
+        The dtypes allowed: a name such as ``"uint8"``, a numpy dtype or type, or a tuple of them; kept as names.
+    shape
+        The length of every axis; None, or the axis's name, where any length will do.
+    range
+        The least and the largest value allowed. NaN lies outside.
+    order
+        ``"bgr"`` or ``"rgb"``: what three and four channels are. Where nothing says it, they are BGR, as in OpenCV.
+
+    Raises
+    ------
+    ValueError
+        A dtype or an order that does not exist, an empty range, a shape that no array has.
+
+    Examples
+    --------
+    >>> print(Image("uint8", ("h", "w", 3), order="rgb"))
+    uint8 (h, w, 3) rgb
+    """
+
+    dtype: Any = None
+    shape: tuple[int | str | None, ...] | None = None
+    range: tuple[float, float] | None = None
+    order: Order | None = None
+
+    def __post_init__(self) -> None:
+        if self.dtype is not None:
+            given = self.dtype if isinstance(self.dtype, tuple | list) else (self.dtype,)
+            object.__setattr__(self, "dtype", tuple(map(_dtype_name, given)))
+        if self.shape is not None:
+            object.__setattr__(self, "shape", _checked_shape(self.shape))
+        if self.range is not None:
+            object.__setattr__(self, "range", _checked_range(self.range))
+        if self.order is not None and self.order not in ORDERS:
+            raise ValueError(_unknown("order", self.order, ORDERS))
+        if self.order is not None and self.shape is not None and not _has_colours(self.shape):
+            axes = _shape_text(self.shape)
+            raise ValueError(f"An image of shape {axes} has no order {self.order!r}. Leave it out, or add 3 channels.")
+
+    def found(self, value: Any) -> str | None:
+        """Return what a value is, in a few words, if it breaks the contract; None if it keeps it."""
+        dtype, shape = getattr(value, "dtype", None), getattr(value, "shape", None)
+        if not hasattr(dtype, "kind") or not isinstance(shape, tuple):
+            return f"of type {type(value).__name__!r}"
+        allowed = self._allows_dtype(dtype) and self._allows_shape(shape)
+        outside = self._outside(value) if allowed else ""
+        if allowed and not outside:
+            return None
+        return f"{dtype} {' x '.join(map(str, shape)) or 'without axes'} {outside}".rstrip()
+
+    def findings(self, value: Any) -> str | None:
+        """Return what is wrong with a value, ``"float64 480 x 640, expected uint8 (h, w, 3)"``, or None."""
+        found = self.found(value)
+        return found and f"{found}, expected {self}"
+
+    def _allows_dtype(self, dtype: Any) -> bool:
+        return self.dtype is None or dtype.name in self.dtype
+
+    def _allows_shape(self, shape: tuple[int, ...]) -> bool:
+        if self.shape is None:
+            return True
+        return len(shape) == len(self.shape) and all(
+            not isinstance(wanted, int) or side == wanted for side, wanted in zip(shape, self.shape, strict=True)
+        )
+
+    def _outside(self, array: Any) -> str:
+        """Return the values of an array, if some lie outside of the range; they are looked at only if they can."""
+        if self.range is None or not array.size or _fits(array.dtype, self.range):
+            return ""
+        if array.dtype.kind not in "biuf":
+            return "without a range"
+        low, high = array.min().item(), array.max().item()
+        if math.isnan(low):
+            return "with NaN"
+        return "" if self.range[0] <= low and high <= self.range[1] else f"from {low:g} to {high:g}"
+
+    def __str__(self) -> str:
+        parts = (
+            self.dtype and " or ".join(self.dtype),
+            _shape_text(self.shape) if self.shape is not None else "",
+            self.order,
+            self.range and f"from {self.range[0]:g} to {self.range[1]:g}",
+        )
+        return " ".join(part for part in parts if part) or "array"
+
+
+def _unknown(kind: str, name: object, known: Iterable[str]) -> str:
+    near = difflib.get_close_matches(str(name).lower(), tuple(known), n=1, cutoff=0.6)
+    way_out = f"Did you mean {near[0]!r}?" if near else f"There are: {', '.join(known)}."
+    return f"No {kind} {name!r} of an image. {way_out}"
+
+
+def _dtype_name(dtype: Any) -> str:
+    if isinstance(dtype, str):
+        name = dtype
+    elif isinstance(dtype, type):
+        name = _PYTHON.get(dtype, dtype.__name__)
+    else:
+        name = str(getattr(dtype, "name", dtype))
+    if name not in _DTYPES:
+        raise ValueError(_unknown("dtype", name, _DTYPES))
+    return name
+
+
+def _checked_shape(shape: Any) -> tuple[int | str | None, ...]:
+    good = isinstance(shape, tuple | list) and len(shape) > 0
+    if not good or not all(_is_axis(side) for side in shape):
+        raise ValueError(f"shape must be a tuple such as (None, None, 3), not {shape!r}. Write None for any length.")
+    return tuple(shape)
+
+
+def _is_axis(side: Any) -> bool:
+    return side is None or isinstance(side, str) or (type(side) is int and side > 0)
+
+
+def _checked_range(ends: Any) -> tuple[float, float]:
+    good = isinstance(ends, tuple | list) and len(ends) == 2
+    if not good or not all(isinstance(end, int | float) for end in ends):
+        raise ValueError(f"range must be (low, high), not {ends!r}.")
+    low, high = ends
+    if not low <= high:
+        raise ValueError(f"The range from {low} to {high} is empty. Give the lower end first.")
+    return low, high
+
+
+def _has_colours(shape: tuple[int | str | None, ...]) -> bool:
+    return len(shape) == 3 and (not isinstance(shape[2], int) or shape[2] in (3, 4))
+
+
+def _shape_text(shape: tuple[int | str | None, ...]) -> str:
+    names = (*_AXES, *("any" for _ in shape)) if len(shape) in (2, 3) else ("any",) * len(shape)
+    sides = [names[axis] if side is None else str(side) for axis, side in enumerate(shape)]
+    return f"({', '.join(sides)}{',' if len(sides) == 1 else ''})"
+
+
+def _fits(dtype: Any, ends: tuple[float, float]) -> bool:
+    """Whether no value of an integer dtype can lie outside of a range."""
+    bits = 8 * dtype.itemsize
+    least, largest = {"u": (0, 2**bits - 1), "i": (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1), "b": (0, 1)}.get(
+        dtype.kind, (-math.inf, math.inf)
+    )
+    return dtype.kind in "uib" and ends[0] <= least and largest <= ends[1]
+
+
+def swapped(image: Any) -> Any:
+    """Return a copy of an array (y, x, 3) or (y, x, 4) with red and blue exchanged: BGR as RGB, and back."""
+    copy = image.copy()
+    copy[..., 0], copy[..., 2] = image[..., 2], image[..., 0]
+    return copy
+
+
+Contracts = tuple[tuple[Image | None, ...], tuple[Image | None, ...]]
+# Weak, so that a function of a notebook that was defined again can go; reading annotations evaluates their text.
+_READ: WeakKeyDictionary[FunctionType, tuple[inspect.Signature, dict[str, Any]] | None] = WeakKeyDictionary()
+
+
+def image_contracts(function: Callable[..., Any]) -> Contracts:
+    """Read the marks in a function's annotations: by positional parameter, and by output.
+
+    A return annotation ``tuple[A, B]`` says it of two outputs, any other of one. Nothing is said (``((), ())``) where
+    there is no mark, or where the annotations can't be resolved.
+    """
+    read = _read(function)
+    if read is None:
+        return (), ()
+    signature, hints = read
+    positional = [
+        parameter.name
+        for parameter in signature.parameters.values()
+        if parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
+    ]
+    returned = hints.get("return")
+    several = get_args(returned) if _is_several(returned) else (returned,)
+    return tuple(_mark(hints.get(name)) for name in positional), tuple(map(_mark, several))
+
+
+def contracts_of(function: Callable[..., Any], inputs: int, outputs: int) -> Contracts:
+    """Read the marks of a function as it stands in a graph: one entry per input and per output token.
+
+    ``*args`` speak for every input that they take, ``tuple[A, ...]`` and ``list[A]`` for every output. A return
+    annotation of another number of values says nothing. Without any mark, the answer is ``((), ())``.
+    """
+    read = _read(function)
+    if read is None:
+        return (), ()
+    signature, hints = read
+    taken, made = image_contracts(function)
+    rest = [parameter.name for parameter in signature.parameters.values() if parameter.kind == parameter.VAR_POSITIONAL]
+    filler = _mark(hints.get(rest[0])) if rest else None
+    taken = (*taken, *(filler for _ in range(inputs - len(taken))))[:inputs]
+    returned = hints.get("return")
+    alike = get_args(returned)[:1] if _is_alike(returned) else ()
+    if alike:
+        made = (_mark(alike[0]),) * outputs
+    return taken, made if len(made) == outputs else (None,) * outputs
+
+
+def _read(function: Callable[..., Any]) -> tuple[inspect.Signature, dict[str, Any]] | None:
+    """Return signature and resolved annotations of a function that has a mark."""
+    plain = _unwrapped(function)
+    if not getattr(plain, "__annotations__", None):
+        return None
+    if not isinstance(plain, FunctionType):
+        return _resolved(plain) if isinstance(plain, MethodType) else None
+    if plain not in _READ:
+        _READ[plain] = _resolved(plain)
+    return _READ[plain]
+
+
+def _unwrapped(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return what a decorated function, or a Node, stands for."""
+    try:
+        is_wrapper = not isinstance(function, MethodType) and hasattr(function, "__wrapped__")
+        return inspect.unwrap(function) if is_wrapper else function
+    except Exception:  # whatever an object's __getattr__ raises
+        return function
+
+
+def _resolved(function: Callable[..., Any]) -> tuple[inspect.Signature, dict[str, Any]] | None:
+    try:
+        hints = get_type_hints(function, include_extras=True)
+        if not any(_mark(part) for hint in hints.values() for part in (hint, *get_args(hint))):
+            return None
+        return inspect.signature(function), hints
+    except Exception:  # what the text of an annotation raises, when it is evaluated, is the user's
+        return None
+
+
+def _mark(annotation: Any) -> Image | None:
+    marks = get_args(annotation)[1:] if get_origin(annotation) is Annotated else ()
+    return next((mark for mark in marks if isinstance(mark, Image)), None)
+
+
+def _is_several(annotation: Any) -> bool:
+    return get_origin(annotation) is tuple and Ellipsis not in get_args(annotation)
+
+
+def _is_alike(annotation: Any) -> bool:
+    return get_origin(annotation) is list or (get_origin(annotation) is tuple and Ellipsis in get_args(annotation))

@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+import pytest
+
+import epypes as ep
+from epypes.errors import GraphError, UnknownName
+from epypes.graph import colour_order, image_hint
+
+RGB, BGR, UNSAID = ep.Image(order="rgb"), ep.Image(order="bgr"), ep.Image("uint8")
+
+
+def load(path) -> Annotated[np.ndarray, RGB]: ...
+def measure(image: Annotated[np.ndarray, UNSAID]) -> Annotated[np.ndarray, UNSAID]: ...
+def show_bgr(image: Annotated[np.ndarray, BGR]): ...
+def show_rgb(image: Annotated[np.ndarray, RGB]): ...
+def both(image) -> tuple[Annotated[np.ndarray, RGB], Annotated[np.ndarray, BGR]]: ...
+def plain(image): ...
+
+
+def graph(**functions):
+    return ep.CompGraph(
+        {name: f for name, (f, _) in functions.items()}, {name: io for name, (_, io) in functions.items()}
+    )
+
+
+def test_the_function_that_makes_a_token_says_its_colours():
+    cg = graph(load=(load, ("path", "image")), plain=(plain, ("image", "out")))
+    assert image_hint(cg, "image") == RGB
+    assert [colour_order(cg, token) for token in cg.tokens] == ["bgr", "rgb", "bgr"]
+
+
+def test_without_it_those_that_take_the_token_say_them():
+    cg = graph(plain=(plain, ("image", "a")), measure=(measure, ("image", "b")), show=(show_rgb, ("image", "c")))
+    assert image_hint(cg, "image") == RGB
+    assert image_hint(cg, "b") == UNSAID
+    assert image_hint(cg, "a") is None
+    assert [colour_order(cg, token) for token in ("image", "a", "b", "c")] == ["rgb", "bgr", "bgr", "bgr"]
+
+
+def test_a_mark_without_order_leaves_the_order_to_those_that_take_the_token():
+    cg = graph(measure=(measure, ("raw", "image")), show=(show_rgb, ("image", "c")))
+    assert colour_order(cg, "image") == "rgb"
+
+
+def test_several_outputs_have_a_mark_each():
+    cg = graph(both=(both, ("image", ("left", "right"))))
+    assert [colour_order(cg, token) for token in ("left", "right")] == ["rgb", "bgr"]
+
+
+def test_a_token_that_is_not_there_has_no_colours():
+    with pytest.raises(UnknownName, match="Did you mean 'image'"):
+        image_hint(graph(plain=(plain, ("image", "out"))), "imag")
+
+
+@pytest.mark.parametrize(
+    ("functions", "text", "names"),
+    [
+        (
+            {"show": (show_bgr, ("image", "out")), "load": (load, ("path", "image"))},
+            "Function 'load' makes token 'image' as rgb, but 'show' takes it as bgr. Convert it in a function between "
+            "them: cv2.cvtColor(image, cv2.COLOR_RGB2BGR).",
+            ("image", "load", "show"),
+        ),
+        (
+            {"a": (show_bgr, ("image", "x")), "b": (show_rgb, ("image", "y"))},
+            "Function 'a' takes token 'image' as bgr, but 'b' takes it as rgb. Convert it in a function before 'b': "
+            "cv2.cvtColor(image, cv2.COLOR_BGR2RGB).",
+            ("image", "a", "b"),
+        ),
+    ],
+)  # fmt: skip
+def test_two_orders_of_one_token_are_refused(functions, text, names):
+    with pytest.raises(GraphError) as error:
+        graph(**functions)
+    (finding,) = error.value.findings
+    assert (finding.kind, finding.text, finding.names) == ("colour", text, names)
+
+
+def test_colours_are_told_together_with_what_else_is_wrong():
+    with pytest.raises(GraphError) as error:
+        graph(load=(load, ("path", "image")), show=(show_bgr, ("image", "path")), odd=(plain, (("a", "b"), "c")))
+    assert sorted(finding.kind for finding in error.value.findings) == ["arity", "colour", "cycle"]
+
+
+def test_a_mark_that_says_no_order_disagrees_with_nobody():
+    cg = graph(load=(load, ("path", "image")), measure=(measure, ("image", "out")), again=(show_rgb, ("image", "end")))
+    assert colour_order(cg, "image") == "rgb"
