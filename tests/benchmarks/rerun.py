@@ -29,7 +29,7 @@ def _first_value(x: np.ndarray, k: int) -> int:
 def rows(effort: Effort) -> list[Row]:
     numbers = tuned_chain(_COUNT, add_one, 0, _sum)
     arrays = tuned_chain(_COUNT, passed, np.zeros(_EIGHT_MB), _first_value)
-    uncached = "pipefunc without its cache, which hashes the array in every function (20 s)"
+    uncached = "" if effort.quick else "pipefunc without its cache, which hashes arrays"
     return [
         _row(effort, f"rerun of the last of {_COUNT}", numbers, _COUNT - 1, tuned=True),
         _row(effort, f"rerun of the last of {_COUNT}, 8 MB array", arrays, arrays.payload["t0"], note=uncached),
