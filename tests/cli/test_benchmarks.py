@@ -8,9 +8,11 @@ import json
 import pytest
 
 from tests.benchmarks import engine
+from tests.benchmarks.peers import natural_functions
 from tests.benchmarks.row import OURS, Goal, Row, row
 from tests.benchmarks.table import as_table, write_json
 from tests.benchmarks.timing import Effort, Times
+from tests.benchmarks.work import add_one, fan, tuned_chain
 
 QUICK = Effort(quick=True)
 WORKS = [
@@ -93,3 +95,17 @@ def test_a_ratio_must_hold_for_the_medians_and_within_the_rounds():
 
 def test_what_could_not_be_measured_has_no_verdict():
     assert Row("work", goal=Goal("ratio", 2), note="this version has no workers").as_dict()["reached"] is None
+
+
+def test_peers_get_the_same_functions_under_the_names_of_the_tokens():
+    functions = natural_functions(fan(3))
+    assert list(functions) == ["a", "b0", "b1", "b2", "y"]
+    assert functions["a"].__name__ == "a"
+    assert functions["a"](x=1) == 2
+    assert functions["y"](b0=1, b1=2, b2=4) == 7
+
+
+def test_only_what_depends_on_a_token_is_downstream_of_it():
+    work = tuned_chain(3, add_one, 0, lambda x, k: x + k)
+    assert list(work.downstream("k")) == ["last"]
+    assert list(work.downstream("t1")) == ["f1", "last"]
