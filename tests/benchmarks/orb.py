@@ -41,14 +41,18 @@ def gather_keypoints(keypoints_1: Any, keypoints_2: Any, matches: list[Any]) -> 
 
 
 def orb_graph() -> ep.CompGraph:
-    detect = detect_and_describe_features
     return ep.CompGraph(
-        {f"{detect.__name__}_1": detect, f"{detect.__name__}_2": detect, "match": match, "gather": gather_keypoints},
         {
-            f"{detect.__name__}_1": (("image_1", "mask_1", *_OPTIONS), ("keypoints_1", "descriptors_1")),
-            f"{detect.__name__}_2": (("image_2", "mask_2", *_OPTIONS), ("keypoints_2", "descriptors_2")),
+            "detect_and_describe_features_1": detect_and_describe_features,
+            "detect_and_describe_features_2": detect_and_describe_features,
+            "match": match,
+            "gather_keypoints": gather_keypoints,
+        },
+        {
+            "detect_and_describe_features_1": (("image_1", "mask_1", *_OPTIONS), ("keypoints_1", "descriptors_1")),
+            "detect_and_describe_features_2": (("image_2", "mask_2", *_OPTIONS), ("keypoints_2", "descriptors_2")),
             "match": (("descriptors_1", "descriptors_2", "normType", "crossCheck"), "matches"),
-            "gather": (("keypoints_1", "keypoints_2", "matches"), "keypoints_paired"),
+            "gather_keypoints": (("keypoints_1", "keypoints_2", "matches"), "keypoints_paired"),
         },
     )
 

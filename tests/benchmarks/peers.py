@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import os
 from collections.abc import Callable, Collection, Mapping
 from types import FunctionType
 from typing import Any, ClassVar
@@ -137,8 +136,6 @@ ALL: tuple[type[Peer], ...] = (PipeFunc, Hamilton, Dask, Loman)
 
 def installed() -> tuple[type[Peer], ...]:
     """Return the peers that can be imported."""
-    # One of them reports its use to its makers unless told not to: no network, and no such work in the times.
-    os.environ.setdefault("HAMILTON_TELEMETRY_ENABLED", "false")
     return tuple(peer for peer in ALL if importlib.util.find_spec(peer.module.partition(".")[0]))
 
 

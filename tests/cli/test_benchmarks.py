@@ -12,7 +12,7 @@ from tests.benchmarks.peers import natural_functions
 from tests.benchmarks.row import OURS, Goal, Row, row
 from tests.benchmarks.table import as_table, write_json
 from tests.benchmarks.timing import Effort, Times
-from tests.benchmarks.work import add_one, fan, tuned_chain
+from tests.benchmarks.work import add_one, tuned_chain
 
 QUICK = Effort(quick=True)
 WORKS = [
@@ -98,11 +98,11 @@ def test_what_could_not_be_measured_has_no_verdict():
 
 
 def test_peers_get_the_same_functions_under_the_names_of_the_tokens():
-    functions = natural_functions(fan(3))
-    assert list(functions) == ["a", "b0", "b1", "b2", "y"]
-    assert functions["a"].__name__ == "a"
-    assert functions["a"](x=1) == 2
-    assert functions["y"](b0=1, b1=2, b2=4) == 7
+    functions = natural_functions(tuned_chain(3, add_one, 0, lambda x, k: x + k))
+    assert list(functions) == ["t1", "t2", "y"]
+    assert functions["t1"].__name__ == "t1"
+    assert functions["t1"](t0=1) == 2
+    assert functions["y"](t2=1, k=2) == 3
 
 
 def test_only_what_depends_on_a_token_is_downstream_of_it():
