@@ -21,7 +21,7 @@ test: $(VENV)/.test chromium
 lab: $(VENV)/.all
 	$(BIN)/jupyter lab --ip=127.0.0.1 $(if $(filter 0,$(shell id -u)),--allow-root) notebooks
 
-bench: $(VENV)/.test
+bench: $(VENV)/.bench
 	$(BIN)/python -m tests.benchmarks
 
 fix: $(VENV)/.test
@@ -44,6 +44,10 @@ $(VENV)/.all: pyproject.toml | $(BIN)/python
 $(VENV)/.test: pyproject.toml | $(BIN)/python
 	$(PIP) --editable '.[all,test]'
 	touch $@ $(VENV)/.all
+
+$(VENV)/.bench: pyproject.toml | $(BIN)/python
+	$(PIP) --editable '.[all,test,bench]'
+	touch $@ $(VENV)/.test $(VENV)/.all
 
 .PHONY: chromium
 chromium:

@@ -2,21 +2,34 @@
 
 from __future__ import annotations
 
-import json
+import argparse
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 
-from tests.benchmarks import engine, imports, picture, sockets
+from tests.benchmarks import engine, imports, peers, picture, sockets
+from tests.benchmarks.table import as_table, write_json
+from tests.benchmarks.timing import Effort
 
-out = Path("test-output")
-table = Table(title="Medians of one interleaved run; 'limit' is the same work by hand")
-for heading in ("work", "limit", "EPypes", "ratio", "to reach"):
-    table.add_column(heading)
-rows = [row for module in (imports, engine, picture, sockets) for row in module.rows()]
-for row in rows:
-    table.add_row(*row.cells())
-Console(width=140).print(table)
-out.mkdir(exist_ok=True)
-(out / "benchmarks.json").write_text(json.dumps([row.as_dict() for row in rows], indent=1))
+_WIDTH = 170
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="few rounds and no peers: only proves that all of it runs")
+    effort = Effort(quick=parser.parse_args().quick)
+    console = Console()
+    console = console if console.is_terminal else Console(width=_WIDTH)
+    rows = []
+    for module in (imports, engine, picture, sockets):
+        console.print(module.__doc__, style="dim")
+        rows += module.rows(effort)
+    console.print(as_table(rows))
+    absent = {peer.name for peer in peers.ALL} - {peer.name for peer in peers.present(effort)}
+    if absent:
+        console.print(f"Left out: {', '.join(sorted(absent))}" + (" (quick)." if effort.quick else " (not installed)."))
+    write_json(rows, absent, Path("test-output") / "benchmarks.json")
+
+
+if __name__ == "__main__":
+    main()

@@ -5,13 +5,15 @@ from __future__ import annotations
 import subprocess
 import sys
 
-from tests.benchmarks.timing import Row, interleaved
+from tests.benchmarks.row import OURS, Goal, Row, row
+from tests.benchmarks.timing import Effort
 
 
 def _python(code: str) -> None:
     subprocess.run([sys.executable, "-I", "-c", code], check=True)
 
 
-def rows() -> list[Row]:
-    bare, ours = interleaved(lambda: _python("pass"), lambda: _python("import epypes"), 15)
-    return [Row("bare Python, and with import epypes", bare, ours, "60 ms more at most")]
+def rows(effort: Effort) -> list[Row]:
+    contenders = {"bare Python": lambda: _python("pass"), OURS: lambda: _python("import epypes")}
+    times = effort.measure(contenders, 20)
+    return [row("bare Python, and with import epypes", times, goal=Goal("above", 60e6), limit="bare Python")]

@@ -9,12 +9,13 @@ import zmq
 
 import epypes as ep
 from epypes.wire import Envelope
-from tests.benchmarks.timing import Row, interleaved
+from tests.benchmarks.row import OURS, Row, row
+from tests.benchmarks.timing import Effort
 
 ANY = "tcp://127.0.0.1:*"
 
 
-def _row(name: str, image: np.ndarray, rounds: int) -> Row:
+def _row(effort: Effort, name: str, image: np.ndarray, rounds: int) -> Row:
     context = zmq.Context()
     sender, receiver = context.socket(zmq.PUB), context.socket(zmq.SUB)
     sender.bind(ANY)
@@ -38,15 +39,15 @@ def _row(name: str, image: np.ndarray, rounds: int) -> Row:
             q_out.put(Envelope(type="image", parts={"image": image}))
             return q_in.get(timeout=10).parts["image"]
 
-        row = Row(name, *interleaved(by_hand, ours, rounds))
+        times = effort.measure({"by hand": by_hand, OURS: ours}, rounds)
     sender.close(0)
     receiver.close(0)
     context.term()
-    return row
+    return row(name, times)
 
 
-def rows() -> list[Row]:
+def rows(effort: Effort) -> list[Row]:
     return [
-        _row("1 kB over tcp: raw frame, queue to queue", np.zeros((32, 32), np.uint8), 500),
-        _row("1 MB over tcp: raw frame, queue to queue", np.zeros((1000, 1000), np.uint8), 200),
+        _row(effort, "1 kB over tcp: raw frame, queue to queue", np.zeros((32, 32), np.uint8), 500),
+        _row(effort, "1 MB over tcp: raw frame, queue to queue", np.zeros((1000, 1000), np.uint8), 200),
     ]
