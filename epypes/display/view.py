@@ -120,7 +120,7 @@ def _with_run(structure: GraphView, run: Run, hparams: Mapping[str, Any], stale:
     stale |= {steps[index].name for index in run.tokens.stale}
     spent = {entry.function: entry for entry in run.report.functions}
     functions = tuple(
-        _function_view(function.name, step.index, run, stale, spent.get(function.name))
+        _function_view(function.name, step.place, run, stale, spent.get(function.name))
         for function, step in zip(structure.functions, steps, strict=True)
     )
     every = [_token_view(token, run, hparams, stale) for token in structure.tokens]
@@ -140,7 +140,8 @@ def _function_view(name: str, index: int, run: Run, stale: frozenset[str], entry
             message=run.failure.message or type(run.failure.exception).__name__,
         )
     if name in stale:
-        return FunctionView(name, "not run" if run.tokens.used[index] is None else "stale")
+        made = run.cg.func_outputs(name)
+        return FunctionView(name, "not run" if made and not any(map(run.tokens.is_computed, made)) else "stale")
     if entry is None or not entry.ran:
         return FunctionView(name, "reused")
     return FunctionView(name, "ran", entry.duration_ns, entry.duration_ns / max(run.report.total_ns, 1))

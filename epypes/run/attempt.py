@@ -84,7 +84,7 @@ class Attempts:
         if compiled is None:
             return None
         program = self._program
-        values: list[Any] = last.values.copy()
+        values = last.values.copy()
         for token in changes:
             values[program.slots[token]] = changes[token]
         durations_ns: dict[int, int] = {}
@@ -94,7 +94,7 @@ class Attempts:
             new = {program.slots[token] for token in changes}
             new |= {slot for slot, value in enumerate(values) if value is not last.values[slot]}
             dirty = bytearray(
-                step.index not in durations_ns and not new.isdisjoint(step.inputs) for step in program.steps
+                step.place not in durations_ns and not new.isdisjoint(step.inputs) for step in program.steps
             )
             return _ended(Draft(program, values, dirty, True), failed, None, durations_ns, start_ns)
         return (

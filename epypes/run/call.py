@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from time import perf_counter_ns
 from typing import Any
 
-from epypes.errors import OutputArityError
+from epypes.errors import ContractBroken, OutputArityError
+from epypes.images import Image
 from epypes.run.guard import ARRAYLESS, FRESH, keep, lend, writable
 from epypes.run.program import Program, Step
 
@@ -43,10 +44,11 @@ def call(program: Program, step: Step, values: Sequence[Any]) -> tuple[Sequence[
         if program.guard:
             args = [arg if type(arg) in ARRAYLESS else _given(step, arg) for arg in args]
         if step.contracts is not None:
-            step.contracts.check_inputs(step.name, [program.tokens[slot] for slot in step.inputs], args)
+            _check(program, step, step.contracts[0], step.inputs, args)
         start_ns = perf_counter_ns()
         result = step.function(*args)
         duration_ns = perf_counter_ns() - start_ns
+        made: Sequence[Any]
         if not step.single:
             made = unpack(program, step, result)
         elif program.guard:
@@ -54,14 +56,24 @@ def call(program: Program, step: Step, values: Sequence[Any]) -> tuple[Sequence[
         else:
             made = (result,)
         if step.contracts is not None:
-            step.contracts.check_outputs(step.name, [program.tokens[slot] for slot in step.outputs], made)
+            _check(program, step, step.contracts[1], step.outputs, made)
     except BaseException as exception:
-        raise StepFailed(step.index, exception, perf_counter_ns() - start_ns) from None
+        raise StepFailed(step.place, exception, perf_counter_ns() - start_ns) from None
     return made, duration_ns
 
 
 def _given(step: Step, value: Any) -> Any:
     return writable(value) if step.unguarded else lend(value)
+
+
+def _check(
+    program: Program, step: Step, contracts: Sequence[Image | None], slots: Sequence[int], values: Sequence[Any]
+) -> None:
+    """Raise ContractBroken for the first value that is not the image that the function's annotation says."""
+    for contract, slot, value in zip(contracts, slots, values, strict=False):
+        found = contract.found(value) if contract is not None else None
+        if contract is not None and found is not None:
+            raise ContractBroken(step.name, program.tokens[slot], contract, found, made=slots is step.outputs)
 
 
 def unpack(program: Program, step: Step, result: Any) -> list[Any]:

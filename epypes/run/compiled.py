@@ -43,7 +43,7 @@ class CompiledRuns:
         """
         compiled = self._compiled.get(wanted)
         if compiled is None and self._is_worth_it(wanted):
-            steps = [step for step in self._program.steps if wanted is None or wanted[step.index]]
+            steps = [step for step in self._program.steps if wanted is None or wanted[step.place]]
             compiled = self._compiled[wanted] = compile_run(self._program, steps, ())
         return compiled
 
@@ -84,7 +84,7 @@ def compile_run(program: Program, steps: list[Step], changed: Collection[int]) -
     """
     lines = [
         "def make(program, steps, failed, clock, kind, ARRAYLESS, FRESH, lend, keep, call, unpack, is_unchanged):",
-        *(f"    f{step.index} = steps[{step.index}].function" for step in steps),
+        *(f"    f{step.place} = steps[{step.place}].function" for step in steps),
         "    def run(v, d):",
         "        at = 0",
         "        start = clock()",
@@ -113,7 +113,7 @@ def _body(program: Program, steps: list[Step], changed: set[int]) -> Iterator[st
     locked: set[int] = set()
     for step in steps:
         new = [] if changed.intersection(step.inputs) or not changed else [slot for slot in step.inputs if slot in known]
-        lines = [f"at = {step.index}", *_call(program, step, locked)]
+        lines = [f"at = {step.place}", *_call(program, step, locked)]
         checked = [slot for slot in step.outputs if changed and slot in read]
         for place, slot in enumerate(step.outputs):
             lines += _store(step, slot, "made" if step.single else f"made[{place}]", slot in checked)
@@ -131,7 +131,7 @@ def _body(program: Program, steps: list[Step], changed: set[int]) -> Iterator[st
 def _call(program: Program, step: Step, locked: set[int]) -> Iterator[str]:
     """Write out the call of a step; the slots in ``locked`` hold what ``keep`` gave."""
     if step.switch is not None or step.unguarded or step.contracts is not None:
-        yield f"made, d[{step.index}] = call(program, steps[{step.index}], v)"
+        yield f"made, d[{step.place}] = call(program, steps[{step.place}], v)"
         if step.single:
             yield "made = made[0]"
         return
@@ -142,13 +142,13 @@ def _call(program: Program, step: Step, locked: set[int]) -> Iterator[str]:
         if program.guard and not (step.is_builtin and slot in locked):
             yield f"if kind(a{place}) not in ARRAYLESS: a{place} = lend(a{place})"
     yield "start = clock()"
-    yield f"made = f{step.index}({', '.join(args)})"
+    yield f"made = f{step.place}({', '.join(args)})"
     yield "end = clock()"
     if not step.single:
-        yield f"made = unpack(program, steps[{step.index}], made)"
+        yield f"made = unpack(program, steps[{step.place}], made)"
     elif program.guard:
         yield "if kind(made) not in ARRAYLESS: made = keep(made, FRESH)"
-    yield f"d[{step.index}] = end - start"
+    yield f"d[{step.place}] = end - start"
 
 
 def _store(step: Step, slot: int, made: str, is_checked: bool) -> Iterator[str]:

@@ -33,7 +33,7 @@ class Draft:
     def after(cls, manager: TokenManager) -> Draft:
         """Begin with what another run has left; the values are shared."""
         freshness = manager.freshness
-        return cls(freshness.program, [*manager.values], bytearray(freshness.dirty), freshness.has_payload)
+        return cls(freshness.program, manager.values.copy(), bytearray(freshness.dirty), freshness.has_payload)
 
     def change(self, token: str, value: Any) -> None:
         """Give a source token a value."""

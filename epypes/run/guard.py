@@ -117,17 +117,10 @@ def keep(value: Any, fresh_count: int) -> Any:
     if kind in ARRAYLESS:
         return value
     if kind is (_ndarray or _array_type()):
-        owner = value.base
-        if owner is None:
-            known_elsewhere = getrefcount(value) > fresh_count
-        else:
-            known_elsewhere = type(owner) is kind and getrefcount(owner) > _FRESH_OWNER
-        if (known_elsewhere or owner is not None) and not value.flags.writeable:
-            return value
-        if known_elsewhere:
+        if value.base is not None:
+            value = _keep_view(value)
+        elif getrefcount(value) > fresh_count and value.flags.writeable:
             value = value.copy(order="K")
-        elif owner is not None and type(owner) is not kind:
-            value = value.view()  # memory of another library's object: whether it is used again can't be seen
         value.setflags(write=False)
         return value
     if is_array(value):
@@ -135,6 +128,16 @@ def keep(value: Any, fresh_count: int) -> Any:
     if _holds_arrays(value):
         return _make(kind)(keep(item, fresh_count + 1) if is_array(item) else item for item in value)
     return value
+
+
+def _keep_view(array: Any) -> Any:
+    """Return an array that lies in another object's memory so that it can be locked."""
+    owner = array.base
+    if not array.flags.writeable:
+        return array
+    if type(owner) is not type(array):
+        return array.view()  # memory of another library's object: whether it is used again can't be seen
+    return array.copy(order="K") if getrefcount(owner) > _FRESH_OWNER else array
 
 
 def _holds_arrays(value: Any) -> bool:
@@ -220,7 +223,8 @@ def explain_write(function: str, tokens: Sequence[str], exception: BaseException
 
 
 class _Holder:
-    __slots__ = ("base",)
+    def __init__(self, base: object) -> None:
+        self.base = base
 
 
 def _count(value: Any, unused: int) -> int:
@@ -232,8 +236,7 @@ def _measure_fresh() -> tuple[int, int]:
 
     Measured, since interpreters differ in which references they count.
     """
-    holder = _Holder()
-    holder.base = object()
+    holder = _Holder(object())
     owner = holder.base
     result = object()
     return _count(result, 0), getrefcount(owner)

@@ -47,7 +47,7 @@ def _without_superfluous(program: Program, values: Sequence[Any]) -> bytes:
     for step in reversed(program.steps):
         readers = [(index, slot) for slot in step.outputs for index in program.consumers[slot]]
         if readers and not any(wanted[index] and slot in read.get(index, (slot,)) for index, slot in readers):
-            wanted[step.index] = 0
+            wanted[step.place] = 0
     return bytes(wanted)
 
 
@@ -56,7 +56,7 @@ def missing_sources(program: Program, values: Sequence[Any], wanted: bytes | Non
     slots = {
         slot
         for step in program.steps
-        if wanted is None or wanted[step.index]
+        if wanted is None or wanted[step.place]
         for slot in program.read_by(step, values)
         if program.makers[slot] < 0 and values[slot] is NOT_COMPUTED
     }

@@ -69,17 +69,17 @@ def plan(manager: TokenManager, targets: Sequence[str], changed: Collection[str]
     """
     program = manager.program
     wanted = wanted_steps(program, manager.values, targets)
-    needed = [step for step in program.steps if wanted is None or wanted[step.index]]
+    needed = [step for step in program.steps if wanted is None or wanted[step.place]]
     stale = manager.stale
     return Plan(
         targets=tuple(targets),
-        order=tuple(step.name for step in needed if step.index in stale),
-        reused=tuple(step.name for step in needed if step.index not in stale),
+        order=tuple(step.name for step in needed if step.place in stale),
+        reused=tuple(step.name for step in needed if step.place not in stale),
         missing=missing_sources(program, manager.values, wanted),
         placeholders=needed_placeholders(program, wanted),
-        left_out=tuple(step.name for step in program.steps if wanted is not None and not wanted[step.index]),
+        left_out=tuple(step.name for step in program.steps if wanted is not None and not wanted[step.place]),
         why=MappingProxyType(
-            {step.name: _reason(manager, step.index, changed) for step in needed if step.index in stale}
+            {step.name: _reason(manager, step.place, changed) for step in needed if step.place in stale}
         ),
         cg=program.cg,
     )

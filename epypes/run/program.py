@@ -9,11 +9,8 @@ from collections.abc import Callable, Iterable, Sequence
 from types import BuiltinFunctionType
 from typing import Any, NamedTuple
 
-from epypes.graph import CompGraph
-from epypes.graph.placeholder import is_placeholder
-from epypes.graph.switch import Switch
-from typing import Any as Contracts
-def contracts_of(*a): return None
+from epypes.graph import CompGraph, Switch, as_switch
+from epypes.images import Image, contracts_of
 from epypes.run.guard import is_unguarded
 
 
@@ -22,8 +19,8 @@ class Step(NamedTuple):
 
     Attributes
     ----------
-    index
-        Its place in run order.
+    place
+        Where it stands in run order.
     inputs, outputs
         The slots it reads and writes.
     single
@@ -35,10 +32,10 @@ class Step(NamedTuple):
     switch
         The switch that it is, if it is one.
     contracts
-        What its annotations say of its images, if they say anything.
+        What its annotations say of the images that it takes and makes; by input and by output, if they say anything.
     """
 
-    index: int
+    place: int
     name: str
     function: Callable[..., Any]
     inputs: tuple[int, ...]
@@ -47,7 +44,7 @@ class Step(NamedTuple):
     unguarded: bool
     is_builtin: bool
     switch: Switch | None
-    contracts: Contracts | None
+    contracts: tuple[Sequence[Image | None], Sequence[Image | None]] | None
 
 
 class Program:
@@ -96,13 +93,13 @@ class Program:
         consumers: list[list[int]] = [[] for _ in slots]
         for step in self.steps:
             for slot in step.outputs:
-                self.makers[slot] = step.index
+                self.makers[slot] = step.place
             for slot in step.inputs:
-                if not consumers[slot] or consumers[slot][-1] != step.index:
-                    consumers[slot].append(step.index)
+                if not consumers[slot] or consumers[slot][-1] != step.place:
+                    consumers[slot].append(step.place)
         self.consumers: Sequence[Sequence[int]] = consumers
-        self.switches = tuple(step.index for step in self.steps if step.switch is not None)
-        self.placeholders = frozenset(step.index for step in self.steps if is_placeholder(step.function))
+        self.switches = tuple(step.place for step in self.steps if step.switch is not None)
+        self.placeholders = frozenset(step.place for step in self.steps if step.name in cg.placeholders)
         self.selectors: dict[str, list[Switch]] = {}
         for index in self.switches:
             step = self.steps[index]
@@ -134,6 +131,7 @@ class Program:
 
 def _steps(cg: CompGraph, slots: dict[str, int]) -> Iterable[Step]:
     inputs, outputs, of = cg.digraph.inputs, cg.digraph.outputs, slots.__getitem__
+    switches = set(cg.switches)
     for index, (name, function) in enumerate(cg.functions.items()):
         read, written = tuple(map(of, inputs[name])), tuple(map(of, outputs[name]))
         yield Step(
@@ -145,6 +143,6 @@ def _steps(cg: CompGraph, slots: dict[str, int]) -> Iterable[Step]:
             type(cg.func_io[name][1]) is str,
             is_unguarded(function),
             type(function) is BuiltinFunctionType,
-            function if isinstance(function, Switch) else None,
-            contracts_of(function, len(read), len(written)),
+            as_switch(function) if name in switches else None,
+            contracts if any(contracts := contracts_of(function, len(read), len(written))) else None,
         )

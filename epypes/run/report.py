@@ -63,9 +63,9 @@ class RunReport:
         """One entry per function that the run needed, in run order."""
         ran_ns, wanted = self._ran_ns(), self._wanted
         return tuple(
-            FunctionTime(step.name, ran_ns.get(step.index, 0), step.index in ran_ns)
+            FunctionTime(step.name, ran_ns.get(step.place, 0), step.place in ran_ns)
             for step in self._program.steps
-            if wanted is None or wanted[step.index] or step.index in ran_ns
+            if wanted is None or wanted[step.place] or step.place in ran_ns
         )
 
     @property

@@ -271,7 +271,9 @@ class CompGraphRunner:
         hparams, last = self._hparams, self._last
         now = self._now(last, hparams)
         return tuple(
-            token for token in self.cg.tokens if token in hparams.entries or (now.is_computed(token) and not now.is_stale(token))
+            token
+            for token in self.cg.tokens
+            if token in hparams.entries or (now.is_computed(token) and not now.is_stale(token))
         )
 
     def __repr__(self) -> str:

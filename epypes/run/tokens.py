@@ -6,7 +6,6 @@ The cost does not depend on the size of the values.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, Final
 
 from epypes.errors import NotComputed, StaleToken
@@ -70,7 +69,7 @@ class TokenManager:
 
     __slots__ = ("_stale", "freshness", "values")
 
-    def __init__(self, values: Sequence[Any], freshness: Freshness) -> None:
+    def __init__(self, values: list[Any], freshness: Freshness) -> None:
         self.values, self.freshness = values, freshness
         self._stale: set[int] | None = None
 
