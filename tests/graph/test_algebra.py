@@ -1,6 +1,9 @@
 from __future__ import annotations
 
 import functools
+import os
+import subprocess
+import sys
 import time
 
 import pytest
@@ -275,3 +278,22 @@ def test_one_bound_method_read_twice_is_one_function():
         one | ep.CompGraph({"f": Camera().shot}, {"f": ("x", "y")})
     with pytest.raises(GraphError):
         one | ep.CompGraph({"f": functools.partial(camera.shot)}, {"f": ("x", "y")})
+
+
+def test_unions_have_one_order_under_any_hash_seed():
+    code = (
+        "import epypes as ep\n"
+        "f = lambda *xs: (1, 2)\n"
+        "one = ep.CompGraph(dict.fromkeys('dcba', f), {'d': (('p', 'q'), 'r'), 'c': ('x', ('p', 'q')), 'b': ('x', ('u', 'v')),"
+        " 'a': (('u', 'v', 'r'), None)})\n"
+        "cg = ep.subgraph(ep.union(one, one, suffixes=('_1', '_2'), keep='x'), ('v_2', 'r_1'))\n"
+        "print(list(cg.functions), cg.tokens, cg.source_tokens, cg.sink_tokens)"
+    )
+    texts = {
+        subprocess.run(
+            [sys.executable, "-c", code], env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, check=True
+        ).stdout
+        for seed in ("0", "12345")
+    }
+    assert len(texts) == 1
+    assert b"['c_1', 'd_1', 'b_2']" in texts.pop()
