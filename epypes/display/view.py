@@ -120,8 +120,7 @@ def _with_run(structure: GraphView, run: Run, hparams: Mapping[str, Any], stale:
     stale |= {steps[index].name for index in run.tokens.stale}
     spent = {entry.function: entry for entry in run.report.functions}
     functions = tuple(
-        _function_view(function.name, step.place, run, stale, spent.get(function.name))
-        for function, step in zip(structure.functions, steps, strict=True)
+        _function_view(function.name, run, stale, spent.get(function.name)) for function in structure.functions
     )
     every = [_token_view(token, run, hparams, stale) for token in structure.tokens]
     tokens, left_out = within_budget(every, run.cg.sink_tokens)
@@ -131,7 +130,7 @@ def _with_run(structure: GraphView, run: Run, hparams: Mapping[str, Any], stale:
     return replace(structure, functions=functions, tokens=tokens, caption=caption)
 
 
-def _function_view(name: str, index: int, run: Run, stale: frozenset[str], entry: FunctionTime | None) -> FunctionView:
+def _function_view(name: str, run: Run, stale: frozenset[str], entry: FunctionTime | None) -> FunctionView:
     if run.failure and run.failure.function == name:
         return FunctionView(
             name,

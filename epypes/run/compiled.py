@@ -112,7 +112,8 @@ def _body(program: Program, steps: list[Step], changed: set[int]) -> Iterator[st
     known: set[int] = set()
     locked: set[int] = set()
     for step in steps:
-        new = [] if changed.intersection(step.inputs) or not changed else [slot for slot in step.inputs if slot in known]
+        is_certain = not changed or not changed.isdisjoint(step.inputs)
+        new = [] if is_certain else [slot for slot in step.inputs if slot in known]
         lines = [f"at = {step.place}", *_call(program, step, locked)]
         checked = [slot for slot in step.outputs if changed and slot in read]
         for place, slot in enumerate(step.outputs):

@@ -123,5 +123,3 @@ class RunReport:
         from epypes.display import mimebundle
 
         return mimebundle(self)
-
-

@@ -28,9 +28,8 @@ def test_ten_times_the_functions_cost_about_ten_times_as_much():
             best = min(best, time.perf_counter() - start)
         return best / count
 
-    assert cost(10_000) < 3 * cost(1_000)
-    # 2 us on two shared cores; inspect.signature alone takes 7.
-    assert cost(10_000) < 8e-6
+    # Where it is quadratic, ten times as much per function.
+    assert cost(10_000) < 4 * cost(1_000)
 
 
 def test_a_graph_without_cycle_is_not_searched_for_one(monkeypatch):
