@@ -13,13 +13,14 @@ from epypes.run.program import Program, Step
 
 
 class StepFailed(BaseException):
-    """A step raised: which one, what, and after how many nanoseconds.
+    """A step raised: which one, what, after how many nanoseconds, and how long those took that had ended.
 
     Carries the user's exception through the engine to the runner, which raises that one.
     """
 
-    def __init__(self, index: int, exception: BaseException, duration_ns: int) -> None:
-        self.index, self.exception, self.duration_ns = index, exception, duration_ns
+    def __init__(self, place: int, exception: BaseException, duration_ns: int) -> None:
+        self.place, self.exception, self.duration_ns = place, exception, duration_ns
+        self.done_ns: dict[int, int] = {}
 
 
 def call(program: Program, step: Step, values: Sequence[Any]) -> tuple[Sequence[Any], int]:

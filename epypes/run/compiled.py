@@ -8,17 +8,18 @@ names and values of the user never enter it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Hashable, Iterator
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
+from sys import getrefcount
 from time import perf_counter_ns
 from typing import Any, Final, NoReturn
 
 from epypes.run.call import StepFailed, call, unpack
 from epypes.run.draft import is_unchanged
-from epypes.run.guard import ARRAYLESS, FRESH, keep, lend
+from epypes.run.guard import ARRAYLESS, FRESH, FRESH_HERE, array_type, keep, lend
 from epypes.run.program import Program, Step
 
-# Runs its steps on values by slot, and gives nanoseconds by step that ran; raises StepFailed.
-CompiledRun = Callable[[list[Any], dict[int, int]], None]
+# Runs its steps on values by slot, and gives nanoseconds by step; -1, or none, for those that did not run.
+CompiledRun = Callable[[list[Any]], Mapping[int, int] | Sequence[int]]
 
 # Compiling takes some 40 us per function, once: worth it for what is repeated, and a pause below 20 ms.
 _RUNS_BEFORE: Final = 3
@@ -26,13 +27,48 @@ _MOST_STEPS: Final = 400
 _MOST_KEPT: Final = 64
 
 
-class CompiledRuns:
-    """The compiled runs of a program, each made when it has been repeated."""
+def _failed(error: BaseException, duration_ns: int, found: Mapping[str, Any]) -> NoReturn:
+    """Raise StepFailed for the step that was under way.
 
-    __slots__ = ("_compiled", "_counts", "_program")
+    ``found`` are the local variables: ``d3`` is how long step 3 took, and missing or -1 if it has not ended; ``at`` is
+    the step under way.
+    """
+    failed = error if isinstance(error, StepFailed) else StepFailed(found["at"], error, duration_ns)
+    failed.done_ns = {int(name[1:]): spent for name, spent in found.items() if name[1:].isdigit() and name[0] == "d"}
+    raise failed from None
+
+
+# What the source refers to besides the program and the functions.
+_NAMES: Final = {
+    "failed": _failed,
+    "clock": perf_counter_ns,
+    "kind": type,
+    "count": getrefcount,
+    "ARRAYLESS": ARRAYLESS,
+    "FRESH": FRESH,
+    "FRESH_HERE": FRESH_HERE,
+    "lend": lend,
+    "keep": keep,
+    "call": call,
+    "unpack": unpack,
+    "is_unchanged": is_unchanged,
+}
+
+
+class CompiledRuns:
+    """The compiled runs of a program, each made when it has been repeated.
+
+    Attributes
+    ----------
+    whole
+        The run of every step, as soon as there is one; never in a graph with switches or placeholders.
+    """
+
+    __slots__ = ("_compiled", "_counts", "_program", "whole")
 
     def __init__(self, program: Program) -> None:
         self._program = program
+        self.whole: CompiledRun | None = None
         self._counts: Counter[Hashable] = Counter()
         self._compiled: dict[Hashable, CompiledRun] = {}
 
@@ -45,6 +81,8 @@ class CompiledRuns:
         if compiled is None and self._is_worth_it(wanted):
             steps = [step for step in self._program.steps if wanted is None or wanted[step.place]]
             compiled = self._compiled[wanted] = compile_run(self._program, steps, ())
+            if wanted is None and not self._program.switches:
+                self.whole = compiled
         return compiled
 
     def of_changes(self, tokens: tuple[str, ...]) -> CompiledRun | None:
@@ -83,27 +121,20 @@ def compile_run(program: Program, steps: list[Step], changed: Collection[int]) -
         Empty if every step is to be run.
     """
     lines = [
-        "def make(program, steps, failed, clock, kind, ARRAYLESS, FRESH, lend, keep, call, unpack, is_unchanged):",
+        f"def make(program, steps, {', '.join(_NAMES)}, array):",
         *(f"    f{step.place} = steps[{step.place}].function" for step in steps),
-        "    def run(v, d):",
-        "        at = 0",
-        "        start = clock()",
+        "    def run(v):",
+        "        at, start = 0, clock()",
         "        try:",
         *(f"            {line}" for line in _body(program, steps, set(changed))),
         "        except BaseException as error:",
-        "            failed(at, error, clock() - start)",
+        "            failed(error, clock() - start, locals())",
         "    return run",
     ]
     names: dict[str, Any] = {}
     exec(compile("\n".join(lines), "<epypes: a compiled run>", "exec"), names)  # noqa: S102 - made of numbers only
-    run: CompiledRun = names["make"](
-        program, program.steps, _failed, perf_counter_ns, type, ARRAYLESS, FRESH, lend, keep, call, unpack, is_unchanged
-    )
+    run: CompiledRun = names["make"](program, program.steps, *_NAMES.values(), array_type())
     return run
-
-
-def _failed(index: int, error: BaseException, duration_ns: int) -> NoReturn:
-    raise (error if isinstance(error, StepFailed) else StepFailed(index, error, duration_ns)) from None
 
 
 def _body(program: Program, steps: list[Step], changed: set[int]) -> Iterator[str]:
@@ -114,25 +145,30 @@ def _body(program: Program, steps: list[Step], changed: set[int]) -> Iterator[st
     for step in steps:
         is_certain = not changed or not changed.isdisjoint(step.inputs)
         new = [] if is_certain else [slot for slot in step.inputs if slot in known]
-        lines = [f"at = {step.place}", *_call(program, step, locked)]
         checked = [slot for slot in step.outputs if changed and slot in read]
+        lines = [f"at = {step.place}", *_call(program, step, locked)]
         for place, slot in enumerate(step.outputs):
             lines += _store(step, slot, "made" if step.single else f"made[{place}]", slot in checked)
+        lines.append(f"d{step.place} = spent")
         if step.switch is None:
             locked.update(step.outputs)
         if new:
+            yield f"d{step.place} = -1"
             yield from (f"c{slot} = False" for slot in checked)
             yield f"if {' or '.join(f'c{slot}' for slot in dict.fromkeys(new))}:"
             lines = [f"    {line}" for line in lines]
         yield from lines
         known.update(checked)
-    yield "pass"
+    if len(steps) == len(program.steps) and not changed:
+        yield f"return ({''.join(f'd{step.place}, ' for step in steps)})"
+    else:
+        yield f"return {{{', '.join(f'{step.place}: d{step.place}' for step in steps)}}}"
 
 
 def _call(program: Program, step: Step, locked: set[int]) -> Iterator[str]:
     """Write out the call of a step; the slots in ``locked`` hold what ``keep`` gave."""
     if step.switch is not None or step.unguarded or step.contracts is not None:
-        yield f"made, d[{step.place}] = call(program, steps[{step.place}], v)"
+        yield f"made, spent = call(program, steps[{step.place}], v)"
         if step.single:
             yield "made = made[0]"
         return
@@ -141,15 +177,33 @@ def _call(program: Program, step: Step, locked: set[int]) -> Iterator[str]:
         args.append(f"a{place}")
         yield f"a{place} = v[{slot}]"
         if program.guard and not (step.is_builtin and slot in locked):
-            yield f"if kind(a{place}) not in ARRAYLESS: a{place} = lend(a{place})"
+            yield from _lend(f"a{place}")
     yield "start = clock()"
     yield f"made = f{step.place}({', '.join(args)})"
-    yield "end = clock()"
+    yield "spent = clock() - start"
     if not step.single:
         yield f"made = unpack(program, steps[{step.place}], made)"
     elif program.guard:
-        yield "if kind(made) not in ARRAYLESS: made = keep(made, FRESH)"
-    yield f"d[{step.place}] = end - start"
+        yield from _keep(is_read=bool(program.consumers[step.outputs[0]]))
+
+
+def _lend(name: str) -> Iterator[str]:
+    """Write out ``lend``, for what it does to most values."""
+    yield f"k = kind({name})"
+    yield "if k not in ARRAYLESS:"
+    yield "    if k is array:"
+    yield f"        {name} = {name}.view()"
+    yield f"        {name}.setflags(False)"
+    yield f"    else: {name} = lend({name})"
+
+
+def _keep(is_read: bool) -> Iterator[str]:
+    """Write out ``keep``, for what it does to most values; an array that no function reads need not be locked."""
+    yield "k = kind(made)"
+    yield "if k not in ARRAYLESS:"
+    yield "    if k is array and made.base is None and count(made) <= FRESH_HERE:"
+    yield "        made.setflags(False)" if is_read else "        pass"
+    yield "    else: made = keep(made, FRESH)"
 
 
 def _store(step: Step, slot: int, made: str, is_checked: bool) -> Iterator[str]:

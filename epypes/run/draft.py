@@ -66,9 +66,13 @@ class Draft:
             for slot in self.program.steps[index].outputs:
                 self.values[slot] = NOT_COMPUTED
 
-    def ended(self) -> TokenManager:
+    def freshness(self) -> Freshness:
+        """Return what is up to date now, for good."""
+        return Freshness(self.program, bytes(self.dirty), self.has_payload)
+
+    def tokens(self) -> TokenManager:
         """Return the tokens as they are now, for good."""
-        return TokenManager(self.values, Freshness(self.program, bytes(self.dirty), self.has_payload))
+        return TokenManager(self.values, self.freshness())
 
 
 def is_unchanged(old: Any, new: Any, given: Sequence[Any], guard: bool) -> bool:

@@ -48,7 +48,7 @@ def is_unguarded(function: object) -> bool:
 _ndarray: Any = None
 
 
-def _array_type() -> Any:
+def array_type() -> Any:
     """Return numpy's array type, or None as long as nobody has imported numpy."""
     global _ndarray
     if _ndarray is None:
@@ -58,14 +58,14 @@ def _array_type() -> Any:
 
 def is_array(value: Any) -> bool:
     """Whether a value is a NumPy array."""
-    kind = _array_type()
+    kind = array_type()
     # By type: isinstance would ask the value itself for its class, which hostile objects answer as they like.
     return kind is not None and issubclass(type(value), kind)
 
 
 def is_plain_array(value: Any) -> bool:
     """Whether a value is a NumPy array, and not of a subclass."""
-    return type(value) is _array_type()
+    return type(value) is array_type()
 
 
 def own_view(value: Any) -> Any:
@@ -84,9 +84,9 @@ def lend(value: Any) -> Any:
     kind = type(value)
     if kind in ARRAYLESS:
         return value
-    if kind is (_ndarray or _array_type()):
+    if kind is (_ndarray or array_type()):
         view = value.view()
-        view.setflags(write=False)
+        view.setflags(False)
         return view
     if is_array(value):
         return _locked(own_view(value))
@@ -116,12 +116,12 @@ def keep(value: Any, fresh_count: int) -> Any:
     kind = type(value)
     if kind in ARRAYLESS:
         return value
-    if kind is (_ndarray or _array_type()):
+    if kind is (_ndarray or array_type()):
         if value.base is not None:
             value = _keep_view(value)
         elif getrefcount(value) > fresh_count and value.flags.writeable:
             value = value.copy(order="K")
-        value.setflags(write=False)
+        value.setflags(False)
         return value
     if is_array(value):
         return _locked(own_view(value))
@@ -148,7 +148,7 @@ def _holds_arrays(value: Any) -> bool:
     kinds = set(map(type, islice(value, _TELLING_ITEMS)))
     if len(value) > _TELLING_ITEMS and (len(kinds) > 1 or type(None) in kinds):
         kinds = set(map(type, value))
-    array = _array_type()
+    array = array_type()
     return array is not None and any(issubclass(kind, array) for kind in kinds)
 
 
@@ -231,15 +231,15 @@ def _count(value: Any, unused: int) -> int:
     return getrefcount(value)
 
 
-def _measure_fresh() -> tuple[int, int]:
-    """Return the reference counts that ``keep`` sees of an object that nobody else knows, and of a fresh owner.
+def _measure_fresh() -> tuple[int, int, int]:
+    """Return the reference counts of an object that only its finder knows: seen by ``keep``, by its caller, as owner.
 
     Measured, since interpreters differ in which references they count.
     """
     holder = _Holder(object())
     owner = holder.base
     result = object()
-    return _count(result, 0), getrefcount(owner)
+    return _count(result, 0), getrefcount(result), getrefcount(owner)
 
 
-FRESH, _FRESH_OWNER = _measure_fresh()
+FRESH, FRESH_HERE, _FRESH_OWNER = _measure_fresh()

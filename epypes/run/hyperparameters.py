@@ -19,10 +19,12 @@ class Hyperparameters:
     ----------
     entries
         By token, a tuple that holds its value. Setting a token makes a new tuple: it is the token's version.
-    changed
-        The values that differ from the revision before; None if that had other hyperparameters.
     revision
         How often they have changed.
+    changed
+        The values that differ from the revision before.
+    follows
+        That revision; -1 if other tokens were hyperparameters in it.
     """
 
     # Made at every move of a slider, so what is rarely asked for is made when it is.
@@ -30,9 +32,10 @@ class Hyperparameters:
     _free: dict[str, int] | None = None
 
     def __init__(
-        self, program: Program, entries: dict[str, tuple[Any]], changed: dict[str, Any] | None, revision: int
+        self, program: Program, entries: dict[str, tuple[Any]], revision: int, changed: dict[str, Any], follows: int
     ) -> None:
-        self.program, self.entries, self.changed, self.revision = program, entries, changed, revision
+        self.program, self.entries, self.revision = program, entries, revision
+        self.changed, self.follows = changed, follows
 
     @property
     def values(self) -> Mapping[str, Any]:
@@ -61,15 +64,22 @@ class Hyperparameters:
             self._base = base
         return self._base
 
-    def frozen(self, changes: Mapping[str, Any]) -> Hyperparameters:
-        """Return these with source tokens given values; all or nothing. An equal value changes nothing.
+    def frozen(self, changes: Mapping[str, Any], *, also_new: bool = True) -> Hyperparameters:
+        """Return these with tokens given values; all or nothing. An equal value changes nothing.
+
+        Parameters
+        ----------
+        changes
+            Values by token.
+        also_new
+            Whether source tokens that are not hyperparameters become some.
 
         Raises
         ------
         UnknownName
             There is no such token, or a switch has no such branch.
         HyperparameterError
-            A function makes the token.
+            A function makes the token, or it is not a hyperparameter.
         """
         new: dict[str, Any] = {}
         entries = self.entries.copy()
@@ -77,9 +87,10 @@ class Hyperparameters:
         for token, value in changes.items():
             entry = entries.get(token)
             if entry is None:
-                self.require_source(token)
+                (self.require_source if also_new else self.require)(token)
                 same_tokens = False
-            elif is_same_value(entry[0], value):
+            # An integer, which most sliders give, is compared without a call.
+            elif entry[0] == value if type(value) is int is type(entry[0]) else is_same_value(entry[0], value):
                 continue
             if token in self.program.selectors:
                 self.require_branch(token, value)
@@ -87,19 +98,20 @@ class Hyperparameters:
             entries[token] = (value,)
         if not new:
             return self
-        return Hyperparameters(self.program, entries, new if same_tokens else None, self.revision + 1)
+        revision = self.revision
+        return Hyperparameters(self.program, entries, revision + 1, new, revision if same_tokens else -1)
 
     def unfrozen(self, token: str) -> Hyperparameters:
         """Return these without a token, which becomes a free source token."""
         self.require(token)
         entries = {name: entry for name, entry in self.entries.items() if name != token}
-        return Hyperparameters(self.program, entries, None, self.revision + 1)
+        return Hyperparameters(self.program, entries, self.revision + 1, {}, -1)
 
     def changes_since(self, earlier: Hyperparameters) -> dict[str, Any]:
         """Return the tokens that have another version than in an earlier or later revision, with their values."""
         if earlier is self:
             return {}
-        if self.changed is not None and earlier.revision == self.revision - 1:
+        if self.follows == earlier.revision:
             return self.changed
         entries = self.entries.items()
         return {token: entry[0] for token, entry in entries if earlier.entries.get(token) is not entry}

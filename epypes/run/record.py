@@ -8,11 +8,14 @@ from typing import TYPE_CHECKING, Any
 from epypes.errors import NotComputed, StaleToken
 from epypes.run.failure import Failure
 from epypes.run.hyperparameters import Hyperparameters
-from epypes.run.report import RunReport
-from epypes.run.tokens import TokenManager
+from epypes.run.report import RunReport, Times
+from epypes.run.tokens import Freshness, TokenManager
 
 if TYPE_CHECKING:
     from epypes.graph import CompGraph
+
+# Values by slot, which of them are up to date, the hyperparameters with their versions, times and failure.
+Record = tuple[list[Any], Freshness, Hyperparameters, Times, Failure | None]
 
 
 class Run(Mapping[str, Any]):
@@ -22,51 +25,49 @@ class Run(Mapping[str, Any]):
     draw on a copy, ``run["edges"].copy()``.
     """
 
-    __slots__ = ("__weakref__", "_failure", "_hparams", "_manager", "_report")
+    # One tuple to be set, and nothing else: to record a run takes a good part of what EPypes adds to its functions.
+    __slots__ = ("__weakref__", "_tokens", "record")
 
-    def __init__(
-        self, manager: TokenManager, report: RunReport, failure: Failure | None, hparams: Hyperparameters
-    ) -> None:
-        self._manager, self._report, self._failure, self._hparams = manager, report, failure, hparams
+    def __init__(self, record: Record) -> None:
+        self.record = record
 
     @property
     def report(self) -> RunReport:
         """The times of the run."""
-        return self._report
+        return RunReport(*self.record[3])
 
     @property
     def failure(self) -> Failure | None:
         """None, or the function that failed; the tokens that were computed before keep their values."""
-        return self._failure
-
-    @property
-    def hparams(self) -> Hyperparameters:
-        """The hyperparameters that the run was computed with, and their versions."""
-        return self._hparams
+        return self.record[4]
 
     @property
     def hyperparameters(self) -> Mapping[str, Any]:
         """The values that the run was computed with."""
-        return self._hparams.values
+        return self.record[2].values
 
     @property
     def revision(self) -> int:
         """The runner's count of hyperparameter changes when the run began."""
-        return self._hparams.revision
+        return self.record[2].revision
 
     @property
     def cg(self) -> CompGraph:
         """The graph that was run."""
-        return self._manager.program.cg
+        return self.record[1].program.cg
 
     @property
     def tokens(self) -> TokenManager:
-        """The token store; take ``.copy()`` before changing it."""
-        return self._manager
+        """The token store."""
+        try:
+            return self._tokens
+        except AttributeError:
+            self._tokens: TokenManager = TokenManager(self.record[0], self.record[1])
+            return self._tokens
 
     def __getitem__(self, token: str) -> Any:
         try:
-            return self._manager.read(token)
+            return self.tokens.read(token)
         except StaleToken:
             raise
         except NotComputed as error:
@@ -76,8 +77,8 @@ class Run(Mapping[str, Any]):
             raise NotComputed(token, text) from error
 
     def __iter__(self) -> Iterator[str]:
-        manager = self._manager
-        return (token for token in self.cg.tokens if manager.is_computed(token) and not manager.is_stale(token))
+        tokens = self.tokens
+        return (token for token in self.cg.tokens if tokens.is_computed(token) and not tokens.is_stale(token))
 
     def __len__(self) -> int:
         return sum(1 for _ in self)

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final, overload
 
 from epypes.run.program import Program
 
 if TYPE_CHECKING:
     import pandas as pd
 
-# Above so many functions the times are packed: a thousand reports of a large graph would hold gigabytes of integers.
-_PACKED_ABOVE: Final = 200
+# The program, the steps that were wanted, nanoseconds by step that ran, nanoseconds in all, whether side by side.
+Times = tuple[Program, bytes | None, Mapping[int, int] | Sequence[int], int, bool]
+
+_KEPT: Final = 1_000
+# Above so many functions kept times are packed: a thousand reports of a large graph would hold a gigabyte of integers.
+_PACKED_ABOVE: Final = 400
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,21 +47,19 @@ class RunReport:
         self,
         program: Program,
         wanted: bytes | None,
-        durations_ns: dict[int, int],
+        durations_ns: Mapping[int, int] | Sequence[int],
         total_ns: int,
-        side_by_side: bool = False,
+        side_by_side: bool,
     ) -> None:
-        # A list has an entry for every step, -1 for those that did not run; a dictionary those that ran.
+        # A sequence has an entry for every step; -1 stands for a step that did not run.
         self._program, self._wanted, self.total_ns, self.side_by_side = program, wanted, total_ns, side_by_side
-        self._durations_ns: Any = durations_ns
-        if len(durations_ns) > _PACKED_ABOVE and isinstance(durations_ns, list):
-            self._durations_ns = array("q", durations_ns)
+        self._durations_ns = durations_ns
 
     def _ran_ns(self) -> Mapping[int, int]:
         """Return nanoseconds by step that ran."""
-        if isinstance(self._durations_ns, dict):
-            return self._durations_ns
-        return {index: duration for index, duration in enumerate(self._durations_ns) if duration >= 0}
+        durations_ns = self._durations_ns
+        entries = durations_ns.items() if isinstance(durations_ns, Mapping) else enumerate(durations_ns)
+        return {place: duration for place, duration in entries if duration >= 0}
 
     @property
     def functions(self) -> tuple[FunctionTime, ...]:
@@ -123,3 +126,42 @@ class RunReport:
         from epypes.display import mimebundle
 
         return mimebundle(self)
+
+
+class Reports(Sequence[RunReport]):
+    """The reports of a runner's last 1,000 runs, the oldest first; without the values of their tokens."""
+
+    def __init__(self) -> None:
+        self.kept: deque[Times] = deque(maxlen=_KEPT)
+
+    def add(self, times: Times) -> None:
+        """Keep the times of one more run."""
+        if len(times[2]) > _PACKED_ABOVE:
+            times = _packed(times)
+        self.kept.append(times)
+
+    @overload
+    def __getitem__(self, index: int) -> RunReport: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[RunReport]: ...
+    def __getitem__(self, index: int | slice) -> RunReport | list[RunReport]:
+        if isinstance(index, slice):
+            return [RunReport(*times) for times in list(self.kept)[index]]
+        return RunReport(*self.kept[index])
+
+    def __len__(self) -> int:
+        return len(self.kept)
+
+    def __iter__(self) -> Iterator[RunReport]:
+        return (RunReport(*times) for times in tuple(self.kept))
+
+    def __repr__(self) -> str:
+        return f"<Reports of {len(self)} runs>"
+
+
+def _packed(times: Times) -> Times:
+    program, wanted, durations_ns, total_ns, side_by_side = times
+    if not isinstance(durations_ns, Mapping):
+        return times
+    packed: Sequence[int] = array("q", [durations_ns.get(step.place, -1) for step in program.steps])
+    return program, wanted, packed, total_ns, side_by_side

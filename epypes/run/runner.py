@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from time import perf_counter_ns
 from typing import Any
@@ -11,16 +10,15 @@ from typing import Any
 from epypes.errors import NotComputed, PayloadError, StaleToken, UnknownName, run_call
 from epypes.graph import CompGraph
 from epypes.run.attempt import Attempts, Outcome
+from epypes.run.call import StepFailed
 from epypes.run.draft import Draft
 from epypes.run.guard import lend
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.plan import Plan, plan
 from epypes.run.program import Program
 from epypes.run.record import Run
-from epypes.run.report import RunReport
+from epypes.run.report import Reports
 from epypes.run.tokens import TokenManager
-
-_KEPT_REPORTS = 1000
 
 
 class CompGraphRunner:
@@ -63,13 +61,13 @@ class CompGraphRunner:
             raise TypeError(f"A CompGraphRunner runs a CompGraph, not {kind!r}: CompGraphRunner(cg, hparams).")
         self.cg = cg
         self.guard = guard
-        self.reports: deque[RunReport] = deque(maxlen=_KEPT_REPORTS)
+        self.reports = Reports()
         self._program = Program(cg, guard)
         self._attempts = Attempts(self._program)
         self._lock = threading.Lock()
         self._last: Run | None = None
         given = {**cg.defaults, **(hparams or {})}
-        self._hparams = Hyperparameters(self._program, {}, None, 0).frozen(given)
+        self._hparams = Hyperparameters(self._program, {}, 0, {}, -1).frozen(given)
 
     # -- running ------------------------------------------------------------------------------------------------
 
@@ -112,9 +110,21 @@ class CompGraphRunner:
         if program.selectors:
             for token in payload:
                 hparams.require_branch(token, payload[token])
-        return self._ended(hparams, self._attempts.whole(values, len(payload) == len(free), targets, start_ns))
+        attempts, has_payload = self._attempts, len(payload) == len(free)
+        compiled = attempts.compiled.whole
+        if compiled is None or targets or not has_payload:
+            return self._ended(attempts.whole(values, has_payload, targets, start_ns), hparams)
+        # The way of a stream of images: as short as can be.
+        try:
+            durations_ns = compiled(values)
+        except StepFailed as failed:
+            return self._ended(attempts.run_broken_off(values, failed, None, True, start_ns), hparams)
+        times = (program, None, durations_ns, perf_counter_ns() - start_ns, False)
+        run = self._last = Run((values, attempts.clean, hparams, times, None))
+        self.reports.kept.append(times)
+        return run
 
-    def rerun(self, /, *targets: str, **hparams: Any) -> Run:
+    def rerun(self, /, *targets: str, **changes: Any) -> Run:
         """Set hyperparameters, all or none of them, then run the stale functions on the last payload.
 
         Raises
@@ -131,24 +141,38 @@ class CompGraphRunner:
         start_ns = perf_counter_ns()
         if targets:
             self._check_targets(targets)
-        current = self._set(hparams)
-        last = self._last
+        with self._lock:
+            hparams = self._hparams = self._hparams.frozen(changes, also_new=False)
+        last, attempts = self._last, self._attempts
         if last is None:
             free = self.free_source_tokens
             text = f"Nothing has been run yet, so there is no payload. Call {run_call(free)} first."
             raise PayloadError(free, text)
-        outcome = None
-        if last.tokens.freshness.is_clean and not targets:
-            outcome = self._attempts.changed(last.tokens, current.changes_since(last.hparams), start_ns)
-        if outcome is None:
-            outcome = self._attempts.stale(self._draft(last, current), targets, start_ns)
-        return self._ended(current, outcome)
+        stored, freshness, before, *_ = last.record
+        compiled = None
+        if freshness.is_clean and not targets and hparams.follows == before.revision:
+            compiled = attempts.compiled.of_changes(tuple(hparams.changed))
+        if compiled is None:
+            return self._ended(attempts.stale(self._draft(last, hparams), targets, start_ns), hparams)
+        # The way of a slider: as short as can be.
+        values = stored.copy()
+        slots = self._program.slots
+        for token, value in hparams.changed.items():
+            values[slots[token]] = value
+        try:
+            durations_ns = compiled(values)
+        except StepFailed as failed:
+            return self._ended(attempts.rerun_broken_off(values, stored, failed, hparams.changed, start_ns), hparams)
+        times = (self._program, None, durations_ns, perf_counter_ns() - start_ns, False)
+        run = self._last = Run((values, freshness, hparams, times, None))
+        self.reports.kept.append(times)
+        return run
 
-    def _ended(self, hparams: Hyperparameters, outcome: Outcome) -> Run:
+    def _ended(self, outcome: Outcome, hparams: Hyperparameters) -> Run:
         """Make what was run the last Run; raise the user's exception if a function failed."""
-        manager, report, failure = outcome
-        run = self._last = Run(manager, report, failure, hparams)
-        self.reports.append(report)
+        values, freshness, times, failure = outcome
+        run = self._last = Run((values, freshness, hparams, times, failure))
+        self.reports.add(times)
         if failure is not None:
             raise failure.exception
         return run
@@ -157,7 +181,7 @@ class CompGraphRunner:
         """Return what ``rerun(*targets)`` would do, and why."""
         self._check_targets(targets)
         last, hparams = self._last, self._hparams
-        changed = () if last is None else tuple(hparams.changes_since(last.hparams))
+        changed = () if last is None else tuple(hparams.changes_since(last.record[2]))
         return plan(self._now(last, hparams), targets, changed)
 
     def _check_targets(self, targets: Sequence[object]) -> None:
@@ -203,14 +227,8 @@ class CompGraphRunner:
             self._hparams = self._hparams.unfrozen(token)
 
     def __setitem__(self, token: str, value: Any) -> None:
-        self._set({token: value})
-
-    def _set(self, values: Mapping[str, Any]) -> Hyperparameters:
         with self._lock:
-            for token in values:
-                self._hparams.require(token)
-            hparams = self._hparams = self._hparams.frozen(values)
-            return hparams
+            self._hparams = self._hparams.frozen({token: value}, also_new=False)
 
     # -- reading ------------------------------------------------------------------------------------------------
 
@@ -232,15 +250,15 @@ class CompGraphRunner:
         if last is None:
             return Draft.of_sources(self._program, hparams.base.copy(), not hparams.free_slots)
         draft = Draft.after(last.tokens)
-        for token, value in hparams.changes_since(last.hparams).items():
+        for token, value in hparams.changes_since(last.record[2]).items():
             draft.change(token, value)
         return draft
 
     def _now(self, last: Run | None, hparams: Hyperparameters) -> TokenManager:
         """Return a run's tokens as they are to be read with these hyperparameters."""
-        if last is not None and last.hparams is hparams:
+        if last is not None and last.record[2] is hparams:
             return last.tokens
-        return self._draft(last, hparams).ended()
+        return self._draft(last, hparams).tokens()
 
     def __getitem__(self, token: str) -> Any:
         hparams, last = self._hparams, self._last
