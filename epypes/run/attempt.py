@@ -11,7 +11,9 @@ from epypes.run.compiled import CompiledRuns
 from epypes.run.draft import Draft
 from epypes.run.engine import execute
 from epypes.run.failure import Failure, failure_of
+from epypes.run.gain import Gain, Gains, GuardedWay, has_independent_steps
 from epypes.run.need import check_ready, wanted_steps
+from epypes.run.parallel import execute_side_by_side
 from epypes.run.program import Program
 from epypes.run.report import Times
 from epypes.run.tokens import Freshness
@@ -29,15 +31,17 @@ class Attempts:
 
     Attributes
     ----------
-    compiled
-        The runs that have been repeated.
+    short_way
+        The compiled runs, as far as they are to be taken without asking here.
     clean
         What is up to date after a run of everything.
     """
 
-    def __init__(self, program: Program) -> None:
-        self._program = program
-        self.compiled = CompiledRuns(program)
+    def __init__(self, program: Program, workers: int) -> None:
+        self._program, self._workers = program, workers
+        self._compiled = CompiledRuns(program)
+        self._gains = Gains(program, workers) if workers > 1 and has_independent_steps(program) else None
+        self.short_way = self._compiled if self._gains is None else GuardedWay(self._compiled, self._gains)
         self.clean = Freshness(program, bytes(len(program.steps)), True)
 
     def whole(self, values: list[Any], has_payload: bool, targets: Sequence[str], start_ns: int) -> Outcome:
@@ -48,22 +52,20 @@ class Attempts:
         PayloadError, PlaceholderNeeded
             Something is needed that is not there.
         """
-        program = self._program
-        wanted = wanted_steps(program, values, targets) if targets or program.switches else None
-        if program.placeholders or not has_payload:
-            check_ready(program, values, wanted)
-        compiled = self.compiled.of_steps(wanted)
-        if compiled is None:
-            return _step_by_step(Draft.of_sources(program, values, has_payload), wanted, start_ns)
+        wanted = self._wanted(values, targets, has_payload)
+        gain = None if self._gains is None else self._gains.of_steps(wanted)
+        compiled = None if gain is not None and not gain.is_known else self._compiled.of_steps(wanted)
+        if compiled is None or (gain is not None and gain.is_worth_it()):
+            return self._step_by_step(Draft.of_sources(self._program, values, has_payload), wanted, gain, start_ns)
         try:
             durations_ns = compiled(values)
         except StepFailed as failed:
             return self.run_broken_off(values, failed, wanted, has_payload, start_ns)
         freshness = self.clean
         if wanted is not None or not has_payload:
-            dirty = bytes(len(program.steps)) if wanted is None else wanted.translate(_INVERTED)
-            freshness = Freshness(program, dirty, has_payload)
-        return values, freshness, (program, wanted, durations_ns, perf_counter_ns() - start_ns, False), None
+            dirty = bytes(len(self._program.steps)) if wanted is None else wanted.translate(_INVERTED)
+            freshness = Freshness(self._program, dirty, has_payload)
+        return values, freshness, (self._program, wanted, durations_ns, perf_counter_ns() - start_ns, False), None
 
     def stale(self, draft: Draft, targets: Sequence[str], start_ns: int) -> Outcome:
         """Run the dirty steps that the targets need, all without.
@@ -73,11 +75,31 @@ class Attempts:
         PayloadError, PlaceholderNeeded
             Something is needed that is not there.
         """
+        wanted = self._wanted(draft.values, targets, draft.has_payload)
+        gain = None if self._gains is None else self._gains.of_dirty(bytes(draft.dirty), wanted)
+        return self._step_by_step(draft, wanted, gain, start_ns)
+
+    def _wanted(self, values: list[Any], targets: Sequence[str], has_payload: bool) -> bytes | None:
         program = self._program
-        wanted = wanted_steps(program, draft.values, targets) if targets or program.switches else None
-        if program.placeholders or not draft.has_payload:
-            check_ready(program, draft.values, wanted)
-        return _step_by_step(draft, wanted, start_ns)
+        wanted = wanted_steps(program, values, targets) if targets or program.switches else None
+        if program.placeholders or not has_payload:
+            check_ready(program, values, wanted)
+        return wanted
+
+    def _step_by_step(self, draft: Draft, wanted: bytes | None, gain: Gain | None, start_ns: int) -> Outcome:
+        durations_ns: dict[int, int] = {}
+        side_by_side = gain is not None and gain.is_worth_it()
+        try:
+            if side_by_side:
+                execute_side_by_side(draft, wanted, durations_ns, self._workers)
+            else:
+                execute(draft, wanted, durations_ns)
+        except StepFailed as failed:
+            return _ended(draft, failed, wanted, durations_ns, start_ns, side_by_side)
+        outcome = _ended(draft, None, wanted, durations_ns, start_ns, side_by_side)
+        if gain is not None:
+            gain.learn(durations_ns, outcome[2][3], side_by_side)
+        return outcome
 
     def run_broken_off(
         self, values: list[Any], failed: StepFailed, wanted: bytes | None, has_payload: bool, start_ns: int
@@ -86,7 +108,7 @@ class Attempts:
         draft = Draft.of_sources(self._program, values, has_payload)
         for place in failed.done_ns:
             draft.dirty[place] = 0
-        return _ended(draft, failed, wanted, failed.done_ns, start_ns)
+        return _ended(draft, failed, wanted, failed.done_ns, start_ns, False)
 
     def rerun_broken_off(
         self, values: list[Any], old: list[Any], failed: StepFailed, changed: Iterable[str], start_ns: int
@@ -98,25 +120,21 @@ class Attempts:
         dirty = bytearray(
             failed.done_ns.get(step.place, -1) < 0 and not new.isdisjoint(step.inputs) for step in program.steps
         )
-        return _ended(Draft(program, values, dirty, True), failed, None, failed.done_ns, start_ns)
-
-
-def _step_by_step(draft: Draft, wanted: bytes | None, start_ns: int) -> Outcome:
-    durations_ns: dict[int, int] = {}
-    try:
-        execute(draft, wanted, durations_ns)
-    except StepFailed as failed:
-        return _ended(draft, failed, wanted, durations_ns, start_ns)
-    return _ended(draft, None, wanted, durations_ns, start_ns)
+        return _ended(Draft(program, values, dirty, True), failed, None, failed.done_ns, start_ns, False)
 
 
 def _ended(
-    draft: Draft, failed: StepFailed | None, wanted: bytes | None, durations_ns: dict[int, int], start_ns: int
+    draft: Draft,
+    failed: StepFailed | None,
+    wanted: bytes | None,
+    durations_ns: dict[int, int],
+    start_ns: int,
+    side_by_side: bool,
 ) -> Outcome:
     failure = None
     if failed is not None:
         durations_ns[failed.place] = failed.duration_ns
         failure = failure_of(draft, failed.place, failed.exception)
         draft.forget(draft.program.downstream([failed.place], draft.values))
-    times = (draft.program, wanted, durations_ns, perf_counter_ns() - start_ns, False)
+    times = (draft.program, wanted, durations_ns, perf_counter_ns() - start_ns, side_by_side)
     return draft.values, draft.freshness(), times, failure

@@ -2,7 +2,8 @@
 
 The engine's loop looks up, for every function, which slots it reads and how many values it makes. A run that is
 repeated is written out as one Python function instead, and compiled. Its source is made of slot and step numbers only:
-names and values of the user never enter it.
+names and values of the user never enter it. Calls into EPypes are written out too: after a function that has filled
+the caches with an image, each costs some microseconds.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any, Final, NoReturn
 
 from epypes.run.call import StepFailed, call, unpack
 from epypes.run.draft import is_unchanged
-from epypes.run.guard import ARRAYLESS, FRESH, FRESH_HERE, array_type, keep, lend
+from epypes.run.guard import ARRAYLESS, FRESH, FRESH_HERE, HARMLESS, LISTS, LONG, array_type, keep, lend
 from epypes.run.program import Program, Step
 
 # Runs its steps on values by slot, and gives nanoseconds by step; -1, or none, for those that did not run.
@@ -45,6 +46,9 @@ _NAMES: Final = {
     "kind": type,
     "count": getrefcount,
     "ARRAYLESS": ARRAYLESS,
+    "HARMLESS": HARMLESS,
+    "LISTS": LISTS,
+    "LONG": LONG,
     "FRESH": FRESH,
     "FRESH_HERE": FRESH_HERE,
     "lend": lend,
@@ -85,18 +89,19 @@ class CompiledRuns:
                 self.whole = compiled
         return compiled
 
-    def of_changes(self, tokens: tuple[str, ...]) -> CompiledRun | None:
+    def of_changes(self, tokens: Collection[str]) -> CompiledRun | None:
         """Return the rerun of what depends on these source tokens, where everything else is up to date.
 
         None if it has not been repeated enough, or the graph has switches, which decide what depends on what.
         """
-        compiled = self._compiled.get(tokens)
-        if compiled is None and not self._program.switches and self._is_worth_it(tokens):
+        (key,) = tokens if len(tokens) == 1 else (tuple(tokens),)
+        compiled = self._compiled.get(key)
+        if compiled is None and not self._program.switches and self._is_worth_it(key):
             program = self._program
             slots = [program.slots[token] for token in tokens]
             readers = {index for slot in slots for index in program.consumers[slot]}
             steps = [program.steps[index] for index in sorted(program.downstream(readers, ()))]
-            compiled = self._compiled[tokens] = compile_run(program, steps, slots)
+            compiled = self._compiled[key] = compile_run(program, steps, slots)
         return compiled
 
     def _is_worth_it(self, key: Hashable) -> bool:
@@ -181,10 +186,26 @@ def _call(program: Program, step: Step, locked: set[int]) -> Iterator[str]:
     yield "start = clock()"
     yield f"made = f{step.place}({', '.join(args)})"
     yield "spent = clock() - start"
-    if not step.single:
-        yield f"made = unpack(program, steps[{step.place}], made)"
-    elif program.guard:
-        yield from _keep(is_read=bool(program.consumers[step.outputs[0]]))
+    if step.single and program.guard:
+        yield from _keep("made", is_read=bool(program.consumers[step.outputs[0]]))
+    elif not step.single:
+        yield from _unpack(program, step)
+
+
+def _unpack(program: Program, step: Step) -> Iterator[str]:
+    """Write out ``unpack``, for a tuple of as many values as there are output tokens."""
+    count = len(step.outputs)
+    items = [f"m{place}" for place in range(count)]
+    if not step.outputs:
+        return
+    yield f"if kind(made) is tuple and len(made) == {count}:"
+    yield f"    {', '.join(items)}, = made"
+    yield "    made = None"  # so that it does not count as one who knows the items
+    for item, slot in zip(items, step.outputs, strict=True):
+        if program.guard:
+            yield from (f"    {line}" for line in _keep(item, is_read=bool(program.consumers[slot])))
+    yield f"    made = {', '.join(items)},"
+    yield f"else: made = unpack(program, steps[{step.place}], made)"
 
 
 def _lend(name: str) -> Iterator[str]:
@@ -194,16 +215,17 @@ def _lend(name: str) -> Iterator[str]:
     yield "    if k is array:"
     yield f"        {name} = {name}.view()"
     yield f"        {name}.setflags(False)"
-    yield f"    else: {name} = lend({name})"
+    yield f"    elif k not in LISTS or len({name}) < LONG or kind({name}[0]) not in HARMLESS: {name} = lend({name})"
 
 
-def _keep(is_read: bool) -> Iterator[str]:
+def _keep(name: str, is_read: bool) -> Iterator[str]:
     """Write out ``keep``, for what it does to most values; an array that no function reads need not be locked."""
-    yield "k = kind(made)"
+    yield f"k = kind({name})"
     yield "if k not in ARRAYLESS:"
-    yield "    if k is array and made.base is None and count(made) <= FRESH_HERE:"
-    yield "        made.setflags(False)" if is_read else "        pass"
-    yield "    else: made = keep(made, FRESH)"
+    yield f"    if k is array and {name}.base is None and count({name}) <= FRESH_HERE:"
+    yield f"        {name}.setflags(False)" if is_read else "        pass"
+    yield f"    elif k not in LISTS or len({name}) < LONG or kind({name}[0]) not in HARMLESS:"
+    yield f"        {name} = keep({name}, FRESH)"
 
 
 def _store(step: Step, slot: int, made: str, is_checked: bool) -> Iterator[str]:

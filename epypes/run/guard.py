@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from itertools import islice
 from sys import getrefcount
 from typing import Any, Final, TypeVar
 
@@ -17,9 +16,12 @@ F = TypeVar("F", bound=Callable[..., Any])
 _MARK = "__epypes_unguarded__"
 # What holds no array, known at a glance: most values of a graph are looked at several times per run.
 ARRAYLESS: Final = frozenset({int, float, bool, str, bytes, complex, type(None)})
-# So many items of one type, none of them an array, tell that a long list holds none. Looking at each of 500
-# keypoints would take 10 us at every call.
-_TELLING_ITEMS: Final = 32
+# Of a long tuple or list the first item tells whether it holds arrays: to look at each of 500 keypoints would take
+# 10 us at every call, and much more when they are not in the caches.
+LONG: Final = 33
+LISTS: Final = frozenset({tuple, list})
+# Types of first items that were found to be no arrays.
+HARMLESS: Final[set[type]] = set()
 
 
 def unguarded(function: F) -> F:
@@ -142,14 +144,14 @@ def _keep_view(array: Any) -> Any:
 
 def _holds_arrays(value: Any) -> bool:
     """Whether a tuple, named tuple or list has an array among its items."""
-    kind = type(value)
-    if not (kind is tuple or kind is list or _is_named_tuple(value)):
+    if type(value) not in LISTS and not _is_named_tuple(value):
         return False
-    kinds = set(map(type, islice(value, _TELLING_ITEMS)))
-    if len(value) > _TELLING_ITEMS and (len(kinds) > 1 or type(None) in kinds):
-        kinds = set(map(type, value))
-    array = array_type()
-    return array is not None and any(issubclass(kind, array) for kind in kinds)
+    if len(value) < LONG or value[0] is None:
+        return any(map(is_array, value))
+    first = type(value[0])
+    if first not in HARMLESS and not is_array(value[0]):
+        HARMLESS.add(first)
+    return first not in HARMLESS
 
 
 def _make(kind: type) -> Any:

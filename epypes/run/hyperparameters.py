@@ -81,25 +81,26 @@ class Hyperparameters:
         HyperparameterError
             A function makes the token, or it is not a hyperparameter.
         """
+        program, entries, same_tokens = self.program, self.entries.copy(), True
         new: dict[str, Any] = {}
-        entries = self.entries.copy()
-        same_tokens = True
         for token, value in changes.items():
-            entry = entries.get(token)
+            kind, entry = type(value), entries.get(token)
             if entry is None:
                 (self.require_source if also_new else self.require)(token)
                 same_tokens = False
             # An integer, which most sliders give, is compared without a call.
-            elif entry[0] == value if type(value) is int is type(entry[0]) else is_same_value(entry[0], value):
+            elif entry[0] == value if kind is int is type(entry[0]) else is_same_value(entry[0], value):
                 continue
-            if token in self.program.selectors:
+            if program.selectors:
                 self.require_branch(token, value)
-            new[token] = value = value if type(value) in ARRAYLESS or not self.program.guard else lend(value)
+            if program.guard and kind not in ARRAYLESS:
+                value = lend(value)
+            new[token] = value
             entries[token] = (value,)
         if not new:
             return self
         revision = self.revision
-        return Hyperparameters(self.program, entries, revision + 1, new, revision if same_tokens else -1)
+        return Hyperparameters(program, entries, revision + 1, new, revision if same_tokens else -1)
 
     def unfrozen(self, token: str) -> Hyperparameters:
         """Return these without a token, which becomes a free source token."""

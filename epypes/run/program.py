@@ -5,7 +5,7 @@ A graph is compiled once: tokens become slot numbers, functions become steps in 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import BuiltinFunctionType
 from typing import Any, NamedTuple
 
@@ -146,3 +146,12 @@ def _steps(cg: CompGraph, slots: dict[str, int]) -> Iterable[Step]:
             as_switch(function) if name in switches else None,
             contracts if any(contracts := contracts_of(function, len(read), len(written))) else None,
         )
+
+
+def longest_path_ns(program: Program, durations_ns: Mapping[int, int]) -> int:
+    """Return how long those functions take that need each other's outputs one after another, at most."""
+    ends_ns: dict[int, int] = {}
+    for place in sorted(durations_ns):
+        makers = {program.makers[slot] for slot in program.steps[place].inputs}
+        ends_ns[place] = durations_ns[place] + max((ends_ns.get(maker, 0) for maker in makers), default=0)
+    return max(ends_ns.values(), default=0)

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, overload
 
-from epypes.run.program import Program
+from epypes.run.program import Program, longest_path_ns
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -90,12 +90,7 @@ class RunReport:
     @property
     def critical_path_ns(self) -> int:
         """The longest time that functions which need each other's outputs took one after another, in nanoseconds."""
-        program, ran_ns = self._program, self._ran_ns()
-        ends_ns: dict[int, int] = {}
-        for index in sorted(ran_ns):
-            makers = {program.makers[slot] for slot in program.steps[index].inputs}
-            ends_ns[index] = ran_ns[index] + max((ends_ns.get(maker, 0) for maker in makers), default=0)
-        return max(ends_ns.values(), default=0)
+        return longest_path_ns(self._program, self._ran_ns())
 
     @property
     def overhead_ns(self) -> int:

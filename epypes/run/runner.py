@@ -30,6 +30,9 @@ class CompGraphRunner:
         The graph.
     hparams
         Values of hyperparameter tokens; source tokens that are not among them are free: ``run`` takes them.
+    workers
+        How many functions may run at once, in threads. They run side by side where that is faster, which is tried; the
+        results, the order of the report and the errors are those of one after another.
     guard
         Whether functions get arrays as read-only views.
 
@@ -55,15 +58,20 @@ class CompGraphRunner:
     7
     """
 
-    def __init__(self, cg: CompGraph, hparams: Mapping[str, Any] | None = None, *, guard: bool = True) -> None:
+    def __init__(
+        self, cg: CompGraph, hparams: Mapping[str, Any] | None = None, *, workers: int = 1, guard: bool = True
+    ) -> None:
         if not isinstance(cg, CompGraph):
             kind = type(cg).__name__
             raise TypeError(f"A CompGraphRunner runs a CompGraph, not {kind!r}: CompGraphRunner(cg, hparams).")
+        if type(workers) is not int or workers < 1:
+            raise ValueError(f"workers is how many functions may run at once, 1 or more, not {workers!r}.")
         self.cg = cg
+        self.workers = workers
         self.guard = guard
         self.reports = Reports()
         self._program = Program(cg, guard)
-        self._attempts = Attempts(self._program)
+        self._attempts = Attempts(self._program, workers)
         self._lock = threading.Lock()
         self._last: Run | None = None
         given = {**cg.defaults, **(hparams or {})}
@@ -111,7 +119,7 @@ class CompGraphRunner:
             for token in payload:
                 hparams.require_branch(token, payload[token])
         attempts, has_payload = self._attempts, len(payload) == len(free)
-        compiled = attempts.compiled.whole
+        compiled = attempts.short_way.whole
         if compiled is None or targets or not has_payload:
             return self._ended(attempts.whole(values, has_payload, targets, start_ns), hparams)
         # The way of a stream of images: as short as can be.
@@ -148,21 +156,21 @@ class CompGraphRunner:
             free = self.free_source_tokens
             text = f"Nothing has been run yet, so there is no payload. Call {run_call(free)} first."
             raise PayloadError(free, text)
-        stored, freshness, before, *_ = last.record
-        compiled = None
+        stored, freshness, before, _, _ = last.record
+        compiled, changed = None, hparams.changed
         if freshness.is_clean and not targets and hparams.follows == before.revision:
-            compiled = attempts.compiled.of_changes(tuple(hparams.changed))
+            compiled = attempts.short_way.of_changes(changed)
         if compiled is None:
             return self._ended(attempts.stale(self._draft(last, hparams), targets, start_ns), hparams)
         # The way of a slider: as short as can be.
         values = stored.copy()
         slots = self._program.slots
-        for token, value in hparams.changed.items():
-            values[slots[token]] = value
+        for token in changed:
+            values[slots[token]] = changed[token]
         try:
             durations_ns = compiled(values)
         except StepFailed as failed:
-            return self._ended(attempts.rerun_broken_off(values, stored, failed, hparams.changed, start_ns), hparams)
+            return self._ended(attempts.rerun_broken_off(values, stored, failed, changed, start_ns), hparams)
         times = (self._program, None, durations_ns, perf_counter_ns() - start_ns, False)
         run = self._last = Run((values, freshness, hparams, times, None))
         self.reports.kept.append(times)

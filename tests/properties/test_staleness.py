@@ -1,98 +1,320 @@
-"""After any sequence of edits, what can be read equals a from-scratch run, and nothing ran in vain."""
+"""After any sequence of edits, what can be read equals a run from scratch, and nothing ran in vain.
+
+A machine edits, runs and reads a random graph beside a model of a few lines: a dictionary of values, each with a
+version, and for each function the versions that it last ran with. Values are integers and None; functions have any
+number of inputs and outputs, fail now and then, are switches or placeholders.
+"""
 
 from __future__ import annotations
+
+import itertools
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
 
 import epypes as ep
-from epypes.errors import NotComputed
+from epypes.errors import NotComputed, PayloadError, PlaceholderNeeded
+from epypes.run import attempt, compiled, gain
+from epypes.run.call import StepFailed
+from epypes.run.draft import Draft
+from epypes.run.engine import execute
+from epypes.run.parallel import execute_side_by_side
+from epypes.run.program import Program
 
-PRIME = 10_007
+NOTHING = object()
+VALUES = st.integers(0, 4)
 
 
 class Recorded:
-    """A function of integers that records what it was called with; fails on multiples of seven if told so."""
+    """A function of integers and None that counts its calls; fails on some inputs, passes some values through."""
 
     def __init__(self, index: int, outputs: int, fails: bool):
         self.index, self.outputs, self.fails = index, outputs, fails
-        self.calls: list[tuple[int, ...]] = []
+        self.calls = 0
+
+    def compute(self, *args):
+        total = (self.index + 1) * 31 + sum(
+            (place + 2) * (-3 if arg is None else arg) for place, arg in enumerate(args)
+        )
+        if self.fails and total % 5 == 0:
+            raise ArithmeticError(total)
+        values = tuple(None if (total + place) % 7 == 0 else (total + place) % 4 for place in range(self.outputs))
+        return values if self.outputs != 1 else values[0]
 
     def __call__(self, *args):
-        self.calls.append(args)
-        total = (self.index + 1) * 31 + sum((place + 2) * arg for place, arg in enumerate(args))
-        if self.fails and total % 7 == 0:
-            raise ArithmeticError(total)
-        values = tuple((total * (place + 3)) % PRIME for place in range(self.outputs))
-        return values if self.outputs != 1 else values[0]
+        self.calls += 1
+        return self.compute(*args)
 
 
 @st.composite
-def graphs(draw):
-    """Return functions, io and hyperparameter names of a random bipartite DAG."""
-    functions, io = {}, {}
-    tokens = [f"s{index}" for index in range(draw(st.integers(1, 4)))]
+def graphs(draw, placeholders=True):
+    """Return functions and io of a random graph, its source tokens and the selectors of its switches."""
+    functions, io, selectors = {}, {}, {}
+    tokens = [f"s{index}" for index in range(draw(st.integers(1, 3)))]
     sources = list(tokens)
     for index in range(draw(st.integers(1, 8))):
-        inputs = draw(st.lists(st.sampled_from(tokens), max_size=3))
-        count = draw(st.integers(0, 3))
-        outputs = [f"t{index}_{place}" for place in range(count)]
-        functions[f"f{index}"] = (index, count, draw(st.booleans()) and draw(st.booleans()))
-        io[f"f{index}"] = (tuple(inputs), outputs[0] if count == 1 else tuple(outputs) if outputs else None)
-        tokens += outputs
-    return functions, io, sources, tokens
+        kind = draw(st.sampled_from(["plain"] * 6 + ["switch", "placeholder"]))
+        inputs = tuple(draw(st.lists(st.sampled_from(tokens), max_size=3)))
+        name, made = f"f{index}", [f"t{index}_{place}" for place in range(draw(st.integers(0, 3)))]
+        if kind == "switch" and inputs:
+            selector = f"by{index}"
+            graph = ep.switch(name, dict(enumerate(inputs)), by=selector, output=f"t{index}")
+            functions[name], io[name] = graph.functions[name], graph.func_io[name]
+            selectors[selector], made = len(inputs), [f"t{index}"]
+            sources.append(selector)
+        else:
+            fails = draw(st.integers(0, 4)) == 0
+            functions[name] = Recorded(index, len(made), fails)
+            io[name] = (inputs, made[0] if len(made) == 1 else tuple(made) if made else None)
+            if kind == "placeholder" and placeholders:
+                functions[name] = ep.Placeholder()
+        tokens += made
+    return functions, io, sources, selectors
 
 
-def build(functions, io):
-    return ep.CompGraph({name: Recorded(*made) for name, made in functions.items()}, io)
+class Model:
+    """What the runner must know, in a few lines."""
+
+    def __init__(self, cg, selectors):
+        self.cg, self.selectors = cg, selectors
+        self.values, self.versions, self.ran = {}, {}, {}
+        self.count = itertools.count(1)
+
+    def put(self, token, value):
+        if token not in self.values or self.values[token] is NOTHING or self.values[token] != value:
+            self.values[token], self.versions[token] = value, next(self.count)
+
+    def reads(self, name):
+        inputs = self.cg.func_inputs(name)
+        if name in self.cg.switches and inputs[0] in self.values:
+            return inputs[0], inputs[1 + self.values[inputs[0]]]
+        return inputs
+
+    def used(self, name):
+        return tuple((token, self.versions.get(token)) for token in self.reads(name))
+
+    def wanted(self, targets):
+        if targets:
+            found, pending = set(), [self.cg.digraph.producer.get(token) for token in targets]
+            while pending:
+                name = pending.pop()
+                if name is not None and name not in found:
+                    found.add(name)
+                    pending += [self.cg.digraph.producer.get(token) for token in self.reads(name)]
+            return [name for name in self.cg.functions if name in found]
+        kept = []
+        for name in reversed(self.cg.functions):
+            readers = [
+                (reader, token)
+                for token in self.cg.func_outputs(name)
+                for reader in self.cg.digraph.consumers.get(token, ())
+            ]
+            if not readers or any(reader in kept and token in self.reads(reader) for reader, token in readers):
+                kept.append(name)
+        return kept[::-1]
+
+    def missing(self, wanted):
+        read = {token for name in wanted for token in self.reads(name)}
+        return {token for token in read if token in self.cg.source_tokens and token not in self.values}
+
+    def run(self, wanted):
+        """Run what is out of date; return the functions that were called and whether one failed."""
+        called = []
+        for name in wanted:
+            if self.ran.get(name) == self.used(name):
+                continue
+            called.append(name)
+            function, inputs = self.cg.functions[name], [self.values[token] for token in self.reads(name)]
+            try:
+                made = inputs[1] if name in self.cg.switches else function.compute(*inputs)
+            except ArithmeticError:
+                self.forget(name)
+                return called, True
+            outputs = self.cg.func_outputs(name)
+            self.ran[name] = self.used(name)
+            for token, value in zip(outputs, (made,) if len(outputs) == 1 else made, strict=True):
+                self.put(token, value)
+        return called, False
+
+    def forget(self, name):
+        self.ran.pop(name, None)
+        for token in self.cg.func_outputs(name):
+            self.values[token] = NOTHING
+            for reader in self.cg.digraph.consumers.get(token, ()):
+                if token in self.reads(reader):
+                    self.forget(reader)
+
+    def is_fresh(self, token):
+        maker = self.cg.digraph.producer.get(token)
+        if maker is None:
+            return token in self.values
+        reads = self.reads(maker)
+        return self.ran.get(maker) == self.used(maker) and all(map(self.is_fresh, reads))
 
 
-def attempt(runner, call):
-    """Run, and return the run even if a function failed."""
-    try:
-        return call()
-    except ArithmeticError:
-        return runner.last
+class Machine(RuleBasedStateMachine):
+    workers = 1
+
+    @initialize(graph=graphs(), data=st.data())
+    def begin(self, graph, data):
+        self.functions, self.io, self.sources, self.selectors = graph
+        self.sources = [token for token in self.sources if any(token in read for read, _ in self.io.values())]
+        hparams = [token for token in self.sources if token in self.selectors or data.draw(st.booleans())]
+        self.hparams = {token: self.draw_value(data, token) for token in hparams}
+        self.start()
+
+    def start(self):
+        self.cg = ep.CompGraph(self.functions, self.io)
+        self.runner = ep.CompGraphRunner(self.cg, self.hparams, workers=self.workers)
+        self.model = Model(self.cg, self.selectors)
+        self.has_run = False
+
+    def draw_value(self, data, token):
+        if token in self.selectors:
+            return data.draw(st.integers(0, self.selectors[token] - 1))
+        return data.draw(st.one_of(VALUES, st.none()))
+
+    def draw_targets(self, data):
+        return data.draw(st.lists(st.sampled_from(self.cg.tokens), max_size=2)) if self.cg.tokens else []
+
+    def calls(self):
+        return {name: function.calls for name, function in self.cg.functions.items() if isinstance(function, Recorded)}
+
+    def attempt(self, run, targets):
+        """Run in the runner and in the model; both must call the same functions and end in the same way."""
+        for token, value in self.hparams.items():
+            self.model.put(token, value)
+        wanted, before = self.model.wanted(targets), self.calls()
+        placeholders = [name for name in wanted if name in self.cg.placeholders]
+        missing = set() if placeholders else self.model.missing(wanted)
+        if placeholders or missing:
+            with pytest.raises(PlaceholderNeeded if placeholders else PayloadError) as error:
+                run()
+            told = error.value.functions if placeholders else error.value.tokens
+            assert set(told) == set(placeholders or missing)
+            return
+        called, failed = self.model.run(wanted)
+        if failed:
+            with pytest.raises(ArithmeticError):
+                run()
+        else:
+            run()
+        self.has_run = True
+        now = self.calls()
+        assert {name: now[name] - before[name] for name in now} == {name: int(name in called) for name in now}
+        assert self.runner.last.report.ran == tuple(called)
+
+    @rule(data=st.data())
+    def run(self, data):
+        free = [token for token in self.sources if token not in self.hparams]
+        given = [token for token in free if data.draw(st.integers(0, 9))]
+        payload = {token: self.draw_value(data, token) for token in given}
+        targets = self.draw_targets(data)
+        fresh = Model(self.cg, self.selectors)
+        for token, value in payload.items():
+            fresh.put(token, value)
+        old, self.model = self.model, fresh
+        count = len(self.runner.reports)
+        self.attempt(lambda: self.runner.run(*targets, **payload), targets)
+        if len(self.runner.reports) == count:
+            self.model = old  # refused: the last run stands
+
+    @precondition(lambda self: self.has_run)
+    @rule(data=st.data())
+    def rerun(self, data):
+        changes = {}
+        if self.hparams:
+            changed = data.draw(st.lists(st.sampled_from(sorted(self.hparams)), max_size=2, unique=True))
+            changes = {token: self.draw_value(data, token) for token in changed}
+        self.hparams.update(changes)
+        targets = self.draw_targets(data)
+        self.attempt(lambda: self.runner.rerun(*targets, **changes), targets)
+
+    @precondition(lambda self: self.hparams)
+    @rule(data=st.data())
+    def set(self, data):
+        token = data.draw(st.sampled_from(sorted(self.hparams)))
+        self.runner[token] = self.hparams[token] = self.draw_value(data, token)
+
+    @rule(data=st.data())
+    def freeze_or_unfreeze(self, data):
+        tokens = [token for token in self.sources if token not in self.selectors]
+        if not tokens:
+            return
+        token = data.draw(st.sampled_from(tokens))
+        if token in self.hparams:
+            del self.hparams[token]
+            self.runner.unfreeze(token)
+        else:
+            self.hparams[token] = self.draw_value(data, token)
+            self.runner.freeze(**{token: self.hparams[token]})
+
+    @precondition(lambda self: self.cg.placeholders)
+    @rule(data=st.data())
+    def fill(self, data):
+        name = data.draw(st.sampled_from(self.cg.placeholders))
+        outputs = self.cg.func_outputs(name)
+        self.functions = {**self.functions, name: Recorded(99, len(outputs), False)}
+        self.cg = ep.extend(self.cg, {name: self.functions[name]})
+        self.start()
+
+    @invariant()
+    def what_can_be_read_is_what_the_model_says(self):
+        now = Model(self.cg, self.selectors)
+        now.values, now.versions, now.ran = dict(self.model.values), dict(self.model.versions), self.model.ran
+        now.count = self.model.count
+        for token, value in self.hparams.items():
+            now.put(token, value)
+        for token in self.cg.tokens:
+            if now.is_fresh(token) and (self.has_run or token in self.hparams):
+                assert self.runner[token] == now.values[token]
+                assert token in self.runner
+            else:
+                with pytest.raises(NotComputed):
+                    self.runner[token]
+                assert token not in self.runner
 
 
-def from_scratch(functions, io, hparams, payload, *targets):
-    runner = ep.CompGraphRunner(build(functions, io), hparams)
-    return attempt(runner, lambda: runner.run(*targets, **payload))
+MACHINE = settings(max_examples=60, stateful_step_count=12, deadline=None)
+
+
+@pytest.mark.parametrize("way", ["the loop", "compiled at once", "in threads"])
+def test_after_any_edits_what_is_read_equals_a_run_from_scratch_and_nothing_runs_in_vain(way, monkeypatch):
+    monkeypatch.setattr(compiled, "_RUNS_BEFORE", 0 if way == "compiled at once" else 10_000)
+    Machine.workers = 1
+    if way == "in threads":
+        Machine.workers = 2
+        monkeypatch.setattr(attempt, "has_independent_steps", lambda program: True)
+        monkeypatch.setattr(gain.Gain, "is_worth_it", lambda self: True)
+    run_state_machine_as_test(Machine, settings=MACHINE)
 
 
 @settings(max_examples=150, deadline=None)
-@given(graphs(), st.data())
-def test_readable_tokens_always_equal_a_run_from_scratch(parts, data):
-    functions, io, sources, _ = parts
-    cg = build(functions, io)
-    used = [token for token in sources if token in cg.tokens]
-    hparams = dict.fromkeys(used[: len(used) // 2 + 1], 1)
-    payload = {token: 2 for token in used if token not in hparams}
-    runner = ep.CompGraphRunner(cg, hparams)
-    attempt(runner, lambda: runner.run(**payload))
-    edits = st.dictionaries(st.sampled_from(sorted(hparams)), st.integers(0, 5), max_size=2) if hparams else st.just({})
-    wanted = st.lists(st.sampled_from(cg.tokens), max_size=2) if cg.tokens else st.just([])
-    for changes, targets in data.draw(st.lists(st.tuples(edits, wanted), min_size=1, max_size=5)):
-        before = {name: len(function.calls) for name, function in cg.functions.items()}
-        for token, value in changes.items():
-            runner[token] = value
-        hparams.update(changes)
-        stale = set(runner.stale)
-        run = attempt(runner, lambda targets=targets: runner.rerun(*targets))
-        times = {name: len(function.calls) - before[name] for name, function in cg.functions.items()}
-        assert {name for name, count in times.items() if count} <= stale, "a function ran whose inputs did not change"
-        assert max(times.values(), default=0) <= 1
-        check_against_scratch(run, from_scratch(functions, io, hparams, payload), functions, io, hparams, payload)
-
-
-def check_against_scratch(run, expected, functions, io, hparams, payload):
-    for token in run.cg.tokens:
-        if token not in run:
-            with pytest.raises(NotComputed):
-                run[token]
-        elif token in expected:
-            assert run[token] == expected[token]
-        else:
-            # The run from scratch ended in a failure before it came here; the token by itself must be reachable.
-            assert from_scratch(functions, io, hparams, payload, token)[token] == run[token]
+@given(graphs(placeholders=False), st.data())
+def test_side_by_side_ends_as_one_after_another(graph, data):
+    functions, io, _, selectors = graph
+    cg = ep.CompGraph(functions, io)
+    program = Program(cg, True)
+    values = [
+        0 if token in selectors else data.draw(VALUES) if program.makers[slot] < 0 else NOTHING
+        for slot, token in enumerate(cg.tokens)
+    ]
+    ends = []
+    for run in (execute, lambda *args: execute_side_by_side(*args, 3)):
+        draft, durations = Draft.of_sources(program, values.copy(), True), {}
+        failed = None
+        try:
+            run(draft, None, durations)
+        except StepFailed as step_failed:
+            failed = step_failed.place
+        ends.append((draft.values, bytes(draft.dirty), set(durations), failed))
+    assert ends[0] == ends[1]
