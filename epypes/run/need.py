@@ -1,7 +1,7 @@
 """Which functions does a run need?
 
-Without targets every function, except what a switch makes superfluous: a function is left out when all that it makes
-goes to branches that are not chosen. With targets, what they depend on.
+With targets, what they depend on. Without, every function, except what a switch makes superfluous: a function is left
+out when all that it makes goes to branches that are not chosen. One that makes a sink token is always run.
 """
 
 from __future__ import annotations
@@ -41,12 +41,14 @@ def _upstream(program: Program, values: Sequence[Any], targets: Iterable[str]) -
 
 
 def _without_superfluous(program: Program, values: Sequence[Any]) -> bytes:
-    """Leave out what is read by somebody, but only by branches that are not chosen and by what is left out itself."""
+    """Leave out what makes no sink token and is read only by branches not chosen and by what is left out itself."""
     wanted = bytearray(b"\1") * len(program.steps)
     read = {index: program.read_by(program.steps[index], values) for index in program.switches}
     for step in reversed(program.steps):
         readers = [(index, slot) for slot in step.outputs for index in program.consumers[slot]]
-        if readers and not any(wanted[index] and slot in read.get(index, (slot,)) for index, slot in readers):
+        makes_sink = not all(program.consumers[slot] for slot in step.outputs)
+        is_read = any(wanted[index] and slot in read.get(index, (slot,)) for index, slot in readers)
+        if readers and not makes_sink and not is_read:
             wanted[step.place] = 0
     return bytes(wanted)
 
