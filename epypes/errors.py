@@ -57,8 +57,8 @@ class Finding:
     kind
         ``"cycle"``, ``"two producers"``, ``"no io"``, ``"no function"``, ``"bad io"``, ``"arity"``,
         ``"not callable"``, ``"selector"``, ``"types"`` or ``"colour"``; where a graph is made of
-        functions or of graphs also ``"no name"``, ``"no signature"``, ``"two functions"``, ``"one name"``, ``"defaults"`` or
-        ``"not a placeholder"``.
+        functions or of graphs also ``"no name"``, ``"no signature"``, ``"two functions"``, ``"one name"``,
+        ``"defaults"`` or ``"not a placeholder"``.
     text
         What is wrong and the way out, as a sentence.
     names

@@ -8,13 +8,13 @@ from __future__ import annotations
 import ast
 import builtins
 import dataclasses
-import dis
 import types
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Annotated, Any, Final, get_origin
 
 from epypes.bundle.literal import is_data, literal_source
 from epypes.bundle.source import Definition, Importable, Refused, definition, importable
+from epypes.bundle.uses import global_names, submodules
 from epypes.hints import Param
 from epypes.images import Image
 from epypes.run.guard import is_plain_array
@@ -99,7 +99,7 @@ class Slice:
             return found
         self._seen.add(id(function))
         _check_defaults(found, what)
-        for name in _global_names(found, what):
+        for name in global_names(found, what):
             try:
                 self._add_name(name, found, what)
             except Refused as refusal:
@@ -198,7 +198,7 @@ class Slice:
             self._claim(name, ("object", id(module)), what)
             self.imports[name, module.__name__] = f"import {module.__name__} as {name}"
             return
-        for dotted in _submodules(found.node, name, module) or (name,):
+        for dotted in submodules(found.node, name, module) or (name,):
             self._import_module(dotted, what)
 
     def _import_module(self, module: str, what: str) -> None:
@@ -225,58 +225,6 @@ def _check_defaults(found: Definition, what: str) -> None:
         except ValueError:
             text = f"{what} has the default {ast.unparse(default)!r} ({found.place}), which is not a literal."
             raise Refused(f"{text} Write the value itself.") from None
-
-
-def _global_names(found: Definition, what: str) -> Iterator[str]:
-    """Return the global names that a function reads when it is called or defined, each once, in order of use."""
-    names: dict[str, None] = {}
-    for code in _nested_codes(found.function.__code__):
-        for instruction in dis.get_instructions(code):
-            if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
-                raise Refused(f"{what} changes the global {instruction.argval!r} ({found.place}). Return the value.")
-            if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
-                names[instruction.argval] = None
-    arguments = found.node.args
-    every = (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs, arguments.vararg, arguments.kwarg)
-    outside = [argument.annotation for argument in every if argument] + [found.node.returns]
-    for expression in (*outside, *found.node.decorator_list):
-        for node in ast.walk(expression) if expression else ():
-            if isinstance(node, ast.Name):
-                names[node.id] = None
-    return iter(names)
-
-
-def _nested_codes(code: types.CodeType) -> Iterator[types.CodeType]:
-    yield code
-    for constant in code.co_consts:
-        if isinstance(constant, types.CodeType):
-            yield from _nested_codes(constant)
-
-
-def _submodules(tree: ast.AST, name: str, module: types.ModuleType) -> tuple[str, ...]:
-    """Return the submodules that are reached as attributes (``skimage.filters``): each needs an import of its own."""
-    found: dict[str, None] = {}
-    for node in ast.walk(tree):
-        chain = _chain(node)
-        if chain and chain[0] == name:
-            reached: Any = module
-            dotted = name
-            for part in chain[1:]:
-                reached = getattr(reached, part, None)
-                if not isinstance(reached, types.ModuleType) or reached.__name__ != f"{dotted}.{part}":
-                    break
-                dotted = f"{dotted}.{part}"
-            if dotted != name:
-                found[dotted] = None
-    return tuple(found)
-
-
-def _chain(node: ast.AST) -> list[str]:
-    parts: list[str] = []
-    while isinstance(node, ast.Attribute):
-        parts.append(node.attr)
-        node = node.value
-    return [node.id, *reversed(parts)] if isinstance(node, ast.Name) and parts else []
 
 
 def slice_functions(gathered: Slice, functions: Sequence[tuple[str, Callable[..., Any]]]) -> list[str]:
