@@ -93,8 +93,10 @@ def assignment(targets: Sequence[str], is_single: bool, value: Piece, depth: int
         names = f"({names},)"
     whole = prefixed(f"{names} = ", value)
     first = whole.opening if isinstance(whole, Group) and whole.items else flat(whole)
+    pad = "    " * depth
+    if not is_single and len(targets) == 1 and not fits(depth, first):
+        return [f"{pad}{names} = (", *laid_out(value, depth + 1), f"{pad})"]
     if len(targets) > 1 and not fits(depth, first):
-        pad = "    " * depth
         exploded = [f"{pad}(", *(f"{pad}    {name}," for name in targets)]
         return [*exploded, *laid_out(prefixed(") = ", value), depth)]
     if isinstance(whole, str) and not fits(depth, whole) and fits(depth + 1, flat(value)):
