@@ -91,17 +91,21 @@ def assignment(targets: Sequence[str], is_single: bool, value: Piece, depth: int
     names = ", ".join(targets)
     if not is_single and len(targets) == 1:
         names = f"({names},)"
-    whole = prefixed(f"{names} = ", value)
-    first = whole.opening if isinstance(whole, Group) and whole.items else flat(whole)
     pad = "    " * depth
-    if not is_single and len(targets) == 1 and not fits(depth, first):
-        return [f"{pad}{names} = (", *laid_out(value, depth + 1), f"{pad})"]
-    if len(targets) > 1 and not fits(depth, first):
+    whole = prefixed(f"{names} = ", value)
+    if fits(depth, _first(whole)):
+        return laid_out(whole, depth)
+    if len(targets) > 1:
         exploded = [f"{pad}(", *(f"{pad}    {name}," for name in targets)]
         return [*exploded, *laid_out(prefixed(") = ", value), depth)]
-    if isinstance(whole, str) and not fits(depth, whole) and fits(depth + 1, flat(value)):
-        return laid_out(Group(f"{names} = (", (value,), ")"), depth)
+    if fits(depth + 1, _first(value)):
+        return [f"{pad}{names} = (", *laid_out(value, depth + 1), f"{pad})"]
     return laid_out(whole, depth)
+
+
+def _first(piece: Piece) -> str:
+    """Return what of a piece can't be moved to the next line."""
+    return piece.opening if isinstance(piece, Group) and piece.items else flat(piece)
 
 
 def condition(keyword: str, left: str, operator: str, right: Piece, depth: int) -> list[str]:
