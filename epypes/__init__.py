@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from epypes import errors
-    from epypes.bundle import load, load_pipeline, promote, verify
+    from epypes.bundle import load, load_pipeline, promote, to_source, verify
     from epypes.graph import CompGraph, Placeholder, extend, outputs, rename, subgraph, suffix, switch, union
     from epypes.hints import Param
     from epypes.images import Image
@@ -75,6 +75,7 @@ _HOMES = {
     "load": "epypes.bundle",
     "load_pipeline": "epypes.bundle",
     "promote": "epypes.bundle",
+    "to_source": "epypes.bundle",
     "verify": "epypes.bundle",
 }
 
@@ -112,6 +113,7 @@ __all__ = [
     "subgraph",
     "suffix",
     "switch",
+    "to_source",
     "unguarded",
     "union",
     "verify",

@@ -14,6 +14,7 @@ Everything an error's text mentions is an attribute of it::
     +-- ContractBroken          a value is not the image that an annotation says; .function, .token
     +-- StillRunning            something did not stop in time; .name, .functions, .timeout_s
     +-- MailboxOverflow         a mailbox with policy "fault" is full; .size
+    +-- SourceRefused           a graph can't be written as one function; .reasons
     +-- LayoutUnavailable       no Graphviz engine answers; .tried
     +-- ImageFileError          an image file can't be read or written; .path
     +-- MessageError            a message can't be made or understood; .reason
@@ -185,6 +186,14 @@ class MailboxOverflow(EpypesError):
     def __init__(self, size: int) -> None:
         self.size = size
         super().__init__(f"The mailbox is full ({size}) and its policy is 'fault'. Take faster, or drop.")
+
+
+class SourceRefused(EpypesError):
+    """A graph that can't be written as one Python function; ``reasons`` lists all of them."""
+
+    def __init__(self, reasons: Sequence[str]) -> None:
+        self.reasons = tuple(reasons)
+        super().__init__("Not written:\n" + "\n".join(f"- {reason}" for reason in self.reasons))
 
 
 class LayoutUnavailable(EpypesError):

@@ -27,7 +27,7 @@ def emit_module(settings: Settings, cg: CompGraph, needed: Slice, references: Ma
     ends = f"{', '.join(settings.inputs) or 'nothing'} -> {', '.join(settings.outputs)}"
     sections = [f'"""{_escaped(f"The computational graph {settings.name}: {ends}.")}"""\n']
     if needed.imports:
-        sections.append("\n".join(_ordered_imports(list(needed.imports.values()))) + "\n")
+        sections.append("\n".join(ordered_imports(list(needed.imports.values()))) + "\n")
     if needed.constants:
         sections.append("".join(f"{constant} = {source}\n" for constant, source in needed.constants.items()))
     body = "\n".join(sections)
@@ -45,7 +45,7 @@ def _escaped(text: str) -> str:
     return json.dumps(text)[1:-1]
 
 
-def _ordered_imports(statements: Sequence[str]) -> list[str]:
+def ordered_imports(statements: Sequence[str]) -> list[str]:
     """Sort as linters want it: plain imports first, then from-imports, each by name."""
     return sorted(dict.fromkeys(statements), key=lambda statement: (statement.startswith("from"), statement))
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 import ast
 import builtins
 import dataclasses
-import dis
 import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Annotated, Any, Final, get_origin
 
+from epypes.bundle.literal import is_data, literal_source
 from epypes.bundle.source import Definition, Importable, Refused, definition, importable
+from epypes.bundle.uses import global_names, submodules
 from epypes.hints import Param
 from epypes.images import Image
 from epypes.run.guard import is_plain_array
@@ -24,6 +25,11 @@ RESERVED: Final = frozenset({"func_dict", "func_io"})
 
 class Slice:
     """What a module needs, gathered from several functions.
+
+    Parameters
+    ----------
+    reserved
+        The names that the module keeps for the graph.
 
     Attributes
     ----------
@@ -37,7 +43,8 @@ class Slice:
         Why something can't be promoted.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, reserved: Collection[str] = RESERVED) -> None:
+        self.reserved = reserved
         self.imports: dict[tuple[str, str], str] = {}
         self.constants: dict[str, str] = {}
         self.definitions: dict[str, Definition] = {}
@@ -45,17 +52,38 @@ class Slice:
         self._meanings: dict[str, tuple[str, object]] = {}
         self._seen: set[int] = set()
 
-    def add_graph_function(self, name: str, function: Callable[..., Any]) -> str:
-        """Add a function of the graph; return the expression by which the module refers to it."""
-        what = f"Function {name!r}"
+    def add_graph_function(self, what: str, function: Callable[..., Any]) -> str:
+        """Add a function of the graph; return the expression by which the module refers to it.
+
+        ``what`` is how reasons call it, as ``"Function 'blur'"``.
+        """
         home = importable(function)
         try:
-            if home is None:
-                return self._add_definition(function, what).name
-            return f"{self._module_name(home.module, what)}.{home.qualname}"
+            return self._add_definition(function, what).name if home is None else self.reference(home, what)
         except Refused as refusal:
             self.refusals.append(str(refusal))
             return "None"
+
+    def reference(self, home: Importable, what: str) -> str:
+        """Return the expression for what can be imported: ``cv2.Canny``, or ``len``, which needs no import."""
+        top = home.qualname.partition(".")[0]
+        builtin = ("builtin", top)
+        if home.module == "builtins" and self._meanings.setdefault(top, builtin) == builtin:
+            return home.qualname
+        return f"{self._module_name(home.module, what)}.{home.qualname}"
+
+    def is_taken(self, name: str) -> bool:
+        """Whether a name means something in the module already."""
+        return name in self.reserved or name in self._meanings or hasattr(builtins, name)
+
+    def add_made_constant(self, name: str, source: str) -> None:
+        """Add a constant under a name that is not taken."""
+        self._claim(name, ("constant", name), f"Constant {name!r}")
+        self.constants[name] = source
+
+    def keep_name(self, name: str) -> None:
+        """Keep a name that is not taken for what is written below the functions."""
+        self._claim(name, ("kept", name), f"Function {name!r}")
 
     def _module_name(self, module: str, what: str) -> str:
         """Import a module, unless a function has brought it already under a name of its own (``np``)."""
@@ -71,7 +99,7 @@ class Slice:
             return found
         self._seen.add(id(function))
         _check_defaults(found, what)
-        for name in _global_names(found, what):
+        for name in global_names(found, what):
             try:
                 self._add_name(name, found, what)
             except Refused as refusal:
@@ -81,7 +109,7 @@ class Slice:
 
     def _claim(self, name: str, meaning: tuple[str, object], what: str) -> None:
         """Make a name mean one thing in the module."""
-        if name in RESERVED:
+        if name in self.reserved:
             raise Refused(f"{what} uses the name {name!r}, which the module keeps for the graph. Rename it.")
         if self._meanings.setdefault(name, meaning) != meaning:
             raise Refused(
@@ -100,7 +128,7 @@ class Slice:
         if isinstance(value, types.ModuleType):
             self._add_module(name, value, found, what)
             return
-        home = importable(value, name) if callable(value) or not _is_data(value) else None
+        home = importable(value, name) if callable(value) or not is_data(value) else None
         if home is not None:
             self._claim(name, ("object", id(value)), what)
             self._import_from(home, name)
@@ -119,9 +147,9 @@ class Slice:
 
     def _add_constant(self, name: str, value: Any, found: Definition, what: str) -> None:
         if is_plain_array(value):
-            source = self._array_source(value, what)
+            source = self.array_source(value, what)
         else:
-            source = self._annotation_source(value, what) or _literal_source(value)
+            source = self.annotation_source(value, what) or literal_source(value)
         if not source or len(source) > _CONSTANT_CHARACTERS:
             kind = f"the class {name!r}" if isinstance(value, type) else f"of type {type(value).__name__}"
             raise Refused(
@@ -134,17 +162,17 @@ class Slice:
             self._claim(name, ("constant", name), what)
             self.constants[name] = source
 
-    def _annotation_source(self, value: Any, what: str) -> str:
+    def annotation_source(self, value: Any, what: str) -> str:
         """Return the source of a mark, or of ``Annotated`` with marks, as annotations use them; "" for any other."""
         if isinstance(value, Image | Param):
             given = [(field.name, getattr(value, field.name), field.default) for field in dataclasses.fields(value)]
-            words = [(name, _literal_source(setting)) for name, setting, default in given if setting != default]
+            words = [(name, literal_source(setting)) for name, setting, default in given if setting != default]
             if not all(source for _, source in words):
                 return ""
             listed = ", ".join(f"{name}={source}" for name, source in words)
             return f"{self._module_name('epypes', what)}.{type(value).__name__}({listed})"
         home = importable(value.__origin__) if get_origin(value) is Annotated else None
-        parts = [self._annotation_source(mark, what) for mark in value.__metadata__] if home else [""]
+        parts = [self.annotation_source(mark, what) for mark in value.__metadata__] if home else [""]
         if home is None or not all(parts):
             return ""
         plain = (
@@ -152,7 +180,7 @@ class Slice:
         )
         return f"{self._module_name('typing', what)}.Annotated[{plain}, {', '.join(parts)}]"
 
-    def _array_source(self, array: Any, what: str) -> str:
+    def array_source(self, array: Any, what: str) -> str:
         """Return a small array of numbers as source that makes it again, to the last bit; "" for any other."""
         import numpy as np
 
@@ -170,7 +198,7 @@ class Slice:
             self._claim(name, ("object", id(module)), what)
             self.imports[name, module.__name__] = f"import {module.__name__} as {name}"
             return
-        for dotted in _submodules(found.node, name, module) or (name,):
+        for dotted in submodules(found.node, name, module) or (name,):
             self._import_module(dotted, what)
 
     def _import_module(self, module: str, what: str) -> None:
@@ -189,35 +217,6 @@ class Slice:
         self.imports[name, f"{home.module}.{top}"] = f"from {home.module} import {top}{alias}"
 
 
-def _is_data(value: object) -> bool:
-    kinds = (bool, int, float, complex, str, bytes, type(None), tuple, list, dict, set, frozenset)
-    return type(value) in kinds
-
-
-def _literal(value: Any) -> str:
-    """Return the source of a constant: as repr, but with sets sorted, whose order changes from process to process."""
-    if type(value) is set and value:
-        return "{" + ", ".join(sorted(map(_literal, value))) + "}"
-    if type(value) is dict:
-        return "{" + ", ".join(f"{_literal(key)}: {_literal(item)}" for key, item in value.items()) + "}"
-    if type(value) is list:
-        return "[" + ", ".join(map(_literal, value)) + "]"
-    if type(value) is tuple and len(value) != 1:
-        return "(" + ", ".join(map(_literal, value)) + ")"
-    return repr(value)
-
-
-def _literal_source(value: Any) -> str:
-    """Return the literal of this very value; "" if there is none."""
-    source = _literal(value) if _is_data(value) else ""
-    try:
-        read = ast.literal_eval(source)
-    except (ValueError, SyntaxError):
-        return ""
-    # By source: 0j == -0j, but they are not the same.
-    return source if type(read) is type(value) and _literal(read) == source else ""
-
-
 def _check_defaults(found: Definition, what: str) -> None:
     arguments = found.node.args
     for default in (*arguments.defaults, *(default for default in arguments.kw_defaults if default)):
@@ -228,56 +227,20 @@ def _check_defaults(found: Definition, what: str) -> None:
             raise Refused(f"{text} Write the value itself.") from None
 
 
-def _global_names(found: Definition, what: str) -> Iterator[str]:
-    """Return the global names that a function reads when it is called or defined, each once, in order of use."""
-    names: dict[str, None] = {}
-    for code in _nested_codes(found.function.__code__):
-        for instruction in dis.get_instructions(code):
-            if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
-                raise Refused(f"{what} changes the global {instruction.argval!r} ({found.place}). Return the value.")
-            if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
-                names[instruction.argval] = None
-    arguments = found.node.args
-    every = (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs, arguments.vararg, arguments.kwarg)
-    outside = [argument.annotation for argument in every if argument] + [found.node.returns]
-    for expression in (*outside, *found.node.decorator_list):
-        for node in ast.walk(expression) if expression else ():
-            if isinstance(node, ast.Name):
-                names[node.id] = None
-    return iter(names)
-
-
-def _nested_codes(code: types.CodeType) -> Iterator[types.CodeType]:
-    yield code
-    for constant in code.co_consts:
-        if isinstance(constant, types.CodeType):
-            yield from _nested_codes(constant)
-
-
-def _submodules(tree: ast.AST, name: str, module: types.ModuleType) -> tuple[str, ...]:
-    """Return the submodules that are reached as attributes (``skimage.filters``): each needs an import of its own."""
-    found: dict[str, None] = {}
-    for node in ast.walk(tree):
-        chain = _chain(node)
-        if chain and chain[0] == name:
-            reached: Any = module
-            dotted = name
-            for part in chain[1:]:
-                reached = getattr(reached, part, None)
-                if not isinstance(reached, types.ModuleType) or reached.__name__ != f"{dotted}.{part}":
-                    break
-                dotted = f"{dotted}.{part}"
-            if dotted != name:
-                found[dotted] = None
-    return tuple(found)
-
-
-def _chain(node: ast.AST) -> list[str]:
-    parts: list[str] = []
-    while isinstance(node, ast.Attribute):
-        parts.append(node.attr)
-        node = node.value
-    return [node.id, *reversed(parts)] if isinstance(node, ast.Name) and parts else []
+def slice_functions(gathered: Slice, functions: Sequence[tuple[str, Callable[..., Any]]]) -> list[str]:
+    """Add functions of graphs, each given with how reasons call it; return the expressions that refer to them."""
+    homes = {id(function): importable(function) for _, function in functions}
+    # The notebook's own functions first: they know by which names they import modules.
+    own_first = sorted(range(len(functions)), key=lambda index: homes[id(functions[index][1])] is not None)
+    references: dict[int, str] = {}
+    known: dict[int, str] = {}
+    for index in own_first:
+        what, function = functions[index]
+        refused = len(gathered.refusals)
+        references[index] = known.get(id(function)) or gathered.add_graph_function(what, function)
+        if len(gathered.refusals) == refused:
+            known[id(function)] = references[index]
+    return [references[index] for index in range(len(functions))]
 
 
 def slice_graph(functions: Mapping[str, Callable[..., Any]]) -> tuple[Slice, dict[str, str]]:
@@ -289,7 +252,5 @@ def slice_graph(functions: Mapping[str, Callable[..., Any]]) -> tuple[Slice, dic
         What the module needs, and by function of the graph the expression that refers to it.
     """
     gathered = Slice()
-    # The notebook's own functions first: they know by which names they import modules.
-    own_first = sorted(functions, key=lambda name: importable(functions[name]) is not None)
-    references = {name: gathered.add_graph_function(name, functions[name]) for name in own_first}
-    return gathered, {name: references[name] for name in functions}
+    references = slice_functions(gathered, [(f"Function {name!r}", function) for name, function in functions.items()])
+    return gathered, dict(zip(functions, references, strict=True))

@@ -12,9 +12,10 @@ import textwrap
 import types
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
+from epypes.graph import outputs
 from epypes.run.guard import unguarded
 
 
@@ -168,23 +169,37 @@ def place_of(code: types.CodeType) -> str:
 
 
 def _find(lines: list[str], code: types.CodeType) -> ast.FunctionDef | None:
+    return _definitions("".join(lines)).get((code.co_name, code.co_firstlineno))
+
+
+@lru_cache(maxsize=16)  # one cell often defines many functions
+def _definitions(source: str) -> dict[tuple[str, int], ast.FunctionDef]:
+    """Return the definitions in a cell by name and first line, decorators included."""
     try:
-        tree = ast.parse("".join(lines))
+        tree = ast.parse(source)
     except SyntaxError:
-        return None
+        return {}
+    found: dict[tuple[str, int], ast.FunctionDef] = {}
     for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef) and node.name == code.co_name:
+        if isinstance(node, ast.FunctionDef):
             first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
-            if first == code.co_firstlineno:
-                return node
-    return None
+            found.setdefault((node.name, first), node)
+    return found
 
 
 def _check_decorators(node: ast.FunctionDef, function: types.FunctionType, what: str, place: str) -> None:
     for decorator in node.decorator_list:
-        if _evaluated(decorator, function.__globals__) is not unguarded:
+        if not _is_our_mark(decorator, function.__globals__):
             text = f"{what} is decorated by @{ast.unparse(decorator)} ({place})."
             raise Refused(f"{text} Call the decorator's work inside the function.")
+
+
+def _is_our_mark(decorator: ast.expr, names: dict[str, Any]) -> bool:
+    """Whether a decorator is ``@ep.unguarded``, or ``@ep.outputs`` of literals: both return the function itself."""
+    if isinstance(decorator, ast.Call):
+        plain = not decorator.keywords and all(isinstance(name, ast.Constant) for name in decorator.args)
+        return plain and _evaluated(decorator.func, names) is outputs
+    return _evaluated(decorator, names) is unguarded
 
 
 def _evaluated(expression: ast.expr, names: dict[str, Any]) -> Any:

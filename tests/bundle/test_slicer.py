@@ -201,7 +201,7 @@ def test_library_functions_have_a_public_name(value, expected):
 
 
 def test_a_set_has_the_same_source_under_any_hash_seed():
-    code = "from epypes.bundle.slicer import _literal; print(_literal({'a': ({'x', 'y', 'z', 'w'}, [1], (2,), ())}))"
+    code = "from epypes.bundle.literal import literal; print(literal({'a': ({'x', 'y', 'z', 'w'}, [1], (2,), ())}))"
     texts = {
         subprocess.run(
             [sys.executable, "-c", code], env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, check=True

@@ -1,0 +1,63 @@
+"""Which names and modules from outside does a function use?"""
+
+from __future__ import annotations
+
+import ast
+import dis
+import types
+from collections.abc import Iterator
+from typing import Any
+
+from epypes.bundle.source import Definition, Refused
+
+
+def global_names(found: Definition, what: str) -> Iterator[str]:
+    """Return the global names that a function reads when it is called or defined, each once, in order of use."""
+    names: dict[str, None] = {}
+    for code in _nested_codes(found.function.__code__):
+        for instruction in dis.get_instructions(code):
+            if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
+                raise Refused(f"{what} changes the global {instruction.argval!r} ({found.place}). Return the value.")
+            if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
+                names[instruction.argval] = None
+    arguments = found.node.args
+    every = (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs, arguments.vararg, arguments.kwarg)
+    outside = [argument.annotation for argument in every if argument] + [found.node.returns]
+    for expression in (*outside, *found.node.decorator_list):
+        for node in ast.walk(expression) if expression else ():
+            if isinstance(node, ast.Name):
+                names[node.id] = None
+    return iter(names)
+
+
+def _nested_codes(code: types.CodeType) -> Iterator[types.CodeType]:
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, types.CodeType):
+            yield from _nested_codes(constant)
+
+
+def submodules(tree: ast.AST, name: str, module: types.ModuleType) -> tuple[str, ...]:
+    """Return the submodules that are reached as attributes (``skimage.filters``): each needs an import of its own."""
+    found: dict[str, None] = {}
+    for node in ast.walk(tree):
+        chain = _chain(node)
+        if chain and chain[0] == name:
+            reached: Any = module
+            dotted = name
+            for part in chain[1:]:
+                reached = getattr(reached, part, None)
+                if not isinstance(reached, types.ModuleType) or reached.__name__ != f"{dotted}.{part}":
+                    break
+                dotted = f"{dotted}.{part}"
+            if dotted != name:
+                found[dotted] = None
+    return tuple(found)
+
+
+def _chain(node: ast.AST) -> list[str]:
+    parts: list[str] = []
+    while isinstance(node, ast.Attribute):
+        parts.append(node.attr)
+        node = node.value
+    return [node.id, *reversed(parts)] if isinstance(node, ast.Name) and parts else []
