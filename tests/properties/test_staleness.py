@@ -118,7 +118,12 @@ class Model:
                 for token in self.cg.func_outputs(name)
                 for reader in self.cg.digraph.consumers.get(token, ())
             ]
-            if not readers or any(reader in kept and token in self.reads(reader) for reader, token in readers):
+            has_sink = any(token in self.cg.sink_tokens for token in self.cg.func_outputs(name))
+            if (
+                not readers
+                or has_sink
+                or any(reader in kept and token in self.reads(reader) for reader, token in readers)
+            ):
                 kept.append(name)
         return kept[::-1]
 
@@ -191,6 +196,7 @@ class Machine(RuleBasedStateMachine):
 
     def attempt(self, run, targets):
         """Run in the runner and in the model; both must call the same functions and end in the same way."""
+        values, versions = dict(self.model.values), dict(self.model.versions)
         for token, value in self.hparams.items():
             self.model.put(token, value)
         wanted, before = self.model.wanted(targets), self.calls()
@@ -201,6 +207,7 @@ class Machine(RuleBasedStateMachine):
                 run()
             told = error.value.functions if placeholders else error.value.tokens
             assert set(told) == set(placeholders or missing)
+            self.model.values, self.model.versions = values, versions  # the last run stands
             return
         called, failed = self.model.run(wanted)
         if failed:

@@ -5,14 +5,15 @@ import os
 import subprocess
 import sys
 import threading
-import time
 
 import pytest
 
 import epypes as ep
 from epypes.run import gain
 
-SLEEP_NS = 20_000_000
+# Functions that take time without computing wait for a device that never answers.
+WAIT_S = 0.02
+device = threading.Event()
 
 
 @pytest.fixture
@@ -102,9 +103,8 @@ def test_runs_in_many_threads_with_workers_do_not_mix(always):
     wrong = []
 
     def run(value):
-        for _ in range(25):
-            if runner.run(x=value)["out"] != (value,) * 4:
-                wrong.append(value)
+        outs = [runner.run(x=value)["out"] for _ in range(25)]
+        wrong.extend(out for out in outs if out != (value,) * 4)
 
     threads = [threading.Thread(target=run, args=(value,)) for value in range(6)]
     for thread in threads:
@@ -119,10 +119,10 @@ def test_the_overhead_of_functions_side_by_side_is_wall_time_less_the_critical_p
 
     def meet(x):
         barrier.wait(10)
-        time.sleep(SLEEP_NS / 1e9)  # takes time without computing
+        device.wait(WAIT_S)
 
     report = ep.CompGraphRunner(fork(2, meet), workers=2).run(x=1).report
-    assert report.critical_path_ns >= SLEEP_NS
+    assert report.critical_path_ns >= WAIT_S * 1e9
     assert report.overhead_ns == report.total_ns - report.critical_path_ns
     assert report.overhead_ns > report.total_ns - sum(report.durations_ns.values())
 
@@ -141,7 +141,7 @@ def test_the_context_of_the_caller_goes_along(always):
 
 def test_threads_are_tried_where_functions_are_long_and_kept_where_they_are_faster():
     def wait(x):
-        time.sleep(SLEEP_NS / 1e9)  # as a function that releases the interpreter's lock
+        device.wait(WAIT_S)  # as a function that releases the interpreter's lock
 
     runner = ep.CompGraphRunner(fork(2, wait), workers=2)
     for _ in range(8):
@@ -155,7 +155,7 @@ def test_threads_are_given_up_where_they_are_slower():
     def exclusive(x):
         is_alone = lock.acquire(blocking=False)
         # Beside another one it takes much longer than after it.
-        time.sleep(SLEEP_NS / 1e9 * (1 if is_alone else 4))
+        device.wait(WAIT_S * (1 if is_alone else 4))
         if is_alone:
             lock.release()
 
