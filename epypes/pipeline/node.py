@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable
 from time import perf_counter_ns
 from typing import Any
@@ -43,20 +44,22 @@ class Node:
         self.func = func
         self.time = 0.0
         self.run_count = 0
-        self._calls_under_way = 0
+        self._counter = itertools.count(1)
+        # A list, since adding to it and taking from it are whole in every thread, and counting up is not.
+        self._calls_under_way: list[None] = []
         # Gives the node its function's signature, so that a graph of nodes is checked like one of functions.
         functools.update_wrapper(self, func)
 
     def __call__(self, *args: Any) -> Any:
         """Compute, and measure the time."""
-        self._calls_under_way += 1
+        self._calls_under_way.append(None)
         start_ns = perf_counter_ns()
         try:
             return self.compute(*args)
         finally:
             self.time = (perf_counter_ns() - start_ns) / 1e9
-            self.run_count += 1
-            self._calls_under_way -= 1
+            self.run_count = next(self._counter)
+            self._calls_under_way.pop()
 
     def compute(self, *args: Any) -> Any:
         """Compute the node's value from its inputs; the hook for subclasses."""
@@ -65,7 +68,7 @@ class Node:
     @property
     def is_running(self) -> bool:
         """Whether a call has not returned yet."""
-        return self._calls_under_way > 0
+        return bool(self._calls_under_way)
 
     def traverse_time(self) -> tuple[Any, ...]:
         """Return ``(name, seconds of the last call)``; a pipeline adds its nodes' tuples as a third item."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from typing import Any
 
@@ -26,6 +27,8 @@ class Pipeline(Node):
         The graph.
     hparams
         Values of hyperparameter tokens.
+    workers
+        How many functions may run at once, in threads; see CompGraphRunner.
 
     Attributes
     ----------
@@ -39,12 +42,25 @@ class Pipeline(Node):
     Semeniuta and Falkman 2019, "Nodes and pipelines".
     """
 
-    def __init__(self, name: str, cg: CompGraph, hparams: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, name: str, cg: CompGraph, hparams: Mapping[str, Any] | None = None, *, workers: int = 1) -> None:
         self.network = NodeBasedCompGraph(cg)
-        self.runner = CompGraphRunner(self.network.cg, hparams)
+        self.runner = CompGraphRunner(self.network.cg, hparams, workers=workers)
         self.source_cg = cg
         self.attributes: dict[str, Any] = {}
         super().__init__(name, self.__call__)
+
+    @property
+    def __signature__(self) -> inspect.Signature:
+        """The free source tokens, so that a graph checks how many inputs it gives."""
+        kind = inspect.Parameter.POSITIONAL_ONLY
+        free = self.runner.free_source_tokens
+        return inspect.Signature([inspect.Parameter(f"input_{place}", kind) for place, _ in enumerate(free)])
+
+    @property
+    def __epypes_revision__(self) -> tuple[Any, ...]:
+        """Another value whenever a hyperparameter of this pipeline, or of one inside it, has changed."""
+        inner = (node.__epypes_revision__ for node in self.network.nodes.values() if isinstance(node, Pipeline))
+        return self.runner.revision, *inner
 
     @property
     def cg(self) -> CompGraph:
@@ -85,7 +101,13 @@ class Pipeline(Node):
         return self.name, self.time, self.network.traverse_time()
 
     def compute_overhead(self) -> float:
-        """Return the graph overhead of the last call, in seconds: its time less the sum of its nodes' times."""
+        """Return the graph overhead of the last call, in seconds: its time less the sum of its nodes' times.
+
+        Where nodes ran side by side, it is that of the last run's report: wall time less the critical path.
+        """
+        last = self.runner.last
+        if last is not None and last.report.side_by_side:
+            return last.report.overhead_ns / 1e9
         _, total, nodes = self.traverse_time()
         return float(total - sum(node[1] for node in nodes))
 

@@ -42,8 +42,10 @@ class SourcePipeline(Pipeline):
         q_out: Any,
         f_out: FOut,
         hparams: Mapping[str, Any] | None = None,
+        *,
+        workers: int = 1,
     ) -> None:
-        super().__init__(name, cg, hparams)
+        super().__init__(name, cg, hparams, workers=workers)
         self.q_out, self.f_out = q_out, f_out
 
     def run(self, /, **payload: Any) -> Run:
@@ -81,8 +83,10 @@ class SinkPipeline(Pipeline):
         q_in: Any,
         f_in: FIn,
         hparams: Mapping[str, Any] | None = None,
+        *,
+        workers: int = 1,
     ) -> None:
-        super().__init__(name, cg, hparams)
+        super().__init__(name, cg, hparams, workers=workers)
         self.q_in, self.f_in = q_in, f_in
         self.on_error: Callable[[Failure], None] | None = None
         self.failed = 0
@@ -212,8 +216,10 @@ class FullPipeline(SinkPipeline):
         f_in: FIn,
         f_out: FOut,
         hparams: Mapping[str, Any] | None = None,
+        *,
+        workers: int = 1,
     ) -> None:
-        super().__init__(name, cg, q_in, f_in, hparams)
+        super().__init__(name, cg, q_in, f_in, hparams, workers=workers)
         self.q_out, self.f_out = q_out, f_out
 
     def emit(self, event: Any, run: Run) -> None:

@@ -62,7 +62,7 @@ class Attempts:
         except StepFailed as failed:
             return self.run_broken_off(values, failed, wanted, has_payload, start_ns)
         freshness = self.clean
-        if wanted is not None or not has_payload:
+        if wanted is not None or not has_payload or self._program.revised:
             dirty = bytes(len(self._program.steps)) if wanted is None else wanted.translate(_INVERTED)
             freshness = Freshness(self._program, dirty, has_payload)
         return values, freshness, (self._program, wanted, durations_ns, perf_counter_ns() - start_ns, False), None

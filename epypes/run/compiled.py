@@ -65,7 +65,7 @@ class CompiledRuns:
     Attributes
     ----------
     whole
-        The run of every step, as soon as there is one; never in a graph with switches or placeholders.
+        The run of every step, as soon as there is one; never in a graph with switches or nested pipelines.
     """
 
     __slots__ = ("_compiled", "_counts", "_program", "whole")
@@ -85,7 +85,7 @@ class CompiledRuns:
         if compiled is None and self._is_worth_it(wanted):
             steps = [step for step in self._program.steps if wanted is None or wanted[step.place]]
             compiled = self._compiled[wanted] = compile_run(self._program, steps, ())
-            if wanted is None and not self._program.switches:
+            if wanted is None and not self._program.switches and not self._program.revised:
                 self.whole = compiled
         return compiled
 

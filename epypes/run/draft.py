@@ -33,7 +33,10 @@ class Draft:
     def after(cls, manager: TokenManager) -> Draft:
         """Begin with what another run has left; the values are shared."""
         freshness = manager.freshness
-        return cls(freshness.program, manager.values.copy(), bytearray(freshness.dirty), freshness.has_payload)
+        program, dirty = freshness.program, bytearray(freshness.dirty)
+        for place, before, now in zip(program.revised, freshness.revisions, program.revisions(), strict=True):
+            dirty[place] |= before != now
+        return cls(program, manager.values.copy(), dirty, freshness.has_payload)
 
     def change(self, token: str, value: Any) -> None:
         """Give a source token a value."""

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import BuiltinFunctionType
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from epypes.graph import CompGraph, Switch, as_switch
 from epypes.images import Image, contracts_of
 from epypes.run.guard import is_unguarded
+
+# What a function has that keeps hyperparameters of its own: a value that is another one whenever they have changed.
+REVISION: Final = "__epypes_revision__"
 
 
 class Step(NamedTuple):
@@ -70,6 +73,8 @@ class Program:
         The steps that are one.
     selectors
         By the selector's token, the switches that it selects for.
+    revised
+        The steps whose function computes something else when it has got another revision: nested pipelines.
     """
 
     __slots__ = (
@@ -78,6 +83,7 @@ class Program:
         "guard",
         "makers",
         "placeholders",
+        "revised",
         "selectors",
         "slots",
         "steps",
@@ -100,11 +106,16 @@ class Program:
         self.consumers: Sequence[Sequence[int]] = consumers
         self.switches = tuple(step.place for step in self.steps if step.switch is not None)
         self.placeholders = frozenset(step.place for step in self.steps if step.name in cg.placeholders)
+        self.revised = tuple(step.place for step in self.steps if hasattr(type(step.function), REVISION))
         self.selectors: dict[str, list[Switch]] = {}
         for index in self.switches:
             step = self.steps[index]
             if step.switch is not None:
                 self.selectors.setdefault(self.tokens[step.inputs[0]], []).append(step.switch)
+
+    def revisions(self) -> tuple[Any, ...]:
+        """Return the present revisions of the functions that have one."""
+        return tuple(getattr(self.steps[place].function, REVISION) for place in self.revised)
 
     def read_by(self, step: Step, values: Sequence[Any]) -> tuple[int, ...]:
         """Return the slots that a step reads with these values: of a switch, the selector and the chosen branch."""

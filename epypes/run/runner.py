@@ -220,6 +220,11 @@ class CompGraphRunner:
         return self._hparams.values
 
     @property
+    def revision(self) -> int:
+        """How often the hyperparameters have changed."""
+        return self._hparams.revision
+
+    @property
     def free_source_tokens(self) -> tuple[str, ...]:
         """The source tokens that ``run`` takes, in order of first appearance in func_io."""
         return tuple(self._hparams.free_slots)
@@ -264,7 +269,7 @@ class CompGraphRunner:
 
     def _now(self, last: Run | None, hparams: Hyperparameters) -> TokenManager:
         """Return a run's tokens as they are to be read with these hyperparameters."""
-        if last is not None and last.record[2] is hparams:
+        if last is not None and last.record[2] is hparams and not self._program.revised:
             return last.tokens
         return self._draft(last, hparams).tokens()
 
