@@ -8,10 +8,11 @@ from urllib.parse import quote
 from epypes.display.markup import escape
 from epypes.display.svg import alt_text, paint_svg
 from epypes.display.text import paint_text
-from epypes.display.view import GraphView, duration_text, view
+from epypes.display.times import paint_report, paint_summary
+from epypes.display.view import GraphView, view
 from epypes.errors import LayoutUnavailable
 from epypes.graph import CompGraph
-from epypes.run import CompGraphRunner, Run, RunReport
+from epypes.run import CompGraphRunner, Run, RunReport, TimingSummary
 
 _SVG_URI: Final = "data:image/svg+xml,"
 _INLINE: Final = (
@@ -41,6 +42,8 @@ def mimebundle(shown: Any) -> dict[str, str]:
 def _painted(shown: Any) -> dict[str, str]:
     if isinstance(shown, RunReport):
         return {"text/html": paint_report(shown)}
+    if isinstance(shown, TimingSummary):
+        return {"text/html": paint_summary(shown)}
     graph = view(_subject(shown))
     svg = paint_svg(graph)
     return {"text/html": _figure(svg, graph), "image/svg+xml": svg}
@@ -91,20 +94,4 @@ def _table_twin(graph: GraphView) -> str:
     return (
         f'<table style="{_HIDDEN}"><caption>{escape(alt_text(graph))}</caption>'
         f"<tr><th>function</th><th>inputs</th><th>outputs</th><th>state</th></tr>{rows}</table>"
-    )
-
-
-def paint_report(report: RunReport) -> str:
-    """Paint a report as an HTML table: per function its time and its share of the whole."""
-    total_ns = max(report.total_ns, 1)
-    rows = "".join(
-        f"<tr><td>{escape(entry.function)}</td>"
-        f"<td>{duration_text(entry.duration_ns) if entry.ran else 'reused'}</td>"
-        f"<td>{f'{entry.duration_ns / total_ns:.0%}' if entry.ran else ''}</td></tr>"
-        for entry in report.functions
-    )
-    return (
-        f"<table><tr><th>function</th><th>time</th><th>share</th></tr>{rows}"
-        f"<tr><td>graph overhead</td><td>{duration_text(report.overhead_ns)}</td>"
-        f"<td>{report.overhead_ns / total_ns:.0%}</td></tr></table>"
     )

@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from typing import Final
 
 from epypes.display.layout import Box, Layout, Point, lay_out
-from epypes.display.markup import escape
+from epypes.display.markup import cut, escape
 from epypes.display.view import FunctionView, GraphView, TokenView, duration_text
 
 _LINE_PX: Final = 16
@@ -109,7 +109,7 @@ def _function_lines(function: FunctionView) -> tuple[str, ...]:
     if function.state == "ran" and function.duration_ns is not None:
         return name, f"{duration_text(function.duration_ns)}, {function.share:.0%}"
     if function.state == "failed":
-        return name, _cut(function.message, _MESSAGE_CHARACTERS)
+        return name, cut(function.message, _MESSAGE_CHARACTERS)
     return name, function.state
 
 
@@ -138,9 +138,8 @@ def _token_box(token: TokenView) -> Box:
     return Box("ellipse", _width(*lines) * 1.18, _LINE_PX * len(lines) + 16)
 
 
-def _cut(text: str, characters: int = _NAME_CHARACTERS) -> str:
-    text = " ".join(text.split())
-    return text if len(text) <= characters else text[: characters - 1] + "…"
+def _cut(text: str) -> str:
+    return cut(text, _NAME_CHARACTERS)
 
 
 # -- marks ------------------------------------------------------------------------------------------------------------

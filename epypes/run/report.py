@@ -52,6 +52,11 @@ class RunReport:
         if len(durations_ns) > _PACKED_ABOVE and isinstance(durations_ns, list):
             self._durations_ns = array("q", durations_ns)
 
+    @property
+    def program(self) -> Program:
+        """What was run."""
+        return self._program
+
     def _ran_ns(self) -> Mapping[int, int]:
         """Return nanoseconds by step that ran."""
         if isinstance(self._durations_ns, dict):
