@@ -1,17 +1,61 @@
-"""How do the times of one run, and of many, look as a table?"""
+"""How do a graph, a plan, and the times of one run and of many, look as tables?"""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Final
 
+from epypes.display.graphview import FunctionView, GraphView
 from epypes.display.markup import cut, escape
 from epypes.display.view import duration_text, overhead_text
 from epypes.run import FunctionTime, LogNormal, RunReport, TimingSummary
 
 # Below them stand the rest, the total and the graph overhead: a hundred rows in all.
 _MOST_FUNCTIONS: Final = 97
+_CELL_CHARACTERS: Final = 200
 _NAME_CHARACTERS: Final = 60
+_DONE: Final = {"missing": "placeholder", "planned": "runs"}
+_HIDDEN: Final = "position:absolute;width:1px;height:1px;overflow:hidden;clip-path:inset(50%);white-space:nowrap"
+
+
+def paint_twin(graph: GraphView, title: str) -> str:
+    """Paint a graph as a table for screen readers; it also stays where a page strips the picture."""
+    rows = "".join(
+        "<tr>" + "".join(f"<td>{escape(cell[:_CELL_CHARACTERS])}</td>" for cell in cells) + "</tr>"
+        for cells in (
+            (function.name, ", ".join(inputs), ", ".join(outputs), "; ".join((function.state, *function.notes)))
+            for (inputs, outputs), function in zip(graph.io(), graph.functions, strict=True)
+        )
+    )
+    return (
+        f'<table style="{_HIDDEN}"><caption>{escape(title)}</caption>'
+        f"<tr><th>function</th><th>inputs</th><th>outputs</th><th>state</th></tr>{rows}</table>"
+    )
+
+
+def paint_plan(graph: GraphView) -> str:
+    """Paint the view of a plan as an HTML table: per function what would be done, and why.
+
+    The functions stand in run order; of many those that would run, the rest in one row.
+    """
+    order = {"missing": 0, "planned": 1, "reused": 2}
+    by_weight = sorted(graph.functions, key=lambda function: order.get(function.state, 3))
+    kept = {function.name for function in by_weight[:_MOST_FUNCTIONS]}
+    rows: list[tuple[str, ...]] = [
+        (function.name, _DONE.get(function.state, function.state), function.message)
+        for function in graph.functions
+        if function.name in kept
+    ]
+    rows += _other_plans(by_weight[_MOST_FUNCTIONS:])
+    return _table("", ("function", "plan", "why"), rows)
+
+
+def _other_plans(rest: Sequence[FunctionView]) -> Iterable[tuple[str, ...]]:
+    """Sum up what has no row of its own."""
+    if rest:
+        counts = Counter(_DONE.get(function.state, function.state) for function in rest)
+        yield f"{_functions(len(rest))} more", ", ".join(f"{count} {done}" for done, count in counts.items()), ""
 
 
 def paint_report(report: RunReport) -> str:
@@ -85,4 +129,5 @@ def _table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> 
         "<tr>" + "".join(f"<td>{escape(cut(cell, _NAME_CHARACTERS))}</td>" for cell in cells) + "</tr>"
         for cells in rows
     )
-    return f"<table><caption>{escape(caption)}</caption><tr>{titles}</tr>{lines}</table>"
+    above = f"<caption>{escape(caption)}</caption>" if caption else ""
+    return f"<table>{above}<tr>{titles}</tr>{lines}</table>"
