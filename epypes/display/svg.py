@@ -46,13 +46,13 @@ STYLE: Final = """
 .epypes-graph .hyperparameter .shape{fill:var(--jp-layout-color3,#dcdfe4)}
 .epypes-graph .bar{fill:var(--jp-brand-color1,#1976d2)}
 .epypes-graph .planned .shape{stroke-width:3}
-.epypes-graph .placeholder .shape{stroke-dasharray:7 4}
 .epypes-graph .redefined .shape{stroke:var(--jp-warn-color1,#e65100);stroke-width:3}
 .epypes-graph .missing .shape{stroke:var(--jp-error-color1,#d32f2f);stroke-width:2}
 .epypes-graph .left-out .shape{stroke-dasharray:2 3}
-.epypes-graph .left-out{opacity:.5}
+.epypes-graph .left-out{opacity:.6}
 .epypes-graph .failed .shape{stroke:var(--jp-error-color1,#d32f2f);stroke-width:3}
 .epypes-graph .stale .shape,.epypes-graph .not-computed .shape,.epypes-graph .not-run .shape{stroke-dasharray:2 3}
+.epypes-graph .placeholder .shape{stroke-dasharray:7 4}
 .epypes-graph .stale image{opacity:.35}
 .epypes-graph .edge{fill:none;stroke:#80868f}
 .epypes-graph .dense{stroke-width:.5}
