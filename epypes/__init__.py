@@ -37,7 +37,17 @@ if TYPE_CHECKING:
         SinkPipeline,
         SourcePipeline,
     )
-    from epypes.run import CompGraphRunner, Failure, Plan, Run, RunReport, TokenManager
+    from epypes.run import (
+        CompGraphRunner,
+        Failure,
+        LogNormal,
+        Plan,
+        Run,
+        RunReport,
+        TimingSummary,
+        TokenManager,
+        summarize,
+    )
     from epypes.run.guard import unguarded
     from epypes.transport import ZMQPublisher, ZMQSubscriber
 
@@ -54,10 +64,13 @@ _HOMES = {
     "union": "epypes.graph",
     "CompGraphRunner": "epypes.run",
     "Failure": "epypes.run",
+    "LogNormal": "epypes.run",
     "Plan": "epypes.run",
     "Run": "epypes.run",
     "RunReport": "epypes.run",
+    "TimingSummary": "epypes.run",
     "TokenManager": "epypes.run",
+    "summarize": "epypes.run",
     "unguarded": "epypes.run.guard",
     "EventLoop": "epypes.pipeline",
     "EventView": "epypes.pipeline",
@@ -89,6 +102,7 @@ __all__ = [
     "Failure",
     "FullPipeline",
     "Image",
+    "LogNormal",
     "Mailbox",
     "Node",
     "NodeBasedCompGraph",
@@ -100,6 +114,7 @@ __all__ = [
     "RunReport",
     "SinkPipeline",
     "SourcePipeline",
+    "TimingSummary",
     "TokenManager",
     "ZMQPublisher",
     "ZMQSubscriber",
@@ -112,6 +127,7 @@ __all__ = [
     "rename",
     "subgraph",
     "suffix",
+    "summarize",
     "switch",
     "to_source",
     "unguarded",

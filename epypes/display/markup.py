@@ -13,3 +13,9 @@ _NOT_XML: Final = re.compile("[^\\t\\n\\r\\x20-\\ud7ff\\ue000-\\ufffd\\U00010000
 def escape(text: str) -> str:
     """Return text for SVG and HTML, elements and attributes alike; what XML forbids shows as a replacement mark."""
     return html.escape(_NOT_XML.sub("\ufffd", text))
+
+
+def cut(text: str, characters: int) -> str:
+    """Return text on one line, of at most so many characters."""
+    text = " ".join(text.split())
+    return text if len(text) <= characters else text[: characters - 1] + "…"

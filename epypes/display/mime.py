@@ -5,13 +5,15 @@ from __future__ import annotations
 from typing import Any, Final
 from urllib.parse import quote
 
+from epypes.display.graphview import GraphView
 from epypes.display.markup import escape
 from epypes.display.svg import alt_text, paint_svg
+from epypes.display.tables import paint_plan, paint_report, paint_summary, paint_twin
 from epypes.display.text import paint_text
-from epypes.display.view import GraphView, duration_text, view
+from epypes.display.view import Shown, view
 from epypes.errors import LayoutUnavailable
 from epypes.graph import CompGraph
-from epypes.run import CompGraphRunner, Run, RunReport
+from epypes.run import CompGraphRunner, Plan, Run, RunReport, TimingSummary
 
 _SVG_URI: Final = "data:image/svg+xml,"
 _INLINE: Final = (
@@ -20,12 +22,10 @@ _INLINE: Final = (
     "const d=new DOMParser().parseFromString(t,'image/svg+xml').documentElement;"
     "if(d.tagName==='svg')i.replaceWith(document.importNode(d,true))})()"
 )
-_CELL_CHARACTERS: Final = 200
-_HIDDEN: Final = "position:absolute;width:1px;height:1px;overflow:hidden;clip-path:inset(50%);white-space:nowrap"
 
 
 def mimebundle(shown: Any) -> dict[str, str]:
-    """Return ``text/plain``, ``text/html`` and ``image/svg+xml`` of a graph, a runner, a run, a pipeline or a report.
+    """Return ``text/plain``, ``text/html`` and ``image/svg+xml`` of what shows itself; of reports without SVG.
 
     Never raises: what can't be painted is shown as text, with the reason and the way out.
     """
@@ -41,20 +41,23 @@ def mimebundle(shown: Any) -> dict[str, str]:
 def _painted(shown: Any) -> dict[str, str]:
     if isinstance(shown, RunReport):
         return {"text/html": paint_report(shown)}
+    if isinstance(shown, TimingSummary):
+        return {"text/html": paint_summary(shown)}
     graph = view(_subject(shown))
     svg = paint_svg(graph)
-    return {"text/html": _figure(svg, graph), "image/svg+xml": svg}
+    table = paint_plan(graph) if isinstance(shown, Plan) else ""
+    return {"text/html": _figure(svg, graph) + table, "image/svg+xml": svg}
 
 
-def _subject(shown: Any) -> CompGraph | CompGraphRunner | Run:
+def _subject(shown: Any) -> Shown:
     """Return what is to be seen of an object: of a pipeline, its runner."""
-    if isinstance(shown, CompGraph | CompGraphRunner | Run):
+    if isinstance(shown, CompGraph | CompGraphRunner | Run | Plan):
         return shown
     runner: CompGraphRunner = shown.runner
     return runner
 
 
-def to_svg(shown: CompGraph | CompGraphRunner | Run) -> str:
+def to_svg(shown: Shown) -> str:
     """Return the picture as the text of an SVG file.
 
     Raises
@@ -72,39 +75,9 @@ def _figure(svg: str, graph: GraphView) -> str:
     keeps the image. Where the script runs, the picture takes the page's colours and its vertices tell their titles.
     """
     source = quote(svg, safe=" <>/=:;,.()!?+*'@|^~-_{}[]$")
+    twin = paint_twin(graph, alt_text(graph))
     return (
         f'<figure style="margin:0"><img src="{_SVG_URI}{source}" alt="{escape(alt_text(graph))}" '
         f'style="max-width:100%"><script>{_INLINE}</script>'
-        f'<figcaption style="font-size:11px">{escape(graph.caption)}</figcaption>{_table_twin(graph)}</figure>'
-    )
-
-
-def _table_twin(graph: GraphView) -> str:
-    """Return the graph as a table for screen readers; it also stays where a page strips the picture."""
-    rows = "".join(
-        "<tr>" + "".join(f"<td>{escape(cell[:_CELL_CHARACTERS])}</td>" for cell in cells) + "</tr>"
-        for cells in (
-            (function.name, ", ".join(inputs), ", ".join(outputs), function.state)
-            for (inputs, outputs), function in zip(graph.io(), graph.functions, strict=True)
-        )
-    )
-    return (
-        f'<table style="{_HIDDEN}"><caption>{escape(alt_text(graph))}</caption>'
-        f"<tr><th>function</th><th>inputs</th><th>outputs</th><th>state</th></tr>{rows}</table>"
-    )
-
-
-def paint_report(report: RunReport) -> str:
-    """Paint a report as an HTML table: per function its time and its share of the whole."""
-    total_ns = max(report.total_ns, 1)
-    rows = "".join(
-        f"<tr><td>{escape(entry.function)}</td>"
-        f"<td>{duration_text(entry.duration_ns) if entry.ran else 'reused'}</td>"
-        f"<td>{f'{entry.duration_ns / total_ns:.0%}' if entry.ran else ''}</td></tr>"
-        for entry in report.functions
-    )
-    return (
-        f"<table><tr><th>function</th><th>time</th><th>share</th></tr>{rows}"
-        f"<tr><td>graph overhead</td><td>{duration_text(report.overhead_ns)}</td>"
-        f"<td>{report.overhead_ns / total_ns:.0%}</td></tr></table>"
+        f'<figcaption style="font-size:11px">{escape(graph.caption)}</figcaption>{twin}</figure>'
     )

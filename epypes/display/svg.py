@@ -7,15 +7,16 @@ without a new layout, and colours follow the page's theme.
 from __future__ import annotations
 
 import base64
-import math
 import re
 import zlib
 from collections.abc import Iterable
 from typing import Final
 
+from epypes.display.edges import paint_edges
+from epypes.display.graphview import FunctionView, GraphView, TokenView
 from epypes.display.layout import Box, Layout, Point, lay_out
-from epypes.display.markup import escape
-from epypes.display.view import FunctionView, GraphView, TokenView, duration_text
+from epypes.display.markup import cut, escape
+from epypes.display.view import duration_text
 
 _LINE_PX: Final = 16
 _CHARACTER_PX: Final = 6.9
@@ -29,6 +30,8 @@ _DENSE: Final = 1.6
 _THUMB_WIDTH: Final = 128
 _THUMB_HEIGHT: Final = 96
 _MARGIN: Final = 6
+# A switch is drawn like a multiplexer, narrower at its output, by this much on each side.
+_SLOPE_PX: Final = 14
 
 # The fallbacks serve where the page has no Jupyter theme: dark text on light vertices, grey edges, readable on white
 # and on black paper alike.
@@ -42,12 +45,20 @@ STYLE: Final = """
 .epypes-graph .function .shape{stroke:var(--jp-brand-color1,#1976d2)}
 .epypes-graph .hyperparameter .shape{fill:var(--jp-layout-color3,#dcdfe4)}
 .epypes-graph .bar{fill:var(--jp-brand-color1,#1976d2)}
+.epypes-graph .planned .shape{stroke-width:3}
+.epypes-graph .redefined .shape{stroke:var(--jp-warn-color1,#e65100);stroke-width:3}
+.epypes-graph .missing .shape{stroke:var(--jp-error-color1,#d32f2f);stroke-width:2}
+.epypes-graph .left-out .shape{stroke-dasharray:2 3}
+.epypes-graph .left-out{opacity:.6}
 .epypes-graph .failed .shape{stroke:var(--jp-error-color1,#d32f2f);stroke-width:3}
 .epypes-graph .stale .shape,.epypes-graph .not-computed .shape,.epypes-graph .not-run .shape{stroke-dasharray:2 3}
+.epypes-graph .placeholder .shape{stroke-dasharray:7 4}
 .epypes-graph .stale image{opacity:.35}
 .epypes-graph .edge{fill:none;stroke:#80868f}
 .epypes-graph .dense{stroke-width:.5}
 .epypes-graph .tip{fill:#80868f}
+.epypes-graph .off{opacity:.6}
+.epypes-graph .edge.off{stroke-dasharray:4 4}
 """.replace("\n", "")
 
 
@@ -62,8 +73,8 @@ def paint_svg(graph: GraphView) -> str:
     functions = len(graph.functions)
     boxes = (*map(_function_box, graph.functions), *map(_token_box, graph.tokens))
     edges = tuple(
-        (functions + token, function) if taken else (function, functions + token)
-        for function, token, taken in graph.edges
+        (functions + edge.token, edge.function) if edge.is_input else (edge.function, functions + edge.token)
+        for edge in graph.edges
     )
     is_dense = len(edges) > max(_MANY_EDGES, _DENSE * len(boxes))
     layout = lay_out(boxes, edges, is_dense)
@@ -74,7 +85,7 @@ def paint_svg(graph: GraphView) -> str:
         f'aria-label="{escape(alt_text(graph))}" width="{size[0]}" height="{size[1]}" viewBox="{box}">'
     )
     parts = [head, f"<style>{STYLE}</style>"]
-    parts.append(_paint_lines(layout, edges) if is_dense else _paint_splines(layout))
+    parts += paint_edges(graph.edges, edges, layout)
     parts += _paint_vertices(graph, boxes, layout)
     parts.append("</svg>")
     return "\n".join(parts)
@@ -103,30 +114,35 @@ def _width(*lines: str) -> float:
 
 
 def _function_lines(function: FunctionView) -> tuple[str, ...]:
-    name = _cut(function.name)
-    if function.state in ("static", "not run"):
-        return (name,)
+    return (_cut(function.name), *function.notes, *_state_line(function))
+
+
+def _state_line(function: FunctionView) -> tuple[str, ...]:
+    """Say in which state a function is, where that is more than its shape and its notes say."""
+    if function.state in ("static", "not run", "missing"):
+        return ()
     if function.state == "ran" and function.duration_ns is not None:
-        return name, f"{duration_text(function.duration_ns)}, {function.share:.0%}"
+        return (f"{duration_text(function.duration_ns)}, {function.share:.0%}",)
     if function.state == "failed":
-        return name, _cut(function.message, _MESSAGE_CHARACTERS)
-    return name, function.state
+        return (cut(function.message, _MESSAGE_CHARACTERS),)
+    return ("to run" if function.state == "planned" else function.state,)
 
 
 def _function_box(function: FunctionView) -> Box:
     lines = _function_lines(function)
     # The widest time is reserved for, so that another run's times do not move anything.
     widest = "000.0 ms, 100%" if len(lines) > 1 and function.state != "failed" else ""
-    return Box("box", max(_width(*lines, widest), 64), _LINE_PX * len(lines) + 14)
+    slope = 2 * _SLOPE_PX if function.kind == "switch" else 0
+    return Box("box", max(_width(*lines, widest), 64) + slope, _LINE_PX * len(lines) + 14)
 
 
 def _token_lines(token: TokenView) -> tuple[str, ...]:
     name = _cut(token.name)
-    if token.preview is None:
-        return (name,)
-    if token.role == "hyperparameter":
+    if token.role == "hyperparameter" and token.preview:
         return (f"{name} = {token.preview.text}",)
-    return name, token.preview.text
+    if token.state in ("missing", "left out"):
+        return name, token.state
+    return (name, token.preview.text) if token.preview else (name,)
 
 
 def _token_box(token: TokenView) -> Box:
@@ -138,9 +154,8 @@ def _token_box(token: TokenView) -> Box:
     return Box("ellipse", _width(*lines) * 1.18, _LINE_PX * len(lines) + 16)
 
 
-def _cut(text: str, characters: int = _NAME_CHARACTERS) -> str:
-    text = " ".join(text.split())
-    return text if len(text) <= characters else text[: characters - 1] + "…"
+def _cut(text: str) -> str:
+    return cut(text, _NAME_CHARACTERS)
 
 
 # -- marks ------------------------------------------------------------------------------------------------------------
@@ -161,15 +176,25 @@ def _group(kind: str, name: str, states: tuple[str, ...], title: str, body: str)
 
 def _paint_function(function: FunctionView, box: Box, centre: Point) -> str:
     x, y = centre[0] - box.width / 2, centre[1] - box.height / 2
-    body = f'<rect class="shape" x="{x:.1f}" y="{y:.1f}" width="{box.width:.1f}" height="{box.height:.1f}" rx="3"/>'
+    slope = _SLOPE_PX if function.kind == "switch" else 0
+    if slope:
+        body = f'<polygon class="shape" points="{_trapezium(x, y, box)}"/>'
+    else:
+        body = f'<rect class="shape" x="{x:.1f}" y="{y:.1f}" width="{box.width:.1f}" height="{box.height:.1f}" rx="3"/>'
     if function.share > 0:
         body += (
-            f'<rect class="bar" x="{x:.1f}" y="{y + box.height - 4:.1f}" '
-            f'width="{box.width * min(function.share, 1):.1f}" height="4"/>'
+            f'<rect class="bar" x="{x + slope:.1f}" y="{y + box.height - 4:.1f}" '
+            f'width="{(box.width - 2 * slope) * min(function.share, 1):.1f}" height="4"/>'
         )
     body += _text(_function_lines(function), centre)
-    title = f"function {function.name}: {function.state}. {function.message}".removesuffix(" ")
-    return _group("function", function.name, (function.state,), title[:600], body)
+    said = "; ".join((function.state, *function.notes))
+    title = f"{function.kind} {function.name}: {said}. {function.message}".removesuffix(" ")
+    return _group("function", function.name, _classes(function), title[:600], body)
+
+
+def _classes(function: FunctionView) -> tuple[str, ...]:
+    kind = () if function.kind == "function" else (function.kind,)
+    return (*kind, *(("redefined",) if function.is_redefined else ()), function.state)
 
 
 def _paint_token(token: TokenView, box: Box, centre: Point) -> str:
@@ -195,6 +220,12 @@ def _paint_token(token: TokenView, box: Box, centre: Point) -> str:
 def _title(token: TokenView, state: str) -> str:
     kind = "hyperparameter token" if token.role == "hyperparameter" else "token"
     return f"{kind} {token.name}{state}"[:600]
+
+
+def _trapezium(x: float, y: float, box: Box) -> str:
+    right, bottom = x + box.width, y + box.height
+    points = ((x, y), (right, y), (right - _SLOPE_PX, bottom), (x + _SLOPE_PX, bottom))
+    return " ".join(f"{a:.1f},{b:.1f}" for a, b in points)
 
 
 def _hexagon(x: float, y: float, box: Box) -> str:
@@ -232,29 +263,3 @@ def _thumbnail(token: TokenView, x: float, y: float) -> str:
         f'<image x="{x - width / 2:.1f}" y="{y + (_THUMB_HEIGHT - height) / 2:.1f}" width="{width:.1f}" '
         f'height="{height:.1f}" href="data:{picture.media_type};base64,{data}"/>'
     )
-
-
-def _paint_splines(layout: Layout) -> str:
-    """Paint edges as one path of curves and one of their tips."""
-    curves, tips = [], []
-    for *spline, tip in layout.splines:
-        start, *controls = spline
-        curves.append(f"M{start[0]:.1f},{start[1]:.1f}C" + " ".join(f"{x:.1f},{y:.1f}" for x, y in controls))
-        tips.append(f"M{_arrow(controls[-1] if controls else start, tip)}Z")
-    return f'<path class="edge" d="{"".join(curves)}"/><path class="tip" d="{"".join(tips)}"/>'
-
-
-def _paint_lines(layout: Layout, edges: Iterable[tuple[int, int]]) -> str:
-    """Paint edges as one path of straight lines between centres, under the vertices."""
-    at = layout.centres
-    lines = (f"M{at[a][0]:.0f},{at[a][1]:.0f}L{at[b][0]:.0f},{at[b][1]:.0f}" for a, b in edges)
-    return f'<path class="edge dense" d="{"".join(lines)}"/>'
-
-
-def _arrow(end: Point, tip: Point) -> str:
-    """Return a triangle from the end of a spline to its tip."""
-    dx, dy = tip[0] - end[0], tip[1] - end[1]
-    length = math.hypot(dx, dy) or 1.0
-    across = (-dy / length * 3.5, dx / length * 3.5)
-    corners = (tip, (end[0] + across[0], end[1] + across[1]), (end[0] - across[0], end[1] - across[1]))
-    return "L".join(f"{x:.1f},{y:.1f}" for x, y in corners)

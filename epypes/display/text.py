@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from epypes.display.view import GraphView, duration_text
+from epypes.display.graphview import FunctionView, GraphView
+from epypes.display.view import duration_text
 
 _MOST_LINES = 40
+_STATES = {"planned": "[to run]", "reused": "[reused]", "stale": "[stale]", "left out": "[left out]"}
 
 
 def paint_text(graph: GraphView) -> str:
@@ -12,9 +14,7 @@ def paint_text(graph: GraphView) -> str:
     lines = []
     for (inputs, outputs), function in zip(graph.io(), graph.functions[:_MOST_LINES], strict=False):
         line = f"{function.name}({', '.join(inputs)}) -> {', '.join(outputs) or 'nothing'}"
-        if function.duration_ns is not None:
-            line += f"  [{duration_text(function.duration_ns)}]"
-        lines.append(f"{line}  {function.message}".rstrip())
+        lines.append("  ".join(filter(None, (line, _state(function), *function.notes, function.message))))
     if len(graph.functions) > _MOST_LINES:
         lines.append(f"... and {len(graph.functions) - _MOST_LINES} functions more")
     values = [
@@ -22,4 +22,14 @@ def paint_text(graph: GraphView) -> str:
         for token in graph.tokens
         if token.role == "hyperparameter" and token.preview
     ]
-    return "\n".join(lines + (["with " + ", ".join(values[:_MOST_LINES])] if values else []))
+    missing = [token.name for token in graph.tokens if token.state == "missing"]
+    for start, names in (("with", values), ("missing", missing)):
+        if names:
+            lines.append(f"{start} {', '.join(names[:_MOST_LINES])}")
+    return "\n".join(lines)
+
+
+def _state(function: FunctionView) -> str:
+    if function.duration_ns is not None:
+        return f"[{duration_text(function.duration_ns)}]"
+    return _STATES.get(function.state, "")

@@ -6,10 +6,11 @@ out when all that it makes goes to branches that are not chosen. One that makes 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import contextlib
+from collections.abc import Hashable, Iterable, Sequence
 from typing import Any
 
-from epypes.errors import PayloadError, PlaceholderNeeded, run_call
+from epypes.errors import PayloadError, PlaceholderNeeded, UnknownName, run_call
 from epypes.run.program import Program
 from epypes.run.tokens import NOT_COMPUTED
 
@@ -51,6 +52,18 @@ def _without_superfluous(program: Program, values: Sequence[Any]) -> bytes:
         if readers and not makes_sink and not is_read:
             wanted[step.place] = 0
     return bytes(wanted)
+
+
+def chosen_branches(program: Program, values: Sequence[Any]) -> dict[str, Hashable]:
+    """Return the key of the chosen branch by switch, of those whose selector has a value."""
+    found: dict[str, Hashable] = {}
+    for index in program.switches:
+        step = program.steps[index]
+        selector = values[step.inputs[0]]
+        if step.switch is not None and selector is not NOT_COMPUTED:
+            with contextlib.suppress(UnknownName):  # such a selector is refused when the step runs
+                found[step.name] = step.switch.branches[step.switch.branch_index(selector)]
+    return found
 
 
 def missing_sources(program: Program, values: Sequence[Any], wanted: bytes | None) -> tuple[str, ...]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import Any
 
 from epypes.graph import CompGraph
-from epypes.run.need import missing_sources, needed_placeholders, wanted_steps
+from epypes.run.need import chosen_branches, missing_sources, needed_placeholders, wanted_steps
 from epypes.run.tokens import NOT_COMPUTED, TokenManager
 
 
@@ -32,6 +33,10 @@ class Plan:
         The functions that are not needed: for these targets, or since a switch has chosen another branch.
     why
         By function of ``order``, the reason why it would run.
+    branches
+        By switch whose selector has a value, the key of the chosen branch.
+    hyperparameters
+        The values that it was planned with.
     cg
         The graph.
     """
@@ -43,6 +48,8 @@ class Plan:
     placeholders: tuple[str, ...]
     left_out: tuple[str, ...]
     why: Mapping[str, str]
+    branches: Mapping[str, Hashable]
+    hyperparameters: Mapping[str, Any] = field(repr=False, compare=False)
     cg: CompGraph = field(repr=False, compare=False)
 
     def __repr__(self) -> str:
@@ -55,7 +62,9 @@ class Plan:
         return mimebundle(self)
 
 
-def plan(manager: TokenManager, targets: Sequence[str], changed: Collection[str]) -> Plan:
+def plan(
+    manager: TokenManager, targets: Sequence[str], changed: Collection[str], hyperparameters: Mapping[str, Any]
+) -> Plan:
     """Plan a run that starts from these token values; changes nothing.
 
     Parameters
@@ -66,6 +75,8 @@ def plan(manager: TokenManager, targets: Sequence[str], changed: Collection[str]
         Tokens of the graph; empty for all.
     changed
         The hyperparameters that have changed since the last run; for the reasons.
+    hyperparameters
+        The values of all hyperparameters now.
     """
     program = manager.program
     wanted = wanted_steps(program, manager.values, targets)
@@ -81,6 +92,8 @@ def plan(manager: TokenManager, targets: Sequence[str], changed: Collection[str]
         why=MappingProxyType(
             {step.name: _reason(manager, step.place, changed) for step in needed if step.place in stale}
         ),
+        branches=MappingProxyType(chosen_branches(program, manager.values)),
+        hyperparameters=hyperparameters,
         cg=program.cg,
     )
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from epypes.errors import NotComputed, StaleToken
+from epypes.graph.redefined import redefined
 from epypes.run.failure import Failure
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.report import RunReport, Times
@@ -91,7 +92,9 @@ class Run(Mapping[str, Any]):
 
     def __repr__(self) -> str:
         state = f"failed in {self.failure.function!r:.30}" if self.failure else "completed"
-        return f"<Run: {state}; {len(self)} of {len(self.cg.tokens)} tokens>"
+        redefinitions = len(redefined(self.cg))
+        old = f"; {redefinitions} function{'s' * (redefinitions != 1)} redefined" * bool(redefinitions)
+        return f"<Run: {state}; {len(self)} of {len(self.cg.tokens)} tokens{old}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         from epypes.display import mimebundle

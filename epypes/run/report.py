@@ -55,6 +55,11 @@ class RunReport:
         self._program, self._wanted, self.total_ns, self.side_by_side = program, wanted, total_ns, side_by_side
         self._durations_ns = durations_ns
 
+    @property
+    def program(self) -> Program:
+        """What was run."""
+        return self._program
+
     def _ran_ns(self) -> Mapping[int, int]:
         """Return nanoseconds by step that ran."""
         durations_ns = self._durations_ns

@@ -9,6 +9,7 @@ from typing import Any
 
 from epypes.errors import NotComputed, PayloadError, StaleToken, UnknownName, run_call
 from epypes.graph import CompGraph
+from epypes.graph.redefined import redefined
 from epypes.run.attempt import Attempts, Outcome
 from epypes.run.call import StepFailed
 from epypes.run.draft import Draft
@@ -190,7 +191,7 @@ class CompGraphRunner:
         self._check_targets(targets)
         last, hparams = self._last, self._hparams
         changed = () if last is None else tuple(hparams.changes_since(last.record[2]))
-        return plan(self._now(last, hparams), targets, changed)
+        return plan(self._now(last, hparams), targets, changed, hparams.values)
 
     def _check_targets(self, targets: Sequence[object]) -> None:
         for token in targets:
@@ -253,7 +254,8 @@ class CompGraphRunner:
     @property
     def stale(self) -> tuple[str, ...]:
         """The functions that ``rerun()`` would run, in run order."""
-        return plan(self._now(self._last, self._hparams), (), ()).order
+        hparams = self._hparams
+        return plan(self._now(self._last, hparams), (), (), hparams.values).order
 
     def _draft(self, last: Run | None, hparams: Hyperparameters) -> Draft:
         """Return a run's tokens with these hyperparameters, to go on from.
@@ -308,15 +310,17 @@ class CompGraphRunner:
         )
 
     def __repr__(self) -> str:
+        redefinitions = len(redefined(self.cg))
+        old = f" ({redefinitions} redefined)" * bool(redefinitions)
         if self._last is None:
             state = "not run yet"
         elif self._last.failure:
-            state = f"failed in {self._last.failure.function!r:.24}"
+            state = f"failed in {self._last.failure.function!r:.{24 - len(old)}}"
         else:
             stale = len(self.stale)
             state = f"{stale} functions stale" if stale else "up to date"
         count = len(self.cg.functions)
-        return f"<CompGraphRunner: {count} functions, {len(self.hyperparameters)} hyperparameters; {state}>"
+        return f"<CompGraphRunner: {count} functions{old}, {len(self.hyperparameters)} hyperparameters; {state}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         from epypes.display import mimebundle

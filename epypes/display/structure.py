@@ -1,0 +1,104 @@
+"""What is to be seen of a graph whatever has been run: its parts, the branches chosen, what is to be written or old?"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any, Final
+
+from epypes.display.graphview import EdgeView, FunctionState, FunctionView, GraphView, TokenView
+from epypes.display.markup import cut
+from epypes.display.preview import preview
+from epypes.graph import CompGraph, Switch, as_switch, colour_order
+from epypes.graph.redefined import redefined
+
+TO_BE_WRITTEN: Final = "to be written"
+_REDEFINED: Final = "redefined since: build the graph again"
+_SELECTOR_CHARACTERS: Final = 20
+_KEY_CHARACTERS: Final = 16
+_NAMED: Final = 3
+
+
+def structure_of(cg: CompGraph, branches: Mapping[str, Any], left_out: Collection[str]) -> GraphView:
+    """Look at a graph.
+
+    Parameters
+    ----------
+    branches
+        By switch, the key of the chosen branch; a switch that has not chosen is not in it.
+    left_out
+        The functions that are not needed; they, and the tokens that only they make or take, get this state.
+    """
+    unread = {name: _unread(cg, name, branches) for name in cg.switches}
+    old = frozenset(redefined(cg))
+    return GraphView(
+        tuple(_function_view(cg, name, branches, name in left_out, name in old) for name in cg.functions),
+        tuple(_token_view(cg, token, branches, left_out, unread) for token in cg.tokens),
+        tuple(_edges(cg, left_out, unread)),
+        _redefined_caption([name for name in cg.functions if name in old]),
+    )
+
+
+def _unread(cg: CompGraph, name: str, branches: Mapping[str, Any]) -> frozenset[str]:
+    """Return the tokens of the branches that a switch does not read: all as long as it has not chosen."""
+    selector, *tokens = cg.func_inputs(name)
+    read = {selector}
+    function = as_switch(cg.functions[name])
+    if function is not None and name in branches:
+        read.add(tokens[function.branch_index(branches[name])])
+    return frozenset(tokens) - read
+
+
+def _function_view(
+    cg: CompGraph, name: str, branches: Mapping[str, Any], is_left_out: bool, is_redefined: bool
+) -> FunctionView:
+    state: FunctionState = "left out" if is_left_out else "static"
+    function = as_switch(cg.functions[name])
+    if function is not None:
+        return FunctionView(name, state, kind="switch", notes=(_choice(cg, name, function, branches),))
+    if name in cg.placeholders:
+        return FunctionView(name, state, kind="placeholder", notes=(TO_BE_WRITTEN,))
+    return FunctionView(name, state, notes=(_REDEFINED,) * is_redefined, is_redefined=is_redefined)
+
+
+def _choice(cg: CompGraph, name: str, function: Switch, branches: Mapping[str, Any]) -> str:
+    selector = cut(cg.func_inputs(name)[0], _SELECTOR_CHARACTERS)
+    if name not in branches:
+        return f"one of {len(function.branches)} by {selector}"
+    key = branches[name]
+    return f"{selector} = {cut(key if isinstance(key, str) else preview(key).text, _KEY_CHARACTERS)}"
+
+
+def _token_view(
+    cg: CompGraph,
+    token: str,
+    branches: Mapping[str, Any],
+    left_out: Collection[str],
+    unread: Mapping[str, frozenset[str]],
+) -> TokenView:
+    maker = cg.digraph.producer.get(token)
+    if maker is not None:
+        is_left_out = maker in left_out
+    else:
+        is_left_out = all(
+            name in left_out or (name in branches and token in unread[name]) for name in cg.digraph.consumers[token]
+        )
+    return TokenView(token, "payload", "left out" if is_left_out else "static", order=colour_order(cg, token))
+
+
+def _edges(cg: CompGraph, left_out: Collection[str], unread: Mapping[str, frozenset[str]]) -> Iterator[EdgeView]:
+    place = {token: index for index, token in enumerate(cg.tokens)}
+    for index, name in enumerate(cg.functions):
+        is_needed, closed = name not in left_out, unread.get(name, frozenset())
+        for token in dict.fromkeys(cg.func_inputs(name)):
+            yield EdgeView(index, place[token], True, is_needed and token not in closed)
+        for token in dict.fromkeys(cg.func_outputs(name)):
+            yield EdgeView(index, place[token], False, is_needed)
+
+
+def _redefined_caption(names: list[str]) -> str:
+    if not names:
+        return ""
+    some = ", ".join(repr(cut(name, _SELECTOR_CHARACTERS)) for name in names[:_NAMED])
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    verb = "was" if len(names) == 1 else "were"
+    return f"{some}{more} {verb} redefined since the graph was built: run the cell that builds it again"

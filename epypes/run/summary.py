@@ -1,0 +1,230 @@
+"""How long do the functions of a graph take over many runs?
+
+Durations are skewed: most are near the shortest possible, a few are much longer. So they are described by log-normal
+distributions, fitted by maximum likelihood. Semeniuta and Falkman 2019, PeerJ Computer Science 5:e176, figures 15
+and 16.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import NormalDist, fmean
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final
+
+from epypes.run.report import RunReport
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_STANDARD: Final = NormalDist()
+_COLUMNS: Final = ("function", "runs", "not_positive", "mode_ms", "median_ms", "p05_ms", "p95_ms")
+
+
+@dataclass(frozen=True, slots=True)
+class LogNormal:
+    """The log-normal distribution that fits some durations best; does not change.
+
+    Attributes
+    ----------
+    count
+        How many durations there are.
+    not_positive
+        How many of them are zero or negative, which a clock's resolution can cause; they are counted, not fitted.
+    mu, sigma
+        The mean and the population standard deviation of the logarithms of the positive ones, in nanoseconds; nan if
+        there are none.
+    least_ns, most_ns
+        The range of all of them, in nanoseconds.
+
+    Notes
+    -----
+    Semeniuta and Falkman 2019, PeerJ Computer Science 5:e176, figures 15 and 16: the curve is ``pdf``, the thin line
+    is at ``mode_ns``, the thick lines are at ``least_ns`` and ``most_ns``.
+
+    Examples
+    --------
+    >>> fitted = LogNormal(count=3, not_positive=0, mu=math.log(2e6), sigma=0.5, least_ns=1_000_000, most_ns=4_000_000)
+    >>> round(fitted.median_ns), round(fitted.mode_ns), round(fitted.mean_ns)
+    (2000000, 1557602, 2266297)
+    """
+
+    count: int
+    not_positive: int
+    mu: float
+    sigma: float
+    least_ns: int
+    most_ns: int
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether there was a positive duration to fit."""
+        return self.not_positive < self.count
+
+    @property
+    def median_ns(self) -> float:
+        """Half of the durations are shorter, in nanoseconds."""
+        return math.exp(self.mu)
+
+    @property
+    def mode_ns(self) -> float:
+        """The most likely duration, in nanoseconds."""
+        return math.exp(self.mu - self.sigma**2)
+
+    @property
+    def mean_ns(self) -> float:
+        """The mean of the distribution, in nanoseconds."""
+        return math.exp(self.mu + self.sigma**2 / 2)
+
+    def quantile_ns(self, share: float) -> float:
+        """Return the duration that this share of the distribution stays below, in nanoseconds.
+
+        Parameters
+        ----------
+        share
+            Between 0 and 1, both excluded.
+        """
+        return math.exp(self.mu + self.sigma * _STANDARD.inv_cdf(share))
+
+    def pdf(self, duration_ns: float) -> float:
+        """Return the probability density at a duration, per nanosecond.
+
+        nan if nothing was fitted. Where all durations are equal, it is infinite there and 0 elsewhere.
+        """
+        if not self.is_fitted:
+            return math.nan
+        if duration_ns <= 0:
+            return 0.0
+        away = math.log(duration_ns) - self.mu
+        if self.sigma == 0:
+            return 0.0 if away else math.inf
+        scale = duration_ns * self.sigma * math.sqrt(2 * math.pi)
+        return math.exp(-((away / self.sigma) ** 2) / 2) / scale
+
+    def __repr__(self) -> str:
+        if not self.is_fitted:
+            return f"<LogNormal of {self.count} durations: no positive value>"
+        return f"<LogNormal of {self.count} durations{f', {self.not_positive} not positive' * bool(self.not_positive)}>"
+
+
+@dataclass(frozen=True, slots=True)
+class TimingSummary:
+    """The times of many runs; shows itself as a table.
+
+    Attributes
+    ----------
+    functions
+        By function that ran at least once, in run order, how long it took in the runs in which it ran.
+    total
+        From the start of a run to its end.
+    overhead
+        The graph overhead (the paper's o_cg).
+    runs
+        How many runs there were.
+    side_by_side
+        Whether in one of them functions may have run side by side; graph overhead is then wall time less the critical
+        path.
+
+    Notes
+    -----
+    Semeniuta and Falkman 2019, PeerJ Computer Science 5:e176, figures 15 and 16.
+    """
+
+    functions: Mapping[str, LogNormal]
+    total: LogNormal
+    overhead: LogNormal
+    runs: int
+    side_by_side: bool = False
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return a table: function, runs, not_positive, mode_ms, median_ms, p05_ms, p95_ms.
+
+        The last two rows are ``total`` and ``graph overhead``; p05 and p95 are quantiles of the fitted distribution.
+        """
+        import pandas as pd
+
+        rows = (*self.functions.items(), ("total", self.total), ("graph overhead", self.overhead))
+        return pd.DataFrame([_row(name, fitted) for name, fitted in rows], columns=list(_COLUMNS))
+
+    def __repr__(self) -> str:
+        functions = len(self.functions)
+        return f"<TimingSummary: {self.runs} run{'s' * (self.runs != 1)}, {functions} function{'s' * (functions != 1)}>"
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
+        from epypes.display import mimebundle
+
+        return mimebundle(self)
+
+
+def summarize(reports: Iterable[RunReport]) -> TimingSummary:
+    """Summarize the times of many runs by log-normal distributions.
+
+    Parameters
+    ----------
+    reports
+        Such as ``runner.reports``. Reports of failed runs are among them, with the times up to the failure. Functions
+        of one name in several graphs are taken together.
+
+    Raises
+    ------
+    ValueError
+        There is no report.
+
+    Notes
+    -----
+    Semeniuta and Falkman 2019, PeerJ Computer Science 5:e176, figures 15 and 16: maximum likelihood, so mu and sigma
+    are the mean and the population standard deviation of the logarithms.
+
+    Examples
+    --------
+    >>> import epypes as ep
+    >>> runner = ep.CompGraphRunner(ep.CompGraph({"double": lambda x: 2 * x}, {"double": ("x", "y")}))
+    >>> for x in range(5):
+    ...     _ = runner.run(x=x)
+    >>> ep.summarize(runner.reports)
+    <TimingSummary: 5 runs, 1 function>
+    """
+    # A copy, since a run in another thread may add to the runner's reports meanwhile.
+    given = tuple(reports)
+    if not given:
+        raise ValueError("There is no report to summarize. Run something first: runner.run(...), then runner.reports.")
+    for report in given:
+        if not isinstance(report, RunReport):
+            kind = type(report).__name__
+            raise TypeError(f"summarize takes RunReports, such as runner.reports, not {kind!r}.")
+    durations = _by_function(given)
+    return TimingSummary(
+        functions=MappingProxyType({name: _fit(values) for name, values in durations.items() if values}),
+        total=_fit([report.total_ns for report in given]),
+        overhead=_fit([report.overhead_ns for report in given]),
+        runs=len(given),
+        side_by_side=any(report.side_by_side for report in given),
+    )
+
+
+def _by_function(reports: Sequence[RunReport]) -> dict[str, list[int]]:
+    """Return the durations by function of the graphs that were run, in run order."""
+    programs = dict.fromkeys(report.program for report in reports)
+    found: dict[str, list[int]] = {step.name: [] for program in programs for step in program.steps}
+    for report in reports:
+        for name, duration_ns in report.durations_ns.items():
+            found[name].append(duration_ns)
+    return found
+
+
+def _fit(durations_ns: Sequence[int]) -> LogNormal:
+    """Fit the positive durations by maximum likelihood."""
+    logs = [math.log(duration) for duration in durations_ns if duration > 0]
+    mu = sigma = math.nan
+    if logs:
+        mu = fmean(logs)
+        sigma = math.sqrt(fmean([(log - mu) ** 2 for log in logs]))
+    count = len(durations_ns)
+    return LogNormal(count, count - len(logs), mu, sigma, min(durations_ns), max(durations_ns))
+
+
+def _row(name: str, fitted: LogNormal) -> tuple[str | int | float, ...]:
+    times_ns = (fitted.mode_ns, fitted.median_ns, fitted.quantile_ns(0.05), fitted.quantile_ns(0.95))
+    return name, fitted.count, fitted.not_positive, *(time / 1e6 for time in times_ns)
