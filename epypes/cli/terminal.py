@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from epypes.display.view import duration_text
-
 if TYPE_CHECKING:
     from rich.progress import Progress
 
@@ -35,6 +33,8 @@ def progress() -> Iterator[Progress]:
 def print_answer(title: str, answer: Answer) -> None:
     """Print the times of a service's answer as a table."""
     from rich.table import Table
+
+    from epypes.display.view import duration_text
 
     table = Table(title=title, title_justify="left")
     table.add_column("where")

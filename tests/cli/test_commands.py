@@ -11,6 +11,7 @@ import pytest
 import epypes as ep
 from epypes.acquisition import read_image, write_image
 from epypes.bundle.load import read_bundle
+from epypes.cli import main
 from epypes.cli.call import by_token
 from epypes.errors import ServiceError, UnknownName
 from epypes.service import Service
@@ -39,9 +40,20 @@ def bundle(promoted, tmp_path):
     return read_bundle(shutil.copytree(promoted.path, tmp_path / "edges"))
 
 
-def epypes(*arguments, **options):
-    command = [sys.executable, "-m", "epypes.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, **options)
+@pytest.fixture
+def epypes(capsys):
+    """Run a command in this process, as far as its exit."""
+
+    def run(*arguments):
+        with pytest.raises(SystemExit) as stop:
+            main(list(map(str, arguments)))
+        said = capsys.readouterr()
+        code = stop.value.code
+        if isinstance(code, str):  # as the interpreter does at its end
+            return subprocess.CompletedProcess(arguments, 1, said.out, said.err + code + "\n")
+        return subprocess.CompletedProcess(arguments, code or 0, said.out, said.err)
+
+    return run
 
 
 def one_line(done) -> str:
@@ -53,7 +65,7 @@ def one_line(done) -> str:
     return done.stderr
 
 
-def test_call_writes_the_answer_and_prints_the_times(bundle, photograph, tmp_path):
+def test_call_writes_the_answer_and_prints_the_times(epypes, bundle, photograph, tmp_path):
     write_image(tmp_path / "photo.png", photograph)
     with StateLock(bundle.path) as lock, Service(bundle.path, ANY, ANY) as service:
         lock.publish(service.start())
@@ -74,17 +86,17 @@ def test_call_writes_the_answer_and_prints_the_times(bundle, photograph, tmp_pat
         assert "can't be written: [Errno 2] No such file" in said
 
 
-def test_an_image_path_that_does_not_exist_is_one_line(bundle):
+def test_an_image_path_that_does_not_exist_is_one_line(epypes, bundle):
     assert "Image 'nothing.png' can't be read" in one_line(epypes("call", bundle.path, "nothing.png", "--out", "x.png"))
 
 
-def test_calling_where_nothing_serves_is_one_line(bundle, photograph, tmp_path):
+def test_calling_where_nothing_serves_is_one_line(epypes, bundle, photograph, tmp_path):
     write_image(tmp_path / "photo.png", photograph)
     said = one_line(epypes("call", bundle.path, tmp_path / "photo.png", "--out", "x.png"))
     assert "No service runs for" in said
 
 
-def test_verify_says_identical_or_what_differs(bundle):
+def test_verify_says_identical_or_what_differs(epypes, bundle):
     done = epypes("verify", bundle.path)
     assert (done.returncode, done.stderr) == (0, "")
     assert "identical: 1 token of 1 sample" in done.stdout
@@ -93,21 +105,21 @@ def test_verify_says_identical_or_what_differs(bundle):
 
 
 @pytest.mark.parametrize("command", ["verify", "serve"])
-def test_a_folder_that_is_not_there_is_one_line(command, tmp_path):
+def test_a_folder_that_is_not_there_is_one_line(epypes, command, tmp_path):
     assert "does not exist" in one_line(epypes(command, tmp_path / "nothing"))
 
 
 @pytest.mark.parametrize("address", ["nonsense", "tcp://127.0.0.1:99999", "tcp://0.0.0.0:5555", "tcp://"])
-def test_an_address_that_makes_no_sense_is_one_line(bundle, address):
+def test_an_address_that_makes_no_sense_is_one_line(epypes, bundle, address):
     one_line(epypes("serve", bundle.path, "--sub", address))
 
 
-def test_wrong_usage_exits_with_2():
+def test_wrong_usage_exits_with_2(epypes):
     assert epypes("serve").returncode == 2
     assert epypes("nonsense").returncode == 2
 
 
-def test_help_names_every_command():
+def test_help_names_every_command(epypes):
     done = epypes("--help")
     assert done.returncode == 0
     for command in ("promote", "verify", "serve", "call", "demo"):
@@ -144,7 +156,7 @@ def test_a_module_that_an_extra_brings_is_named():
     assert done.stderr.strip() == "epypes: module 'tomlkit' is missing. Run: pip install 'epypes[all]'"
 
 
-def test_files_have_the_right_colours_whatever_the_order_of_the_tokens(tmp_path):
+def test_files_have_the_right_colours_whatever_the_order_of_the_tokens(epypes, tmp_path):
     runner = red_runner()
     runner.run(image=red_image())
     bundle = ep.promote(runner, tmp_path / "red", outputs=["red", "unsaid"])
