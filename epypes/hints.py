@@ -9,7 +9,9 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+from epypes.annotations import hints_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,11 +105,11 @@ def annotated_param(function: Callable[..., Any], position: int) -> Param | None
     ``Annotated`` with a Param or with the Ge, Gt, Le, Lt, Interval and MultipleOf of ``annotated_types``,
     ``Literal``, an ``Enum`` and ``bool`` are understood.
     """
+    hints = hints_of(function)
     try:
-        hints = get_type_hints(function, include_extras=True)
         name = tuple(function.__code__.co_varnames[: function.__code__.co_argcount])[position]
-    except (AttributeError, IndexError, NameError, TypeError):
-        return None  # a C function, or an annotation that can't be resolved: the value must do
+    except (AttributeError, IndexError):
+        return None  # a C function: the value must do
     return _from_annotation(hints.get(name))
 
 

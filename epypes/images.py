@@ -9,11 +9,13 @@ from __future__ import annotations
 import difflib
 import inspect
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from types import FunctionType, MethodType
-from typing import Annotated, Any, Final, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Final, Literal, get_args, get_origin
 from weakref import WeakKeyDictionary
+
+from epypes.annotations import hints_of
 
 Order = Literal["bgr", "rgb"]
 
@@ -188,8 +190,13 @@ def swapped(image: Any) -> Any:
 
 
 Contracts = tuple[tuple[Image | None, ...], tuple[Image | None, ...]]
-# Weak, so that a function of a notebook that was defined again can go; reading annotations evaluates their text.
-_READ: WeakKeyDictionary[FunctionType, tuple[inspect.Signature, dict[str, Any]] | None] = WeakKeyDictionary()
+# By function, whether its hints have a mark. Weak, so that a function of a notebook that was defined again can go.
+_MARKED: WeakKeyDictionary[FunctionType, bool] = WeakKeyDictionary()
+
+
+def is_marked(function: Callable[..., Any]) -> bool:
+    """Whether a function's annotations have a mark."""
+    return bool(_marked_hints(function))
 
 
 def image_contracts(function: Callable[..., Any]) -> Contracts:
@@ -233,16 +240,31 @@ def contracts_of(function: Callable[..., Any], inputs: int, outputs: int) -> Con
     return taken, made if len(made) == outputs else (None,) * outputs
 
 
-def _read(function: Callable[..., Any]) -> tuple[inspect.Signature, dict[str, Any]] | None:
-    """Return signature and resolved annotations of a function that has a mark."""
-    plain = _unwrapped(function)
-    if not getattr(plain, "__annotations__", None):
+def _read(function: Callable[..., Any]) -> tuple[inspect.Signature, Mapping[str, Any]] | None:
+    """Return signature and hints of a function that has a mark."""
+    hints = _marked_hints(function)
+    try:
+        return (inspect.signature(_unwrapped(function)), hints) if hints else None
+    except Exception:  # an object's own __signature__ may be anything
         return None
-    if not isinstance(plain, FunctionType):
-        return _resolved(plain) if isinstance(plain, MethodType) else None
-    if plain not in _READ:
-        _READ[plain] = _resolved(plain)
-    return _READ[plain]
+
+
+def _marked_hints(function: Callable[..., Any]) -> Mapping[str, Any]:
+    """Return the hints of a function that has a mark, else none."""
+    plain = _unwrapped(function)
+    if not isinstance(plain, FunctionType | MethodType):
+        return {}
+    hints = hints_of(plain)
+    if not hints or isinstance(plain, MethodType):
+        return hints if _has_mark(hints) else {}
+    marked = _MARKED.get(plain)
+    if marked is None:
+        marked = _MARKED[plain] = _has_mark(hints)
+    return hints if marked else {}
+
+
+def _has_mark(hints: Mapping[str, Any]) -> bool:
+    return any(_mark(part) for hint in hints.values() for part in (hint, *get_args(hint)))
 
 
 def _unwrapped(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -252,16 +274,6 @@ def _unwrapped(function: Callable[..., Any]) -> Callable[..., Any]:
         return inspect.unwrap(function) if is_wrapper else function
     except Exception:  # whatever an object's __getattr__ raises
         return function
-
-
-def _resolved(function: Callable[..., Any]) -> tuple[inspect.Signature, dict[str, Any]] | None:
-    try:
-        hints = get_type_hints(function, include_extras=True)
-        if not any(_mark(part) for hint in hints.values() for part in (hint, *get_args(hint))):
-            return None
-        return inspect.signature(function), hints
-    except Exception:  # what the text of an annotation raises, when it is evaluated, is the user's
-        return None
 
 
 def _mark(annotation: Any) -> Image | None:

@@ -11,9 +11,10 @@ import itertools
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class BipartiteDigraph:
     """Functions, tokens and the edges between them.
 
@@ -23,30 +24,28 @@ class BipartiteDigraph:
         By function name, its input and output tokens; the order of the functions is the order of definition.
     producer
         By token, the function that makes it (the first one, where a faulty graph has several).
-    consumers
-        By token, the functions that take it, in order of definition.
     """
 
     inputs: Mapping[str, tuple[str, ...]]
     outputs: Mapping[str, tuple[str, ...]]
     producer: dict[str, str] = field(init=False)
-    consumers: dict[str, list[str]] = field(init=False)
 
     def __post_init__(self) -> None:
         producer: dict[str, str] = {}
-        consumers: dict[str, list[str]] = {}
         for function, tokens in self.outputs.items():
             for token in tokens:
                 if token not in producer:
                     producer[token] = function
-        for function, tokens in self.inputs.items():
-            for token in tokens if len(tokens) < 2 else dict.fromkeys(tokens):
-                if token in consumers:
-                    consumers[token].append(function)
-                else:
-                    consumers[token] = [function]
         object.__setattr__(self, "producer", producer)
-        object.__setattr__(self, "consumers", consumers)
+
+    @cached_property
+    def consumers(self) -> dict[str, list[str]]:
+        """By token, the functions that take it, in order of definition. Made when it is asked for: a run is not."""
+        consumers: dict[str, list[str]] = {}
+        for function, tokens in self.inputs.items():
+            for token in dict.fromkeys(tokens):
+                consumers.setdefault(token, []).append(function)
+        return consumers
 
     def successors(self, function: str) -> Iterable[str]:
         """Return the functions that take an output of ``function``, each once, in order of definition."""

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from types import FunctionType
-from typing import Any
+from typing import Any, Final
 
 from epypes.errors import Finding
 from epypes.graph.bipartite import BipartiteDigraph
 from epypes.graph.signature import Parameters, is_plain, parameters_of, signature_of
 from epypes.graph.switch import as_switch
 
+_STRING: Final = frozenset({str})
 _SHAPES = "(x, y), ((x1, ..., xm), y), (x, (y1, ..., yn)) or ((x1, ..., xm), (y1, ..., yn))"
 
 
@@ -36,11 +37,16 @@ def read_io(func_io: Mapping[str, Any], findings: list[Finding]) -> tuple[Bipart
     inputs: dict[str, tuple[str, ...]] = {}
     outputs: dict[str, tuple[str, ...]] = {}
     written: dict[str, Any] = {}
+    are_strings = _STRING.issuperset
     for name, io in func_io.items():
-        if type(io) is tuple and len(io) == 2 and type(io[0]) is type(io[1]) is str and io[0] and io[1]:
-            # The usual case, first, so that large graphs are read fast.
-            inputs[name], outputs[name], written[name] = (io[0],), (io[1],), io
-            continue
+        if type(io) is tuple and len(io) == 2:
+            # As it is written nearly always; large graphs are read fast.
+            given, made = io
+            taken = given if type(given) is tuple else (given,)
+            returned = made if type(made) is tuple else (made,)
+            if are_strings(map(type, (*taken, *returned))) and "" not in taken and "" not in returned:
+                inputs[name], outputs[name], written[name] = taken, returned, io
+                continue
         try:
             given, made = io if isinstance(io, tuple | list) else (None, 0)
             taken, returned = _tokens(given), () if made is None else _tokens(made)
@@ -54,15 +60,14 @@ def read_io(func_io: Mapping[str, Any], findings: list[Finding]) -> tuple[Bipart
 
 
 def _tokens(given: Any) -> tuple[str, ...]:
-    if type(given) is str and given:
+    if isinstance(given, str) and given:
         return (given,)
-    names = (given,) if isinstance(given, str) else given
-    if not isinstance(names, tuple | list):
+    if not isinstance(given, tuple | list):
         raise TypeError
-    for name in names:
+    for name in given:
         if not isinstance(name, str) or not name:
             raise TypeError
-    return tuple(names)
+    return tuple(given)
 
 
 def _as_tuple(side: Any) -> Any:
@@ -72,6 +77,11 @@ def _as_tuple(side: Any) -> Any:
 def is_single(io_side: object) -> bool:
     """Whether a side of an io is one token as it is (``"y"``), not a sequence of tokens (``("y",)``)."""
     return isinstance(io_side, str)
+
+
+def distinct(functions: Mapping[str, Any]) -> dict[int, Any]:
+    """Return each function once, by its id: a large graph has few functions under many names."""
+    return {id(function): function for function in functions.values()}
 
 
 def check_pairing(functions: Mapping[str, Any], func_io: Mapping[str, Any]) -> Iterable[Finding]:
@@ -127,9 +137,11 @@ def check_cycle(graph: BipartiteDigraph) -> Iterable[Finding]:
 def check_arity(functions: Mapping[str, Callable[..., Any]], graph: BipartiteDigraph) -> Iterable[Finding]:
     """Find functions that can't be called with as many inputs as their io names."""
     known: dict[int, Parameters | None] = {}
+    # What a plain function takes is seen without asking more: the usual case.
+    exact = {key: function.__code__.co_argcount for key, function in distinct(functions).items() if _is_exact(function)}
     for name, tokens in graph.inputs.items():
         function = functions.get(name)
-        if function is None or _takes_exactly(function, len(tokens)) or not callable(function):
+        if exact.get(id(function)) == len(tokens) or function is None or not callable(function):
             continue
         if id(function) not in known:
             known[id(function)] = parameters_of(function)
@@ -138,12 +150,9 @@ def check_arity(functions: Mapping[str, Callable[..., Any]], graph: BipartiteDig
             yield from _arity_findings(name, function, tokens, parameters)
 
 
-def _takes_exactly(function: object, count: int) -> bool:
-    """Whether a plain function has as many parameters as inputs: the usual case, seen without asking more."""
-    if type(function) is not FunctionType:
-        return False
-    code = function.__code__
-    return code.co_argcount == count and not code.co_kwonlyargcount and is_plain(function)
+def _is_exact(function: Any) -> bool:
+    """Whether it is a plain function whose every parameter can be given by position."""
+    return is_plain(function) and not function.__code__.co_kwonlyargcount
 
 
 def _arity_findings(

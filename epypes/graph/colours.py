@@ -7,13 +7,29 @@ from typing import Any
 
 from epypes.errors import Finding
 from epypes.graph.bipartite import BipartiteDigraph
-from epypes.images import Image, Order, contracts_of
+from epypes.graph.checks import distinct
+from epypes.images import Contracts, Image, Order, contracts_of, is_marked
 
 
-def check_colours(functions: Mapping[str, Callable[..., Any]], graph: BipartiteDigraph) -> Iterable[Finding]:
+def read_contracts(functions: Mapping[str, Callable[..., Any]], graph: BipartiteDigraph) -> dict[str, Contracts]:
+    """Return what the annotations of functions say of the images that they take and make, by name.
+
+    Functions that say nothing are left out.
+    """
+    marked = {key for key, function in distinct(functions).items() if is_marked(function)}
+    if not marked:
+        return {}
+    return {
+        name: contracts_of(functions[name], len(tokens), len(graph.outputs[name]))
+        for name, tokens in graph.inputs.items()
+        if id(functions.get(name)) in marked
+    }
+
+
+def check_colours(contracts: Mapping[str, Contracts], graph: BipartiteDigraph) -> Iterable[Finding]:
     """Find tokens that two functions want in different orders of colours."""
     said: dict[str, tuple[str, str, Order]] = {}
-    for name, token, mark, verb in marks(functions, graph):
+    for name, token, mark, verb in _marks(contracts, graph):
         if mark.order is None:
             continue
         other, other_verb, order = said.setdefault(token, (name, verb, mark.order))
@@ -21,18 +37,11 @@ def check_colours(functions: Mapping[str, Callable[..., Any]], graph: BipartiteD
             yield _disagreement(token, (other, other_verb, order), (name, verb, mark.order))
 
 
-def marks(
-    functions: Mapping[str, Callable[..., Any]], graph: BipartiteDigraph
-) -> Iterator[tuple[str, str, Image, str]]:
-    """Give every mark of a graph's annotations: function, token, mark and ``"makes"`` or ``"takes"``, makers first."""
-    read = {
-        name: contracts_of(functions[name], len(tokens), len(graph.outputs[name]))
-        for name, tokens in graph.inputs.items()
-        if name in functions
-    }
+def _marks(contracts: Mapping[str, Contracts], graph: BipartiteDigraph) -> Iterator[tuple[str, str, Image, str]]:
+    """Give every mark: function, token, mark and ``"makes"`` or ``"takes"``, makers first."""
     for side, (verb, tokens_of) in ((1, ("makes", graph.outputs)), (0, ("takes", graph.inputs))):
-        for name, contracts in read.items():
-            for token, mark in zip(tokens_of[name], contracts[side], strict=False):
+        for name, said in contracts.items():
+            for token, mark in zip(tokens_of[name], said[side], strict=False):
                 if mark is not None:
                     yield name, token, mark, verb
 

@@ -18,13 +18,14 @@ from epypes.graph.checks import (
     is_single,
     read_io,
 )
-from epypes.graph.colours import check_colours
+from epypes.graph.colours import check_colours, read_contracts
 from epypes.graph.declared import read_functions
 from epypes.graph.parts import Default, Parts, check_defaults
 from epypes.graph.placeholder import is_placeholder
 from epypes.graph.redefined import redefined
 from epypes.graph.switch import as_switch
 from epypes.graph.typecheck import check_types
+from epypes.images import Contracts
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -68,8 +69,8 @@ class CompGraph:
     """
 
     __slots__ = (
-        "__weakref__", "_defaults", "_digraph", "_func_io", "_functions", "_placeholders", "_sinks", "_sources",
-        "_switches", "_tokens", "_types",
+        "__weakref__", "_contracts", "_defaults", "_digraph", "_func_io", "_functions", "_known", "_placeholders",
+        "_sinks", "_sources", "_switches", "_tokens", "_types",
     )  # fmt: skip
 
     def __init__(self, func_dict: Mapping[str, Callable[..., Any]], func_io: FuncIO, *, types: bool = True) -> None:
@@ -133,7 +134,8 @@ class CompGraph:
         if len(order) < len(digraph.inputs):
             findings += check_cycle(digraph)
         findings += check_arity(func_dict, digraph)
-        findings += check_colours(func_dict, digraph)
+        contracts = read_contracts(func_dict, digraph)
+        findings += check_colours(contracts, digraph)
         findings += check_selectors(func_dict, digraph)
         if types:
             findings += check_types(func_dict, digraph, written)
@@ -145,7 +147,7 @@ class CompGraph:
             inputs, outputs = digraph.inputs, digraph.outputs
             digraph = BipartiteDigraph({name: inputs[name] for name in order}, {name: outputs[name] for name in order})
             written = {name: written[name] for name in order}
-        self._digraph, self._types = digraph, types
+        self._digraph, self._types, self._contracts = digraph, types, contracts
         self._functions = MappingProxyType({name: func_dict[name] for name in order})
         self._func_io = MappingProxyType(written)
         self._look_up()
@@ -156,9 +158,11 @@ class CompGraph:
         """Note what is often asked for."""
         digraph = self._digraph
         sides = itertools.chain.from_iterable(zip(digraph.inputs.values(), digraph.outputs.values(), strict=True))
-        self._tokens = tuple(dict.fromkeys(itertools.chain.from_iterable(sides)))
+        self._known = dict.fromkeys(itertools.chain.from_iterable(sides))
+        self._tokens = tuple(self._known)
         self._sources = tuple([token for token in self._tokens if token not in digraph.producer])
-        self._sinks = tuple([token for token in self._tokens if token not in digraph.consumers])
+        taken = set(itertools.chain.from_iterable(digraph.inputs.values()))
+        self._sinks = tuple([token for token in self._tokens if token not in taken])
         special = [item for item in self._functions.items() if type(item[1]) is not FunctionType]
         self._placeholders = tuple(name for name, function in special if is_placeholder(function))
         self._switches = tuple(name for name, function in special if as_switch(function))
@@ -213,6 +217,11 @@ class CompGraph:
         """Whether annotations were compared; what is made from this graph does it the same way."""
         return self._types
 
+    @property
+    def contracts(self) -> Mapping[str, Contracts]:
+        """What annotations say of images, by function: a mark or None for each input, and for each output."""
+        return MappingProxyType(self._contracts)
+
     def func_inputs(self, name: str) -> tuple[str, ...]:
         """Return the input tokens of a function."""
         self.require_function(name)
@@ -230,7 +239,7 @@ class CompGraph:
 
     def has_token(self, name: str) -> bool:
         """Whether there is such a token."""
-        return name in self._digraph.producer or name in self._digraph.consumers
+        return name in self._known
 
     def require_function(self, name: str) -> None:
         """Raise UnknownName, with the nearest name, unless there is such a function."""

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Final
 
 from epypes.graph.compgraph import CompGraph
 from epypes.hints import Param, annotated_param
-from epypes.images import Image, Order, contracts_of
+from epypes.images import Contracts, Image, Order
+
+_NOTHING: Final[Contracts] = ((), ())
 
 
 def annotated_params(cg: CompGraph, token: str) -> Iterator[Param]:
@@ -40,13 +43,12 @@ def _made_as(cg: CompGraph, token: str) -> Image | None:
     function = cg.digraph.producer.get(token)
     if function is None:
         return None
-    tokens = cg.func_outputs(function)
-    _, made = contracts_of(cg.functions[function], len(cg.func_inputs(function)), len(tokens))
-    return made[tokens.index(token)] if made else None
+    _, made = cg.contracts.get(function, _NOTHING)
+    return made[cg.func_outputs(function).index(token)] if made else None
 
 
 def _taken_as(cg: CompGraph, token: str) -> Iterator[Image]:
     for function in cg.digraph.consumers.get(token, ()):
+        taken, _ = cg.contracts.get(function, _NOTHING)
         tokens = cg.func_inputs(function)
-        taken, _ = contracts_of(cg.functions[function], len(tokens), len(cg.func_outputs(function)))
         yield from (mark for name, mark in zip(tokens, taken, strict=False) if name == token and mark is not None)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import typing
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from types import FunctionType, MethodType
 from typing import Any, Final
 
+from epypes.annotations import hints_of
 from epypes.errors import Finding
 from epypes.graph.bipartite import BipartiteDigraph
-from epypes.graph.checks import is_single
+from epypes.graph.checks import distinct
 from epypes.graph.disjoint import are_disjoint, bare
 from epypes.graph.placeholder import innermost
 from epypes.graph.signature import parameters_of
@@ -20,21 +21,20 @@ _WAY_OUT: Final = "Change one of the annotations, or build the graph with types=
 _WIDEST: Final = 60
 
 
-@dataclass(slots=True)
-class TokenHints:
-    """What annotations say about one token.
+@dataclass(frozen=True, slots=True)
+class Said:
+    """What the annotations of a function say.
 
     Attributes
     ----------
-    made
-        The function that makes it and the hint of what it returns; None if there is no such hint.
     taken
-        Every function that takes it and the hint of that parameter, in order of definition.
+        The hint of each positional parameter; Any where there is none.
+    returned
+        The hint of the return value; Any if there is none.
     """
 
-    token: str
-    made: tuple[str, Any] | None = None
-    taken: list[tuple[str, Any]] = field(default_factory=list)
+    taken: tuple[Any, ...]
+    returned: Any
 
 
 def check_types(functions: Mapping[str, Any], graph: BipartiteDigraph, written: Mapping[str, Any]) -> Iterable[Finding]:
@@ -49,36 +49,46 @@ def check_types(functions: Mapping[str, Any], graph: BipartiteDigraph, written: 
     written
         The io by function name, as it was written.
     """
-    annotated = [name for name, function in functions.items() if _is_annotated(function) and name in graph.inputs]
-    if not annotated:
+    said = {key: _said(function) for key, function in distinct(functions).items() if _is_annotated(function)}
+    if not said:
         return
-    hints: dict[str, TokenHints] = {}
-    for name in annotated:
-        found = _resolved(functions[name])
-        if found:
-            _note_taken(hints, name, functions[name], graph.inputs[name], found)
-            yield from _note_made(hints, name, written[name][1], found)
-    for token in hints.values():
-        for check in TOKEN_CHECKS:
-            yield from check(token)
+    speakers = [(name, said[id(function)]) for name, function in functions.items() if id(function) in said]
+    made: dict[str, Any] = {}
+    for name, speaker in speakers:
+        outputs = written[name][1] if name in written else None
+        if not outputs or speaker.returned is Any:
+            continue
+        if type(outputs) is str:
+            made[outputs] = speaker.returned
+        else:
+            items = _items(speaker.returned, len(outputs))
+            if len(items) == len(outputs):
+                made.update(zip(outputs, items, strict=True))
+            else:
+                yield _wrong_number(name, speaker.returned, len(items), outputs)
+    yield from _no_common_value(made, speakers, graph)
 
 
-def no_common_value(hints: TokenHints) -> Iterable[Finding]:
+def _no_common_value(
+    made: Mapping[str, Any], speakers: Iterable[tuple[str, Said]], graph: BipartiteDigraph
+) -> Iterable[Finding]:
     """Find consumers that no value of the producer's type can satisfy."""
-    if hints.made is None:
-        return
-    maker, made = hints.made
-    for taker, taken in hints.taken:
-        if are_disjoint(made, taken):
-            text = (
-                f"Function {maker!r} makes token {hints.token!r} as {_type_text(made)}, but {taker!r} takes it as "
-                f"{_type_text(taken)}, and no value is both. {_WAY_OUT}"
-            )
-            yield Finding("types", text, (hints.token, maker, taker))
-
-
-# What is asked about every token that an annotation says something about; another check of hints is added here.
-TOKEN_CHECKS: Final[tuple[Callable[[TokenHints], Iterable[Finding]], ...]] = (no_common_value,)
+    disjoint: dict[tuple[int, int], bool] = {}
+    for taker, said in speakers:
+        for token, taken in zip(graph.inputs.get(taker, ()), said.taken, strict=False):
+            hint = made.get(token, Any)
+            if hint is taken or hint is Any:
+                continue
+            pair = id(hint), id(taken)
+            if pair not in disjoint:
+                disjoint[pair] = are_disjoint(hint, taken)
+            if disjoint[pair]:
+                maker = graph.producer[token]
+                text = (
+                    f"Function {maker!r} makes token {token!r} as {_type_text(hint)}, but {taker!r} takes it as "
+                    f"{_type_text(taken)}, and no value is both. {_WAY_OUT}"
+                )
+                yield Finding("types", text, (token, maker, taker))
 
 
 def _is_annotated(function: Any) -> bool:
@@ -88,41 +98,19 @@ def _is_annotated(function: Any) -> bool:
     return type(function) is MethodType or innermost(function) is not function
 
 
-def _resolved(function: Any) -> dict[str, Any]:
-    """Return the hints by parameter, and that of ``return``; none where they can't be resolved."""
-    try:
-        return typing.get_type_hints(function, include_extras=True)
-    except Exception:  # names that are not there yet, and whatever an annotation raises when it is evaluated
-        return {}
-
-
-def _note_taken(
-    hints: dict[str, TokenHints], name: str, function: Any, tokens: tuple[str, ...], found: Mapping[str, Any]
-) -> None:
-    parameters = parameters_of(function)
+def _said(function: Any) -> Said:
+    hints = hints_of(function)
+    parameters = parameters_of(function) if hints else None
     positional = parameters.positional if parameters is not None else ()
-    for token, (parameter, _) in zip(tokens, positional, strict=False):
-        if parameter in found:
-            hints.setdefault(token, TokenHints(token)).taken.append((name, found[parameter]))
+    return Said(tuple(hints.get(name, Any) for name, _ in positional), hints.get("return", Any))
 
 
-def _note_made(hints: dict[str, TokenHints], name: str, outputs: Any, found: Mapping[str, Any]) -> Iterable[Finding]:
-    """Note what a function returns, a tuple by its items; its length is a finding if it does not fit the io."""
-    if "return" not in found or not outputs:
-        return
-    if is_single(outputs):
-        hints.setdefault(outputs, TokenHints(outputs)).made = (name, found["return"])
-        return
-    items = _items(found["return"], len(outputs))
-    if len(items) != len(outputs):
-        text = (
-            f"Function {name!r} returns {_type_text(found['return'])}, {len(items)} values, but its io names "
-            f"{len(outputs)} outputs: ({', '.join(outputs)}). Name as many, or build the graph with types=False."
-        )
-        yield Finding("types", text, (name, *outputs))
-        return
-    for token, item in zip(outputs, items, strict=True):
-        hints.setdefault(token, TokenHints(token)).made = (name, item)
+def _wrong_number(name: str, returned: Any, count: int, outputs: tuple[str, ...]) -> Finding:
+    text = (
+        f"Function {name!r} returns {_type_text(returned)}, {count} values, but its io names "
+        f"{len(outputs)} outputs: ({', '.join(outputs)}). Name as many, or build the graph with types=False."
+    )
+    return Finding("types", text, (name, *outputs))
 
 
 def _items(returned: Any, count: int) -> tuple[Any, ...]:

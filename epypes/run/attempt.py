@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from time import perf_counter_ns
 from typing import Any
 
 from epypes.run.call import StepFailed
 from epypes.run.compiled import CompiledRuns
 from epypes.run.draft import Draft
-from epypes.run.engine import execute
+from epypes.run.engine import execute, execute_from_scratch
 from epypes.run.failure import Failure, failure_of
 from epypes.run.gain import Gain, Gains, GuardedWay, has_independent_steps
 from epypes.run.need import check_ready, wanted_steps
@@ -20,6 +20,8 @@ from epypes.run.tokens import Freshness
 
 # What Run is made of, but for the hyperparameters.
 Outcome = tuple[list[Any], Freshness, Times, Failure | None]
+
+Engine = Callable[[Draft, bytes | None, dict[int, int]], None]
 
 _INVERTED = bytes((1, 0)).ljust(256)
 
@@ -56,7 +58,8 @@ class Attempts:
         gain = None if self._gains is None else self._gains.of_steps(wanted)
         compiled = None if gain is not None and not gain.is_known else self._compiled.of_steps(wanted)
         if compiled is None or (gain is not None and gain.is_worth_it()):
-            return self._step_by_step(Draft.of_sources(self._program, values, has_payload), wanted, gain, start_ns)
+            draft = Draft.of_sources(self._program, values, has_payload)
+            return self._step_by_step(execute_from_scratch, draft, wanted, gain, start_ns)
         try:
             durations_ns = compiled(values)
         except StepFailed as failed:
@@ -77,7 +80,7 @@ class Attempts:
         """
         wanted = self._wanted(draft.values, targets, draft.has_payload)
         gain = None if self._gains is None else self._gains.of_dirty(bytes(draft.dirty), wanted)
-        return self._step_by_step(draft, wanted, gain, start_ns)
+        return self._step_by_step(execute, draft, wanted, gain, start_ns)
 
     def _wanted(self, values: list[Any], targets: Sequence[str], has_payload: bool) -> bytes | None:
         program = self._program
@@ -86,14 +89,16 @@ class Attempts:
             check_ready(program, values, wanted)
         return wanted
 
-    def _step_by_step(self, draft: Draft, wanted: bytes | None, gain: Gain | None, start_ns: int) -> Outcome:
+    def _step_by_step(
+        self, one_by_one: Engine, draft: Draft, wanted: bytes | None, gain: Gain | None, start_ns: int
+    ) -> Outcome:
         durations_ns: dict[int, int] = {}
         side_by_side = gain is not None and gain.is_worth_it()
         try:
             if side_by_side:
                 execute_side_by_side(draft, wanted, durations_ns, self._workers)
             else:
-                execute(draft, wanted, durations_ns)
+                one_by_one(draft, wanted, durations_ns)
         except StepFailed as failed:
             return _ended(draft, failed, wanted, durations_ns, start_ns, side_by_side)
         outcome = _ended(draft, None, wanted, durations_ns, start_ns, side_by_side)

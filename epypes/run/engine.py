@@ -6,6 +6,21 @@ from epypes.run.call import call
 from epypes.run.draft import Draft
 
 
+def execute_from_scratch(draft: Draft, wanted: bytes | None, durations_ns: dict[int, int]) -> None:
+    """Run the wanted steps, all for None, where none has been run before: as ``execute`` does, with less to ask."""
+    program, values, dirty = draft.program, draft.values, draft.dirty
+    steps = program.steps if wanted is None else [step for step in program.steps if wanted[step.place]]
+    for step in steps:
+        place, outputs = step.place, step.outputs
+        made, durations_ns[place] = call(program, step, values)
+        dirty[place] = 0
+        if len(outputs) == 1:
+            values[outputs[0]] = made[0]
+        else:
+            for slot, value in zip(outputs, made, strict=True):
+                values[slot] = value
+
+
 def execute(draft: Draft, wanted: bytes | None, durations_ns: dict[int, int]) -> None:
     """Run the dirty steps in run order, those included that become dirty on the way.
 

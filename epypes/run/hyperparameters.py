@@ -46,12 +46,8 @@ class Hyperparameters:
     def free_slots(self) -> dict[str, int]:
         """The slots of the source tokens that are not frozen, in order of first appearance in func_io."""
         if self._free is None:
-            makers = self.program.makers
-            self._free = {
-                token: slot
-                for slot, token in enumerate(self.program.tokens)
-                if makers[slot] < 0 and token not in self.entries
-            }
+            slots = self.program.slots
+            self._free = {token: slots[token] for token in self.program.cg.source_tokens if token not in self.entries}
         return self._free
 
     @property

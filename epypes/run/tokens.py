@@ -96,6 +96,8 @@ class TokenManager:
 
     def is_stale(self, token: str) -> bool:
         """Whether the token has a value that is out of date."""
+        if not self.stale:
+            return False
         slot = self.program.slots[token]
         return self.program.makers[slot] in self.stale and self.values[slot] is not NOT_COMPUTED
 
