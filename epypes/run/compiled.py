@@ -9,7 +9,7 @@ the caches with an image, each costs some microseconds.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from sys import getrefcount
 from time import perf_counter_ns
 from typing import Any, Final, NoReturn
@@ -19,8 +19,10 @@ from epypes.run.draft import is_unchanged
 from epypes.run.guard import ARRAYLESS, FRESH, FRESH_HERE, HARMLESS, LISTS, LONG, array_type, keep, lend
 from epypes.run.program import Program, Step
 
-# Runs its steps on values by slot, and gives nanoseconds by step; -1, or none, for those that did not run.
+# Runs its steps on values by slot, and gives nanoseconds by step; -1, or none, for those that did not run. A rerun is
+# given the new values of the source tokens too.
 CompiledRun = Callable[[list[Any]], Mapping[int, int] | Sequence[int]]
+CompiledRerun = Callable[[list[Any], Iterable[Any]], Mapping[int, int]]
 
 # Compiling takes some 40 us per function, once: worth it for what is repeated, and a pause below 20 ms.
 _RUNS_BEFORE: Final = 3
@@ -74,14 +76,14 @@ class CompiledRuns:
         self._program = program
         self.whole: CompiledRun | None = None
         self._counts: Counter[Hashable] = Counter()
-        self._compiled: dict[Hashable, CompiledRun] = {}
+        self._compiled: dict[Hashable, Any] = {}
 
     def of_steps(self, wanted: bytes | None) -> CompiledRun | None:
         """Return the run of the wanted steps, all of them for None, from values of source tokens.
 
         None if it has not been repeated enough.
         """
-        compiled = self._compiled.get(wanted)
+        compiled: CompiledRun | None = self._compiled.get(wanted)
         if compiled is None and self._is_worth_it(wanted):
             steps = [step for step in self._program.steps if wanted is None or wanted[step.place]]
             compiled = self._compiled[wanted] = compile_run(self._program, steps, ())
@@ -89,13 +91,15 @@ class CompiledRuns:
                 self.whole = compiled
         return compiled
 
-    def of_changes(self, tokens: Collection[str]) -> CompiledRun | None:
+    def of_changes(self, tokens: Collection[str]) -> CompiledRerun | None:
         """Return the rerun of what depends on these source tokens, where everything else is up to date.
+
+        It is given their values in this order.
 
         None if it has not been repeated enough, or the graph has switches, which decide what depends on what.
         """
         (key,) = tokens if len(tokens) == 1 else (tuple(tokens),)
-        compiled = self._compiled.get(key)
+        compiled: CompiledRerun | None = self._compiled.get(key)
         if compiled is None and not self._program.switches and self._is_worth_it(key):
             program = self._program
             slots = [program.slots[token] for token in tokens]
@@ -114,7 +118,7 @@ class CompiledRuns:
         return True
 
 
-def compile_run(program: Program, steps: list[Step], changed: Collection[int]) -> CompiledRun:
+def compile_run(program: Program, steps: list[Step], changed: Collection[int]) -> Any:
     """Write out and compile a run.
 
     Parameters
@@ -122,24 +126,29 @@ def compile_run(program: Program, steps: list[Step], changed: Collection[int]) -
     steps
         What to run, in run order.
     changed
-        The slots that have new values; then a step is passed over if nothing that it reads turns out to be new.
+        The slots that get new values; then a step is passed over if nothing that it reads turns out to be new.
         Empty if every step is to be run.
+
+    Returns
+    -------
+    CompiledRun or CompiledRerun
+        A rerun if there are ``changed`` slots.
     """
     lines = [
         f"def make(program, steps, {', '.join(_NAMES)}, array):",
         *(f"    f{step.place} = steps[{step.place}].function" for step in steps),
-        "    def run(v):",
-        "        at, start = 0, clock()",
+        f"    def run(v{', given' if changed else ''}):",
+        *(f"        {', '.join(f'v[{slot}]' for slot in changed)}, = given" for _ in range(bool(changed))),
+        "        at = start = 0",
         "        try:",
         *(f"            {line}" for line in _body(program, steps, set(changed))),
         "        except BaseException as error:",
-        "            failed(error, clock() - start, locals())",
+        "            failed(error, start and clock() - start, locals())",
         "    return run",
     ]
     names: dict[str, Any] = {}
     exec(compile("\n".join(lines), "<epypes: a compiled run>", "exec"), names)  # noqa: S102 - made of numbers only
-    run: CompiledRun = names["make"](program, program.steps, *_NAMES.values(), array_type())
-    return run
+    return names["make"](program, program.steps, *_NAMES.values(), array_type())
 
 
 def _body(program: Program, steps: list[Step], changed: set[int]) -> Iterator[str]:

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Collection, Hashable, Mapping
 from typing import Final
 
-from epypes.run.compiled import CompiledRun, CompiledRuns
+from epypes.run.compiled import CompiledRerun, CompiledRun, CompiledRuns
 from epypes.run.program import Program, longest_path_ns
 
 # What must be gained at best: the waking of two threads, and a tenth of the whole.
@@ -96,7 +96,7 @@ class GuardedWay:
         """As in CompiledRuns."""
         return self._compiled.whole if self._is_free(self._gains.of_steps(None)) else None
 
-    def of_changes(self, tokens: Collection[str]) -> CompiledRun | None:
+    def of_changes(self, tokens: Collection[str]) -> CompiledRerun | None:
         """As in CompiledRuns."""
         return self._compiled.of_changes(tokens) if self._is_free(self._gains.of_changes(tokens)) else None
 

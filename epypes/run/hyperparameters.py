@@ -28,14 +28,16 @@ class Hyperparameters:
     """
 
     # Made at every move of a slider, so what is rarely asked for is made when it is.
-    _base: list[Any] | None = None
-    _free: dict[str, int] | None = None
+    __slots__ = ("_base", "_free", "changed", "entries", "follows", "program", "revision")
 
     def __init__(
         self, program: Program, entries: dict[str, tuple[Any]], revision: int, changed: dict[str, Any], follows: int
     ) -> None:
-        self.program, self.entries, self.revision = program, entries, revision
-        self.changed, self.follows = changed, follows
+        self.program = program
+        self.entries = entries
+        self.revision = revision
+        self.changed = changed
+        self.follows = follows
 
     @property
     def values(self) -> Mapping[str, Any]:
@@ -45,20 +47,24 @@ class Hyperparameters:
     @property
     def free_slots(self) -> dict[str, int]:
         """The slots of the source tokens that are not frozen, in order of first appearance in func_io."""
-        if self._free is None:
-            slots = self.program.slots
-            self._free = {token: slots[token] for token in self.program.cg.source_tokens if token not in self.entries}
-        return self._free
+        try:
+            return self._free
+        except AttributeError:
+            slots, sources = self.program.slots, self.program.cg.source_tokens
+            self._free: dict[str, int] = {token: slots[token] for token in sources if token not in self.entries}
+            return self._free
 
     @property
     def base(self) -> list[Any]:
         """The values by slot, with which a run begins."""
-        if self._base is None:
+        try:
+            return self._base
+        except AttributeError:
             base: list[Any] = [NOT_COMPUTED] * len(self.program.tokens)
             for token, entry in self.entries.items():
                 base[self.program.slots[token]] = entry[0]
-            self._base = base
-        return self._base
+            self._base: list[Any] = base
+            return base
 
     def frozen(self, changes: Mapping[str, Any], *, also_new: bool = True) -> Hyperparameters:
         """Return these with tokens given values; all or nothing. An equal value changes nothing.
@@ -77,26 +83,23 @@ class Hyperparameters:
         HyperparameterError
             A function makes the token, or it is not a hyperparameter.
         """
-        program, entries, same_tokens = self.program, self.entries.copy(), True
-        new: dict[str, Any] = {}
+        program, revision = self.program, self.revision
+        entries, new, follows = self.entries.copy(), {}, revision
         for token, value in changes.items():
-            kind, entry = type(value), entries.get(token)
+            entry = entries.get(token)
             if entry is None:
                 (self.require_source if also_new else self.require)(token)
-                same_tokens = False
+                follows = -1
             # An integer, which most sliders give, is compared without a call.
-            elif entry[0] == value if kind is int is type(entry[0]) else is_same_value(entry[0], value):
+            elif entry[0] == value if type(value) is int is type(entry[0]) else is_same_value(entry[0], value):
                 continue
             if program.selectors:
                 self.require_branch(token, value)
-            if program.guard and kind not in ARRAYLESS:
+            if type(value) not in ARRAYLESS and program.guard:
                 value = lend(value)
             new[token] = value
             entries[token] = (value,)
-        if not new:
-            return self
-        revision = self.revision
-        return Hyperparameters(program, entries, revision + 1, new, revision if same_tokens else -1)
+        return Hyperparameters(program, entries, revision + 1, new, follows) if new else self
 
     def unfrozen(self, token: str) -> Hyperparameters:
         """Return these without a token, which becomes a free source token."""

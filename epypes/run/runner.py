@@ -150,26 +150,26 @@ class CompGraphRunner:
         start_ns = perf_counter_ns()
         if targets:
             self._check_targets(targets)
-        with self._lock:
+        self._lock.acquire()  # half the time of a with statement
+        try:
             hparams = self._hparams = self._hparams.frozen(changes, also_new=False)
-        last, attempts = self._last, self._attempts
+        finally:
+            self._lock.release()
+        last, changed, compiled = self._last, hparams.changed, None
         if last is None:
             free = self.free_source_tokens
             text = f"Nothing has been run yet, so there is no payload. Call {run_call(free)} first."
             raise PayloadError(free, text)
+        attempts = self._attempts
         stored, freshness, before, _, _ = last.record
-        compiled, changed = None, hparams.changed
         if freshness.is_clean and not targets and hparams.follows == before.revision:
             compiled = attempts.short_way.of_changes(changed)
         if compiled is None:
             return self._ended(attempts.stale(self._draft(last, hparams), targets, start_ns), hparams)
         # The way of a slider: as short as can be.
         values = stored.copy()
-        slots = self._program.slots
-        for token in changed:
-            values[slots[token]] = changed[token]
         try:
-            durations_ns = compiled(values)
+            durations_ns = compiled(values, changed.values())
         except StepFailed as failed:
             return self._ended(attempts.rerun_broken_off(values, stored, failed, changed, start_ns), hparams)
         times = (self._program, None, durations_ns, perf_counter_ns() - start_ns, False)
