@@ -252,6 +252,21 @@ def test_what_is_not_an_image_is_not_taken_for_one(shape):
     assert not is_image(np.zeros(shape, np.uint8))
 
 
+@pytest.mark.parametrize(("shape", "is_shown"), [((500, 32), False), ((32, 500), False), ((300, 32), True)])
+def test_a_table_so_narrow_that_it_shows_nothing_has_no_thumbnail(shape, is_shown):
+    shown = preview(np.zeros(shape, np.uint8))
+    assert (shown.picture is not None) == is_shown
+    assert shown.text == f"uint8 {shape[0]} x {shape[1]}"
+
+
+def test_long_names_that_differ_at_their_ends_differ_in_the_picture():
+    names = [f"detect_and_describe_the_features_of_image_{side}" for side in ("left", "right")]
+    cg = ep.CompGraph(dict.fromkeys(names, abs), {name: ("x", f"{name}_out") for name in names})
+    labels = [texts(group)[0] for group in vertices(to_svg(cg)).values()]
+    assert len(set(labels)) == len(labels) == 5
+    assert all(len(label) <= 32 for label in labels)
+
+
 def test_pictures_stay_small_and_say_what_was_left_out(photograph):
     count = 60
     noise = np.random.default_rng(0).integers(0, 255, (128, 128, 3)).astype(np.uint8)
