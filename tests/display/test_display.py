@@ -50,6 +50,16 @@ def test_a_graph_shows_every_function_and_token_once(edge_graph):
     assert found["token-image"].find(f"{SVG}ellipse") is not None
 
 
+def test_a_graph_shows_defaults_as_the_hyperparameters_that_they_will_be():
+    def scale(image, factor=2):
+        return factor * image
+
+    found = vertices(to_svg(ep.CompGraph.from_functions(scale)))
+    assert texts(found["token-factor"]) == ["factor = 2"]
+    assert found["token-factor"].get("class") == "token hyperparameter fresh"
+    assert found["token-image"].get("class") == "token payload static"
+
+
 def test_a_runner_before_a_run_shows_the_values_of_its_hyperparameters(edge_runner):
     found = vertices(to_svg(edge_runner))
     assert texts(found["token-canny_lo"]) == ["canny_lo = 70"]
