@@ -9,12 +9,13 @@ import ast
 import builtins
 import dataclasses
 import types
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from itertools import zip_longest
 from typing import Annotated, Any, Final, get_origin
 
 from epypes.bundle.literal import is_data, literal_source
 from epypes.bundle.source import Definition, Importable, Refused, definition, importable
-from epypes.bundle.uses import global_names, submodules
+from epypes.bundle.uses import global_names, in_module, submodules
 from epypes.hints import Param
 from epypes.images import Image
 from epypes.run.guard import is_plain_array
@@ -218,13 +219,29 @@ class Slice:
 
 
 def _check_defaults(found: Definition, what: str) -> None:
-    arguments = found.node.args
-    for default in (*arguments.defaults, *(default for default in arguments.kw_defaults if default)):
+    for default, value in _defaults(found):
         try:
             ast.literal_eval(default)
         except ValueError:
-            text = f"{what} has the default {ast.unparse(default)!r} ({found.place}), which is not a literal."
-            raise Refused(f"{text} Write the value itself.") from None
+            if _is_constant(value) and in_module(default, found.function.__globals__) is value:
+                continue
+            text = f"{what} has the default {ast.unparse(default)!r} ({found.place})"
+            raise Refused(f"{text}, which is no literal and no constant of a module. Write the value itself.") from None
+
+
+def _defaults(found: Definition) -> Iterator[tuple[ast.expr, Any]]:
+    """Return every default as it is written, with its value."""
+    arguments, function = found.node.args, found.function
+    # Somebody may have changed the values since; then those that are missing are None, which is no module's constant.
+    yield from zip_longest(arguments.defaults, (function.__defaults__ or ())[: len(arguments.defaults)])
+    by_name = function.__kwdefaults__ or {}
+    for argument, default in zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True):
+        if default:
+            yield default, by_name.get(argument.arg)
+
+
+def _is_constant(value: object) -> bool:
+    return isinstance(value, type) or type(value) in (bool, int, float, complex, str, bytes)
 
 
 def slice_functions(gathered: Slice, functions: Sequence[tuple[str, Callable[..., Any]]]) -> list[str]:

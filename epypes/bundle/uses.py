@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import dis
 import types
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from epypes.bundle.source import Definition, Refused
@@ -23,6 +23,7 @@ def global_names(found: Definition, what: str) -> Iterator[str]:
     arguments = found.node.args
     every = (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs, arguments.vararg, arguments.kwarg)
     outside = [argument.annotation for argument in every if argument] + [found.node.returns]
+    outside += [*arguments.defaults, *arguments.kw_defaults]
     for expression in (*outside, *found.node.decorator_list):
         for node in ast.walk(expression) if expression else ():
             if isinstance(node, ast.Name):
@@ -53,6 +54,17 @@ def submodules(tree: ast.AST, name: str, module: types.ModuleType) -> tuple[str,
             if dotted != name:
                 found[dotted] = None
     return tuple(found)
+
+
+def in_module(expression: ast.AST, names: Mapping[str, Any]) -> Any:
+    """Return what a dotted name means that starts with a module (``cv2.NORM_HAMMING``); None for anything else."""
+    chain = _chain(expression)
+    reached = names.get(chain[0]) if chain else None
+    if not isinstance(reached, types.ModuleType) or reached.__name__ == "__main__":
+        return None
+    for part in chain[1:]:
+        reached = getattr(reached, part, None)
+    return reached
 
 
 def _chain(node: ast.AST) -> list[str]:

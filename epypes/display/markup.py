@@ -19,3 +19,12 @@ def cut(text: str, characters: int) -> str:
     """Return text on one line, of at most so many characters."""
     text = " ".join(text.split())
     return text if len(text) <= characters else text[: characters - 1] + "…"
+
+
+def cut_name(name: str, characters: int) -> str:
+    """Return a name on one line, of at most so many characters; its end is kept, since suffixes tell names apart."""
+    name = " ".join(name.split())
+    if len(name) <= characters:
+        return name
+    end = characters // 3
+    return f"{name[: characters - end - 1]}…{name[len(name) - end :]}"

@@ -13,6 +13,7 @@ from epypes.images import Order
 
 THUMBNAIL_PX: Final = 128
 _TEXT_WIDTH: Final = 24
+_MOST_ELONGATED: Final = 10
 _LOOKED_AT: Final = 200
 _PLAIN = (int, float, complex, str, bytes, bool, type(None))
 _CONTAINERS = (tuple, list, dict, set, frozenset)
@@ -57,10 +58,16 @@ def _array_preview(array: Any, order: Order) -> Preview:
     if not array.shape:
         return Preview(_cut(str(array.item())), f"{array.dtype} {array.item()!s:.60}")
     text = f"{array.dtype} {' x '.join(map(str, array.shape))}"
-    if not is_image(array):
+    if not is_image(array) or _is_strip(array):
         return Preview(text, text + _range_text(array))
     colours = f" {order}" if order != "bgr" and array.ndim == 3 and array.shape[2] > 1 else ""
     return Preview(text, text + colours + _range_text(array), encode_image(array, THUMBNAIL_PX, order))
+
+
+def _is_strip(array: Any) -> bool:
+    """Whether a thumbnail would be a line of pixels, as of 500 descriptors of 32 bytes."""
+    height, width = array.shape[:2]
+    return bool(max(height, width) > _MOST_ELONGATED * min(height, width))
 
 
 def _range_text(array: Any) -> str:

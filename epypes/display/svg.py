@@ -15,12 +15,13 @@ from typing import Final
 from epypes.display.edges import paint_edges
 from epypes.display.graphview import FunctionView, GraphView, TokenView
 from epypes.display.layout import Box, Layout, Point, lay_out
-from epypes.display.markup import cut, escape
+from epypes.display.markup import cut, cut_name, escape
 from epypes.display.view import duration_text
 
 _LINE_PX: Final = 16
 _CHARACTER_PX: Final = 6.9
-_NAME_CHARACTERS: Final = 26
+# detect_and_describe_features_1, of the paper's figure 13, is to fit.
+_NAME_CHARACTERS: Final = 32
 _MESSAGE_CHARACTERS: Final = 48
 _ID_CHARACTERS: Final = 40
 # Beyond this many edges, and this many for each vertex, curves and arrows can't be followed by the eye, would take
@@ -155,7 +156,7 @@ def _token_box(token: TokenView) -> Box:
 
 
 def _cut(text: str) -> str:
-    return cut(text, _NAME_CHARACTERS)
+    return cut_name(text, _NAME_CHARACTERS)
 
 
 # -- marks ------------------------------------------------------------------------------------------------------------

@@ -27,12 +27,20 @@ _NAMED: Final = 8
 def view(shown: Shown) -> GraphView:
     """Look at a graph, a runner, a run or a plan; nothing is computed but previews."""
     if isinstance(shown, CompGraph):
-        return structure_of(shown, {}, ())
+        return _graph_view(shown)
     if isinstance(shown, CompGraphRunner):
         return _runner_view(shown)
     if isinstance(shown, Plan):
         return _plan_view(shown)
     return _with_run(_run_structure(shown), shown, shown.hyperparameters, frozenset())
+
+
+def _graph_view(cg: CompGraph) -> GraphView:
+    """Look at a graph; tokens with a default are shown as the hyperparameters that a runner makes of them."""
+    structure = structure_of(cg, {}, ())
+    every = [_valueless_view(token, cg.defaults, "static") for token in structure.tokens]
+    tokens, _ = within_budget(every, ())
+    return replace(structure, tokens=tokens)
 
 
 def _runner_view(runner: CompGraphRunner) -> GraphView:

@@ -87,6 +87,11 @@ SLICED = {
     "comprehension": ("N = 3\ndef f(x):\n    return sum(x for _ in range(N))\n", 9),
     "annotation": ("def f(x: np.ndarray) -> np.ndarray:\n    return x\n", 3),
     "literal default": ("def f(x, k=-1, names=('a',)):\n    return x + k\n", 2),
+    "constant of a module as default": (
+        "def f(x, k=cv2.NORM_HAMMING, *, pi=np.pi):\n    return x + k, round(pi)\n",
+        (9, 3),
+    ),
+    "type as default": ("def f(x, kind=np.uint8):\n    return kind(x).itemsize\n", 1),
     "unguarded": ("@ep.unguarded\ndef f(x):\n    return x\n", 3),
     "redefinition": ("def f(x):\n    return 0\ndef f(x):\n    return x\n", 3),
     "in an if": ("if True:\n    def f(x):\n        return x\n", 3),
@@ -133,6 +138,11 @@ REFUSED = {
     "lambda inside": ("g = lambda x: x\ndef f(x):\n    return g(x)\n", "is a lambda"),
     "global write": ("N = 0\ndef f(x):\n    global N\n    N += 1\n    return N\n", "changes the global 'N'"),
     "missing name": ("def f(x):\n    return x + nothing\n", "uses 'nothing', which is not defined"),
+    "default that the module has no more": (
+        "import types\nm = types.ModuleType('m')\nm.k = 1\ndef f(x, k=m.k):\n    return x + k\nm.k = 2\n",
+        "default 'm.k' .*no constant of a module",
+    ),
+    "default that may change": ("import sys\ndef f(x, k=sys.path):\n    return x\n", "default 'sys.path'"),
     "computed default": ("K = 3\ndef f(x, k=K):\n    return x + k\n", "default 'K'"),
     "helper under another name": (
         "def g(x):\n    return x\nh = g\ndef f(x):\n    return h(x)\n",

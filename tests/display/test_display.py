@@ -50,6 +50,16 @@ def test_a_graph_shows_every_function_and_token_once(edge_graph):
     assert found["token-image"].find(f"{SVG}ellipse") is not None
 
 
+def test_a_graph_shows_defaults_as_the_hyperparameters_that_they_will_be():
+    def scale(image, factor=2):
+        return factor * image
+
+    found = vertices(to_svg(ep.CompGraph.from_functions(scale)))
+    assert texts(found["token-factor"]) == ["factor = 2"]
+    assert found["token-factor"].get("class") == "token hyperparameter fresh"
+    assert found["token-image"].get("class") == "token payload static"
+
+
 def test_a_runner_before_a_run_shows_the_values_of_its_hyperparameters(edge_runner):
     found = vertices(to_svg(edge_runner))
     assert texts(found["token-canny_lo"]) == ["canny_lo = 70"]
@@ -250,6 +260,21 @@ def test_full_size_masks_are_encoded_without_loss(straight_edges):
 @pytest.mark.parametrize("shape", [(7, 100), (100, 2), (100, 100, 2), (5,), (9, 9, 9, 9)])
 def test_what_is_not_an_image_is_not_taken_for_one(shape):
     assert not is_image(np.zeros(shape, np.uint8))
+
+
+@pytest.mark.parametrize(("shape", "is_shown"), [((500, 32), False), ((32, 500), False), ((300, 32), True)])
+def test_a_table_so_narrow_that_it_shows_nothing_has_no_thumbnail(shape, is_shown):
+    shown = preview(np.zeros(shape, np.uint8))
+    assert (shown.picture is not None) == is_shown
+    assert shown.text == f"uint8 {shape[0]} x {shape[1]}"
+
+
+def test_long_names_that_differ_at_their_ends_differ_in_the_picture():
+    names = [f"detect_and_describe_the_features_of_image_{side}" for side in ("left", "right")]
+    cg = ep.CompGraph(dict.fromkeys(names, abs), {name: ("x", f"{name}_out") for name in names})
+    labels = [texts(group)[0] for group in vertices(to_svg(cg)).values()]
+    assert len(set(labels)) == len(labels) == 5
+    assert all(len(label) <= 32 for label in labels)
 
 
 def test_pictures_stay_small_and_say_what_was_left_out(photograph):
