@@ -6,6 +6,7 @@ Functions are looked up by object, never by name: a name may mean another functi
 from __future__ import annotations
 
 import ast
+import copy
 import linecache
 import sys
 import textwrap
@@ -13,7 +14,7 @@ import types
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, TypeGuard
 
 from epypes.graph import outputs
 from epypes.run.guard import unguarded
@@ -143,7 +144,8 @@ def definition(function: Callable[..., Any], what: str) -> Definition:
     if node is None:
         raise Refused(f"{what} has no source ({place}). Define it in a cell, or in a module that is installed.")
     _check_decorators(node, function, what, place)
-    return Definition(node.name, function, _text(lines, node), node, place)
+    text = _text(lines, node, function.__globals__)
+    return Definition(node.name, function, text, _without_outputs(node, function.__globals__), place)
 
 
 def _kind(value: object) -> str:
@@ -196,10 +198,21 @@ def _check_decorators(node: ast.FunctionDef, function: types.FunctionType, what:
 
 def _is_our_mark(decorator: ast.expr, names: dict[str, Any]) -> bool:
     """Whether a decorator is ``@ep.unguarded``, or ``@ep.outputs`` of literals: both return the function itself."""
-    if isinstance(decorator, ast.Call):
-        plain = not decorator.keywords and all(isinstance(name, ast.Constant) for name in decorator.args)
-        return plain and _evaluated(decorator.func, names) is outputs
+    if _names_outputs(decorator, names):
+        call = decorator
+        return not call.keywords and all(isinstance(name, ast.Constant) for name in call.args)
     return _evaluated(decorator, names) is unguarded
+
+
+def _names_outputs(decorator: ast.expr, names: dict[str, Any]) -> TypeGuard[ast.Call]:
+    return isinstance(decorator, ast.Call) and _evaluated(decorator.func, names) is outputs
+
+
+def _without_outputs(node: ast.FunctionDef, names: dict[str, Any]) -> ast.FunctionDef:
+    """Return the definition without ``@ep.outputs``: what is written out has the graph's io, and no need of it."""
+    kept = copy.copy(node)
+    kept.decorator_list = [decorator for decorator in node.decorator_list if not _names_outputs(decorator, names)]
+    return kept
 
 
 def _evaluated(expression: ast.expr, names: dict[str, Any]) -> Any:
@@ -211,8 +224,15 @@ def _evaluated(expression: ast.expr, names: dict[str, Any]) -> Any:
     return None
 
 
-def _text(lines: list[str], node: ast.FunctionDef) -> str:
+def _text(lines: list[str], node: ast.FunctionDef, names: dict[str, Any]) -> str:
     first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)]) - 1
     while first and lines[first - 1].lstrip().startswith("#"):
         first -= 1
-    return textwrap.dedent("".join(lines[first : node.end_lineno])).rstrip() + "\n"
+    dropped = {
+        number
+        for decorator in node.decorator_list
+        if _names_outputs(decorator, names)
+        for number in range(decorator.lineno, (decorator.end_lineno or decorator.lineno) + 1)
+    }
+    kept = [line for number, line in enumerate(lines[first : node.end_lineno], first + 1) if number not in dropped]
+    return textwrap.dedent("".join(kept)).rstrip() + "\n"

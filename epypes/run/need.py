@@ -99,4 +99,13 @@ def check_ready(program: Program, values: Sequence[Any], wanted: bytes | None) -
     missing = missing_sources(program, values, wanted)
     if missing:
         listed = ", ".join(map(repr, missing))
-        raise PayloadError(missing, f"Missing payload: {listed}. Call {run_call(missing)}.")
+        text = f"Missing payload: {listed}. Call {run_call(missing)}."
+        raise PayloadError(missing, " ".join([text, *_selections(program, missing)]))
+
+
+def _selections(program: Program, missing: Iterable[str]) -> Iterable[str]:
+    """Say which of these tokens select a branch, and of which."""
+    for token in missing:
+        for switch in program.selectors.get(token, ()):
+            branches = ", ".join(map(repr, switch.branches))
+            yield f"{token!r} selects a branch of switch {switch.name!r}: {branches}."

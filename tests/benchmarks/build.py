@@ -71,8 +71,6 @@ def _linearity(thousand: Times, large: Times) -> Row:
 
 def _union(effort: Effort) -> Row:
     name, goal = "union of two graphs of 1,000 functions", Goal("ratio", 2)
-    if not ours.has_union():
-        return Row(name, goal=goal, note="this version has no ep.union")
     first, second = chain(1_000), chain(1_000, prefix="other_")
     one, other = (ep.CompGraph(work.functions, work.io) for work in (first, second))
     contenders = {

@@ -12,7 +12,6 @@ import numpy as np
 from skimage import data
 
 import epypes as ep
-from tests.benchmarks import ours
 from tests.benchmarks.functions import STRAIGHT, TIMED
 from tests.benchmarks.row import OURS, Goal, Row, row
 from tests.benchmarks.timing import Effort, Times
@@ -70,8 +69,7 @@ def rows(effort: Effort) -> list[Row]:
     contenders = {STRAIGHT: lambda: _straight(*pair), TIMED: lambda: _timed(*pair, hand_ns), OURS: graph}
     with ThreadPoolExecutor(2) as pool:
         contenders[THREADS] = lambda: _in_threads(*pair, pool)
-        if ours.has_workers():
-            contenders[PARALLEL] = _parallel(pair)
+        contenders[PARALLEL] = _parallel(pair)
         times = effort.measure(contenders, _ROUNDS)
     overheads = Times({TIMED: _of_rounds(hand_ns, times, TIMED), OURS: _of_rounds(graph_ns, times, OURS)})
     return [
@@ -95,8 +93,6 @@ def _parallel(pair: list[np.ndarray]) -> Callable[[], np.ndarray]:
 def _parallel_row(times: Times) -> Row:
     name, goal = "ORB graph, two at a time", Goal("ratio", 1.1)
     saved = times.medians_ns[THREADS] / times.medians_ns[STRAIGHT]
-    if PARALLEL not in times.medians_ns:
-        return Row(name, times.medians_ns, 4, goal, THREADS, PARALLEL, note="this version has no workers")
     note = f"limit: two threads by hand, {saved:.2f} of the straight line"
     return row(name, times, functions=4, goal=goal, limit=THREADS, ours=PARALLEL, note=note)
 

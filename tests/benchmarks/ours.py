@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -22,13 +21,3 @@ def run(work: Work, **options: Any) -> Callable[[], Any]:
 
 def first_result(work: Work) -> Any:
     return runner(work).run(**work.payload)[work.target]
-
-
-def has_workers() -> bool:
-    """Whether this version runs functions side by side."""
-    return "workers" in inspect.signature(ep.CompGraphRunner).parameters
-
-
-def has_union() -> bool:
-    """Whether this version unites graphs."""
-    return hasattr(ep, "union")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
 from tests.benchmarks.timing import Times
@@ -35,23 +35,16 @@ class Goal:
 
 @dataclass(frozen=True)
 class Row:
-    """One piece of work: medians in nanoseconds by contender, of which one is the limit and one is ours.
-
-    A row without medians could not be measured; its note says why.
-    """
+    """One piece of work: medians in nanoseconds by contender, of which one is the limit and one is ours."""
 
     work: str
-    medians_ns: Mapping[str, float] = field(default_factory=dict)
+    medians_ns: Mapping[str, float]
     functions: int = 1
     goal: Goal | None = None
     limit: str = "by hand"
     ours: str = OURS
     pairwise_ratio: float | None = None
     note: str = ""
-
-    @property
-    def measured(self) -> bool:
-        return self.limit in self.medians_ns and self.ours in self.medians_ns
 
     @property
     def limit_ns(self) -> float:
@@ -71,8 +64,8 @@ class Row:
 
     @property
     def reached(self) -> bool | None:
-        """Whether the goal is reached; None without a goal or a measurement."""
-        if self.goal is None or not self.measured:
+        """Whether the goal is reached; None without a goal."""
+        if self.goal is None:
             return None
         value = {
             "ratio": max(self.ratio(self.ours) or 0, self.pairwise_ratio or 0),
@@ -90,9 +83,9 @@ class Row:
             "limit": self.limit,
             "ours": self.ours,
             "medians_ns": dict(self.medians_ns),
-            "ratio": self.ratio(self.ours) if self.measured else None,
+            "ratio": self.ratio(self.ours),
             "pairwise_ratio": self.pairwise_ratio,
-            "us_per_function_above": self.us_per_function(self.ours) if self.measured else None,
+            "us_per_function_above": self.us_per_function(self.ours),
             "goal": str(self.goal) if self.goal else None,
             "reached": self.reached,
             "note": self.note,

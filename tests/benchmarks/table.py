@@ -35,14 +35,12 @@ def _takes_part(name: str, rows: Sequence[Row]) -> bool:
 def _cells(row: Row) -> tuple[str, ...]:
     work = f"{row.work}\n[dim]{row.note}[/]" if row.note else row.work
     goal = str(row.goal or "")
-    if not row.measured:
-        return work, "", "", "", goal, ""
     times = duration_text(row.limit_ns), duration_text(row.ours_ns)
     return work, *times, _beside(row, row.ours), goal, _VERDICTS[row.reached]
 
 
 def _beside(row: Row, name: str) -> str:
-    ratio = row.ratio(name) if row.measured and name in row.medians_ns and name != row.limit else None
+    ratio = row.ratio(name) if name in row.medians_ns and name != row.limit else None
     if ratio is None:
         return ""
     text = f"{ratio:.3f}" if ratio < 10 else f"{ratio:,.0f}"
