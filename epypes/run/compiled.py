@@ -191,7 +191,7 @@ def _call(program: Program, step: Step, locked: set[int]) -> Iterator[str]:
         args.append(f"a{place}")
         yield f"a{place} = v[{slot}]"
         if program.guard and not (step.is_builtin and slot in locked):
-            yield from _lend(f"a{place}")
+            yield from _lend(f"a{place}", is_locked=slot in locked)
     yield "start = clock()"
     yield f"made = f{step.place}({', '.join(args)})"
     yield "spent = clock() - start"
@@ -217,13 +217,14 @@ def _unpack(program: Program, step: Step) -> Iterator[str]:
     yield f"else: made = unpack(program, steps[{step.place}], made)"
 
 
-def _lend(name: str) -> Iterator[str]:
-    """Write out ``lend``, for what it does to most values."""
+def _lend(name: str, is_locked: bool) -> Iterator[str]:
+    """Write out ``lend``, for what it does to most values; the view of a locked array is locked."""
     yield f"k = kind({name})"
     yield "if k not in ARRAYLESS:"
     yield "    if k is array:"
     yield f"        {name} = {name}.view()"
-    yield f"        {name}.setflags(False)"
+    if not is_locked:
+        yield f"        {name}.setflags(False)"
     yield f"    elif k not in LISTS or len({name}) < LONG or kind({name}[0]) not in HARMLESS: {name} = lend({name})"
 
 

@@ -25,10 +25,17 @@ class Hyperparameters:
         The values that differ from the revision before.
     follows
         That revision; -1 if other tokens were hyperparameters in it.
+    free_slots
+        The slots of the source tokens that are not frozen, in order of first appearance in func_io.
+    base
+        The values by slot, with which a run begins.
     """
 
+    base: list[Any]
+    free_slots: dict[str, int]
+
     # Made at every move of a slider, so what is rarely asked for is made when it is.
-    __slots__ = ("_base", "_free", "changed", "entries", "follows", "program", "revision")
+    __slots__ = ("base", "changed", "entries", "follows", "free_slots", "program", "revision")
 
     def __init__(
         self, program: Program, entries: dict[str, tuple[Any]], revision: int, changed: dict[str, Any], follows: int
@@ -44,27 +51,18 @@ class Hyperparameters:
         """The values by token."""
         return MappingProxyType({token: entry[0] for token, entry in self.entries.items()})
 
-    @property
-    def free_slots(self) -> dict[str, int]:
-        """The slots of the source tokens that are not frozen, in order of first appearance in func_io."""
-        try:
-            return self._free
-        except AttributeError:
+    def __getattr__(self, name: str) -> Any:
+        """Make ``base`` and ``free_slots`` when they are asked for first; every run asks for them."""
+        if name == "free_slots":
             slots, sources = self.program.slots, self.program.cg.source_tokens
-            self._free: dict[str, int] = {token: slots[token] for token in sources if token not in self.entries}
-            return self._free
-
-    @property
-    def base(self) -> list[Any]:
-        """The values by slot, with which a run begins."""
-        try:
-            return self._base
-        except AttributeError:
-            base: list[Any] = [NOT_COMPUTED] * len(self.program.tokens)
+            self.free_slots = {token: slots[token] for token in sources if token not in self.entries}
+            return self.free_slots
+        if name == "base":
+            self.base = [NOT_COMPUTED] * len(self.program.tokens)
             for token, entry in self.entries.items():
-                base[self.program.slots[token]] = entry[0]
-            self._base: list[Any] = base
-            return base
+                self.base[self.program.slots[token]] = entry[0]
+            return self.base
+        raise AttributeError(name)
 
     def frozen(self, changes: Mapping[str, Any], *, also_new: bool = True) -> Hyperparameters:
         """Return these with tokens given values; all or nothing. An equal value changes nothing.
