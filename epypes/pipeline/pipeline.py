@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import keyword
 from collections.abc import Mapping
 from typing import Any
 
@@ -48,13 +49,16 @@ class Pipeline(Node):
         self.source_cg = cg
         self.attributes: dict[str, Any] = {}
         super().__init__(name, self.__call__)
+        self.__name__ = name
 
     @property
     def __signature__(self) -> inspect.Signature:
-        """The free source tokens, so that a graph checks how many inputs it gives."""
+        """The free source tokens, so that a graph checks how many inputs it gives, or reads what they are called."""
         kind = inspect.Parameter.POSITIONAL_ONLY
         free = self.runner.free_source_tokens
-        return inspect.Signature([inspect.Parameter(f"input_{place}", kind) for place, _ in enumerate(free)])
+        are_names = all(token.isidentifier() and not keyword.iskeyword(token) for token in free)
+        names = free if are_names else [f"input_{place}" for place, _ in enumerate(free)]
+        return inspect.Signature([inspect.Parameter(name, kind) for name in names])
 
     @property
     def __epypes_revision__(self) -> tuple[Any, ...]:
