@@ -181,16 +181,24 @@ def test_a_full_pipeline_of_ones_own_has_every_hook_of_those_that_it_is_made_of(
     assert not pipe.loop.is_running
 
 
-def test_a_run_of_the_same_pipeline_in_f_out_does_not_disturb_the_view_of_the_event():
+class Disturbed(ep.FullPipeline):
+    """Is run by somebody else between an event's run and its answer."""
+
+    def emit(self, event, run):
+        self.run(x=1000)
+        super().emit(event, run)
+
+
+def test_another_run_of_the_pipeline_does_not_disturb_the_view_of_an_event():
     q_in, q_out = queue.Queue(), queue.Queue()
 
     def f_out(view):
-        pipe.run(x=1000)
+        pipe.run(x=2000)
         pipe.attributes["late"] = True
-        return view["x"], view["y"], dict(view.attributes)
+        return view["x"], view["y"], dict(view), dict(view.attributes)
 
-    pipe = ep.FullPipeline("p", add_graph(), q_in, q_out, lambda event: {"x": event}, f_out, {"n": 1})
+    pipe = Disturbed("p", add_graph(), q_in, q_out, lambda event: {"x": event}, f_out, {"n": 1})
     with pipe:
         q_in.put(5)
-        assert q_out.get(timeout=TIMEOUT_S) == (5, 6, {})
-    assert pipe["y"] == 1001
+        assert q_out.get(timeout=TIMEOUT_S) == (5, 6, {"x": 5, "n": 1, "y": 6}, {})
+    assert pipe["y"] == 2001
