@@ -86,6 +86,30 @@ def test_after_a_failing_rerun_what_does_not_depend_on_it_is_kept(way):
     assert (run["c"], run.report.ran) == (14, ("check", "after"))
 
 
+def test_an_earlier_run_keeps_its_values_whatever_is_run_after_it(way):
+    runner, kept = way.runner(raising_graph(), {"n": 1}), []
+
+    def keep(run):
+        kept.append((run, dict(run), dict(run.hyperparameters), run.report.durations_ns, run.report.total_ns))
+
+    for n in range(10, 10 + way.runs):
+        keep(runner.run(x=n))
+        keep(runner.rerun(n=n))
+        keep(runner.rerun(n=-n))
+        keep(runner.run("b", x=0))
+        keep(runner.rerun("c", n=0))
+        with pytest.raises(ZeroDivisionError):
+            runner.rerun(n=3)
+        keep(runner.last)
+        runner["n"] = n
+        keep(runner.rerun())
+    for run, values, hyperparameters, durations_ns, total_ns in kept:
+        assert (dict(run), dict(run.hyperparameters)) == (values, hyperparameters)
+        assert (run.report.durations_ns, run.report.total_ns) == (durations_ns, total_ns)
+        assert run["a"] == 2 * run["x"]
+        assert "c" not in run or run["c"] == run["a"] + run["n"]
+
+
 def test_a_refilled_buffer_counts_as_new(way):
     runner, buffer = way.runner(one(lambda image: float(image.mean()), "image", "mean")), np.zeros((8, 8))
     for value in range(way.runs):
