@@ -86,6 +86,25 @@ def test_after_a_failing_rerun_what_does_not_depend_on_it_is_kept(way):
     assert (run["c"], run.report.ran) == (14, ("check", "after"))
 
 
+def test_what_ran_before_a_function_failed_is_not_run_again(way):
+    def check(a, m):
+        if m == 3:
+            raise ZeroDivisionError("three")
+        return a + m
+
+    cg = ep.CompGraph({"first": lambda k: 2 * k, "check": check}, {"first": ("k", "a"), "check": (("a", "m"), "b")})
+    runner = way.runner(cg, {"k": 1, "m": 1})
+    runner.run()
+    for value in range(10, 10 + way.runs):
+        runner.rerun(k=value, m=value)
+    with way.is_taken(), pytest.raises(ZeroDivisionError):
+        runner.rerun(k=50, m=3)
+    assert runner.last.report.ran == ("first", "check")
+    assert runner.stale == ("check",)
+    run = runner.rerun(m=4)
+    assert (run["b"], run.report.ran) == (104, ("check",))
+
+
 def test_an_earlier_run_keeps_its_values_whatever_is_run_after_it(way):
     runner, kept = way.runner(raising_graph(), {"n": 1}), []
 
