@@ -11,7 +11,7 @@ from epypes.bundle.ports import answer_with, payload_of
 from epypes.bundle.seal import check_seal
 from epypes.bundle.settings import Settings, read_settings
 from epypes.errors import BundleError
-from epypes.graph import CompGraph
+from epypes.graph import CompGraph, with_defaults
 from epypes.pipeline import FullPipeline
 from epypes.run import CompGraphRunner
 
@@ -64,11 +64,11 @@ def read_bundle(path: str | Path, *, sealed: bool = True) -> Bundle:
             break
     module = _execute(folder / MODULE, source)
     try:
-        cg = CompGraph(module.func_dict, module.func_io)
+        cg = CompGraph(module.func_dict, module.func_io, types=settings.types)
     except AttributeError as error:
         text = f"{folder / MODULE} defines no {error.name!r}. Promote the graph again."
         raise BundleError(folder, text) from error
-    return Bundle(folder, cg, settings, digest)
+    return Bundle(folder, with_defaults(cg, settings.defaults), settings, digest)
 
 
 def _identity(folder: Path) -> tuple[int, int] | None:

@@ -18,7 +18,7 @@ from epypes.bundle.emit import emit_module
 from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
 from epypes.bundle.replay import replay_isolated
 from epypes.bundle.seal import MANIFEST, seal
-from epypes.bundle.settings import Settings, unwritable, write_settings
+from epypes.bundle.settings import Settings, unwritable, writable_defaults, write_settings
 from epypes.bundle.slicer import slice_graph
 from epypes.errors import BundleError, EpypesError, MessageError, PromotionRefused, run_call
 from epypes.graph import CompGraph, colour_order
@@ -121,7 +121,9 @@ def _write(draft: Path, target: Path, runner: CompGraphRunner, cg: CompGraph, ou
     (draft / SAMPLES).mkdir(parents=True)
     free = runner.free_source_tokens
     rgb = tuple(token for token in dict.fromkeys((*free, *wanted)) if colour_order(cg, token) == "rgb")
-    settings = Settings(target.name, free, wanted, runner.hyperparameters, rgb)
+    hyperparameters = runner.hyperparameters
+    defaults = writable_defaults(cg, hyperparameters)
+    settings = Settings(target.name, free, wanted, hyperparameters, rgb, defaults, cg.types)
     (draft / MODULE).write_text(emit_module(settings, cg, needed, references), encoding="utf-8")
     write_settings(draft / SETTINGS, settings, cg)
     if runner.last is not None:  # as _unready has made sure

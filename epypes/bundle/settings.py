@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,6 +32,10 @@ class Settings:
         Values by token.
     rgb
         Of the inputs and outputs, those whose three or four channels are RGB.
+    defaults
+        The graph's defaults of hyperparameters by token: what they are where the graph is used without these settings.
+    types
+        Whether the graph compares annotations, as CompGraph does unless told otherwise.
     """
 
     name: str
@@ -39,6 +43,8 @@ class Settings:
     outputs: tuple[str, ...]
     hyperparameters: Mapping[str, Any]
     rgb: tuple[str, ...] = ()
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+    types: bool = True
 
     def order(self, token: str) -> Order:
         """Return the order of a token's colours."""
@@ -53,6 +59,14 @@ def unwritable(hyperparameters: Mapping[str, Any]) -> list[str]:
         for token, value in hyperparameters.items()
         if not _fits(plain(value))
     ]
+
+
+def writable_defaults(cg: CompGraph, hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the graph's defaults of hyperparameters, but for those that TOML can't hold.
+
+    They may be missing: in the bundle every hyperparameter has a value. What an event brings has no default there.
+    """
+    return {token: value for token, value in cg.defaults.items() if token in hyperparameters and _fits(plain(value))}
 
 
 def plain(value: Any) -> Any:
@@ -83,6 +97,9 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
     bundle = tomlkit.table()
     bundle.add("format", FORMAT)
     bundle.add("name", settings.name)
+    if not settings.types:
+        bundle.add(tomlkit.comment("The annotations of the functions are not compared."))
+        bundle.add("types", False)
     document.add("bundle", bundle)
     ports = tomlkit.table()
     ports.add(tomlkit.comment("The tokens that an event brings, and those that its answer carries."))
@@ -96,6 +113,11 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
     for token, value in settings.hyperparameters.items():
         hyperparameters.add(token, _entry(plain(value), next(annotated_params(cg, token), None)))
     document.add("hyperparameters", hyperparameters)
+    if settings.defaults:
+        defaults = tomlkit.table(is_super_table=True)
+        for token, value in settings.defaults.items():
+            defaults.add(token, _entry(plain(value), None))
+        document.add("defaults", defaults)
     path.write_text(tomlkit.dumps(document), encoding="utf-8")
 
 
@@ -135,8 +157,10 @@ def read_settings(path: Path) -> Settings:
             str(bundle["name"]),
             _strings(ports["inputs"]),
             _strings(ports["outputs"]),
-            {token: _value(entry) for token, entry in document.get("hyperparameters", {}).items()},
+            _values(document.get("hyperparameters", {})),
             _strings(ports.get("rgb", [])),
+            _values(document.get("defaults", {})),
+            bundle.get("types", True) is not False,
         )
     except KeyError as error:
         raise BundleError(path, f"{path} lacks {error.args[0]!r}. Promote the graph again.") from error
@@ -150,6 +174,10 @@ def _strings(values: Sequence[Any]) -> tuple[str, ...]:
     if len(set(values)) < len(values):
         raise TypeError(f"{values!r} names a token twice")
     return tuple(values)
+
+
+def _values(entries: Mapping[str, Any]) -> dict[str, Any]:
+    return {token: _value(entry) for token, entry in entries.items()}
 
 
 def _value(entry: Mapping[str, Any]) -> Any:

@@ -1,6 +1,6 @@
 """What is connected to what: computational graphs, pure and static."""
 
-from epypes.graph.algebra import extend, subgraph, union, with_functions
+from epypes.graph.algebra import extend, subgraph, union, with_defaults, with_functions
 from epypes.graph.compgraph import CompGraph
 from epypes.graph.hinted import annotated_params, colour_order, image_hint
 from epypes.graph.outputs import outputs
@@ -24,5 +24,6 @@ __all__ = [
     "suffix",
     "switch",
     "union",
+    "with_defaults",
     "with_functions",
 ]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from epypes.errors import Finding, UnknownName
 from epypes.graph.compgraph import CompGraph
-from epypes.graph.parts import Parts, defaults_of
+from epypes.graph.parts import Default, Parts, defaults_of
 from epypes.graph.placeholder import is_placeholder
 from epypes.graph.renaming import names_of, require_graph, suffixed
 
@@ -196,3 +196,18 @@ def with_functions(cg: CompGraph, functions: Mapping[str, Callable[..., Any]]) -
         A callable for every function, by name.
     """
     return CompGraph._assemble(Parts(dict(functions), dict(cg.func_io), defaults_of(cg)), cg.types)
+
+
+def with_defaults(cg: CompGraph, values: Mapping[str, Any]) -> CompGraph:
+    """Return the graph with other defaults.
+
+    Parameters
+    ----------
+    cg
+        The graph; it stays as it is.
+    values
+        By source token; others are passed over.
+    """
+    readers = cg.digraph.consumers
+    defaults = [Default(token, value, readers[token][0]) for token, value in values.items() if token in readers]
+    return CompGraph._assemble(Parts(dict(cg.functions), dict(cg.func_io), defaults), cg.types)

@@ -16,7 +16,8 @@ _DEEPEST: Final = 100
 def redefined(cg: CompGraph) -> tuple[str, ...]:
     """Return the functions whose module now binds their name to another function, in run order.
 
-    A function that was defined again in the same words counts as the same. Never raises.
+    A function that was defined again in the same words counts as the same. A pipeline counts as redefined if a function
+    of its graph does. Never raises.
 
     Examples
     --------
@@ -29,6 +30,9 @@ def redefined(cg: CompGraph) -> tuple[str, ...]:
 
 def _is_redefined(function: Any) -> bool:
     try:
+        inner = _inner_graph(function)
+        if inner is not None and redefined(inner):
+            return True
         old = _unwrapped(function)
         if not isinstance(old, FunctionType):
             return False
@@ -36,6 +40,16 @@ def _is_redefined(function: Any) -> bool:
         return isinstance(new, FunctionType) and new is not old and not _is_same(old, new)
     except Exception:  # a repr shows this; whatever odd objects do, it must not fail
         return False
+
+
+def _inner_graph(function: Any) -> CompGraph | None:
+    """Return the graph that a pipeline runs, None for anything else."""
+    if type(function) is FunctionType:
+        return None
+    from epypes.graph.compgraph import CompGraph
+
+    inner = getattr(function, "cg", None)
+    return inner if isinstance(inner, CompGraph) else None
 
 
 def _unwrapped(function: Any) -> Any:

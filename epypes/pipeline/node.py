@@ -48,7 +48,10 @@ class Node:
         # A list, since adding to it and taking from it are whole in every thread, and counting up is not.
         self._calls_under_way: list[None] = []
         # Gives the node its function's signature, so that a graph of nodes is checked like one of functions.
-        functools.update_wrapper(self, func)
+        functools.update_wrapper(self, func, updated=())
+        # Marks go along; whatever else a callable object or another node keeps must not take the place of our own.
+        marks = {key: mark for key, mark in getattr(func, "__dict__", {}).items() if not hasattr(self, key)}
+        self.__dict__.update(marks)
 
     def __call__(self, *args: Any) -> Any:
         """Compute, and measure the time."""
@@ -75,4 +78,4 @@ class Node:
         return self.name, self.time
 
     def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self.name!r:.40}: {self.run_count} calls>"
+        return f"<{type(self).__name__:.30} {self.name!r:.40}: {self.run_count} calls>"

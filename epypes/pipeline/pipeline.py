@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import keyword
 from collections.abc import Mapping
 from typing import Any
 
@@ -48,13 +49,16 @@ class Pipeline(Node):
         self.source_cg = cg
         self.attributes: dict[str, Any] = {}
         super().__init__(name, self.__call__)
+        self.__name__ = name
 
     @property
     def __signature__(self) -> inspect.Signature:
-        """The free source tokens, so that a graph checks how many inputs it gives."""
+        """The free source tokens, so that a graph checks how many inputs it gives, or reads what they are called."""
         kind = inspect.Parameter.POSITIONAL_ONLY
         free = self.runner.free_source_tokens
-        return inspect.Signature([inspect.Parameter(f"input_{place}", kind) for place, _ in enumerate(free)])
+        are_names = all(token.isidentifier() and not keyword.iskeyword(token) for token in free)
+        names = free if are_names else [f"input_{place}" for place, _ in enumerate(free)]
+        return inspect.Signature([inspect.Parameter(name, kind) for name in names])
 
     @property
     def __epypes_revision__(self) -> tuple[Any, ...]:
@@ -103,13 +107,17 @@ class Pipeline(Node):
     def compute_overhead(self) -> float:
         """Return the graph overhead of the last call, in seconds: its time less the sum of its nodes' times.
 
-        Where nodes ran side by side, it is that of the last run's report: wall time less the critical path.
+        Nodes that a switch or a failure kept from running do not count. Where nodes ran side by side, it is that of
+        the last run's report: wall time less the critical path.
         """
         last = self.runner.last
-        if last is not None and last.report.side_by_side:
+        if last is None:
+            return self.time
+        if last.report.side_by_side:
             return last.report.overhead_ns / 1e9
-        _, total, nodes = self.traverse_time()
-        return float(total - sum(node[1] for node in nodes))
+        # Of a rerun, which counts as no call, the times of what was reused are still those of the call.
+        counted = [entry.function for entry in last.report.functions if entry.ran or last.failure is None]
+        return self.time - sum(self.network.nodes[function].time for function in counted)
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         from epypes.display import mimebundle

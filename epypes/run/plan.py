@@ -110,4 +110,6 @@ def _reason(manager: TokenManager, index: int, changed: Collection[str]) -> str:
     remade = [repr(program.tokens[slot]) for slot in dict.fromkeys(read) if program.makers[slot] in manager.stale]
     if remade:
         return f"takes {', '.join(remade)}, made anew"
+    if index in program.revised:
+        return "an input, or a hyperparameter inside it, has changed since it ran"
     return "an input has changed since it ran" if step.outputs else "not run yet"

@@ -187,6 +187,19 @@ def test_ids_differ_where_names_do():
     assert len(vertices(to_svg(cg))) == 6
 
 
+def test_a_function_and_a_token_of_one_name_are_two_vertices():
+    cg = ep.CompGraph({"edges": abs, "image": abs}, {"image": ("image", "gray"), "edges": ("gray", "edges")})
+    found = vertices(to_svg(cg))
+    assert set(found) == {"function-edges", "function-image", "token-image", "token-gray", "token-edges"}
+    found = vertices(to_svg(ep.CompGraphRunner(cg).run(image=-3)))
+    assert found["token-edges"].find(f"{SVG}title").text == "token edges: int 3, fresh"
+    assert found["function-edges"].find(f"{SVG}title").text.startswith("function edges")
+    assert ("function" in found["function-edges"].get("class"), "token" in found["token-edges"].get("class")) == (
+        True,
+        True,
+    )
+
+
 class Hostile:
     def __repr__(self):
         raise RuntimeError("no repr")

@@ -240,6 +240,18 @@ def test_a_function_that_was_redefined_is_marked_everywhere(cells):
     assert repr(run) == "<Run: completed; 3 of 3 tokens; 1 function redefined>"
 
 
+def test_pipelines_and_the_graphs_around_them_are_marked_too(cells):
+    inner = ep.Pipeline("inner", ep.CompGraph({"blur": cells.blur}, {"blur": ("x", "y")}))
+    outer = ep.Pipeline("outer", ep.CompGraph({"smooth": inner, "f": abs}, {"smooth": ("a", "b"), "f": ("b", "c")}))
+    exec(CELL.format(2), cells.__dict__)
+    for pipe, name in ((inner, "blur"), (outer, "smooth")):
+        bundle = mimebundle(pipe)
+        found = vertices(bundle["image/svg+xml"])
+        assert "redefined since: build the graph again" in texts(found[f"function-{name}"])
+        assert f"'{name}' was redefined since the graph was built: run the cell" in unescape(bundle["text/html"])
+    assert "redefined" not in vertices(mimebundle(outer)["image/svg+xml"])["function-f"].get("class")
+
+
 def test_reprs_stay_short_when_a_redefined_function_fails_and_the_names_are_long(cells):
     name = "a_name_of_a_function_that_is_much_too_long_to_be_shown"
     cg = ep.CompGraph({name: cells.blur, **dict.fromkeys(map(str, range(999)), abs)},

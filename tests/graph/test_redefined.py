@@ -80,6 +80,17 @@ def test_nodes_and_partials_are_looked_at_inside(cell, wrap):
     assert redefined(cg) == ("f",)
 
 
+def test_a_pipeline_is_redefined_when_a_function_inside_it_is(cell):
+    pipe = ep.Pipeline("inner", graph(cell(BLUR).blur))
+    deep = ep.Pipeline("middle", ep.CompGraph({"inner": pipe}, {"inner": ("a", "b")}))
+    cg = ep.CompGraph({"middle": deep, "f": abs}, {"middle": ("b", "c"), "f": ("c", "d")})
+    assert redefined(cg) == ()
+    cell("def blur(x, k=3): return x - k")
+    assert redefined(pipe.cg) == ("f",)
+    assert redefined(cg) == ("middle",)
+    assert "'middle' was redefined" in repr(cg)
+
+
 def test_methods_are_found_in_their_class(cell):
     source = "class Camera:\n    def shot(self, x): return x\n    @staticmethod\n    def still(x): return x\n"
     module = cell(source)

@@ -290,32 +290,6 @@ def test_a_pipeline_left_running_warns_and_the_interpreter_exits():
     assert "ResourceWarning: 'left' was left running" in done.stderr
 
 
-def test_custom_nodes_and_pipelines_are_made_by_subclassing():
-    class Doubled(ep.Node):
-        def compute(self, *args):
-            return 2 * super().compute(*args)
-
-    class Timed(ep.Pipeline):
-        def compute(self, *args):
-            run = super().compute(*args)
-            self.attributes["runs"] = self.run_count + 1
-            return run
-
-    class Counting(ep.FullPipeline):
-        def emit(self, event, run):
-            self.attributes["last"] = event
-            super().emit(event, run)
-
-    cg = ep.CompGraph({"f": Doubled("f", lambda x: x + 1)}, {"f": ("x", "y")})
-    timed = Timed("timed", cg)
-    assert timed(2) == 6
-    assert timed.attributes == {"runs": 1}
-    q_in, q_out = queue.Queue(), queue.Queue()
-    with Counting("counting", cg, q_in, q_out, lambda e: {"x": e}, lambda view: (view["y"], dict(view.attributes))):
-        q_in.put(5)
-        assert q_out.get(timeout=TIMEOUT_S) == (12, {"last": 5})
-
-
 def test_an_event_loop_serves_any_callback():
     q_in, seen = queue.Queue(), queue.Queue()
     loop = ep.EventLoop(q_in, lambda value: seen.put(value), lambda event: {"value": event + 1})

@@ -405,6 +405,18 @@ def test_a_plan_says_what_would_run_and_what_is_missing(chain):
     assert functions["add"].calls == 1
 
 
+def test_a_chain_of_10000_functions_is_planned_run_and_run_again():
+    count = 10_000
+    io = {f"f{place}": (f"t{place}", f"t{place + 1}") for place in range(count)} | {"side": ("k", "z")}
+    runner = ep.CompGraphRunner(ep.CompGraph(dict.fromkeys(io, lambda x: x), io), {"t0": 1, "k": 1})
+    runner.run()
+    assert runner.rerun(k=2).report.ran == ("side",)
+    runner["t0"] = 2
+    assert len(runner.stale) == count
+    assert runner.plan(f"t{count}").order == runner.stale
+    assert runner.rerun()[f"t{count}"] == 2
+
+
 def test_a_run_does_not_change(chain):
     runner, _ = chain
     run = runner.run(x=1)

@@ -1,0 +1,217 @@
+"""A pipeline as a function of another graph: what changes inside it is seen outside."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+import epypes as ep
+from epypes.errors import GraphError, NotComputed, OutputArityError, PayloadError, StaleToken
+from epypes.run import attempt, gain
+
+RUNS = 6  # enough that the later ones are compiled
+
+
+class Level:
+    """``depth`` pipelines, each inside the next: x + n, then a function of each level, then the runner of the outermost."""
+
+    def __init__(self, depth, **more):
+        self.calls = dict.fromkeys(["before", "after"], 0)
+        self.inner = ep.Pipeline("add", ep.CompGraph({"add": lambda x, n: x + n}, {"add": (("x", "n"), "y")}), {"n": 1})
+        function = self.inner
+        for level in range(depth - 1):
+            cg = ep.CompGraph({f"level{level}": function}, {f"level{level}": ("x", "y")})
+            function = ep.Pipeline(f"level{level}", cg)
+        cg = ep.CompGraph(
+            {"before": self.counted("before"), "nested": function, "after": self.counted("after")},
+            {"before": ("a", "b"), "nested": ("b", "c"), "after": ("c", "d")},
+        )
+        self.runner = ep.CompGraphRunner(cg, **more)
+
+    def counted(self, name):
+        def function(value):
+            self.calls[name] += 1
+            return value
+
+        return function
+
+
+@pytest.mark.parametrize("depth", [1, 2, 3])
+def test_a_hyperparameter_inside_makes_what_depends_on_it_stale_outside(depth):
+    nest = Level(depth)
+    run = nest.runner.run(a=10)
+    assert nest.runner.stale == ()
+    nest.inner["n"] = 5
+    assert nest.runner.stale == ("nested", "after")
+    assert nest.runner.plan().reused == ("before",)
+    assert nest.runner.plan().why["nested"] == "an input, or a hyperparameter inside it, has changed since it ran"
+    assert nest.runner.keys() == ("a", "b")
+    with pytest.raises(StaleToken, match=r"'d' is stale.*Call rerun\(\)"):
+        nest.runner["d"]
+    assert run["d"] == 11, "a Run does not change"
+    assert nest.runner.rerun()["d"] == 15
+    assert nest.calls == {"before": 1, "after": 2}
+    assert nest.runner.stale == ()
+
+
+@pytest.mark.parametrize("depth", [1, 2])
+def test_an_equal_value_inside_makes_nothing_stale(depth):
+    nest = Level(depth)
+    nest.runner.run(a=10)
+    nest.inner["n"] = 1
+    assert nest.runner.stale == ()
+    assert nest.runner.rerun().report.ran == ()
+
+
+@pytest.mark.parametrize("depth", [1, 2])
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_change_inside_is_seen_when_the_runs_are_compiled(depth, workers, monkeypatch):
+    monkeypatch.setattr(attempt, "has_independent_steps", lambda program: True)
+    monkeypatch.setattr(gain.Gain, "is_worth_it", lambda self: workers > 1)
+    nest = Level(depth, workers=workers)
+    for n in range(RUNS):
+        nest.inner["n"] = n
+        assert nest.runner.run(a=10)["d"] == 10 + n
+        assert nest.runner.stale == ()
+    for n in range(RUNS, 2 * RUNS):
+        nest.inner["n"] = n
+        assert nest.runner.stale == ("nested", "after")
+        assert nest.runner.rerun()["d"] == 10 + n
+        assert nest.runner.rerun().report.ran == ()
+    assert nest.calls == {"before": RUNS, "after": 2 * RUNS}
+
+
+def test_a_hyperparameter_outside_and_one_inside_are_both_seen_by_one_rerun():
+    inner = ep.Pipeline("inner", ep.CompGraph({"add": lambda x, n: x + n}, {"add": (("x", "n"), "y")}), {"n": 1})
+    cg = ep.CompGraph({"inner": inner, "times": lambda y, k: y * k}, {"inner": ("x", "y"), "times": (("y", "k"), "z")})
+    runner = ep.CompGraphRunner(cg, {"k": 2})
+    runner.run(x=1)
+    for step in range(1, RUNS):
+        assert runner.rerun(k=step)["z"] == (inner["n"] + 1) * step
+        inner["n"] = 10 * step
+        assert runner.rerun(k=-step)["z"] == (1 + 10 * step) * -step
+
+
+def test_a_rerun_of_what_does_not_need_the_pipeline_leaves_it_stale():
+    nest = Level(1)
+    nest.runner.run(a=10)
+    nest.inner["n"] = 5
+    assert nest.runner.rerun("b").report.ran == ()
+    assert nest.runner.stale == ("nested", "after")
+    assert nest.runner.rerun()["d"] == 15
+
+
+def test_a_failure_inside_keeps_its_type_and_names_both_functions():
+    def fail_at_3(x, n):
+        if n == 3:
+            raise ZeroDivisionError("three")
+        return x + n
+
+    inner = ep.Pipeline("inner", ep.CompGraph({"check": fail_at_3}, {"check": (("x", "n"), "y")}), {"n": 1})
+    cg = ep.CompGraph({"nested": inner, "after": abs}, {"nested": ("b", "c"), "after": ("c", "d")})
+    runner = ep.CompGraphRunner(cg)
+    for _ in range(RUNS):
+        runner.run(b=1)
+    inner["n"] = 3
+    with pytest.raises(ZeroDivisionError, match="three") as error:
+        runner.rerun()
+    assert error.value.__notes__ == ["In function 'check': (x=1, n=3) -> (y)", "In function 'nested': (b=1) -> (c)"]
+    assert runner.last.failure.function == "nested"
+    for token in ("c", "d"):
+        with pytest.raises(NotComputed):
+            runner[token]
+    inner["n"] = 4
+    assert runner.rerun()["d"] == 5
+
+
+def test_times_nest_as_deep_as_the_pipelines():
+    nest = Level(3)
+    pipe = ep.Pipeline("whole", nest.runner.cg)
+    assert pipe(10) == 11
+    name, total, nodes = pipe.traverse_time()
+    assert name == "whole"
+    assert [node[0] for node in nodes] == ["before", "level1", "after"]
+    outer = total
+    for expected in ("level1", "level0", "add"):
+        (found,) = (node for node in nodes if node[0] == expected)
+        name, seconds, nodes = found
+        assert 0 < seconds < outer, "what is inside takes less time than what is around it"
+        outer = seconds
+    assert [node[0] for node in nodes] == ["add"]
+    assert pipe.compute_overhead() == pytest.approx(total - sum(node[1] for node in pipe.traverse_time()[2]))
+
+
+def test_the_number_of_inputs_of_a_pipeline_is_checked_when_the_graph_is_made():
+    add = ep.CompGraph({"add": lambda x, n: x + n}, {"add": (("x", "n"), "y")})
+    open_pipe, frozen_pipe = ep.Pipeline("open", add), ep.Pipeline("frozen", add, {"n": 1})
+    ep.CompGraph({"f": open_pipe}, {"f": (("a", "b"), "c")})
+    with pytest.raises(GraphError, match="Function 'f' takes 2 inputs"):
+        ep.CompGraph({"f": open_pipe}, {"f": ("a", "c")})
+    ep.CompGraph({"f": frozen_pipe}, {"f": ("a", "c")})
+    with pytest.raises(GraphError, match="Function 'f' takes 1 inputs"):
+        ep.CompGraph({"f": frozen_pipe}, {"f": (("a", "b"), "c")})
+
+
+def test_a_pipeline_that_loses_a_hyperparameter_later_says_what_it_takes():
+    nest = Level(1)
+    nest.runner.run(a=10)
+    nest.inner.runner.unfreeze("n")
+    assert nest.runner.stale == ("nested", "after")
+    with pytest.raises(PayloadError, match=r"'add' takes 2 inputs \(x, n\), not 1"):
+        nest.runner.rerun()
+    nest.inner.runner.freeze(n=2)
+    assert nest.runner.rerun()["d"] == 12
+
+
+@pytest.mark.parametrize("outputs", [("low", "high"), "both"])
+def test_several_sink_tokens_are_a_tuple_in_graph_order(outputs):
+    cg = ep.CompGraph({"f": lambda x: -x, "g": lambda x: x}, {"f": ("x", "low"), "g": ("x", "high")})
+    runner = ep.CompGraphRunner(ep.CompGraph({"ends": ep.Pipeline("ends", cg)}, {"ends": ("a", outputs)}))
+    run = runner.run(a=3)
+    assert ((run["low"], run["high"]) if len(outputs) == 2 else run["both"]) == (-3, 3)
+    wrong = ep.CompGraph({"ends": ep.Pipeline("ends", cg)}, {"ends": ("a", ("p", "q", "r"))})
+    with pytest.raises(OutputArityError, match="3 values"):
+        ep.CompGraphRunner(wrong).run(a=3)
+
+
+def test_a_graph_of_functions_joins_a_pipeline_by_its_name_and_the_names_of_its_inputs():
+    def show(edges):
+        return f"<{edges}>"
+
+    pipe = ep.Pipeline("edges", ep.CompGraph({"f": lambda x, k: x + k}, {"f": (("image", "k"), "y")}), {"k": 2})
+    cg = ep.CompGraph.from_functions(pipe, show)
+    assert dict(cg.func_io) == {"edges": (("image",), "edges"), "show": (("edges",), "show")}
+    assert ep.CompGraphRunner(cg).run(image=1)["show"] == "<3>"
+    odd = ep.Pipeline("odd", ep.CompGraph({"f": lambda *xs: sum(xs)}, {"f": (("the image", "class"), "y")}))
+    assert ep.CompGraph.from_functions(odd).source_tokens == ("input_0", "input_1")
+
+
+def test_a_pipeline_with_workers_runs_independent_functions_at_once(monkeypatch):
+    monkeypatch.setattr(gain.Gain, "is_worth_it", lambda self: True)
+    barrier = threading.Barrier(2)
+
+    def meet(x):
+        barrier.wait(10)  # passes only if two are in it at once
+        return x
+
+    cg = ep.CompGraph({"f": meet, "g": meet}, {"f": ("x", "a"), "g": ("x", "b")})
+    pipe = ep.Pipeline("pipe", cg, workers=2)
+    outer = ep.Pipeline("outer", ep.CompGraph({"pipe": pipe}, {"pipe": ("x", ("a", "b"))}))
+    assert outer(3) == (3, 3)
+    report = pipe.runner.last.report
+    assert report.side_by_side
+    assert pipe.compute_overhead() == report.overhead_ns / 1e9
+    assert [node[0] for node in pipe.traverse_time()[2]] == ["f", "g"]
+    assert all(node.run_count == 1 for node in pipe.network.nodes.values())
+
+
+def test_workers_reach_the_runner_of_every_pipeline():
+    cg = ep.CompGraph({"f": abs}, {"f": ("x", "y")})
+    pipes = [
+        ep.Pipeline("p", cg, workers=2),
+        ep.SourcePipeline("p", cg, None, None, workers=2),
+        ep.SinkPipeline("p", cg, None, None, workers=2),
+        ep.FullPipeline("p", cg, None, None, None, None, workers=2),
+    ]
+    assert [pipe.runner.workers for pipe in pipes] == [2] * 4
