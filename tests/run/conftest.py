@@ -26,7 +26,11 @@ class Way:
     @contextlib.contextmanager
     def is_taken(self):
         """What is run within goes this way."""
-        names = {"execute": "step by step", "execute_side_by_side": "side by side"}
+        names = {
+            "execute": "step by step",
+            "execute_from_scratch": "step by step",
+            "execute_side_by_side": "side by side",
+        }
         found = []
 
         def noting(function):
