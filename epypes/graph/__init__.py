@@ -4,7 +4,7 @@ from epypes.graph.algebra import extend, subgraph, union, with_defaults, with_fu
 from epypes.graph.compgraph import CompGraph
 from epypes.graph.hinted import annotated_params, colour_order, image_hint
 from epypes.graph.outputs import outputs
-from epypes.graph.placeholder import Placeholder, is_placeholder
+from epypes.graph.placeholder import Placeholder, is_placeholder, layers
 from epypes.graph.renaming import rename, suffix
 from epypes.graph.switch import Switch, as_switch, switch
 
@@ -18,6 +18,7 @@ __all__ = [
     "extend",
     "image_hint",
     "is_placeholder",
+    "layers",
     "outputs",
     "rename",
     "subgraph",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, Final, NoReturn
 
 from epypes.errors import PlaceholderNeeded
@@ -37,9 +38,15 @@ _DEEPEST: Final = 100
 
 def innermost(function: object) -> object:
     """Follow ``__wrapped__`` to the function that a node or a decorator wraps."""
+    *_, last = layers(function)
+    return last
+
+
+def layers(function: object) -> Iterator[object]:
+    """Give a function, what it wraps, what that wraps ..."""
     for _ in range(_DEEPEST):
+        yield function
         try:
             function = vars(function)["__wrapped__"]
         except Exception:  # it has no attributes, it wraps nothing, or it raises when it is looked at
-            break
-    return function
+            return

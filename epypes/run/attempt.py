@@ -60,14 +60,15 @@ class Attempts:
         if compiled is None or (gain is not None and gain.is_worth_it()):
             draft = Draft.of_sources(self._program, values, has_payload)
             return self._step_by_step(execute_from_scratch, draft, wanted, gain, start_ns)
+        revisions = self._program.revisions()
         try:
             durations_ns = compiled(values)
         except StepFailed as failed:
-            return self.run_broken_off(values, failed, wanted, has_payload, start_ns)
+            return self.run_broken_off(values, failed, wanted, has_payload, start_ns, revisions)
         freshness = self.clean
         if wanted is not None or not has_payload or self._program.revised:
             dirty = bytes(len(self._program.steps)) if wanted is None else wanted.translate(_INVERTED)
-            freshness = Freshness(self._program, dirty, has_payload)
+            freshness = Freshness(self._program, dirty, has_payload, revisions)
         return values, freshness, (self._program, wanted, durations_ns, perf_counter_ns() - start_ns, False), None
 
     def stale(self, draft: Draft, targets: Sequence[str], start_ns: int) -> Outcome:
@@ -107,10 +108,17 @@ class Attempts:
         return outcome
 
     def run_broken_off(
-        self, values: list[Any], failed: StepFailed, wanted: bytes | None, has_payload: bool, start_ns: int
+        self,
+        values: list[Any],
+        failed: StepFailed,
+        wanted: bytes | None,
+        has_payload: bool,
+        start_ns: int,
+        revisions: tuple[Any, ...] = (),
     ) -> Outcome:
         """Return what is left of a compiled run in which a function failed."""
         draft = Draft.of_sources(self._program, values, has_payload)
+        draft.revisions = revisions
         for place in failed.done_ns:
             draft.dirty[place] = 0
         return _ended(draft, failed, wanted, failed.done_ns, start_ns, False)

@@ -15,14 +15,15 @@ class Draft:
 
     Attributes
     ----------
-    values, dirty
+    values, dirty, revisions
         As in TokenManager and Freshness.
     """
 
-    __slots__ = ("dirty", "has_payload", "program", "values")
+    __slots__ = ("dirty", "has_payload", "program", "revisions", "values")
 
     def __init__(self, program: Program, values: list[Any], dirty: bytearray, has_payload: bool) -> None:
         self.program, self.values, self.dirty, self.has_payload = program, values, dirty, has_payload
+        self.revisions = program.revisions()
 
     @classmethod
     def of_sources(cls, program: Program, values: list[Any], has_payload: bool) -> Draft:
@@ -33,10 +34,11 @@ class Draft:
     def after(cls, manager: TokenManager) -> Draft:
         """Begin with what another run has left; the values are shared."""
         freshness = manager.freshness
-        program, dirty = freshness.program, bytearray(freshness.dirty)
-        for place, before, now in zip(program.revised, freshness.revisions, program.revisions(), strict=True):
-            dirty[place] |= before != now
-        return cls(program, manager.values.copy(), dirty, freshness.has_payload)
+        program = freshness.program
+        draft = cls(program, manager.values.copy(), bytearray(freshness.dirty), freshness.has_payload)
+        for place, before, now in zip(program.revised, freshness.revisions, draft.revisions, strict=True):
+            draft.dirty[place] |= before != now
+        return draft
 
     def change(self, token: str, value: Any) -> None:
         """Give a source token a value."""
@@ -71,7 +73,7 @@ class Draft:
 
     def freshness(self) -> Freshness:
         """Return what is up to date now, for good."""
-        return Freshness(self.program, bytes(self.dirty), self.has_payload)
+        return Freshness(self.program, bytes(self.dirty), self.has_payload, self.revisions)
 
     def tokens(self) -> TokenManager:
         """Return the tokens as they are now, for good."""

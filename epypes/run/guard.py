@@ -197,7 +197,7 @@ def is_same_guarded_array(old: Any, new: Any, given: Sequence[Any]) -> bool:
     given
         The values that the function read, as they are stored.
     """
-    if old is new:
+    if old is new and new.base is None:
         return True
     owner = new.base
     if owner is None or owner is not old.base or new.flags.writeable:

@@ -10,7 +10,7 @@ from functools import cached_property, partial
 from types import BuiltinFunctionType, FunctionType
 from typing import Any, Final, NamedTuple
 
-from epypes.graph import CompGraph, Switch, as_switch
+from epypes.graph import CompGraph, Switch, as_switch, layers
 from epypes.images import Contracts
 from epypes.run.guard import is_unguarded
 
@@ -84,7 +84,7 @@ class Program:
         special = [step for step in steps if type(step.function) is not FunctionType]
         self.switches = tuple(step.place for step in special if step.switch is not None)
         self.placeholders = frozenset(step.place for step in special if step.name in cg.placeholders)
-        self.revised = tuple(step.place for step in special if hasattr(type(step.function), REVISION))
+        self.revised = tuple(step.place for step in special if _with_revision(step.function) is not None)
         self.selectors: dict[str, list[Switch]] = {}
         for place in self.switches:
             step = steps[place]
@@ -113,7 +113,7 @@ class Program:
 
     def revisions(self) -> tuple[Any, ...]:
         """Return the present revisions of the functions that have one."""
-        return tuple(getattr(self.steps[place].function, REVISION) for place in self.revised)
+        return tuple(getattr(_with_revision(self.steps[place].function), REVISION) for place in self.revised)
 
     def read_by(self, step: Step, values: Sequence[Any]) -> tuple[int, ...]:
         """Return the slots that a step reads with these values: of a switch, the selector and the chosen branch."""
@@ -136,6 +136,11 @@ class Program:
                         found.add(index)
                         pending.append(index)
         return found
+
+
+def _with_revision(function: object) -> object | None:
+    """Return the function, or what it wraps, that has a revision; None if there is none."""
+    return next((layer for layer in layers(function) if hasattr(type(layer), REVISION)), None)
 
 
 def _steps(cg: CompGraph, slots: dict[str, int], guard: bool) -> Iterator[Step]:

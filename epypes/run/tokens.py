@@ -44,16 +44,15 @@ class Freshness:
     has_payload
         Whether every source token has a value; if not, each run has to see whether it needs one that has none.
     revisions
-        Those of nested pipelines, when the run ended.
+        Those of nested pipelines, when the run began.
     is_clean
         Whether every step is up to date, for good, and every source token has a value.
     """
 
     __slots__ = ("dirty", "has_payload", "is_clean", "program", "revisions")
 
-    def __init__(self, program: Program, dirty: bytes, has_payload: bool) -> None:
-        self.program, self.dirty, self.has_payload = program, dirty, has_payload
-        self.revisions = program.revisions() if program.revised else ()
+    def __init__(self, program: Program, dirty: bytes, has_payload: bool, revisions: tuple[Any, ...] = ()) -> None:
+        self.program, self.dirty, self.has_payload, self.revisions = program, dirty, has_payload, revisions
         self.is_clean = has_payload and 1 not in dirty and not program.revised
 
 

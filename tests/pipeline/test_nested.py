@@ -215,3 +215,30 @@ def test_workers_reach_the_runner_of_every_pipeline():
         ep.FullPipeline("p", cg, None, None, None, None, workers=2),
     ]
     assert [pipe.runner.workers for pipe in pipes] == [2] * 4
+
+
+def test_a_value_that_changes_inside_while_the_graph_runs_is_stale_afterwards():
+    inner = ep.Pipeline("inner", ep.CompGraph({"f": lambda x, n: x + n}, {"f": (("x", "n"), "y")}), {"n": 1})
+    given = iter(range(2, 100))
+
+    def turn(b):
+        inner["n"] = next(given)
+        return b
+
+    io = {"inner": ("a", "b"), "turn": ("b", "c")}
+    runner = ep.CompGraphRunner(ep.CompGraph({"inner": inner, "turn": turn}, io))
+    for _ in range(RUNS):
+        before = inner["n"]
+        assert runner.run(a=1)["b"] == 1 + before, "of the run, whatever came after"
+        assert runner.stale == ("inner", "turn")
+        with pytest.raises(StaleToken):
+            runner["b"]
+
+
+def test_a_node_around_a_pipeline_shows_its_changes():
+    inner = ep.Pipeline("inner", ep.CompGraph({"f": lambda x, n: x + n}, {"f": (("x", "n"), "y")}), {"n": 1})
+    runner = ep.CompGraphRunner(ep.CompGraph({"node": ep.Node("node", inner)}, {"node": ("a", "b")}))
+    assert runner.run(a=1)["b"] == 2
+    inner["n"] = 5
+    assert runner.stale == ("node",)
+    assert runner.rerun()["b"] == 6

@@ -314,3 +314,18 @@ def test_functions_see_the_callers_context(way):
     for x in range(way.runs):
         SETTING.set(f"mine {x}")
         assert runner.run(x=x)["y"] == f"mine {x}"
+
+
+def test_a_read_only_array_over_memory_that_others_change_counts_as_new(way):
+    memory = bytearray(4)
+    array = np.frombuffer(memoryview(memory).toreadonly(), np.uint8)
+
+    def grab(k):
+        memory[0] = k
+        return array
+
+    cg = ep.CompGraph({"grab": grab, "sum": lambda a: int(a.sum())}, {"grab": ("k", "a"), "sum": ("a", "total")})
+    runner = way.runner(cg, {"k": 0})
+    runner.run()
+    for k in range(1, way.runs):
+        assert runner.rerun(k=k)["total"] == k
