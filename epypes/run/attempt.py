@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from time import perf_counter_ns
-from typing import Any
+from typing import Any, Final
 
 from epypes.run.call import StepFailed
 from epypes.run.compiled import CompiledRuns
@@ -23,11 +23,12 @@ Outcome = tuple[list[Any], Freshness, Times, Failure | None]
 
 Engine = Callable[[Draft, bytes | None, dict[int, int]], None]
 
+_MOST_KINDS: Final = 16
 _INVERTED = bytes((1, 0)).ljust(256)
 
 
 class Attempts:
-    """Runs a program; knows which runs have been repeated.
+    """Runs a program whose ``plain`` tokens hold no arrays; knows which runs have been repeated.
 
     Every method takes ``start_ns``, when the run began on the clock of ``perf_counter_ns``.
 
@@ -39,9 +40,9 @@ class Attempts:
         What is up to date after a run of everything.
     """
 
-    def __init__(self, program: Program, workers: int) -> None:
+    def __init__(self, program: Program, workers: int, plain: Iterable[str]) -> None:
         self._program, self._workers = program, workers
-        self._compiled = CompiledRuns(program)
+        self._compiled = CompiledRuns(program, plain)
         self._gains = Gains(program, workers) if workers > 1 and has_independent_steps(program) else None
         self.short_way = self._compiled if self._gains is None else GuardedWay(self._compiled, self._gains)
         self.clean = Freshness(program, bytes(len(program.steps)), True)
@@ -134,6 +135,20 @@ class Attempts:
             failed.done_ns.get(step.place, -1) < 0 and not new.isdisjoint(step.inputs) for step in program.steps
         )
         return _ended(Draft(program, values, dirty, True), failed, None, failed.done_ns, start_ns, False)
+
+
+class AttemptsByKind(dict[frozenset[str], Attempts]):
+    """The attempts by plain tokens; those of another set of them are made when they are asked for."""
+
+    def __init__(self, program: Program, workers: int) -> None:
+        super().__init__()
+        self._program, self._workers = program, workers
+
+    def __missing__(self, plain: frozenset[str]) -> Attempts:
+        if len(self) >= _MOST_KINDS:
+            self.clear()
+        self[plain] = made = Attempts(self._program, self._workers, plain)
+        return made
 
 
 def _ended(

@@ -64,16 +64,24 @@ _NAMES: Final = {
 class CompiledRuns:
     """The compiled runs of a program, each made when it has been repeated.
 
+    Parameters
+    ----------
+    program
+        What is run.
+    plain
+        The tokens whose values hold no arrays in any of these runs.
+
     Attributes
     ----------
     whole
         The run of every step, as soon as there is one; never in a graph with switches or nested pipelines.
     """
 
-    __slots__ = ("_compiled", "_counts", "_program", "whole")
+    __slots__ = ("_compiled", "_counts", "_plain", "_program", "whole")
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: Program, plain: Iterable[str]) -> None:
         self._program = program
+        self._plain = frozenset(program.slots[token] for token in plain)
         self.whole: CompiledRun | None = None
         self._counts: Counter[Hashable] = Counter()
         self._compiled: dict[Hashable, Any] = {}
@@ -86,7 +94,7 @@ class CompiledRuns:
         compiled: CompiledRun | None = self._compiled.get(wanted)
         if compiled is None and self._is_worth_it(wanted):
             steps = [step for step in self._program.steps if wanted is None or wanted[step.place]]
-            compiled = self._compiled[wanted] = compile_run(self._program, steps, ())
+            compiled = self._compiled[wanted] = compile_run(self._program, steps, self._plain)
             if wanted is None and not self._program.switches and not self._program.revised:
                 self.whole = compiled
         return compiled
@@ -105,7 +113,7 @@ class CompiledRuns:
             slots = [program.slots[token] for token in tokens]
             readers = {index for slot in slots for index in program.consumers[slot]}
             steps = [program.steps[index] for index in sorted(program.downstream(readers, ()))]
-            compiled = self._compiled[key] = compile_run(program, steps, slots)
+            compiled = self._compiled[key] = compile_run(program, steps, self._plain, slots)
         return compiled
 
     def _is_worth_it(self, key: Hashable) -> bool:
@@ -118,13 +126,15 @@ class CompiledRuns:
         return True
 
 
-def compile_run(program: Program, steps: list[Step], changed: Collection[int]) -> Any:
+def compile_run(program: Program, steps: list[Step], plain: Collection[int], changed: Collection[int] = ()) -> Any:
     """Write out and compile a run.
 
     Parameters
     ----------
     steps
         What to run, in run order.
+    plain
+        The slots whose values hold no arrays.
     changed
         The slots that get new values; then a step is passed over if nothing that it reads turns out to be new.
         Empty if every step is to be run.
@@ -141,7 +151,7 @@ def compile_run(program: Program, steps: list[Step], changed: Collection[int]) -
         *(f"        {', '.join(f'v[{slot}]' for slot in changed)}, = given" for _ in range(bool(changed))),
         "        at = start = 0",
         "        try:",
-        *(f"            {line}" for line in _body(program, steps, set(changed))),
+        *(f"            {line}" for line in _body(program, steps, plain, set(changed))),
         "        except BaseException as error:",
         "            failed(error, start and clock() - start, locals())",
         "    return run",
@@ -151,7 +161,7 @@ def compile_run(program: Program, steps: list[Step], changed: Collection[int]) -
     return names["make"](program, program.steps, *_NAMES.values(), array_type())
 
 
-def _body(program: Program, steps: list[Step], changed: set[int]) -> Iterator[str]:
+def _body(program: Program, steps: list[Step], plain: Collection[int], changed: set[int]) -> Iterator[str]:
     """Write out the steps: ``v[3]`` is the value in slot 3, ``c3`` whether it is new, ``f2`` the function of step 2."""
     read = {slot for step in steps for slot in step.inputs}
     known: set[int] = set()
@@ -160,7 +170,7 @@ def _body(program: Program, steps: list[Step], changed: set[int]) -> Iterator[st
         is_certain = not changed or not changed.isdisjoint(step.inputs)
         new = [] if is_certain else [slot for slot in step.inputs if slot in known]
         checked = [slot for slot in step.outputs if changed and slot in read]
-        lines = [f"at = {step.place}", *_call(program, step, locked)]
+        lines = [f"at = {step.place}", *_call(program, step, plain, locked)]
         for place, slot in enumerate(step.outputs):
             lines += _store(step, slot, "made" if step.single else f"made[{place}]", slot in checked)
         lines.append(f"d{step.place} = spent")
@@ -179,7 +189,7 @@ def _body(program: Program, steps: list[Step], changed: set[int]) -> Iterator[st
         yield f"return {{{', '.join(f'{step.place}: d{step.place}' for step in steps)}}}"
 
 
-def _call(program: Program, step: Step, locked: set[int]) -> Iterator[str]:
+def _call(program: Program, step: Step, plain: Collection[int], locked: Collection[int]) -> Iterator[str]:
     """Write out the call of a step; the slots in ``locked`` hold what ``keep`` gave."""
     if step.switch is not None or step.unguarded or step.contracts is not None:
         yield f"made, spent = call(program, steps[{step.place}], v)"
@@ -188,10 +198,12 @@ def _call(program: Program, step: Step, locked: set[int]) -> Iterator[str]:
         return
     args = []
     for place, slot in enumerate(step.inputs):
+        if not program.guard or slot in plain or (step.is_builtin and slot in locked):
+            args.append(f"v[{slot}]")
+            continue
         args.append(f"a{place}")
         yield f"a{place} = v[{slot}]"
-        if program.guard and not (step.is_builtin and slot in locked):
-            yield from _lend(f"a{place}", is_locked=slot in locked)
+        yield from _lend(f"a{place}", is_locked=slot in locked)
     yield "start = clock()"
     yield f"made = f{step.place}({', '.join(args)})"
     yield "spent = clock() - start"
@@ -220,22 +232,25 @@ def _unpack(program: Program, step: Step) -> Iterator[str]:
 def _lend(name: str, is_locked: bool) -> Iterator[str]:
     """Write out ``lend``, for what it does to most values; the view of a locked array is locked."""
     yield f"k = kind({name})"
-    yield "if k not in ARRAYLESS:"
-    yield "    if k is array:"
-    yield f"        {name} = {name}.view()"
+    yield "if k is array:"
+    yield f"    {name} = {name}.view()"
     if not is_locked:
-        yield f"        {name}.setflags(False)"
-    yield f"    elif k not in LISTS or len({name}) < LONG or kind({name}[0]) not in HARMLESS: {name} = lend({name})"
+        yield f"    {name}.setflags(False)"
+    yield f"elif k not in ARRAYLESS and {_may_hold_arrays(name)}:"
+    yield f"    {name} = lend({name})"
 
 
 def _keep(name: str, is_read: bool) -> Iterator[str]:
     """Write out ``keep``, for what it does to most values; an array that no function reads need not be locked."""
     yield f"k = kind({name})"
-    yield "if k not in ARRAYLESS:"
-    yield f"    if k is array and {name}.base is None and count({name}) <= FRESH_HERE:"
-    yield f"        {name}.setflags(False)" if is_read else "        pass"
-    yield f"    elif k not in LISTS or len({name}) < LONG or kind({name}[0]) not in HARMLESS:"
-    yield f"        {name} = keep({name}, FRESH)"
+    yield f"if k is array and {name}.base is None and count({name}) <= FRESH_HERE:"
+    yield f"    {name}.setflags(False)" if is_read else "    pass"
+    yield f"elif k not in ARRAYLESS and {_may_hold_arrays(name)}:"
+    yield f"    {name} = keep({name}, FRESH)"
+
+
+def _may_hold_arrays(name: str) -> str:
+    return f"(k not in LISTS or len({name}) < LONG or kind({name}[0]) not in HARMLESS)"
 
 
 def _store(step: Step, slot: int, made: str, is_checked: bool) -> Iterator[str]:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Final
 
 from epypes.errors import HyperparameterError
 from epypes.run.guard import ARRAYLESS, lend
 from epypes.run.program import Program
 from epypes.run.tokens import NOT_COMPUTED, is_same_value
+
+_NOTHING: Final[Mapping[str, Any]] = {}
 
 
 class Hyperparameters:
@@ -25,6 +27,8 @@ class Hyperparameters:
         The values that differ from the revision before.
     follows
         That revision; -1 if other tokens were hyperparameters in it.
+    plain
+        The tokens whose values are numbers, texts or None: they hold no arrays, so functions get them as they are.
     free_slots
         The slots of the source tokens that are not frozen, in order of first appearance in func_io.
     base
@@ -35,16 +39,23 @@ class Hyperparameters:
     free_slots: dict[str, int]
 
     # Made at every move of a slider, so what is rarely asked for is made when it is.
-    __slots__ = ("base", "changed", "entries", "follows", "free_slots", "program", "revision")
+    __slots__ = ("base", "changed", "entries", "follows", "free_slots", "plain", "program", "revision")
 
     def __init__(
-        self, program: Program, entries: dict[str, tuple[Any]], revision: int, changed: dict[str, Any], follows: int
+        self,
+        program: Program,
+        entries: dict[str, tuple[Any]],
+        revision: int = 0,
+        changed: Mapping[str, Any] = _NOTHING,
+        follows: int = -1,
+        plain: frozenset[str] = frozenset(),
     ) -> None:
         self.program = program
         self.entries = entries
         self.revision = revision
         self.changed = changed
         self.follows = follows
+        self.plain = plain
 
     @property
     def values(self) -> Mapping[str, Any]:
@@ -82,30 +93,32 @@ class Hyperparameters:
             A function makes the token, or it is not a hyperparameter.
         """
         program, revision = self.program, self.revision
-        entries, new, follows = self.entries.copy(), {}, revision
+        entries, new, follows, plain = self.entries.copy(), {}, revision, self.plain
         for token, value in changes.items():
             entry = entries.get(token)
+            # An integer after an integer, which most sliders give, takes no more than a comparison.
+            is_count = entry is not None and type(value) is int is type(entry[0])
             if entry is None:
                 (self.require_source if also_new else self.require)(token)
                 follows = -1
-            # An integer, which most sliders give, is compared without a call.
-            elif entry[0] == value if type(value) is int is type(entry[0]) else is_same_value(entry[0], value):
+            elif entry[0] == value if is_count else is_same_value(entry[0], value):
                 continue
             if program.selectors:
                 self.require_branch(token, value)
-            if type(value) not in ARRAYLESS and program.guard:
-                value = lend(value)
+            if not is_count:
+                plain = plain if (type(value) in ARRAYLESS) == (token in plain) else plain ^ {token}
+                value = lend(value) if program.guard else value
             new[token] = value
             entries[token] = (value,)
-        return Hyperparameters(program, entries, revision + 1, new, follows) if new else self
+        return Hyperparameters(program, entries, revision + 1, new, follows, plain) if new else self
 
     def unfrozen(self, token: str) -> Hyperparameters:
         """Return these without a token, which becomes a free source token."""
         self.require(token)
         entries = {name: entry for name, entry in self.entries.items() if name != token}
-        return Hyperparameters(self.program, entries, self.revision + 1, {}, -1)
+        return Hyperparameters(self.program, entries, self.revision + 1, plain=self.plain - {token})
 
-    def changes_since(self, earlier: Hyperparameters) -> dict[str, Any]:
+    def changes_since(self, earlier: Hyperparameters) -> Mapping[str, Any]:
         """Return the tokens that have another version than in an earlier or later revision, with their values."""
         if earlier is self:
             return {}

@@ -10,7 +10,7 @@ from typing import Any
 from epypes.errors import NotComputed, PayloadError, StaleToken, UnknownName, run_call
 from epypes.graph import CompGraph
 from epypes.graph.redefined import redefined
-from epypes.run.attempt import Attempts, Outcome
+from epypes.run.attempt import AttemptsByKind, Outcome
 from epypes.run.call import StepFailed
 from epypes.run.draft import Draft
 from epypes.run.guard import lend
@@ -72,11 +72,11 @@ class CompGraphRunner:
         self.guard = guard
         self.reports = Reports()
         self._program = Program(cg, guard)
-        self._attempts = Attempts(self._program, workers)
+        self._attempts = AttemptsByKind(self._program, workers)
         self._lock = threading.Lock()
         self._last: Run | None = None
         given = {**cg.defaults, **(hparams or {})}
-        self._hparams = Hyperparameters(self._program, {}, 0, {}, -1).frozen(given)
+        self._hparams = Hyperparameters(self._program, {}).frozen(given)
 
     # -- running ------------------------------------------------------------------------------------------------
 
@@ -119,7 +119,7 @@ class CompGraphRunner:
         if program.selectors:
             for token in payload:
                 hparams.require_branch(token, payload[token])
-        attempts, has_payload = self._attempts, len(payload) == len(free)
+        attempts, has_payload = self._attempts[hparams.plain], len(payload) == len(free)
         compiled = attempts.short_way.whole
         if compiled is None or targets or not has_payload:
             return self._ended(attempts.whole(values, has_payload, targets, start_ns), hparams)
@@ -160,7 +160,7 @@ class CompGraphRunner:
             free = self.free_source_tokens
             text = f"Nothing has been run yet, so there is no payload. Call {run_call(free)} first."
             raise PayloadError(free, text)
-        attempts = self._attempts
+        attempts = self._attempts[hparams.plain]
         stored, freshness, before, _, _ = last.record
         if freshness.is_clean and not targets and hparams.follows == before.revision:
             compiled = attempts.short_way.of_changes(changed)

@@ -329,3 +329,41 @@ def test_a_read_only_array_over_memory_that_others_change_counts_as_new(way):
     runner.run()
     for k in range(1, way.runs):
         assert runner.rerun(k=k)["total"] == k
+
+
+def test_a_hyperparameter_that_becomes_an_array_is_guarded(way):
+    def write(x, k):
+        k[0] = 9
+        return x
+
+    runner = way.runner(one(write, inputs=("x", "k")), {"k": 1})
+    for x in range(way.runs):
+        with pytest.raises(TypeError):
+            runner.run(x=x)
+    array = np.zeros(3)
+    runner["k"] = array
+    for x in range(way.runs):
+        with pytest.raises(ValueError, match="read-only"):
+            runner.run(x=x)
+    runner["k"] = 1
+    with pytest.raises(TypeError):
+        runner.rerun()
+    with pytest.raises(ValueError, match="read-only"):
+        runner.rerun(k=array + 1)
+    assert not array.any()
+
+
+def test_a_hyperparameter_that_becomes_free_is_guarded(way):
+    def write(k):
+        k[0] = 9
+
+    runner = way.runner(one(write, inputs="k"), {"k": 1})
+    for _ in range(way.runs):
+        with pytest.raises(TypeError):
+            runner.run()
+    runner.unfreeze("k")
+    array = np.zeros(3)
+    for _ in range(way.runs):
+        with pytest.raises(ValueError, match="read-only"):
+            runner.run(k=array)
+    assert not array.any()
