@@ -3,6 +3,7 @@
 The rooms, from the bottom up; imports point downwards only (checked by ``lint-imports``):
 
 - ``errors``: every error EPypes raises
+- ``annotations``: what a function's annotations say, once evaluated
 - ``hints``: which values a hyperparameter may take; ``images``: which arrays a function takes as images
 - ``graph``: what is connected to what
 - ``run``: which functions must run, and running them
