@@ -66,11 +66,14 @@ class Attempts:
             durations_ns = compiled(values)
         except StepFailed as failed:
             return self.run_broken_off(values, failed, wanted, has_payload, start_ns, revisions)
+        total_ns = perf_counter_ns() - start_ns
+        if gain is not None:
+            gain.learn(durations_ns, total_ns, False)
         freshness = self.clean
         if wanted is not None or not has_payload or self._program.revised:
             dirty = bytes(len(self._program.steps)) if wanted is None else wanted.translate(_INVERTED)
             freshness = Freshness(self._program, dirty, has_payload, revisions)
-        return values, freshness, (self._program, wanted, durations_ns, perf_counter_ns() - start_ns, False), None
+        return values, freshness, (self._program, wanted, durations_ns, total_ns, False), None
 
     def stale(self, draft: Draft, targets: Sequence[str], start_ns: int) -> Outcome:
         """Run the dirty steps that the targets need, all without.

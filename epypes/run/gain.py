@@ -8,7 +8,7 @@ something to be gained at best, and from then on the faster way is taken. Now an
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Hashable, Mapping
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from typing import Final
 
 from epypes.run.compiled import CompiledRerun, CompiledRun, CompiledRuns
@@ -19,6 +19,7 @@ _LEAST_GAIN_NS: Final = 100_000
 _LEAST_SHARE: Final = 0.1
 _TRIALS: Final = 3
 _TRY_AGAIN_AFTER: Final = 201
+_LOOK_AGAIN_AFTER: Final = 100
 _MOST_KEPT: Final = 64
 
 
@@ -37,6 +38,11 @@ class Gain:
         """Whether the functions have been timed one after another."""
         return len(self._one_by_one_ns) >= _TRIALS
 
+    @property
+    def is_hopeless(self) -> bool:
+        """Whether there is nothing to be gained, as far as is known, so that nothing is tried."""
+        return self.is_known and not self._is_promising
+
     def is_worth_it(self) -> bool:
         """Whether the next run should go side by side."""
         if not self.is_known or not self._is_promising:
@@ -47,12 +53,13 @@ class Gain:
         is_faster = min(self._side_by_side_ns) < min(self._one_by_one_ns)
         return is_faster != (self._asked % _TRY_AGAIN_AFTER == 0)
 
-    def learn(self, durations_ns: Mapping[int, int], total_ns: int, side_by_side: bool) -> None:
-        """Take note of a run that has ended without a failure."""
+    def learn(self, durations: Mapping[int, int] | Sequence[int], total_ns: int, side_by_side: bool) -> None:
+        """Take note of a run that has ended without a failure: nanoseconds by step, and in all."""
         if side_by_side:
             self._side_by_side_ns.append(total_ns)
             return
         self._one_by_one_ns.append(total_ns)
+        durations_ns = durations if isinstance(durations, Mapping) else dict(enumerate(durations))
         work_ns = sum(durations_ns.values())
         best_ns = max(longest_path_ns(self._program, durations_ns), work_ns // self._workers)
         self._is_promising = work_ns - best_ns > max(_LEAST_GAIN_NS, _LEAST_SHARE * total_ns)
@@ -90,11 +97,17 @@ class GuardedWay:
 
     def __init__(self, compiled: CompiledRuns, gains: Gains) -> None:
         self._compiled, self._gains = compiled, gains
+        self._left = 0
 
     @property
     def whole(self) -> CompiledRun | None:
         """As in CompiledRuns."""
-        return self._compiled.whole if self._is_free(self._gains.of_steps(None)) else None
+        if self._left:
+            self._left -= 1
+            return self._compiled.whole
+        # Now and then a run goes the long way, and is learnt from: images may be larger than the first ones were.
+        self._left = _LOOK_AGAIN_AFTER if self._gains.of_steps(None).is_hopeless else 0
+        return None
 
     def of_changes(self, tokens: Collection[str]) -> CompiledRerun | None:
         """As in CompiledRuns."""

@@ -165,6 +165,19 @@ def test_threads_are_given_up_where_they_are_slower():
     assert [report.side_by_side for report in runner.reports][-4:] == [False] * 4
 
 
+def test_threads_are_tried_when_functions_become_long_later(monkeypatch):
+    monkeypatch.setattr(gain, "_LOOK_AGAIN_AFTER", 4)
+
+    def wait(seconds):
+        device.wait(seconds)
+
+    runner = ep.CompGraphRunner(fork(2, wait), workers=2)
+    for seconds in [0] * 10 + [WAIT_S] * 10:
+        runner.run(x=seconds)
+    assert not any(report.side_by_side for report in runner.reports[:10])
+    assert runner.reports[-1].side_by_side
+
+
 def test_trivial_functions_and_chains_stay_in_the_callers_thread():
     wide = ep.CompGraphRunner(fork(20, lambda x: x), workers=4)
     chain = ep.CompGraphRunner(ep.CompGraph({"f": abs, "g": abs}, {"f": ("x", "y"), "g": ("y", "z")}), workers=4)
