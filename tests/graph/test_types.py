@@ -200,3 +200,25 @@ def test_types_are_reported_beside_every_other_problem():
     with pytest.raises(GraphError) as error:
         ep.CompGraph({"f": made, "g": takes_int, "h": takes_str}, {**IO, "h": 3, "k": ("a", "b")})
     assert {finding.kind for finding in error.value.findings} == {"types", "bad io", "no function"}
+
+
+@pytest.mark.parametrize("place", [1, 50, 100])
+def test_one_function_that_does_not_fit_is_found_among_many(place):
+    def add_one(x: int) -> int:
+        return x + 1
+
+    def as_text(x: int) -> str:
+        return str(x)
+
+    def split(x: int) -> tuple[int, int, int]:
+        return x, x, x
+
+    names = [f"f{index}" for index in range(101)]
+    io = {name: (f"t{index}", f"t{index + 1}") for index, name in enumerate(names)}
+    fits = dict.fromkeys(names, add_one)
+    ep.CompGraph(fits, io)
+    ep.CompGraph(fits | {names[-1]: as_text}, io)
+    with pytest.raises(GraphError, match=f"makes token 't{place}' as str, but 'f{place}' takes it as int"):
+        ep.CompGraph(fits | {names[place - 1]: as_text}, io)
+    with pytest.raises(GraphError, match="3 values, but its io names 2"):
+        ep.CompGraph(fits | {names[place]: split}, io | {names[place]: (f"t{place}", (f"t{place + 1}", "more"))})
