@@ -209,7 +209,7 @@ def f(x):
     threading.Event().wait()
 cg = ep.CompGraph({"f": f, "g": f}, {"f": ("x", "a"), "g": ("x", "b")})
 runner = ep.CompGraphRunner(cg, workers=2)
-threading.Timer(3, lambda: os.kill(os.getpid(), 2)).start()
+threading.Timer(1, lambda: os.kill(os.getpid(), 2)).start()
 try:
     runner.run(x=1)
 except KeyboardInterrupt:
