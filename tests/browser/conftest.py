@@ -12,7 +12,9 @@ import pytest
 from tests.browser.jupyter import JupyterLab, Notebook, chromium
 
 ROOT = Path(__file__).parents[2]
-TUTORIAL = ROOT / "notebooks" / "01_edge_detection.ipynb"
+TUTORIALS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+TUTORIAL = TUTORIALS[0]
+SCREENSHOTS = ROOT / "test-output" / "screenshots"
 
 
 @pytest.fixture(scope="session")
@@ -21,23 +23,24 @@ def browser() -> Iterator[Any]:
         yield browser
 
 
-@pytest.fixture(scope="module", params=["light", "dark"])
+@pytest.fixture(scope="session", params=["light", "dark"])
 def theme(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def lab(theme: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[JupyterLab]:
-    """JupyterLab over a folder with a copy of the tutorial, so that what it writes stays there."""
+    """JupyterLab over a folder with copies of the tutorials, so that what they write stays there."""
     folder = tmp_path_factory.mktemp("notebooks")
-    shutil.copy(TUTORIAL, folder)
+    for tutorial in TUTORIALS:
+        shutil.copy(tutorial, folder)
     with JupyterLab(folder, tmp_path_factory.mktemp(f"lab-{theme}"), theme) as lab:
         yield lab
 
 
 @pytest.fixture(scope="module")
 def notebook(browser: Any, lab: JupyterLab) -> Iterator[Notebook]:
-    """The tutorial, with all its cells run."""
+    """The first tutorial, with all its cells run."""
     notebook = Notebook(browser, lab, TUTORIAL.name)
     notebook.run_all()
     yield notebook

@@ -11,13 +11,12 @@ from typing import Any
 import nbformat
 import pytest
 
-from tests.browser.conftest import ROOT, TUTORIAL
+from tests.browser.conftest import SCREENSHOTS, TUTORIAL
 from tests.browser.jupyter import JupyterLab, Notebook
 
 pytestmark = pytest.mark.browser
 
 LOG = logging.getLogger(__name__)
-SCREENSHOTS = ROOT / "test-output" / "screenshots"
 PRESSES = 10
 TIMEOUT_MS = 20_000
 

@@ -1,0 +1,27 @@
+"""Do the other tutorials run in JupyterLab, and what do they look like?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.browser.conftest import SCREENSHOTS, TUTORIALS
+from tests.browser.jupyter import JupyterLab, Notebook
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.mark.parametrize("tutorial", TUTORIALS[1:], ids=lambda path: path.stem)
+def test_every_cell_runs_and_every_graph_is_drawn(browser: Any, lab: JupyterLab, theme: str, tutorial: Path) -> None:
+    notebook = Notebook(browser, lab, tutorial.name)
+    try:
+        notebook.run_all()
+        notebook.screenshot(SCREENSHOTS / f"{tutorial.stem}-{theme}.png")
+        figures = notebook.page.locator("figure:has(figcaption)")
+        assert figures.count() > 0
+        assert notebook.page.locator("figure svg.epypes-graph").count() == figures.count(), "none is left an image"
+        assert not notebook.page_errors
+    finally:
+        notebook.close()
