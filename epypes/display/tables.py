@@ -13,6 +13,7 @@ from epypes.run import FunctionTime, LogNormal, RunReport, TimingSummary
 
 # Below them stand the rest, the total and the graph overhead: a hundred rows in all.
 _MOST_FUNCTIONS: Final = 97
+_LEFT: Final = ' style="text-align:left"'
 _CELL_CHARACTERS: Final = 200
 _NAME_CHARACTERS: Final = 60
 _DONE: Final = {"missing": "placeholder", "planned": "runs"}
@@ -48,7 +49,7 @@ def paint_plan(graph: GraphView) -> str:
         if function.name in kept
     ]
     rows += _other_plans(by_weight[_MOST_FUNCTIONS:])
-    return _table("", ("function", "plan", "why"), rows)
+    return _table("", ("function", "plan", "why"), rows, texts=3)
 
 
 def _other_plans(rest: Sequence[FunctionView]) -> Iterable[tuple[str, ...]]:
@@ -87,7 +88,7 @@ def paint_summary(summary: TimingSummary) -> str:
     rows.append(_summary_row("in all", summary.total))
     rows.append(_summary_row(overhead_text(summary.side_by_side), summary.overhead))
     caption = f"{summary.runs} run{'s' * (summary.runs != 1)}; log-normal distributions"
-    return _table(caption, ("function", "times", "mode", "median", "5 % to 95 %"), rows)
+    return _table(caption, ("function", "runs", "mode", "median", "5 % to 95 %"), rows)
 
 
 def _median_ns(fitted: LogNormal) -> float:
@@ -123,11 +124,13 @@ def _functions(count: int) -> str:
     return f"{count} function{'s' * (count != 1)}"
 
 
-def _table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    titles = "".join(f"<th>{title}</th>" for title in head)
-    lines = "".join(
-        "<tr>" + "".join(f"<td>{escape(cut(cell, _NAME_CHARACTERS))}</td>" for cell in cells) + "</tr>"
-        for cells in rows
-    )
+def _table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], texts: int = 1) -> str:
+    """Write a table; of its columns so many hold texts, to the left, where JupyterLab has everything to the right."""
     above = f"<caption>{escape(caption)}</caption>" if caption else ""
-    return f"<table>{above}<tr>{titles}</tr>{lines}</table>"
+    lines = (_row("td", [escape(cut(cell, _NAME_CHARACTERS)) for cell in cells], texts) for cells in rows)
+    return f"<table>{above}{_row('th', head, texts)}{''.join(lines)}</table>"
+
+
+def _row(tag: str, cells: Sequence[str], texts: int) -> str:
+    written = (f"<{tag}{_LEFT * (column < texts)}>{cell}</{tag}>" for column, cell in enumerate(cells))
+    return f"<tr>{''.join(written)}</tr>"

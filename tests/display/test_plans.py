@@ -50,7 +50,7 @@ def table_of(html: str) -> list[list[str]]:
     """The rows of the table that is seen, not of the one for screen readers."""
     visible = html[html.rindex("<table>") :]
     rows = re.findall(r"<tr>(.*?)</tr>", visible)
-    return [[unescape(cell) for cell in re.findall(r"<t[dh]>(.*?)</t[dh]>", row)] for row in rows]
+    return [[unescape(cell) for cell in re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row)] for row in rows]
 
 
 # -- plans ------------------------------------------------------------------------------------------------------------
