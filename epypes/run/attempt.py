@@ -127,13 +127,10 @@ class Attempts:
             draft.dirty[place] = 0
         return _ended(draft, failed, wanted, failed.done_ns, start_ns, False)
 
-    def rerun_broken_off(
-        self, values: list[Any], old: list[Any], failed: StepFailed, changed: Iterable[str], start_ns: int
-    ) -> Outcome:
-        """Return what is left of a compiled rerun in which a function failed; ``old`` are the values before it."""
+    def rerun_broken_off(self, values: list[Any], failed: StepFailed, changed: Iterable[str], start_ns: int) -> Outcome:
+        """Return what is left of a compiled rerun in which a function failed."""
         program = self._program
-        new = {program.slots[token] for token in changed}
-        new |= {slot for slot, value in enumerate(values) if value is not old[slot]}
+        new = failed.new.union(program.slots[token] for token in changed)
         dirty = bytearray(
             failed.done_ns.get(step.place, -1) < 0 and not new.isdisjoint(step.inputs) for step in program.steps
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from sys import getrefcount
 from time import perf_counter_ns
 from typing import Any
 
@@ -13,7 +14,9 @@ from epypes.run.program import Program, Step
 
 
 class StepFailed(BaseException):
-    """A step raised: which one, what, after how many nanoseconds, and how long those took that had ended.
+    """A step raised: which one, what, after how many nanoseconds.
+
+    Of a compiled run also how long those took that had ended, and, of a rerun, which slots had got new values.
 
     Carries the user's exception through the engine to the runner, which raises that one.
     """
@@ -21,6 +24,7 @@ class StepFailed(BaseException):
     def __init__(self, place: int, exception: BaseException, duration_ns: int) -> None:
         self.place, self.exception, self.duration_ns = place, exception, duration_ns
         self.done_ns: dict[int, int] = {}
+        self.new: set[int] = set()
 
 
 def call(program: Program, step: Step, values: Sequence[Any]) -> tuple[Sequence[Any], int]:
@@ -99,7 +103,9 @@ def unpack(program: Program, step: Step, result: Any) -> list[Any]:
     if isinstance(result, tuple | list):
         found = list(result)
         if len(found) == len(step.outputs):
-            # The result, the list and the loop each hold a reference to an item; _FRESH counts one of them.
-            return [keep(item, FRESH + 2) for item in found] if program.guard else found
+            # The result, the list and the loop each hold a reference to an item; FRESH counts one of them. The items of
+            # a result that the function goes on holding are not fresh, whatever their counts say.
+            fresh_count = 0 if getrefcount(result) > FRESH else FRESH + 2
+            return [keep(item, fresh_count) for item in found] if program.guard else found
         got = f"{type(result).__name__} of {len(found)}"
     raise OutputArityError(step.name, [program.tokens[slot] for slot in step.outputs], got)

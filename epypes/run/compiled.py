@@ -16,7 +16,7 @@ from typing import Any, Final, NoReturn
 
 from epypes.run.call import StepFailed, call, unpack
 from epypes.run.draft import is_unchanged
-from epypes.run.guard import ARRAYLESS, FRESH, FRESH_HERE, HARMLESS, LISTS, LONG, array_type, keep, lend
+from epypes.run.guard import ARRAYLESS, FRESH, FRESH_HERE, HARMLESS, LONG, array_type, keep, lend
 from epypes.run.program import Program, Step
 
 # Runs its steps on values by slot, and gives nanoseconds by step; -1, or none, for those that did not run. A rerun is
@@ -28,16 +28,19 @@ CompiledRerun = Callable[[list[Any], Iterable[Any]], Mapping[int, int]]
 _RUNS_BEFORE: Final = 3
 _MOST_STEPS: Final = 400
 _MOST_KEPT: Final = 64
+_MOST_COUNTED: Final = 1_000
 
 
 def _failed(error: BaseException, duration_ns: int, found: Mapping[str, Any]) -> NoReturn:
     """Raise StepFailed for the step that was under way.
 
-    ``found`` are the local variables: ``d3`` is how long step 3 took, and missing or -1 if it has not ended; ``at`` is
-    the step under way.
+    ``found`` are the local variables: ``d3`` is how long step 3 took, and missing or -1 if it has not ended; ``c3``
+    whether slot 3 has got a new value; ``at`` is the step under way.
     """
     failed = error if isinstance(error, StepFailed) else StepFailed(found["at"], error, duration_ns)
-    failed.done_ns = {int(name[1:]): spent for name, spent in found.items() if name[1:].isdigit() and name[0] == "d"}
+    numbered = [(name[0], int(name[1:]), value) for name, value in found.items() if name[1:].isdigit()]
+    failed.done_ns = {number: spent for letter, number, spent in numbered if letter == "d"}
+    failed.new = {number for letter, number, is_new in numbered if letter == "c" and is_new}
     raise failed from None
 
 
@@ -49,7 +52,6 @@ _NAMES: Final = {
     "count": getrefcount,
     "ARRAYLESS": ARRAYLESS,
     "HARMLESS": HARMLESS,
-    "LISTS": LISTS,
     "LONG": LONG,
     "FRESH": FRESH,
     "FRESH_HERE": FRESH_HERE,
@@ -117,6 +119,8 @@ class CompiledRuns:
         return compiled
 
     def _is_worth_it(self, key: Hashable) -> bool:
+        if len(self._counts) > _MOST_COUNTED:
+            self._counts.clear()
         self._counts[key] += 1
         if self._counts[key] <= _RUNS_BEFORE or len(self._program.steps) > _MOST_STEPS:
             return False
@@ -172,7 +176,8 @@ def _body(program: Program, steps: list[Step], plain: Collection[int], changed: 
         checked = [slot for slot in step.outputs if changed and slot in read]
         lines = [f"at = {step.place}", *_call(program, step, plain, locked)]
         for place, slot in enumerate(step.outputs):
-            lines += _store(step, slot, "made" if step.single else f"made[{place}]", slot in checked)
+            given = _given(step, changed, known) if slot in checked else None
+            lines += _store(slot, "made" if step.single else f"made[{place}]", given)
         lines.append(f"d{step.place} = spent")
         if step.switch is None:
             locked.update(step.outputs)
@@ -219,7 +224,7 @@ def _unpack(program: Program, step: Step) -> Iterator[str]:
     items = [f"m{place}" for place in range(count)]
     if not step.outputs:
         return
-    yield f"if kind(made) is tuple and len(made) == {count}:"
+    yield f"if kind(made) is tuple and len(made) == {count} and count(made) <= FRESH_HERE:"
     yield f"    {', '.join(items)}, = made"
     yield "    made = None"  # so that it does not count as one who knows the items
     for item, slot in zip(items, step.outputs, strict=True):
@@ -250,14 +255,19 @@ def _keep(name: str, is_read: bool) -> Iterator[str]:
 
 
 def _may_hold_arrays(name: str) -> str:
-    return f"(k not in LISTS or len({name}) < LONG or kind({name}[0]) not in HARMLESS)"
+    return f"(k is not tuple or len({name}) < LONG or kind({name}[0]) not in HARMLESS)"
 
 
-def _store(step: Step, slot: int, made: str, is_checked: bool) -> Iterator[str]:
-    """Write out how a value is stored, and whether it is new."""
-    if not is_checked:
+def _given(step: Step, changed: Collection[int], known: Collection[int]) -> str:
+    """Write out the values that a step read and that are not new."""
+    old = [slot for slot in step.inputs if slot not in changed]
+    return "".join(f"None if c{slot} else v[{slot}], " if slot in known else f"v[{slot}], " for slot in old)
+
+
+def _store(slot: int, made: str, given: str | None) -> Iterator[str]:
+    """Write out how a value is stored, and, with what was ``given``, whether it is new."""
+    if given is None:
         yield f"v[{slot}] = {made}"
         return
-    given = "".join(f"v[{slot}], " for slot in step.inputs)
     yield f"c{slot} = not is_unchanged(v[{slot}], {made}, ({given}), program.guard)"
     yield f"if c{slot}: v[{slot}] = {made}"

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from epypes.run.guard import is_plain_array, is_same_guarded_array
-from epypes.run.program import Program
+from epypes.run.program import Program, Step
 from epypes.run.tokens import NOT_COMPUTED, Freshness, TokenManager, is_same_value
 
 
@@ -19,11 +19,14 @@ class Draft:
         As in TokenManager and Freshness.
     """
 
-    __slots__ = ("dirty", "has_payload", "program", "revisions", "values")
+    __slots__ = ("_carried", "_new", "dirty", "has_payload", "program", "revisions", "values")
 
     def __init__(self, program: Program, values: list[Any], dirty: bytearray, has_payload: bool) -> None:
         self.program, self.values, self.dirty, self.has_payload = program, values, dirty, has_payload
         self.revisions = program.revisions()
+        # Slots with new values, and the steps of which it is not known what was new to them.
+        self._new: set[int] = set()
+        self._carried: bytes = b""
 
     @classmethod
     def of_sources(cls, program: Program, values: list[Any], has_payload: bool) -> Draft:
@@ -38,27 +41,27 @@ class Draft:
         draft = cls(program, manager.values.copy(), bytearray(freshness.dirty), freshness.has_payload)
         for place, before, now in zip(program.revised, freshness.revisions, draft.revisions, strict=True):
             draft.dirty[place] |= before != now
+        draft._carried = bytes(draft.dirty)
         return draft
 
     def change(self, token: str, value: Any) -> None:
         """Give a source token a value."""
-        self.store(self.program.slots[token], value, ())
+        self._store(self.program.slots[token], value, ())
 
-    def store(self, slot: int, value: Any, given: Sequence[Any]) -> None:
-        """Store a value; if it is new, the steps that read it become dirty.
+    def store(self, step: Step, made: Sequence[Any]) -> None:
+        """Store what a step has made, guarded if the program is; the steps that read something new become dirty."""
+        self.dirty[step.place] = 0
+        given: Sequence[Any] = ()
+        if not self._carried or not self._carried[step.place]:
+            given = [self.values[slot] for slot in step.inputs if slot not in self._new]
+        for slot, value in zip(step.outputs, made, strict=True):
+            self._store(slot, value, given)
 
-        Parameters
-        ----------
-        slot
-            Where.
-        value
-            Guarded, if the program is.
-        given
-            The values that its function read.
-        """
+    def _store(self, slot: int, value: Any, given: Sequence[Any]) -> None:
         if is_unchanged(self.values[slot], value, given, self.program.guard):
             return
         self.values[slot] = value
+        self._new.add(slot)
         for index in self.program.consumers[slot]:
             step = self.program.steps[index]
             if step.switch is None or slot in self.program.read_by(step, self.values):
@@ -83,8 +86,8 @@ class Draft:
 def is_unchanged(old: Any, new: Any, given: Sequence[Any], guard: bool) -> bool:
     """Whether a function's new value is cheaply known to be what it was.
 
-    ``given`` are the values that the function read. A guarded array that was passed through is known to be unchanged;
-    of other values small immutable ones are compared.
+    ``given`` are the values that the function read and that are not new. A guarded array that was passed through from
+    them is known to be unchanged; of other values small immutable ones are compared.
     """
     if is_same_value(old, new):
         return True

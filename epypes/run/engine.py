@@ -46,9 +46,5 @@ def execute(draft: Draft, wanted: bytes | None, durations_ns: dict[int, int]) ->
         if wanted is None or wanted[index]:
             step = steps[index]
             made, durations_ns[index] = call(program, step, values)
-            dirty[index] = 0
-            if made:
-                given = [values[slot] for slot in step.inputs]
-                for slot, value in zip(step.outputs, made, strict=True):
-                    store(slot, value, given)
+            store(step, made)
         index = next_dirty(1, index + 1)

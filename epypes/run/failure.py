@@ -60,7 +60,7 @@ def failure_of(draft: Draft, index: int, exception: BaseException) -> Failure:
     tokens, step = draft.program.tokens, draft.program.steps[index]
     inputs = tuple(tokens[slot] for slot in step.inputs)
     outputs = tuple(tokens[slot] for slot in step.outputs)
-    values = {token: lend(draft.values[slot]) for token, slot in zip(inputs, step.inputs, strict=True)}
+    values = {token: _lent(draft.values[slot]) for token, slot in zip(inputs, step.inputs, strict=True)}
     told = ", ".join(f"{token}{_brief(value)}" for token, value in values.items())
     note = f"In function {step.name!r}: ({told}) -> ({', '.join(outputs)})"
     # Whatever the exception's own methods do, the failure is told.
@@ -75,8 +75,16 @@ def failure_of(draft: Draft, index: int, exception: BaseException) -> Failure:
 
 def _brief(value: Any) -> str:
     """Return what a note says of an input: a small value itself, of an array its dtype and shape."""
-    if type(value) in (bool, int, float, type(None)) or (type(value) is str and len(value) <= _BRIEF):
-        return f"={value!r:.{_BRIEF}}"
-    if is_array(value):
-        return f": {value.dtype} {' x '.join(map(str, value.shape))}"
+    with contextlib.suppress(Exception):  # of an integer with too many digits, or an array's own class
+        if type(value) in (bool, int, float, type(None)) or (type(value) is str and len(value) <= _BRIEF):
+            return f"={value!r:.{_BRIEF}}"
+        if is_array(value):
+            return f": {value.dtype} {' x '.join(map(str, value.shape))}"
     return ""
+
+
+def _lent(value: Any) -> Any:
+    try:
+        return lend(value)
+    except Exception:  # an array's own class does not let it be viewed, which may be what failed
+        return value

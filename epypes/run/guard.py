@@ -7,6 +7,7 @@ numpy is never imported here: an array can only turn up once somebody else has i
 from __future__ import annotations
 
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from sys import getrefcount
 from typing import Any, Final, TypeVar
@@ -19,7 +20,6 @@ ARRAYLESS: Final = frozenset({int, float, bool, str, bytes, complex, type(None)}
 # Of a long tuple or list the first item tells whether it holds arrays: to look at each of 500 keypoints would take
 # 10 us at every call, and much more when they are not in the caches.
 LONG: Final = 33
-LISTS: Final = frozenset({tuple, list})
 # Types of first items that were found to be no arrays.
 HARMLESS: Final[set[type]] = set()
 
@@ -78,7 +78,7 @@ def own_view(value: Any) -> Any:
 
 
 def lend(value: Any) -> Any:
-    """Return a value as a function or a reader gets it: arrays as read-only views of its own.
+    """Return a value as a function or a reader gets it: arrays as read-only views of its own, lists as copies.
 
     Of tuples, named tuples and lists, the arrays in them count. A masked array is copied, since its mask can be
     changed through any view.
@@ -94,7 +94,7 @@ def lend(value: Any) -> Any:
         return _locked(own_view(value))
     if _holds_arrays(value):
         return _make(kind)(lend(item) if is_array(item) else item for item in value)
-    return value
+    return value.copy() if kind is list else value
 
 
 def _locked(array: Any) -> Any:
@@ -106,45 +106,46 @@ def keep(value: Any, fresh_count: int) -> Any:
     """Return what a function returned as it is stored: arrays locked, and copied where others could write to them.
 
     A function that goes on using the memory of its result would change a value that has been handed out. So an
-    array to which somebody else holds a reference is copied; a new one, the usual case, is locked as it is.
+    array to which somebody else holds a reference is copied; a new one, the usual case, is locked as it is. The same
+    goes for lists, and for the arrays in lists and tuples.
 
     Parameters
     ----------
     value
         What was returned.
     fresh_count
-        The reference count, seen from here, of an array that nobody else knows.
+        The reference count, seen from here, of a value that nobody else knows.
     """
     kind = type(value)
     if kind in ARRAYLESS:
         return value
+    is_known = getrefcount(value) > fresh_count
     if kind is (_ndarray or array_type()):
-        if value.base is not None:
-            value = _keep_view(value)
-        elif getrefcount(value) > fresh_count and value.flags.writeable:
-            value = value.copy(order="K")
+        value = _own(value, is_known)
         value.setflags(False)
         return value
     if is_array(value):
         return _locked(own_view(value))
     if _holds_arrays(value):
-        return _make(kind)(keep(item, fresh_count + 1) if is_array(item) else item for item in value)
-    return value
+        fresh_item = 0 if is_known else fresh_count + 1
+        return _make(kind)(keep(item, fresh_item) if is_array(item) else item for item in value)
+    return value.copy() if kind is list and is_known else value
 
 
-def _keep_view(array: Any) -> Any:
-    """Return an array that lies in another object's memory so that it can be locked."""
+def _own(array: Any, is_known: bool) -> Any:
+    """Return an array whose memory nobody else will write to, as far as can be seen."""
     owner = array.base
     if not array.flags.writeable:
         return array
-    if type(owner) is not type(array):
-        return array.view()  # memory of another library's object: whether it is used again can't be seen
-    return array.copy(order="K") if getrefcount(owner) > _FRESH_OWNER else array
+    if is_known or (type(owner) is type(array) and getrefcount(owner) > _FRESH_OWNER):
+        return array.copy(order="K")
+    # In memory of another library's object, it is unknown whether that is used again; the object itself stays as it is.
+    return array if owner is None or type(owner) is type(array) else array.view()
 
 
 def _holds_arrays(value: Any) -> bool:
     """Whether a tuple, named tuple or list has an array among its items."""
-    if type(value) not in LISTS and not _is_named_tuple(value):
+    if type(value) is not tuple and type(value) is not list and not _is_named_tuple(value):
         return False
     if len(value) < LONG or value[0] is None:
         return any(map(is_array, value))
@@ -176,15 +177,19 @@ def writable(value: Any) -> Any:
     return value
 
 
+_unlocking = threading.Lock()
+
+
 def _view_of_locked(array: Any) -> Any:
     """Return a writable view of an array that ``keep`` has locked; a copy of one whose memory is read-only for good."""
     if array.base is not None or not array.flags.owndata:
         return array.copy()
-    array.setflags(write=True)
-    try:
-        return array.view()
-    finally:
-        array.setflags(write=False)
+    with _unlocking:
+        array.setflags(write=True)
+        try:
+            return array.view()
+        finally:
+            array.setflags(write=False)
 
 
 def is_same_guarded_array(old: Any, new: Any, given: Sequence[Any]) -> bool:
@@ -195,7 +200,7 @@ def is_same_guarded_array(old: Any, new: Any, given: Sequence[Any]) -> bool:
     old, new
         What it returned before and now, both as ``keep`` gave them.
     given
-        The values that the function read, as they are stored.
+        The values that the function read, as they are stored, but for those that are new.
     """
     if old is new and new.base is None:
         return True

@@ -104,7 +104,7 @@ class Hyperparameters:
             elif entry[0] == value if is_count else is_same_value(entry[0], value):
                 continue
             if program.selectors:
-                self.require_branch(token, value)
+                self.require_branches({token: value})
             if not is_count:
                 plain = plain if (type(value) in ARRAYLESS) == (token in plain) else plain ^ {token}
                 value = lend(value) if program.guard else value
@@ -136,10 +136,11 @@ class Hyperparameters:
             text = f"Token {token!r} is made by function {maker!r}, so it can't be a hyperparameter."
             raise HyperparameterError(token, text)
 
-    def require_branch(self, token: str, selector: Any) -> None:
-        """Raise UnknownName, with the nearest name, unless the switches that the token selects for have this branch."""
-        for switch in self.program.selectors.get(token, ()):
-            switch.branch_index(selector)
+    def require_branches(self, values: Mapping[str, Any]) -> None:
+        """Raise UnknownName, with the nearest name, unless switches have the branches that these tokens select."""
+        for token, selector in values.items():
+            for switch in self.program.selectors.get(token, ()):
+                switch.branch_index(selector)
 
     def require(self, token: str) -> None:
         """Raise unless the token is a hyperparameter, with the way out for one that is not."""

@@ -115,11 +115,7 @@ class _Shift:
             self._changed.notify()
 
     def _store(self, place: int) -> None:
-        draft, step = self._draft, self._draft.program.steps[place]
-        draft.dirty[place] = 0
-        given = [draft.values[slot] for slot in step.inputs]
-        for slot, value in zip(step.outputs, self._made[place], strict=True):
-            draft.store(slot, value, given)
+        self._draft.store(self._draft.program.steps[place], self._made[place])
 
     def _done(self, place: int) -> None:
         """Release what waited for a step alone."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
-from types import BuiltinFunctionType, FunctionType
+from types import BuiltinFunctionType, FunctionType, ModuleType
 from typing import Any, Final, NamedTuple
 
 from epypes.graph import CompGraph, Switch, as_switch, layers
@@ -32,7 +32,7 @@ class Step(NamedTuple):
     unguarded
         Whether it gets its arrays writable.
     is_builtin
-        Whether it is a C function, which can write into an array but has no means to change its shape.
+        Whether it is a C function of a module: it can write into an array, but neither change its shape nor keep it.
     switch
         The switch that it is, if it is one.
     contracts
@@ -157,7 +157,7 @@ def _steps(cg: CompGraph, slots: dict[str, int], guard: bool) -> Iterator[Step]:
             (slots[outputs[0]],) if len(outputs) == 1 else tuple(map(slot_of, outputs)),
             type(io[1]) is str,
             unguarded,
-            type(function) is BuiltinFunctionType,
+            type(function) is BuiltinFunctionType and isinstance(function.__self__, ModuleType | None),
             switch,
             contract,
             guard and not unguarded and switch is None and contract is None,

@@ -117,8 +117,7 @@ class CompGraphRunner:
                 raise self._wrong_payload(hparams, token)
             values[slot] = value
         if program.selectors:
-            for token in payload:
-                hparams.require_branch(token, payload[token])
+            hparams.require_branches(payload)
         attempts, has_payload = self._attempts[hparams.plain], len(payload) == len(free)
         compiled = attempts.short_way.whole
         if compiled is None or targets or not has_payload:
@@ -127,11 +126,13 @@ class CompGraphRunner:
         try:
             durations_ns = compiled(values)
         except StepFailed as failed:
-            return self._ended(attempts.run_broken_off(values, failed, None, True, start_ns), hparams)
-        times = (program, None, durations_ns, perf_counter_ns() - start_ns, False)
-        run = self._last = Run((values, attempts.clean, hparams, times, None))
-        self.reports.kept.append(times)
-        return run
+            outcome = attempts.run_broken_off(values, failed, None, True, start_ns)
+        else:
+            times = (program, None, durations_ns, perf_counter_ns() - start_ns, False)
+            run = self._last = Run((values, attempts.clean, hparams, times, None))
+            self.reports.kept.append(times)
+            return run
+        return self._ended(outcome, hparams)
 
     def rerun(self, /, *targets: str, **changes: Any) -> Run:
         """Set hyperparameters, all or none of them, then run the stale functions on the last payload.
@@ -150,35 +151,40 @@ class CompGraphRunner:
         start_ns = perf_counter_ns()
         if targets:
             self._check_targets(targets)
-        self._lock.acquire()  # half the time of a with statement
-        try:
+        with self._lock:
             hparams = self._hparams = self._hparams.frozen(changes, also_new=False)
-        finally:
-            self._lock.release()
         last, changed, compiled = self._last, hparams.changed, None
         if last is None:
             free = self.free_source_tokens
             text = f"Nothing has been run yet, so there is no payload. Call {run_call(free)} first."
             raise PayloadError(free, text)
         attempts = self._attempts[hparams.plain]
-        stored, freshness, before, _, _ = last.record
+        stored, freshness, before = last.record[:3]
         if freshness.is_clean and not targets and hparams.follows == before.revision:
             compiled = attempts.short_way.of_changes(changed)
         if compiled is None:
-            return self._ended(attempts.stale(self._draft(last, hparams), targets, start_ns), hparams)
-        # The way of a slider: as short as can be.
-        values = stored.copy()
-        try:
-            durations_ns = compiled(values, changed.values())
-        except StepFailed as failed:
-            return self._ended(attempts.rerun_broken_off(values, stored, failed, changed, start_ns), hparams)
-        times = (self._program, None, durations_ns, perf_counter_ns() - start_ns, False)
-        run = self._last = Run((values, freshness, hparams, times, None))
-        self.reports.kept.append(times)
-        return run
+            outcome = attempts.stale(self._draft(last, hparams), targets, start_ns)
+        else:
+            # The way of a slider: as short as can be.
+            values = stored.copy()
+            try:
+                durations_ns = compiled(values, changed.values())
+            except StepFailed as failed:
+                outcome = attempts.rerun_broken_off(values, failed, changed, start_ns)
+            else:
+                times = (self._program, None, durations_ns, perf_counter_ns() - start_ns, False)
+                run = self._last = Run((values, freshness, hparams, times, None))
+                self.reports.kept.append(times)
+                return run
+        # A failure keeps this frame, with all that is named in it: the Run before, which may have failed too ...
+        del last, stored, freshness
+        return self._ended(outcome, hparams)
 
     def _ended(self, outcome: Outcome, hparams: Hyperparameters) -> Run:
-        """Make what was run the last Run; raise the user's exception if a function failed."""
+        """Make what was run the last Run; raise the user's exception if a function failed.
+
+        To be called where no exception is being handled, which would become the context of the user's.
+        """
         values, freshness, times, failure = outcome
         run = self._last = Run((values, freshness, hparams, times, failure))
         self.reports.add(times)

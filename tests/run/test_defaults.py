@@ -27,7 +27,7 @@ def ends(edges, margin=1):
 @ep.outputs()
 def show(edges, seen=None):
     if seen is not None:
-        seen.append(edges)
+        seen.add(edges)
 
 
 @pytest.fixture
@@ -54,11 +54,11 @@ def test_a_graph_of_functions_runs_with_its_defaults(cg, way):
 
 
 def test_what_is_given_goes_before_the_default(cg):
-    seen = []
+    seen = set()
     runner = ep.CompGraphRunner(cg, {"threshold": 2, "seen": seen})
     assert dict(runner.hyperparameters) == {"threshold": 2, "margin": 1, "seen": seen}
     assert runner.run(image=4)["high"] == 11
-    assert seen == [10]
+    assert seen == {10}
     assert ep.CompGraphRunner(cg).run(image=4)["high"] == 351, "another runner has the default"
 
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextvars
+import gc
 import logging
+import weakref
 
 import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.errors import NotComputed, OutputArityError
+from epypes.errors import NotComputed, OutputArityError, StaleToken
 
 
 def one(function, inputs="x", outputs="y"):
@@ -367,3 +369,139 @@ def test_a_hyperparameter_that_becomes_free_is_guarded(way):
         with pytest.raises(ValueError, match="read-only"):
             runner.run(k=array)
     assert not array.any()
+
+
+@pytest.mark.parametrize("io", [{"pick": (("x", "k"), "t")}, {"pick": (("x", "k"), ("t", "u"))}])
+def test_a_refilled_array_that_is_passed_through_counts_as_new(way, io):
+    array = np.ones(3)
+    pick = (lambda x, k: k) if io["pick"][1] == "t" else (lambda x, k: (k, x))
+    cg = ep.CompGraph({"pick": pick, "total": lambda t: float(t.sum())}, io | {"total": ("t", "s")})
+    runner = way.runner(cg, {"k": array})
+    runner.run(x=0)
+    for value in range(2, 2 + way.runs):
+        array[:] = value
+        assert runner.rerun(k=array)["s"] == 3 * value
+
+
+def test_a_frame_that_is_refilled_upstream_counts_as_new_behind_what_passes_it_on(way):
+    frame = np.frombuffer(bytearray(4), np.uint8)
+
+    def grab(k):
+        frame[:] = k
+        return frame
+
+    cg = ep.CompGraph(
+        {"grab": grab, "crop": lambda f, n: f, "mean": lambda c: float(c.mean())},
+        {"grab": ("k", "f"), "crop": (("f", "n"), "c"), "mean": ("c", "m")},
+    )
+    runner = way.runner(cg, {"k": 0, "n": 0})
+    runner.run()
+    for k in range(1, way.runs):
+        assert runner.rerun(k=k)["m"] == k
+    assert runner.rerun(n=1).report.ran == ("crop",), "what passes on what is not new makes nothing new"
+
+
+def test_what_was_skipped_by_a_rerun_of_one_target_is_not_taken_for_unchanged(way):
+    array = np.ones(3)
+    cg = ep.CompGraph(
+        {"pick": lambda x, k: k, "total": lambda t: float(t.sum()), "other": lambda k: k.sum()},
+        {"pick": (("x", "k"), "t"), "total": ("t", "s"), "other": ("k", "o")},
+    )
+    runner = way.runner(cg, {"k": array})
+    runner.run(x=0)
+    for value in range(2, 2 + way.runs):
+        array[:] = value
+        runner.rerun("o", k=array)
+        assert runner.rerun()["s"] == 3 * value
+
+
+def test_what_a_failing_rerun_has_changed_is_stale_also_if_it_is_the_same_object(way):
+    class Detector:
+        most = 0
+
+    detector = Detector()
+
+    def configure(k):
+        detector.most = k
+        return detector
+
+    def check(k):
+        if k == 99:
+            raise RuntimeError("too many")
+
+    cg = ep.CompGraph(
+        {"configure": configure, "check": check, "use": lambda d: d.most},
+        {"configure": ("k", "d"), "check": ("k", None), "use": ("d", "n")},
+    )
+    runner = way.runner(cg, {"k": 0})
+    runner.run()
+    for k in range(1, way.runs):
+        assert runner.rerun(k=k)["n"] == k
+    with pytest.raises(RuntimeError, match="too many"):
+        runner.rerun(k=99)
+    if way.name != "side by side":
+        with pytest.raises(StaleToken):
+            runner["n"]
+    assert runner.rerun("n")["n"] == 99
+
+
+def test_the_context_of_the_users_exception_is_the_users(way):
+    def f(x):
+        try:
+            int("q" if x < 0 else "1")
+        except ValueError:
+            raise RuntimeError("mine")  # noqa: B904 - its context is what is looked at
+
+    runner = way.runner(one(f))
+    for x in range(way.runs):
+        runner.run(x=x)
+    with pytest.raises(RuntimeError, match="mine") as error:
+        runner.run(x=-1)
+    assert type(error.value.__context__) is ValueError
+    runner.freeze(x=1)
+    runner.run()
+    for x in range(way.runs):
+        runner.rerun(x=x)
+    with pytest.raises(RuntimeError, match="mine") as error:
+        runner.rerun(x=-2)
+    assert type(error.value.__context__) is ValueError
+
+
+class Unviewable(np.ndarray):
+    def view(self, *args):
+        raise OSError("no view")
+
+
+@pytest.mark.parametrize("value", [10**5000, np.zeros(3).view(Unviewable)], ids=["huge", "unviewable"])
+def test_an_input_that_cannot_be_told_does_not_hide_the_users_exception(way, value):
+    def f(x):
+        raise RuntimeError("mine")
+
+    runner = way.runner(one(f), guard=False)
+    for _ in range(way.runs):
+        with pytest.raises(RuntimeError, match="mine"):
+            runner.run(x=value)
+        assert runner.last.failure.function == "f"
+
+
+def test_runs_that_fail_one_after_another_do_not_keep_each_other(way):
+    class Value:
+        pass
+
+    made = []
+
+    def make(k):
+        value = Value()
+        made.append(weakref.ref(value))
+        return value
+
+    def fail(value):
+        raise RuntimeError
+
+    cg = ep.CompGraph({"make": make, "fail": fail}, {"make": ("k", "v"), "fail": ("v", "y")})
+    runner = way.runner(cg, {"k": 0})
+    for k in range(30):
+        with pytest.raises(RuntimeError):
+            runner.rerun(k=k) if k else runner.run()
+    gc.collect()
+    assert sum(value() is not None for value in made) <= 2

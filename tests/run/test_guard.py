@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -113,11 +114,74 @@ def test_long_and_short_lists_of_arrays_are_guarded(kind, count):
             runner["points"][-1][0] = 1
 
 
-def test_long_lists_of_other_things_are_passed_on_as_they_are():
-    keypoints = [cv2.KeyPoint() for _ in range(500)]
+def test_long_tuples_of_other_things_are_passed_on_as_they_are():
+    keypoints = tuple(cv2.KeyPoint() for _ in range(500))
     runner = runner_of(lambda points: points)
     for _ in range(RUNS):
         assert runner.run(x=keypoints)["y"] is keypoints
+
+
+@pytest.mark.parametrize("count", [3, 500])
+def test_a_list_that_a_function_changes_is_its_own(count):
+    cg = ep.CompGraph(
+        {
+            "make": lambda x: [*range(count), x],
+            "spoil": lambda items, k: (items.reverse(), items.append(k)),
+            "read": list,
+        },
+        {"make": ("x", "l"), "spoil": (("l", "k"), ("a", "b")), "read": ("l", "y")},
+    )
+    runner = ep.CompGraphRunner(cg, {"k": 0})
+    for x in range(RUNS):
+        assert runner.run(x=x)["y"] == [*range(count), x]
+    for k in range(1, RUNS):
+        assert runner.rerun(k=k)["l"] == [*range(count), x]
+    given = [1, 2]
+    runner.run(x=given)["l"][-1]
+    runner["l"].clear()
+    assert runner["l"] == [*range(count), given]
+
+
+@pytest.mark.parametrize("shape", [lambda b: b, lambda b: b.T, lambda b: b[1:], lambda b: b.reshape(-1)])
+@pytest.mark.parametrize("wrapped", [lambda b: b, lambda b: (b, b), lambda b: [b, b]])
+def test_a_buffer_that_a_function_holds_is_neither_locked_nor_changed_later(shape, wrapped):
+    buffer = shape(np.zeros((4, 4)))
+    held = wrapped(buffer)
+
+    def fill(x):
+        buffer[...] = x
+        return held
+
+    several = held is not buffer
+    io = ("x", ("a", "b")) if several else ("x", "a")
+    for runner in (ep.CompGraphRunner(ep.CompGraph({"f": fill}, {"f": io})), runner_of(fill)):
+        token = "a" if "a" in runner.cg.tokens else "y"
+        runs = [runner.run(x=x) for x in range(RUNS)]
+        for x, run in enumerate(runs):
+            kept = run[token][0] if several and token == "y" else run[token]
+            assert (np.asarray(kept) == x).all()
+
+
+def test_threads_that_share_an_array_with_an_unguarded_function_get_it_writable():
+    failed = []
+
+    @ep.unguarded
+    def use(array, k):
+        if not array.flags.writeable:
+            failed.append(k)
+        return k
+
+    cg = ep.CompGraph({"make": lambda x: np.zeros(9), "use": use}, {"make": ("x", "a"), "use": (("a", "k"), "y")})
+    runner = ep.CompGraphRunner(cg, {"k": 0})
+    runner.run(x=1)
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(3) as pool:
+            list(pool.map(lambda k: runner.rerun(k=k), range(3_000)))
+    finally:
+        sys.setswitchinterval(interval)
+    assert not failed
 
 
 @pytest.mark.parametrize("way", ["the loop", "compiled"])
