@@ -56,7 +56,7 @@ class Finding:
     ----------
     kind
         ``"cycle"``, ``"two producers"``, ``"no io"``, ``"no function"``, ``"bad io"``, ``"arity"``,
-        ``"not callable"``, ``"selector"``, ``"types"`` or ``"colour"``; where a graph is made of
+        ``"not callable"``, ``"selector"``, ``"used up"``, ``"types"`` or ``"colour"``; where a graph is made of
         functions or of graphs also ``"no name"``, ``"no signature"``, ``"two functions"``, ``"one name"``,
         ``"defaults"`` or ``"not a placeholder"``.
     text

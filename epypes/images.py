@@ -1,6 +1,7 @@
 """Which arrays does a function take as images, and in which order are their colours?
 
-The mark stands in the function's annotation: ``Annotated[np.ndarray, Image("uint8", (None, None, 3), order="rgb")]``.
+The mark stands in the function's annotation: ``Annotated[np.ndarray, Image("uint8", (None, None, 3), order="rgb")]``,
+or alone, ``image: Image("uint8")``, which type checkers don't like.
 It is read without numpy: a value that is an array brings what is asked of it.
 """
 
@@ -93,6 +94,13 @@ class Image:
         found = self.found(value)
         return found and f"{found}, expected {self}"
 
+    def fits(self, other: Image) -> bool:
+        """Whether one image may keep both contracts, their orders aside."""
+        dtypes = self.dtype is None or other.dtype is None or not set(self.dtype).isdisjoint(other.dtype)
+        shapes = self.shape is None or other.shape is None or _may_be_equal(self.shape, other.shape)
+        ranges = self.range is None or other.range is None or _overlap(self.range, other.range)
+        return dtypes and shapes and ranges
+
     def _allows_dtype(self, dtype: Any) -> bool:
         return self.dtype is None or dtype.name in self.dtype
 
@@ -122,6 +130,17 @@ class Image:
             self.range and f"from {self.range[0]:g} to {self.range[1]:g}",
         )
         return " ".join(part for part in parts if part) or "array"
+
+
+def _may_be_equal(shape: tuple[int | str | None, ...], other: tuple[int | str | None, ...]) -> bool:
+    return len(shape) == len(other) and all(
+        side == opposite or not isinstance(side, int) or not isinstance(opposite, int)
+        for side, opposite in zip(shape, other, strict=True)
+    )
+
+
+def _overlap(ends: tuple[float, float], others: tuple[float, float]) -> bool:
+    return ends[0] <= others[1] and others[0] <= ends[1]
 
 
 def _unknown(kind: str, name: object, known: Iterable[str]) -> str:
@@ -277,6 +296,8 @@ def _unwrapped(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _mark(annotation: Any) -> Image | None:
+    if isinstance(annotation, Image):
+        return annotation
     marks = get_args(annotation)[1:] if get_origin(annotation) is Annotated else ()
     return next((mark for mark in marks if isinstance(mark, Image)), None)
 

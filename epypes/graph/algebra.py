@@ -10,6 +10,7 @@ from epypes.errors import Finding, UnknownName
 from epypes.graph.compgraph import CompGraph
 from epypes.graph.parts import Default, Parts, defaults_of
 from epypes.graph.placeholder import is_placeholder
+from epypes.graph.redefined import have_one_name, is_defined_alike
 from epypes.graph.renaming import names_of, require_graph, suffixed
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ def _require_names(names: Sequence[str], graphs: Sequence[CompGraph]) -> None:
 
 
 def _suffixed(graphs: Sequence[CompGraph], suffixes: Sequence[str], keep: Sequence[str]) -> list[Parts]:
-    if isinstance(suffixes, str) or len(suffixes) != len(graphs):
+    if isinstance(suffixes, str) or not isinstance(suffixes, Sequence) or len(suffixes) != len(graphs):
         text = f"union() of {len(graphs)} graphs needs a sequence of {len(graphs)} suffixes, one per graph, not "
         raise ValueError(f"{text}{suffixes!r}.")
     return [suffixed(cg, ending, keep) for cg, ending in zip(graphs, suffixes, strict=True)]
@@ -81,10 +82,10 @@ def _merge(merged: Parts, part: Parts) -> None:
         elif not _is_same(merged.functions[name], function) or not _is_same_io(
             merged.func_io[name], part.func_io[name]
         ):
-            text = (
-                f"Two graphs have a function {name!r}, with another callable or io. "
-                "Rename one of them with ep.rename(), or give union() suffixes."
-            )
+            text = f"Two graphs have a function {name!r}, with another callable or io. "
+            if merged.functions[name] is not function and have_one_name(merged.functions[name], function):
+                text += "It was defined again in between: build both graphs anew. If both are meant: "
+            text += "Rename one of them with ep.rename(), or give union() suffixes."
             merged.findings.append(Finding("two functions", text, (name,)))
 
 
@@ -95,7 +96,10 @@ def _is_same_io(left: Any, right: Any) -> bool:
 
 def _is_same(left: Any, right: Any) -> bool:
     # A bound method is a new object each time it is read; two are equal if they are bound to one object.
-    return left is right or (type(left) is MethodType and type(right) is MethodType and left == right)
+    if type(left) is MethodType and type(right) is MethodType:
+        return left == right
+    # The cell of a function that was run again, unchanged, makes another object of it.
+    return left is right or (have_one_name(left, right) and is_defined_alike(left, right))
 
 
 def extend(cg: CompGraph, func_dict: Mapping[str, Callable[..., Any]], func_io: FuncIO | None = None) -> CompGraph:

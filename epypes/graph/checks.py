@@ -5,6 +5,7 @@ Every check adds findings; none stops the others (rule 2 of the design: a graph 
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterable, Mapping
 from types import FunctionType
 from typing import Any, Final
@@ -93,7 +94,8 @@ def check_pairing(functions: Mapping[str, Any], func_io: Mapping[str, Any]) -> I
             text = f"A function's name must be a string that is not empty, not {name!r}."
             yield Finding("no function", text, (str(name),))
         if not callable(function):
-            text = f"Function {name!r} is {type(function).__name__}, which can't be called. Give a function."
+            inside = f", or the graph as one: ep.Pipeline({name!r}, graph)" * hasattr(function, "func_io")
+            text = f"Function {name!r} is {type(function).__name__}, which can't be called. Give a function{inside}."
             yield Finding("not callable", text, (str(name),))
         if name not in func_io:
             text = f"Function {name!r} has no io. Add func_io[{name!r}] = (inputs, outputs)."
@@ -186,3 +188,20 @@ def check_selectors(functions: Mapping[str, Any], graph: BipartiteDigraph) -> It
                 "or choose between the values in a function."
             )
             yield Finding("selector", text, (name, tokens[0], maker))
+
+
+def check_results(functions: Mapping[str, Any], graph: BipartiteDigraph) -> Iterable[Finding]:
+    """Find functions whose value can be used only once: generators and coroutines."""
+    once = {key for key, function in distinct(functions).items() if _makes_what_is_used_up(function)}
+    for name in functions if once else ():
+        if id(functions[name]) in once and name in graph.outputs:
+            text = (
+                f"Function {name!r} is a generator or a coroutine, whose value can be used only once; a token is read "
+                "as often as needed. Return a list, or await in a function that is not async."
+            )
+            yield Finding("used up", text, (name, *graph.outputs[name]))
+
+
+def _makes_what_is_used_up(function: Any) -> bool:
+    flags = inspect.CO_GENERATOR | inspect.CO_COROUTINE | inspect.CO_ASYNC_GENERATOR
+    return type(function) is FunctionType and bool(function.__code__.co_flags & flags)

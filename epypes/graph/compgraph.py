@@ -14,11 +14,12 @@ from epypes.graph.checks import (
     check_cycle,
     check_pairing,
     check_producers,
+    check_results,
     check_selectors,
     is_single,
     read_io,
 )
-from epypes.graph.colours import check_colours, read_contracts
+from epypes.graph.contracts import check_colours, check_images, read_contracts
 from epypes.graph.declared import read_functions
 from epypes.graph.parts import Default, Parts, check_defaults
 from epypes.graph.placeholder import is_placeholder
@@ -137,8 +138,10 @@ class CompGraph:
         contracts = read_contracts(func_dict, digraph)
         findings += check_colours(contracts, digraph)
         findings += check_selectors(func_dict, digraph)
+        findings += check_results(func_dict, digraph)
         if types:
             findings += check_types(func_dict, digraph, written)
+            findings += check_images(contracts, digraph)
         kept = [default for default in defaults if _is_source(digraph, default.token)]
         findings += check_defaults(kept)
         if findings:
@@ -273,6 +276,14 @@ class CompGraph:
             graph.add_node(("token", token), kind="token")
         return graph
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Give what a copy or a pickle is made of; functions are pickled by name."""
+        return _again, (dict(self._functions), dict(self._func_io), dict(self._defaults), self._types)
+
+    def __deepcopy__(self, memo: object) -> CompGraph:
+        """Return the graph itself, which does not change."""
+        return self
+
     def __repr__(self) -> str:
         count = len(self._functions)
         start = f"<CompGraph: {count} function{'s' * (count != 1)}, {len(self._tokens)} tokens; "
@@ -284,6 +295,11 @@ class CompGraph:
         from epypes.display import mimebundle
 
         return mimebundle(self)
+
+
+def _again(functions: dict[str, Any], func_io: dict[str, Any], defaults: dict[str, Any], types: bool) -> CompGraph:
+    given = [Default(token, value, "") for token, value in defaults.items()]
+    return CompGraph._assemble(Parts(functions, func_io, given), types)
 
 
 def _is_source(digraph: BipartiteDigraph, token: str) -> bool:

@@ -37,7 +37,7 @@ def _is_redefined(function: Any) -> bool:
         if not isinstance(old, FunctionType):
             return False
         new = _unwrapped(_bound_now(old.__module__, old.__qualname__))
-        return isinstance(new, FunctionType) and new is not old and not _is_same(old, new)
+        return isinstance(new, FunctionType) and new is not old and not is_defined_alike(old, new)
     except Exception:  # a repr shows this; whatever odd objects do, it must not fail
         return False
 
@@ -81,7 +81,14 @@ def _bound_now(module: str, qualname: str) -> Any:
     return found
 
 
-def _is_same(old: FunctionType, new: FunctionType) -> bool:
+def have_one_name(left: object, right: object) -> bool:
+    """Whether these are functions of one name in one module, as a function and its later definition are."""
+    if not isinstance(left, FunctionType) or not isinstance(right, FunctionType):
+        return False
+    return left.__globals__ is right.__globals__ and left.__qualname__ == right.__qualname__ != "<lambda>"
+
+
+def is_defined_alike(old: Any, new: Any) -> bool:
     """Whether two functions were defined in the same words and depend on nothing around them."""
     if old.__closure__ or new.__closure__:
         return False

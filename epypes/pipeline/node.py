@@ -40,6 +40,8 @@ class Node:
     """
 
     def __init__(self, name: str, func: Callable[..., Any]) -> None:
+        if not callable(func):
+            raise TypeError(f"Node {name!r:.40} needs a function to call, not {type(func).__name__!r}.")
         self.name = name
         self.func = func
         self.time = 0.0

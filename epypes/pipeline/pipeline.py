@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import keyword
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from epypes.errors import PayloadError
@@ -44,6 +44,9 @@ class Pipeline(Node):
     """
 
     def __init__(self, name: str, cg: CompGraph, hparams: Mapping[str, Any] | None = None, *, workers: int = 1) -> None:
+        if not isinstance(cg, CompGraph):
+            way_out = "Give its graph: .cg" if isinstance(getattr(cg, "cg", None), CompGraph) else "Pipeline(name, cg)"
+            raise TypeError(f"A pipeline runs a CompGraph, not {type(cg).__name__!r}. {way_out}.")
         self.network = NodeBasedCompGraph(cg)
         self.runner = CompGraphRunner(self.network.cg, hparams, workers=workers)
         self.source_cg = cg
@@ -101,8 +104,16 @@ class Pipeline(Node):
         self.runner[token] = value
 
     def traverse_time(self) -> tuple[Any, ...]:
-        """Return ``(name, seconds of the last call, the nodes' tuples)``."""
-        return self.name, self.time, self.network.traverse_time()
+        """Return ``(name, seconds of the last call, the nodes' tuples)``; 0 seconds for nodes that it left out."""
+        counted = self._counted()
+        return (
+            self.name,
+            self.time,
+            tuple(
+                node.traverse_time() if function in counted else (node.name, 0.0)
+                for function, node in self.network.nodes.items()
+            ),
+        )
 
     def compute_overhead(self) -> float:
         """Return the graph overhead of the last call, in seconds: its time less the sum of its nodes' times.
@@ -111,13 +122,17 @@ class Pipeline(Node):
         the last run's report: wall time less the critical path.
         """
         last = self.runner.last
-        if last is None:
-            return self.time
-        if last.report.side_by_side:
+        if last is not None and last.report.side_by_side:
             return last.report.overhead_ns / 1e9
+        return self.time - sum(self.network.nodes[function].time for function in self._counted())
+
+    def _counted(self) -> Collection[str]:
+        """Return the functions that took part in the last call."""
+        last = self.runner.last
+        if last is None:
+            return self.network.nodes
         # Of a rerun, which counts as no call, the times of what was reused are still those of the call.
-        counted = [entry.function for entry in last.report.functions if entry.ran or last.failure is None]
-        return self.time - sum(self.network.nodes[function].time for function in counted)
+        return [entry.function for entry in last.report.functions if entry.ran or last.failure is None]
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         from epypes.display import mimebundle

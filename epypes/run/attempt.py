@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from time import perf_counter_ns
 from typing import Any, Final
 
@@ -47,15 +47,19 @@ class Attempts:
         self.short_way = self._compiled if self._gains is None else GuardedWay(self._compiled, self._gains)
         self.clean = Freshness(program, bytes(len(program.steps)), True)
 
-    def whole(self, values: list[Any], has_payload: bool, targets: Sequence[str], start_ns: int) -> Outcome:
+    def whole(
+        self, values: list[Any], payload: Collection[str], has_payload: bool, targets: Sequence[str], start_ns: int
+    ) -> Outcome:
         """Run all that the targets need, everything without, from values of source tokens, which are changed.
+
+        ``payload`` are the tokens that were given, ``has_payload`` is whether they are all.
 
         Raises
         ------
         PayloadError, PlaceholderNeeded
             Something is needed that is not there.
         """
-        wanted = self._wanted(values, targets, has_payload)
+        wanted = self._wanted(values, targets, has_payload, payload)
         gain = None if self._gains is None else self._gains.of_steps(wanted)
         compiled = None if gain is not None and not gain.is_known else self._compiled.of_steps(wanted)
         if compiled is None or (gain is not None and gain.is_worth_it()):
@@ -83,15 +87,17 @@ class Attempts:
         PayloadError, PlaceholderNeeded
             Something is needed that is not there.
         """
-        wanted = self._wanted(draft.values, targets, draft.has_payload)
+        wanted = self._wanted(draft.values, targets, draft.has_payload, ())
         gain = None if self._gains is None else self._gains.of_dirty(bytes(draft.dirty), wanted)
         return self._step_by_step(execute, draft, wanted, gain, start_ns)
 
-    def _wanted(self, values: list[Any], targets: Sequence[str], has_payload: bool) -> bytes | None:
+    def _wanted(
+        self, values: list[Any], targets: Sequence[str], has_payload: bool, payload: Collection[str]
+    ) -> bytes | None:
         program = self._program
         wanted = wanted_steps(program, values, targets) if targets or program.switches else None
         if program.placeholders or not has_payload:
-            check_ready(program, values, wanted)
+            check_ready(program, values, wanted, payload)
         return wanted
 
     def _step_by_step(

@@ -7,7 +7,8 @@ out when all that it makes goes to branches that are not chosen. One that makes 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Hashable, Iterable, Sequence
+import difflib
+from collections.abc import Collection, Hashable, Iterable, Sequence
 from typing import Any
 
 from epypes.errors import PayloadError, PlaceholderNeeded, UnknownName, run_call
@@ -83,8 +84,8 @@ def needed_placeholders(program: Program, wanted: bytes | None) -> tuple[str, ..
     return tuple(program.steps[index].name for index in sorted(program.placeholders) if wanted is None or wanted[index])
 
 
-def check_ready(program: Program, values: Sequence[Any], wanted: bytes | None) -> None:
-    """Raise unless the wanted steps have all the payload and functions they need.
+def check_ready(program: Program, values: Sequence[Any], wanted: bytes | None, payload: Collection[str]) -> None:
+    """Raise unless the wanted steps have all the payload and functions they need; ``payload`` is what was given.
 
     Raises
     ------
@@ -99,8 +100,20 @@ def check_ready(program: Program, values: Sequence[Any], wanted: bytes | None) -
     missing = missing_sources(program, values, wanted)
     if missing:
         listed = ", ".join(map(repr, missing))
-        text = f"Missing payload: {listed}. Call {run_call(missing)}."
-        raise PayloadError(missing, " ".join([text, *_selections(program, missing)]))
+        text = f"Missing payload: {listed}. Call {run_call((*payload, *missing))}"
+        if payload:
+            constant = ", ".join(f"{token!r}: ..." for token in missing)
+            text += f", or make what is constant a hyperparameter: CompGraphRunner(cg, {{{constant}}})"
+        hints = (*_misspelt(program, missing), *_selections(program, missing))
+        raise PayloadError(missing, " ".join([f"{text}.", *hints]))
+
+
+def _misspelt(program: Program, missing: Iterable[str]) -> Iterable[str]:
+    """Say which of these tokens may have been meant for one that a function makes."""
+    made = program.cg.digraph.producer
+    for token in missing:
+        for near in difflib.get_close_matches(token, made, n=1, cutoff=0.8):
+            yield f"No function makes {token!r}; {made[near]!r} makes {near!r}: is that what was meant?"
 
 
 def _selections(program: Program, missing: Iterable[str]) -> Iterable[str]:

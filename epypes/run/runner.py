@@ -65,6 +65,9 @@ class CompGraphRunner:
         if not isinstance(cg, CompGraph):
             kind = type(cg).__name__
             raise TypeError(f"A CompGraphRunner runs a CompGraph, not {kind!r}: CompGraphRunner(cg, hparams).")
+        if hparams is not None and not isinstance(hparams, Mapping):
+            kind = type(hparams).__name__
+            raise TypeError(f"hparams must be a mapping of tokens to values, such as a dict, not {kind!r}.")
         if type(workers) is not int or workers < 1:
             raise ValueError(f"workers is how many functions may run at once, 1 or more, not {workers!r}.")
         self.cg = cg
@@ -75,7 +78,7 @@ class CompGraphRunner:
         self._attempts = AttemptsByKind(self._program, workers)
         self._lock = threading.Lock()
         self._last: Run | None = None
-        given = {**cg.defaults, **(hparams or {})}
+        given = {**cg.defaults, **({} if hparams is None else hparams)}
         self._hparams = Hyperparameters(self._program, {}).frozen(given)
 
     # -- running ------------------------------------------------------------------------------------------------
@@ -121,7 +124,7 @@ class CompGraphRunner:
         attempts, has_payload = self._attempts[hparams.plain], len(payload) == len(free)
         compiled = attempts.short_way.whole
         if compiled is None or targets or not has_payload:
-            return self._ended(attempts.whole(values, has_payload, targets, start_ns), hparams)
+            return self._ended(attempts.whole(values, payload, has_payload, targets, start_ns), hparams)
         # The way of a stream of images: as short as can be.
         try:
             durations_ns = compiled(values)

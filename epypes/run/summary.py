@@ -187,7 +187,7 @@ def summarize(reports: Iterable[RunReport]) -> TimingSummary:
     <TimingSummary: 5 runs, 1 function>
     """
     # A copy, since a run in another thread may add to the runner's reports meanwhile.
-    given = tuple(reports)
+    given = tuple(reports) if isinstance(reports, Iterable) else (reports,)
     if not given:
         raise ValueError("There is no report to summarize. Run something first: runner.run(...), then runner.reports.")
     for report in given:

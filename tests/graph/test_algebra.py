@@ -281,3 +281,34 @@ def test_unions_have_one_order_under_any_hash_seed():
     }
     assert len(texts) == 1
     assert b"['c_1', 'd_1', 'b_2']" in texts.pop()
+
+
+CELL = """
+def shared(x):
+    return x + {number}
+"""
+
+
+def defined(number, names):
+    exec(CELL.format(number=number), names)
+    return names["shared"]
+
+
+def test_a_function_whose_cell_was_run_again_is_the_same_one():
+    names = {"__name__": "__main__"}
+    one, again, other = defined(1, names), defined(1, names), defined(2, names)
+    assert one is not again
+    left = ep.CompGraph({"f": one}, {"f": ("x", "y")})
+    assert (left | ep.CompGraph({"f": again}, {"f": ("x", "y")})).functions["f"] is one
+    with pytest.raises(GraphError, match="It was defined again in between: build both graphs anew"):
+        left | ep.CompGraph({"f": other}, {"f": ("x", "y")})
+    with pytest.raises(GraphError, match="with another callable or io. Rename one of them"):
+        left | ep.CompGraph({"f": one}, {"f": ("x", "z")})
+    with pytest.raises(GraphError, match="with another callable or io. Rename one of them"):
+        left | ep.CompGraph({"f": abs}, {"f": ("x", "y")})
+
+
+def test_suffixes_have_an_order():
+    cg = ep.CompGraph({"f": abs}, {"f": ("x", "y")})
+    with pytest.raises(ValueError, match="needs a sequence of 2 suffixes"):
+        ep.union(cg, cg, suffixes={"_1", "_2"})

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import copy
 import os
+import pickle
 import subprocess
 import sys
 
@@ -214,3 +216,34 @@ def test_an_object_whose_signature_raises_is_taken_for_one_without():
             return x
 
     assert ep.CompGraphRunner(ep.CompGraph({"f": Hostile()}, {"f": ("x", "y")})).run(x=1)["y"] == 1
+
+
+def test_functions_whose_value_is_used_up_when_it_is_read_are_refused():
+    def numbers(x):
+        yield from range(x)
+
+    async def later(x):
+        return x
+
+    for function in (numbers, later):
+        with pytest.raises(GraphError, match="'f' is a generator or a coroutine.* Return a list, or await") as error:
+            ep.CompGraph({"f": function}, {"f": ("x", "y")})
+        assert error.value.findings[0].names == ("f", "y")
+
+
+def test_a_graph_can_be_copied_and_pickled():
+    cg = ep.CompGraph.from_functions(add_default)
+    assert copy.deepcopy(cg) is cg
+    for same in (copy.copy(cg), pickle.loads(pickle.dumps(cg))):
+        assert dict(same.functions) == dict(cg.functions)
+        assert (dict(same.func_io), dict(same.defaults)) == (dict(cg.func_io), {"k": 3})
+
+
+def add_default(x, k=3):
+    return x + k
+
+
+def test_a_graph_as_a_function_is_told_to_be_a_pipeline():
+    inner = ep.CompGraph({"f": abs}, {"f": ("x", "y")})
+    with pytest.raises(GraphError, match=r"can't be called. Give a function, or the graph as one: ep.Pipeline\('g', "):
+        ep.CompGraph({"g": inner}, {"g": ("x", "y")})

@@ -242,3 +242,26 @@ def test_a_node_around_a_pipeline_shows_its_changes():
     inner["n"] = 5
     assert runner.stale == ("node",)
     assert runner.rerun()["b"] == 6
+
+
+def test_the_times_of_what_a_switch_left_out_are_not_those_of_an_earlier_call():
+    cg = ep.CompGraph({"slow": abs, "fast": abs}, {"slow": ("x", "a"), "fast": ("x", "b")})
+    cg |= ep.switch("which", {"slow": "a", "fast": "b"}, by="method", output="y")
+    pipe = ep.Pipeline("pipe", cg, {"method": "slow"})
+    pipe.run(x=1)
+    pipe["method"] = "fast"
+    pipe.run(x=1)
+    times = dict(pipe.traverse_time()[2])
+    assert times["slow"] == 0
+    assert times["fast"] > 0
+
+
+@pytest.mark.parametrize("wrong", [{"x": 1}, None, abs])
+def test_a_pipeline_of_no_graph_and_a_node_of_no_function_are_refused(wrong):
+    with pytest.raises(TypeError, match=r"A pipeline runs a CompGraph, not .* Pipeline\(name, cg\)"):
+        ep.Pipeline("p", wrong)
+    if not callable(wrong):
+        with pytest.raises(TypeError, match="Node 'n' needs a function to call"):
+            ep.Node("n", wrong)
+    with pytest.raises(TypeError, match="Give its graph: .cg"):
+        ep.Pipeline("p", ep.CompGraphRunner(ep.CompGraph({"f": abs}, {"f": ("x", "y")})))

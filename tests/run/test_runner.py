@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
+import signal
 import threading
 import warnings
 from concurrent.futures import ThreadPoolExecutor
@@ -580,3 +582,55 @@ def test_what_a_reader_does_to_an_array_changes_no_later_run():
             array.shape = (2, 2)
     assert runner.rerun(k=np.ones(4))["z"] == (4,)
     assert run["y"].shape == (4,)
+
+
+def test_missing_payload_is_told_with_what_was_given_and_with_what_may_be_meant():
+    cg = ep.CompGraph(
+        {"smooth": lambda image: image, "threshold": lambda flat, t: flat > t},
+        {"smooth": ("image", "flat"), "threshold": (("flatt", "t"), "mask")},
+    )
+    runner = ep.CompGraphRunner(cg)
+    with pytest.raises(PayloadError) as error:
+        runner.run(image=3)
+    assert str(error.value) == (
+        "Missing payload: 'flatt', 't'. Call run(image=..., flatt=..., t=...), or make what is constant a "
+        "hyperparameter: CompGraphRunner(cg, {'flatt': ..., 't': ...}). "
+        "No function makes 'flatt'; 'smooth' makes 'flat': is that what was meant?"
+    )
+    assert error.value.tokens == ("flatt", "t")
+
+
+def test_a_selector_that_is_missing_is_told_with_its_branches():
+    cg = ep.CompGraph({"f": abs, "g": abs}, {"f": ("x", "a"), "g": ("x", "b")})
+    cg |= ep.switch("s", {"first": "a", "second": "b"}, by="which", output="y")
+    with pytest.raises(PayloadError, match="'which' selects a branch of switch 's': 'first', 'second'"):
+        ep.CompGraphRunner(cg).run(x=1)
+
+
+@pytest.mark.parametrize("hparams", [[("x", 1)], np.ones(2), "x", 3])
+def test_hyperparameters_that_are_no_mapping_are_refused(hparams):
+    with pytest.raises(TypeError, match="hparams must be a mapping of tokens to values"):
+        ep.CompGraphRunner(ep.CompGraph({"f": abs}, {"f": ("x", "y")}), hparams)
+
+
+def test_an_interrupt_never_leaves_a_runner_locked():
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": abs}, {"f": ("k", "y")}), {"k": 0})
+    runner.run()
+
+    def rerun_until_interrupted():
+        signal.setitimer(signal.ITIMER_REAL, 0.0003)
+        for k in itertools.count():
+            runner.rerun(k=k)
+
+    before = signal.signal(signal.SIGALRM, stop)
+    try:
+        for _ in range(300):
+            with pytest.raises(KeyboardInterrupt):
+                rerun_until_interrupted()
+            assert not runner._lock.locked()
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)

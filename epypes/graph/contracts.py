@@ -1,4 +1,4 @@
-"""Do the functions of a graph agree on the order of a token's colours?"""
+"""What do annotations say of a graph's images, and do the functions agree?"""
 
 from __future__ import annotations
 
@@ -35,6 +35,19 @@ def check_colours(contracts: Mapping[str, Contracts], graph: BipartiteDigraph) -
         other, other_verb, order = said.setdefault(token, (name, verb, mark.order))
         if order != mark.order:
             yield _disagreement(token, (other, other_verb, order), (name, verb, mark.order))
+
+
+def check_images(contracts: Mapping[str, Contracts], graph: BipartiteDigraph) -> Iterable[Finding]:
+    """Find tokens that one function makes as an image that another one can't take."""
+    made = {token: (name, mark) for name, token, mark, verb in _marks(contracts, graph) if verb == "makes"}
+    for taker, token, taken, verb in _marks(contracts, graph):
+        maker, mark = made.get(token, ("", taken))
+        if verb == "takes" and not mark.fits(taken):
+            text = (
+                f"Function {maker!r} makes token {token!r} as {mark}, but {taker!r} takes it as {taken}, and no image "
+                "is both. Change one of the annotations, or build the graph with types=False."
+            )
+            yield Finding("types", text, (token, maker, taker))
 
 
 def _marks(contracts: Mapping[str, Contracts], graph: BipartiteDigraph) -> Iterator[tuple[str, str, Image, str]]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.errors import GraphError, UnknownName
+from epypes.errors import ContractBroken, GraphError, UnknownName
 from epypes.graph import colour_order, image_hint
 
 RGB, BGR, UNSAID = ep.Image(order="rgb"), ep.Image(order="bgr"), ep.Image("uint8")
@@ -88,3 +88,44 @@ def test_colours_are_told_together_with_what_else_is_wrong():
 def test_a_mark_that_says_no_order_disagrees_with_nobody():
     cg = graph(load=(load, ("path", "image")), measure=(measure, ("image", "out")), again=(show_rgb, ("image", "end")))
     assert colour_order(cg, "image") == "rgb"
+
+
+@pytest.mark.parametrize(
+    ("made", "taken", "fits"),
+    [
+        (ep.Image("uint8"), ep.Image("float32"), False),
+        (ep.Image("uint8"), ep.Image(("float32", "uint8")), True),
+        (ep.Image("uint8", ("h", "w")), ep.Image("uint8", ("h", "w", 3)), False),
+        (ep.Image(shape=(480, "w")), ep.Image(shape=(640, None)), False),
+        (ep.Image(shape=("h", 640)), ep.Image(shape=(480, None)), True),
+        (ep.Image(range=(0, 1)), ep.Image(range=(2, 3)), False),
+        (ep.Image(range=(0, 1)), ep.Image(range=(1, 3)), True),
+        (ep.Image(), ep.Image("uint8", (1, 1), (0, 1)), True),
+    ],
+    ids=str,
+)
+def test_contracts_that_no_image_keeps_both_of_are_found_when_the_graph_is_made(made, taken, fits):
+    def make(x):
+        return x
+
+    def take(image):
+        return image
+
+    make.__annotations__["return"] = made
+    take.__annotations__["image"] = Annotated[np.ndarray, taken]
+    functions, io = {"make": make, "take": take}, {"make": ("x", "image"), "take": ("image", "y")}
+    ep.CompGraph(functions, io, types=False)
+    if fits:
+        ep.CompGraph(functions, io)
+    else:
+        with pytest.raises(GraphError, match="'make' makes token 'image' as .*, but 'take' takes it as .* no image is"):
+            ep.CompGraph(functions, io)
+
+
+def test_a_mark_may_stand_alone_as_the_annotation():
+    def threshold(image: ep.Image("uint8", ("h", "w"))) -> ep.Image("uint8"):
+        return image > 3
+
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": threshold}, {"f": ("image", "mask")}))
+    with pytest.raises(ContractBroken, match="'f' takes token 'image' as uint8 \\(h, w\\)|bool"):
+        runner.run(image=np.zeros((4, 4), np.uint8))
