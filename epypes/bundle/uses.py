@@ -5,20 +5,24 @@ from __future__ import annotations
 import ast
 import dis
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from epypes.bundle.source import Definition, Refused
+from epypes.bundle.text import nested_codes
 
 
 def global_names(found: Definition, what: str) -> Iterator[str]:
     """Return the global names that a function reads when it is called or defined, each once, in order of use."""
     names: dict[str, None] = {}
-    for code in _nested_codes(found.function.__code__):
+    for code in nested_codes(found.code):
+        own = {"__name__"}  # a class reads the module's, whichever that is
         for instruction in dis.get_instructions(code):
             if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
                 raise Refused(f"{what} changes the global {instruction.argval!r} ({found.place}). Return the value.")
-            if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
+            if instruction.opname == "STORE_NAME":
+                own.add(instruction.argval)
+            if instruction.opname == "LOAD_GLOBAL" or _is_read_from_outside(instruction, own):
                 names[instruction.argval] = None
     arguments = found.node.args
     every = (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs, arguments.vararg, arguments.kwarg)
@@ -31,11 +35,9 @@ def global_names(found: Definition, what: str) -> Iterator[str]:
     return iter(names)
 
 
-def _nested_codes(code: types.CodeType) -> Iterator[types.CodeType]:
-    yield code
-    for constant in code.co_consts:
-        if isinstance(constant, types.CodeType):
-            yield from _nested_codes(constant)
+def _is_read_from_outside(instruction: dis.Instruction, own: Collection[str]) -> bool:
+    """Whether the body of a class reads a name that it has not given a meaning before."""
+    return instruction.opname == "LOAD_NAME" and instruction.argval not in own
 
 
 def submodules(tree: ast.AST, name: str, module: types.ModuleType) -> tuple[str, ...]:
