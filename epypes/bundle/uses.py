@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import dis
 import types
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from epypes.bundle.source import Definition, Refused
@@ -16,14 +16,10 @@ def global_names(found: Definition, what: str) -> Iterator[str]:
     """Return the global names that a function reads when it is called or defined, each once, in order of use."""
     names: dict[str, None] = {}
     for code in nested_codes(found.code):
-        own = {"__name__"}  # a class reads the module's, whichever that is
         for instruction in dis.get_instructions(code):
             if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
                 raise Refused(f"{what} changes the global {instruction.argval!r} ({found.place}). Return the value.")
-            if instruction.opname == "STORE_NAME":
-                own.add(instruction.argval)
-            if instruction.opname == "LOAD_GLOBAL" or _is_read_from_outside(instruction, own):
-                names[instruction.argval] = None
+        names.update(dict.fromkeys(_read_from_outside(code)))
     arguments = found.node.args
     every = (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs, arguments.vararg, arguments.kwarg)
     outside = [argument.annotation for argument in every if argument] + [found.node.returns]
@@ -35,9 +31,14 @@ def global_names(found: Definition, what: str) -> Iterator[str]:
     return iter(names)
 
 
-def _is_read_from_outside(instruction: dis.Instruction, own: Collection[str]) -> bool:
-    """Whether the body of a class reads a name that it has not given a meaning before."""
-    return instruction.opname == "LOAD_NAME" and instruction.argval not in own
+def _read_from_outside(code: types.CodeType) -> Iterator[str]:
+    """Return the names that code reads, but for those that the body of a class has given a meaning before."""
+    own = {"__name__"}  # a class reads the module's, whichever that is
+    for instruction in dis.get_instructions(code):
+        if instruction.opname == "STORE_NAME":
+            own.add(instruction.argval)
+        elif instruction.opname == "LOAD_GLOBAL" or (instruction.opname == "LOAD_NAME" and instruction.argval not in own):
+            yield instruction.argval
 
 
 def submodules(tree: ast.AST, name: str, module: types.ModuleType) -> tuple[str, ...]:
