@@ -37,7 +37,9 @@ def _read_from_outside(code: types.CodeType) -> Iterator[str]:
     for instruction in dis.get_instructions(code):
         if instruction.opname == "STORE_NAME":
             own.add(instruction.argval)
-        elif instruction.opname == "LOAD_GLOBAL" or (instruction.opname == "LOAD_NAME" and instruction.argval not in own):
+        elif instruction.opname == "LOAD_GLOBAL" or (
+            instruction.opname == "LOAD_NAME" and instruction.argval not in own
+        ):
             yield instruction.argval
 
 
