@@ -13,24 +13,40 @@ def is_data(value: object) -> bool:
 
 
 def literal(value: Any) -> str:
-    """Return the source of a constant: as repr, but with sets sorted, whose order changes from process to process."""
+    """Return the source of a constant: as repr, but with sets sorted, whose order changes from process to process.
+
+    Raises
+    ------
+    ValueError
+        Something in it is of a type that literals are not made of, or is an int that is too long for Python.
+    """
     if type(value) is set and value:
         return "{" + ", ".join(sorted(map(literal, value))) + "}"
     if type(value) is dict:
         return "{" + ", ".join(f"{literal(key)}: {literal(item)}" for key, item in value.items()) + "}"
     if type(value) is list:
         return "[" + ", ".join(map(literal, value)) + "]"
-    if type(value) is tuple and len(value) != 1:
-        return "(" + ", ".join(map(literal, value)) + ")"
+    if type(value) is tuple:
+        return "(" + ", ".join(map(literal, value)) + (",)" if len(value) == 1 else ")")
+    if not is_data(value):  # a kind of str or int inside a tuple would become a plain one
+        raise ValueError(f"an object of class {type(value).__name__!r} has no literal")
     return repr(value)
 
 
 def literal_source(value: Any) -> str:
     """Return the literal of this very value; "" if there is none."""
-    source = literal(value) if is_data(value) else ""
     try:
+        source = literal(value)
         read = ast.literal_eval(source)
-    except (ValueError, SyntaxError):
+    except (ValueError, SyntaxError, RecursionError, MemoryError):  # Python writes no int of 5000 digits, for one
         return ""
     # By source: 0j == -0j, but they are not the same.
     return source if type(read) is type(value) and literal(read) == source else ""
+
+
+def is_same_data(written: Any, value: Any) -> bool:
+    """Whether a value is what a literal says, to the last bit."""
+    try:
+        return type(written) is type(value) and literal(written) == literal(value)
+    except (ValueError, RecursionError):
+        return False

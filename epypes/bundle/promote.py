@@ -16,12 +16,13 @@ from typing import Any, Final
 
 from epypes.bundle.emit import emit_module
 from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
+from epypes.bundle.nodes import called_by, is_plain_pipeline
 from epypes.bundle.replay import replay_isolated
 from epypes.bundle.seal import MANIFEST, seal
 from epypes.bundle.settings import Settings, unwritable, writable_defaults, write_settings
 from epypes.bundle.slicer import slice_graph
 from epypes.errors import BundleError, EpypesError, MessageError, PromotionRefused, run_call
-from epypes.graph import CompGraph, colour_order
+from epypes.graph import CompGraph, as_switch, colour_order, is_placeholder
 from epypes.pipeline import Node, Pipeline
 from epypes.run import CompGraphRunner, Run
 
@@ -32,6 +33,10 @@ _RENAME_EXCHANGE: Final = 2
 _NO_RUNNER: Final = (
     "An object of class {} can't be promoted. Make a runner and run it: "
     "runner = CompGraphRunner(cg, hparams); runner.run(...)."
+)
+_AS_ONE: Final = (
+    "ep.to_source(cg) writes the graph as one plain function: put its text into a cell, make a graph of that "
+    "function, run it and promote that."
 )
 
 
@@ -114,7 +119,8 @@ def _write(draft: Path, target: Path, runner: CompGraphRunner, cg: CompGraph, ou
         cg.require_token(token)
     reasons = [*_unready(runner, wanted), *unwritable(runner.hyperparameters)]
     functions = {name: function.func if type(function) is Node else function for name, function in cg.functions.items()}
-    needed, references = slice_graph(functions)
+    reasons += _unheld(functions)
+    needed, references = slice_graph({name: function for name, function in functions.items() if not _kind(function)})
     reasons += needed.refusals
     if reasons:
         raise PromotionRefused(target, reasons)
@@ -128,6 +134,27 @@ def _write(draft: Path, target: Path, runner: CompGraphRunner, cg: CompGraph, ou
     write_settings(draft / SETTINGS, settings, cg)
     if runner.last is not None:  # as _unready has made sure
         _record(draft / SAMPLES / "000.npz", target, runner.last, settings)
+
+
+def _kind(function: object) -> str:
+    """Return what a function is that a bundle can't hold yet, though it has no text to be refused for; "" if none."""
+    if is_placeholder(function):
+        return "a placeholder"
+    if as_switch(function) is not None:
+        return "a switch"
+    return "a pipeline" if is_plain_pipeline(called_by(function)) else ""
+
+
+def _unheld(functions: Mapping[str, Callable[..., Any]]) -> list[str]:
+    """Return a reason, with the way out, for each function that a bundle can't hold yet."""
+    kinds = {name: _kind(function) for name, function in functions.items()}
+    return [
+        f"Function {name!r} is a placeholder. Give it: ep.extend(cg, {{{name!r}: ...}}), and run that graph."
+        if kind == "a placeholder"
+        else f"Function {name!r} is {kind}, which a bundle can't hold yet. {_AS_ONE}"
+        for name, kind in kinds.items()
+        if kind
+    ]
 
 
 def _unready(runner: CompGraphRunner, outputs: Sequence[str]) -> list[str]:

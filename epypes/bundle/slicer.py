@@ -10,10 +10,9 @@ import builtins
 import dataclasses
 import types
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from itertools import zip_longest
 from typing import Annotated, Any, Final, get_origin
 
-from epypes.bundle.literal import is_data, literal_source
+from epypes.bundle.literal import is_data, is_same_data, literal_source
 from epypes.bundle.source import Definition, Importable, Refused, definition, importable
 from epypes.bundle.uses import global_names, in_module, submodules
 from epypes.hints import Param
@@ -219,25 +218,29 @@ class Slice:
 
 
 def _check_defaults(found: Definition, what: str) -> None:
-    for default, value in _defaults(found):
+    for default, value in _defaults(found, what):
+        text = f"{what} has the default {ast.unparse(default)!r} ({found.place})"
         try:
-            ast.literal_eval(default)
+            written = ast.literal_eval(default)
         except ValueError:
             if _is_constant(value) and in_module(default, found.function.__globals__) is value:
                 continue
-            text = f"{what} has the default {ast.unparse(default)!r} ({found.place})"
             raise Refused(f"{text}, which is no literal and no constant of a module. Write the value itself.") from None
+        if not is_same_data(written, value):
+            raise Refused(f"{text}, which has another value by now. Define the function again, with that value.")
 
 
-def _defaults(found: Definition) -> Iterator[tuple[ast.expr, Any]]:
+def _defaults(found: Definition, what: str) -> Iterator[tuple[ast.expr, Any]]:
     """Return every default as it is written, with its value."""
     arguments, function = found.node.args, found.function
-    # Somebody may have changed the values since; then those that are missing are None, which is no module's constant.
-    yield from zip_longest(arguments.defaults, (function.__defaults__ or ())[: len(arguments.defaults)])
-    by_name = function.__kwdefaults__ or {}
-    for argument, default in zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True):
-        if default:
-            yield default, by_name.get(argument.arg)
+    by_position, by_name = function.__defaults__ or (), function.__kwdefaults__ or {}
+    named = zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True)
+    written = {argument.arg: default for argument, default in named if default}
+    if len(by_position) != len(arguments.defaults) or by_name.keys() != written.keys():
+        text = f"{what} has other parameters with defaults by now than its text says ({found.place})."
+        raise Refused(f"{text} Define the function again, with these defaults.")
+    yield from zip(arguments.defaults, by_position, strict=True)
+    yield from ((default, by_name[name]) for name, default in written.items())
 
 
 def _is_constant(value: object) -> bool:

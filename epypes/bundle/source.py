@@ -9,13 +9,14 @@ import ast
 import copy
 import linecache
 import sys
-import textwrap
 import types
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
+from inspect import CO_ASYNC_GENERATOR, CO_COROUTINE
 from typing import Any, TypeGuard
 
+from epypes.bundle.text import code_on_its_own, definition_of, own_text
 from epypes.graph import outputs
 from epypes.run.guard import unguarded
 
@@ -44,6 +45,8 @@ class Definition:
         Its syntax tree.
     place
         Cell and line, for people.
+    code
+        What that text compiles to, where it is written to.
     """
 
     name: str
@@ -51,6 +54,7 @@ class Definition:
     text: str
     node: ast.FunctionDef
     place: str
+    code: types.CodeType
 
 
 def importable(value: Any, *names: str) -> Importable | None:
@@ -132,20 +136,37 @@ def definition(function: Callable[..., Any], what: str) -> Definition:
     if not isinstance(function, types.FunctionType):
         raise Refused(f"{what} is {_kind(function)}. Write a plain function (def) that makes the object and calls it.")
     place = place_of(function.__code__)
-    if function.__name__ == "<lambda>" or function.__code__.co_name == "<lambda>":
+    _check_kind(function, what, place)
+    lines, node = definition_of(function.__code__)
+    if not lines:
+        raise Refused(f"{what} has no source ({place}). Define it in a cell, or in a module that is installed.")
+    if node is None:
+        text = f"{what} is not what its source says ({place}): that was changed since it was run, or the function was."
+        raise Refused(f"{text} Run it again, so that both are the same.")
+    _check_decorators(node, function, what, place)
+    _check_attributes(function, what, place)
+    names = function.__globals__
+    text = own_text(lines, node, [mark for mark in node.decorator_list if _names_outputs(mark, names)])
+    kept = _without_outputs(node, names)
+    code = code_on_its_own(text, kept, function.__code__)
+    if code is None:
+        text = f"{what} computes something else if its text is moved to another place ({place})."
+        raise Refused(f"{text} Define it at the margin of a cell, not in a class.")
+    return Definition(node.name, function, text, kept, place, code)
+
+
+def _check_kind(function: types.FunctionType, what: str, place: str) -> None:
+    """Refuse functions that have no text of their own, or whose text is not all of them."""
+    code = function.__code__
+    if function.__name__ == "<lambda>" or code.co_name == "<lambda>":
         raise Refused(f"{what} is a lambda ({place}). Write it as a function (def) with a name.")
+    if code.co_flags & (CO_COROUTINE | CO_ASYNC_GENERATOR):
+        raise Refused(f"{what} is asynchronous ({place}), which no graph waits for. Write a plain function (def).")
     if hasattr(function, "__wrapped__"):
         raise Refused(f"{what} is wrapped by a decorator ({place}). Call the decorator's work inside the function.")
     if function.__closure__:
-        captured = ", ".join(map(repr, function.__code__.co_freevars))
+        captured = ", ".join(map(repr, code.co_freevars))
         raise Refused(f"{what} captures {captured} from the function around it ({place}). Make it a token.")
-    lines = linecache.getlines(function.__code__.co_filename)
-    node = _find(lines, function.__code__)
-    if node is None:
-        raise Refused(f"{what} has no source ({place}). Define it in a cell, or in a module that is installed.")
-    _check_decorators(node, function, what, place)
-    text = _text(lines, node, function.__globals__)
-    return Definition(node.name, function, text, _without_outputs(node, function.__globals__), place)
 
 
 def _kind(value: object) -> str:
@@ -170,30 +191,19 @@ def place_of(code: types.CodeType) -> str:
     return f"{code.co_filename}, {line}"
 
 
-def _find(lines: list[str], code: types.CodeType) -> ast.FunctionDef | None:
-    return _definitions("".join(lines)).get((code.co_name, code.co_firstlineno))
-
-
-@lru_cache(maxsize=16)  # one cell often defines many functions
-def _definitions(source: str) -> dict[tuple[str, int], ast.FunctionDef]:
-    """Return the definitions in a cell by name and first line, decorators included."""
-    try:
-        tree = ast.parse(source)
-    except SyntaxError:
-        return {}
-    found: dict[tuple[str, int], ast.FunctionDef] = {}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef):
-            first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
-            found.setdefault((node.name, first), node)
-    return found
-
-
 def _check_decorators(node: ast.FunctionDef, function: types.FunctionType, what: str, place: str) -> None:
     for decorator in node.decorator_list:
         if not _is_our_mark(decorator, function.__globals__):
             text = f"{what} is decorated by @{ast.unparse(decorator)} ({place})."
             raise Refused(f"{text} Call the decorator's work inside the function.")
+
+
+def _check_attributes(function: types.FunctionType, what: str, place: str) -> None:
+    """Refuse what was hung on a function besides our marks: its text does not say it, and its code may read it."""
+    own = ", ".join(repr(name) for name in function.__dict__ if not name.startswith("__epypes_"))
+    if own:
+        text = f"{what} has attributes that its text does not give it, {own} ({place})."
+        raise Refused(f"{text} Make them constants or tokens, and define the function again.")
 
 
 def _is_our_mark(decorator: ast.expr, names: dict[str, Any]) -> bool:
@@ -222,17 +232,3 @@ def _evaluated(expression: ast.expr, names: dict[str, Any]) -> Any:
     if isinstance(expression, ast.Attribute):
         return getattr(_evaluated(expression.value, names), expression.attr, None)
     return None
-
-
-def _text(lines: list[str], node: ast.FunctionDef, names: dict[str, Any]) -> str:
-    first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)]) - 1
-    while first and lines[first - 1].lstrip().startswith("#"):
-        first -= 1
-    dropped = {
-        number
-        for decorator in node.decorator_list
-        if _names_outputs(decorator, names)
-        for number in range(decorator.lineno, (decorator.end_lineno or decorator.lineno) + 1)
-    }
-    kept = [line for number, line in enumerate(lines[first : node.end_lineno], first + 1) if number not in dropped]
-    return textwrap.dedent("".join(kept)).rstrip() + "\n"

@@ -107,8 +107,9 @@ class _Body:
             operator, right = _test([self.straight.keys[name][key] for key in branch.keys])
             lines += condition(keyword, selector, operator, right, depth)
             body = self.region(branch, depth + 1)
-            for token in cg.func_outputs(name):
-                body += assignment([words[token]], True, words[branch.token], depth + 1)
+            targets = [words[token] for token in cg.func_outputs(name)]
+            if targets:
+                body += assignment(targets, cg.has_single_output(name), words[branch.token], depth + 1)
             lines += body or laid_out("pass", depth + 1)
             keyword = "elif"
         refusal = call("raise ValueError", [f'f"Unknown {selector}: {{{selector}!r}}"'])

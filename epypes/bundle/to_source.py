@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import builtins
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,6 +11,7 @@ from epypes.bundle.branches import Placement, place
 from epypes.bundle.emit import ordered_imports
 from epypes.bundle.lines import assignment, piece_of
 from epypes.bundle.literal import literal_source
+from epypes.bundle.nodes import called_by, is_plain_pipeline
 from epypes.bundle.slicer import Slice, slice_functions
 from epypes.bundle.source import Refused
 from epypes.bundle.straight import Straight, emit_function
@@ -18,11 +19,8 @@ from epypes.bundle.values import expression
 from epypes.bundle.words import is_word, word_of
 from epypes.errors import PlaceholderNeeded, SourceRefused
 from epypes.graph import CompGraph, as_switch
-from epypes.pipeline import Node, Pipeline
+from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner
-
-# A node may be made to wrap itself; nobody wraps this deep on purpose.
-_DEEPEST = 100
 
 
 def to_source(
@@ -87,10 +85,10 @@ def to_source(
         y = math.sqrt(x)
         return y
     """
+    if not isinstance(name, str):
+        raise TypeError(f'name is what the function is called, a string as "run_graph", not {type(name).__name__!r}.')
     graph, values = _subject(cg, hparams)
-    wanted = (returns,) if isinstance(returns, str) else None if returns is None else tuple(returns)
-    for token in wanted or ():
-        graph.require_token(token)
+    wanted = _wanted(graph, returns)
     top = _Part(name, graph, values, place(graph, wanted), graph.sink_tokens if wanted is None else wanted)
     parts = _with_pipelines(top)
     _check_placeholders(parts)
@@ -118,6 +116,19 @@ class _Part:
     pipelines: dict[str, _Part] = field(default_factory=dict)
 
 
+def _wanted(cg: CompGraph, returns: Any) -> tuple[str, ...] | None:
+    """Return the tokens that are asked for, which are checked; None for the sink tokens."""
+    if returns is None:
+        return None
+    wanted = (returns,) if isinstance(returns, str) else tuple(returns) if isinstance(returns, Iterable) else (None,)
+    if not all(isinstance(token, str) for token in wanted):
+        kind = type(returns).__name__
+        raise TypeError(f'returns takes a token or a list of tokens, as ["edges"], not this {kind!r}.')
+    for token in wanted:
+        cg.require_token(token)
+    return wanted
+
+
 def _subject(given: Any, hparams: Mapping[str, Any] | None) -> tuple[CompGraph, Mapping[str, Any]]:
     """Return a graph and the values of its hyperparameters, which are checked."""
     if isinstance(given, CompGraphRunner | Pipeline):
@@ -125,6 +136,9 @@ def _subject(given: Any, hparams: Mapping[str, Any] | None) -> tuple[CompGraph, 
         cg, known = given.cg, runner.hyperparameters
     else:
         cg, known = given, getattr(given, "defaults", {})
+    if not isinstance(hparams, Mapping | None):
+        kind = type(hparams).__name__
+        raise TypeError(f"hparams takes the values of hyperparameters by token, such as a dict, not {kind!r}.")
     values = {**known, **(hparams or {})}
     CompGraphRunner(cg, values)  # raises for what is no graph, and for what can't be a hyperparameter
     return cg, values
@@ -137,8 +151,8 @@ def _with_pipelines(top: _Part) -> list[_Part]:
     while pending:
         part = pending.pop()
         for name in part.placement.functions:
-            pipeline = _plain(part.cg.functions[name])
-            if not _is_plain_pipeline(pipeline):
+            pipeline = called_by(part.cg.functions[name])
+            if not is_plain_pipeline(pipeline):
                 continue
             if id(pipeline) not in by_pipeline:
                 cg, values = pipeline.cg, pipeline.runner.hyperparameters
@@ -149,25 +163,6 @@ def _with_pipelines(top: _Part) -> list[_Part]:
                 pending.append(inner)
             part.pipelines[name] = by_pipeline[id(pipeline)]
     return found[::-1]
-
-
-def _plain(function: Any) -> Any:
-    """Return the function of a node that does nothing else than call it."""
-    for _ in range(_DEEPEST):
-        kind = type(function)
-        if not isinstance(function, Node) or isinstance(function, Pipeline):
-            break
-        if kind.compute is not Node.compute or kind.__call__ is not Node.__call__:
-            break
-        function = function.func
-    return function
-
-
-def _is_plain_pipeline(function: Any) -> bool:
-    """Whether this is a pipeline that does nothing else than run its graph."""
-    kind = type(function)
-    hooks = ("__call__", "compute", "run")
-    return isinstance(function, Pipeline) and all(getattr(kind, hook) is getattr(Pipeline, hook) for hook in hooks)
 
 
 def _check_placeholders(parts: Sequence[_Part]) -> None:
@@ -195,7 +190,7 @@ def _slice(gathered: Slice, parts: Sequence[_Part]) -> None:
     called: list[tuple[_Part, str, Callable[..., Any]]] = []
     for part in parts:
         written = [name for name in part.placement.functions if name not in part.placement.branches]
-        called += [(part, name, _plain(part.cg.functions[name])) for name in written if name not in part.pipelines]
+        called += [(part, name, called_by(part.cg.functions[name])) for name in written if name not in part.pipelines]
     functions = [(f"Function {name!r}{part.where}", function) for part, name, function in called]
     for (part, name, _), reference in zip(called, slice_functions(gathered, functions), strict=True):
         part.references[name] = reference
@@ -253,18 +248,21 @@ def _expression(gathered: Slice, value: Any, what: str) -> str:
     except Refused as refusal:
         gathered.refusals.append(str(refusal))
         return "None"
+    except RecursionError:  # it holds itself, or is nested deeper than Python reads
+        return ""
 
 
 def _keys(gathered: Slice, part: _Part, name: str) -> dict[object, str]:
     """Return the expressions of the values that a switch compares its selector with."""
     function = as_switch(part.cg.functions[name])
+    tokens = part.cg.func_inputs(name)[1:]
     sources: dict[object, str] = {}
-    for key in function.branches if function is not None else ():
+    for key, token in zip(function.branches if function is not None else (), tokens, strict=True):
         sources[key] = _expression(gathered, key, f"Switch {name!r}{part.where}")
         if not sources[key]:
             gathered.refusals.append(
-                f"Switch {name!r}{part.where} has a branch for {key!r:.60}, which no expression makes again. "
-                "Choose by strings or numbers."
+                f"Switch {name!r}{part.where} chooses {token!r} by a key of type {type(key).__name__}, which no "
+                "expression makes again. Choose by strings or numbers."
             )
     return sources
 

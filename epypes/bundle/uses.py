@@ -9,17 +9,17 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from epypes.bundle.source import Definition, Refused
+from epypes.bundle.text import nested_codes
 
 
 def global_names(found: Definition, what: str) -> Iterator[str]:
     """Return the global names that a function reads when it is called or defined, each once, in order of use."""
     names: dict[str, None] = {}
-    for code in _nested_codes(found.function.__code__):
+    for code in nested_codes(found.code):
         for instruction in dis.get_instructions(code):
             if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
                 raise Refused(f"{what} changes the global {instruction.argval!r} ({found.place}). Return the value.")
-            if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
-                names[instruction.argval] = None
+        names.update(dict.fromkeys(_read_from_outside(code)))
     arguments = found.node.args
     every = (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs, arguments.vararg, arguments.kwarg)
     outside = [argument.annotation for argument in every if argument] + [found.node.returns]
@@ -31,11 +31,16 @@ def global_names(found: Definition, what: str) -> Iterator[str]:
     return iter(names)
 
 
-def _nested_codes(code: types.CodeType) -> Iterator[types.CodeType]:
-    yield code
-    for constant in code.co_consts:
-        if isinstance(constant, types.CodeType):
-            yield from _nested_codes(constant)
+def _read_from_outside(code: types.CodeType) -> Iterator[str]:
+    """Return the names that code reads, but for those that the body of a class has given a meaning before."""
+    own = {"__name__"}  # a class reads the module's, whichever that is
+    for instruction in dis.get_instructions(code):
+        if instruction.opname == "STORE_NAME":
+            own.add(instruction.argval)
+        elif instruction.opname == "LOAD_GLOBAL" or (
+            instruction.opname == "LOAD_NAME" and instruction.argval not in own
+        ):
+            yield instruction.argval
 
 
 def submodules(tree: ast.AST, name: str, module: types.ModuleType) -> tuple[str, ...]:

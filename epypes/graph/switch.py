@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Hashable, Mapping
+from numbers import Number
 from typing import TYPE_CHECKING, Any
 
 from epypes.errors import UnknownName
@@ -23,6 +24,11 @@ class Switch:
     branches
         The keys of the branches, in the order of the inputs.
 
+    Raises
+    ------
+    ValueError
+        A key is NaN, or a tuple with NaN in it.
+
     Attributes
     ----------
     branches
@@ -30,6 +36,10 @@ class Switch:
     """
 
     def __init__(self, name: str, branches: tuple[Hashable, ...]) -> None:
+        for key in branches:
+            if _is_nan(key):
+                text = f"Switch {name!r} has a branch for NaN, which equals nothing, not even itself."
+                raise ValueError(f"{text} Choose by strings, or by None.")
         self.name, self.branches = name, branches
         self._index = {key: index for index, key in enumerate(branches)}
         # The graph checks the number of inputs against it.
@@ -59,6 +69,13 @@ class Switch:
         return f"<Switch {self.name!r:.40}: {len(self.branches)} branches>"
 
 
+def _is_nan(key: Any) -> bool:
+    """Whether a key would be found again only as the same object."""
+    if isinstance(key, tuple | frozenset):
+        return any(map(_is_nan, key))
+    return isinstance(key, Number) and bool(key != key)
+
+
 def as_switch(function: object) -> Switch | None:
     """Return the switch that a function is or wraps, None if it is no switch."""
     found = innermost(function)
@@ -84,8 +101,10 @@ def switch(name: str, branches: Mapping[Any, str], by: str, output: str) -> Comp
 
     Raises
     ------
+    TypeError
+        The branches are no mapping, or the output is not one token.
     ValueError
-        There is no branch.
+        There is no branch, or one for NaN.
     GraphError
         A name is no name of a token.
 
@@ -101,5 +120,8 @@ def switch(name: str, branches: Mapping[Any, str], by: str, output: str) -> Comp
         raise TypeError(f"branches must be a mapping from selector values to tokens, such as a dict, not {kind!r}.")
     if not branches:
         raise ValueError(f"Switch {name!r} has no branches. Give at least one: {{value of {by!r}: token}}.")
+    if not isinstance(output, str):
+        text = f"output takes one token, not {type(output).__name__!r}: a switch passes on one value as it is."
+        raise TypeError(f"{text} Put a function behind it, which takes the value apart.")
     function = Switch(name, tuple(branches))
     return CompGraph({name: function}, {name: ((by, *branches.values()), output)})

@@ -26,6 +26,7 @@ from epypes.bundle.seal import seal
 from epypes.errors import BundleError, PromotionRefused, ReplayDiffers, UnknownName
 from epypes.graph import colour_order
 from epypes.wire import Envelope
+from tests.bundle.test_slicer import notebook
 from tests.colours import red_image, red_runner
 
 promote_module = importlib.import_module("epypes.bundle.promote")
@@ -513,3 +514,45 @@ def test_an_event_in_another_order_than_the_tokens_is_converted_once(marked, wan
     assert given["more"][1] is plane
     assert given["more"][2]["points"] is points, "only what travels as an image has an order"
     assert (given["image"] is image) == (marked == wanted), "nothing is copied that need not be"
+
+
+INNER = ep.Pipeline("inner", ep.CompGraph({"smooth": cv2.medianBlur}, {"smooth": (("im", "side"), "out")}), {"side": 3})
+AS_ONE = "ep.to_source(cg) writes the graph as one plain function: put its text into a cell"
+
+
+def test_switches_and_pipelines_are_refused_with_what_can_be_done_today(photograph, tmp_path):
+    smooth = ep.CompGraph(
+        {"inner": INNER, "node": ep.Node("node", INNER)}, {"inner": ("image", "a"), "node": ("a", "b")}
+    )
+    cg = smooth | ep.switch("choose", {"once": "a", "twice": "b"}, by="method", output="smoothed")
+    runner = ep.CompGraphRunner(cg, {"method": "twice"})
+    runner.run(image=photograph)
+    with pytest.raises(PromotionRefused) as error:
+        ep.promote(runner, tmp_path / "b")
+    for name, kind in (("choose", "switch"), ("inner", "pipeline"), ("node", "pipeline")):
+        says = f"Function {name!r} is a {kind}, which a bundle can't hold yet. {AS_ONE}"
+        assert sum(reason.startswith(says) for reason in error.value.reasons) == 1
+    assert len(error.value.reasons) == 3
+    one = notebook(ep.to_source(cg))["run_graph"]
+    io = {"run_graph": (("image", "method"), "smoothed")}
+    again = ep.CompGraphRunner(ep.CompGraph({"run_graph": one}, io), {"method": "twice"})
+    again.run(image=photograph)
+    loaded = ep.load(ep.promote(again, tmp_path / "b").path)
+    assert np.array_equal(loaded.run(image=photograph)["smoothed"], runner["smoothed"])
+    assert loaded.hyperparameters == {"method": "twice"}
+
+
+def test_a_placeholder_is_refused_with_the_call_that_fills_it(tmp_path):
+    cg = ep.CompGraph({"f": abs, "g": ep.Placeholder()}, {"f": ("x", "y"), "g": ("y", "z")})
+    with pytest.raises(PromotionRefused) as error:
+        ep.promote(ep.CompGraphRunner(cg), tmp_path / "b")
+    assert error.value.reasons[1:] == (
+        "Function 'g' is a placeholder. Give it: ep.extend(cg, {'g': ...}), and run that graph.",
+    )
+
+
+def test_string_literals_of_indented_functions_are_promoted_as_they_are(tmp_path):
+    source = 'if True:\n    def f(x):\n        s = """\n        a"""\n        return x + len(s)\n'
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": notebook(source)["f"]}, {"f": ("x", "y")}))
+    assert runner.run(x=1)["y"] == 11
+    assert ep.load(ep.promote(runner, tmp_path / "b").path).run(x=1)["y"] == 11

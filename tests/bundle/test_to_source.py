@@ -320,6 +320,58 @@ def test_what_can_not_be_a_hyperparameter_or_a_function_is_refused_as_everywhere
         ep.to_source(edge_graph, name="max")
 
 
+def holding_itself(kind):
+    held = kind()
+    held[:1] = [held]
+    return held
+
+
+@pytest.mark.parametrize(
+    "value",
+    [10**5000, (10**5000, "a"), [-(10**5000)], {"a": 10**5000}, holding_itself(list), [holding_itself(list)] * 2],
+    ids=["int", "tuple", "list", "dict", "list in itself", "twice"],
+)
+def test_a_value_that_python_can_not_write_is_refused_as_every_other(value):
+    with pytest.raises(SourceRefused, match="Hyperparameter 'k' is of type .* Leave it free"):
+        source_with(value)
+
+
+def test_a_switch_by_what_python_can_not_write_is_refused():
+    with pytest.raises(SourceRefused, match="Switch 's' chooses 'a' by a key of type int, which no expression makes"):
+        ep.to_source(ep.switch("s", {10**5000: "a"}, by="k", output="y"))
+
+
+class Loud(str):
+    """A str of another class, which has the same repr."""
+
+
+def test_a_kind_of_string_inside_a_tuple_is_not_written_as_a_plain_one():
+    with pytest.raises(SourceRefused, match="Hyperparameter 'k' is of type tuple"):
+        source_with((Loud("a"),))
+
+
+def test_arguments_of_another_kind_are_refused_with_what_is_taken(edge_graph):
+    for name in (5, None, b"f"):
+        with pytest.raises(TypeError, match="name is what the function is called, a string"):
+            ep.to_source(edge_graph, name=name)
+    for returns in (5, [5], [["edges"]], b"edges", [None]):
+        with pytest.raises(TypeError, match="returns takes a token or a list of tokens"):
+            ep.to_source(edge_graph, returns=returns)
+    for hparams in (5, ["canny_lo"], "canny_lo"):
+        with pytest.raises(TypeError, match="hparams takes the values of hyperparameters by token"):
+            ep.to_source(edge_graph, hparams)
+
+
+def test_a_switch_with_several_outputs_is_unpacked_as_the_runner_unpacks_it():
+    function = ep.switch("s", {"a": "t", "b": "u"}, by="m", output="o").functions["s"]
+    for outputs, given in ((("o", "p"), (1, 2)), (("o",), (1,)), (None, 1)):
+        cg = ep.CompGraph({"s": function}, {"s": (("m", "t", "u"), outputs)})
+        text = ep.to_source(cg, {"m": "a"})
+        run = ep.CompGraphRunner(cg, {"m": "a"}).run(t=given, u=None)
+        expected = tuple(run[token] for token in cg.sink_tokens)
+        assert executed(text)(given, None) == {0: None, 1: expected[:1] and expected[0]}.get(len(expected), expected)
+
+
 def test_a_function_called_like_the_whole_is_refused():
     names = notebook("def f(x):\n    return x\n")
     cg = ep.CompGraph({"g": names["f"]}, {"g": ("x", "y")})
