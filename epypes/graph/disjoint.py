@@ -11,6 +11,8 @@ import typing
 from abc import ABCMeta
 from typing import Annotated, Any, Final, Literal, Union
 
+# An alias may stand for itself by mistake.
+_DEEPEST: Final = 100
 _NONE: Final = type(None)
 _PYTHON_NUMBERS: Final = frozenset({bool, int, float, complex})
 # PEP 484 once let bytes stand for all three, and much code still does.
@@ -34,10 +36,22 @@ def are_disjoint(left: Any, right: Any) -> bool:
 
 
 def bare(hint: Any) -> Any:
-    """Return a hint without its ``Annotated``."""
-    while typing.get_origin(hint) is Annotated:
-        hint = typing.get_args(hint)[0]
+    """Return a hint without its ``Annotated``, and what a ``type`` alias stands for."""
+    for _ in range(_DEEPEST):
+        origin = typing.get_origin(hint)
+        if origin is Annotated:
+            hint = typing.get_args(hint)[0]
+        elif _is_alias(hint):
+            hint = hint.__value__
+        elif _is_alias(origin):  # NDArray[np.uint8], from Python 3.12 on
+            hint = origin.__value__[typing.get_args(hint)]
+        else:
+            break
     return hint
+
+
+def _is_alias(hint: Any) -> bool:
+    return type(hint).__name__ == "TypeAliasType"
 
 
 def alternatives(hint: Any) -> list[Any]:
