@@ -13,8 +13,9 @@ from collections.abc import Iterable
 from typing import Final
 
 from epypes.display.edges import paint_edges
+from epypes.display.geometry import Box, Layout, Point
 from epypes.display.graphview import FunctionView, GraphView, TokenView
-from epypes.display.layout import Box, Layout, Point, lay_out
+from epypes.display.layout import lay_out
 from epypes.display.markup import cut, cut_name, escape
 from epypes.display.view import duration_text
 
