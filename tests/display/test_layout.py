@@ -110,22 +110,32 @@ def test_the_edges_of_a_block_pass_none_of_its_vertices(count, functions):
         assert max(steps) < HEXAGON.width, "without gaps"
 
 
+def test_the_edges_of_a_block_leave_it_together_and_without_a_bend():
+    boxes, edges = sources_of(9, 2)
+    splines = lay_out(boxes, edges).splines
+    assert len({spline[6] for spline in splines}) == 1
+    for spline in splines:
+        assert abs(spline[7][0] - spline[6][0]) < 1, "downwards, as they came"
+
+
 def test_few_sources_stand_in_one_row():
     boxes, edges = sources_of(4)
     assert len({y for _, y in lay_out(boxes, edges).centres[1:]}) == 1
 
 
 def test_images_and_hexagons_stand_in_blocks_of_their_own():
-    boxes = (BOX,) + (HEXAGON, IMAGE) * 6
+    boxes = (BOX, *(HEXAGON, HEXAGON, IMAGE, IMAGE) * 3)
     layout = lay_out(boxes, tuple((source, 0) for source in range(1, 13)))
-    hexagons, images = ([layout.centres[source][0] for source in range(first, 13, 2)] for first in (1, 2))
+    hexagons, images = (
+        [layout.centres[source][0] for source in range(1, 13) if boxes[source] is box] for box in (HEXAGON, IMAGE)
+    )
     assert max(hexagons) < min(images) or max(images) < min(hexagons)
 
 
 def test_sources_of_different_functions_stand_in_different_blocks():
-    boxes = (BOX, BOX) + (HEXAGON,) * 12
-    layout = lay_out(boxes, tuple((2 + index, index % 2) for index in range(12)))
-    ones, others = ([layout.centres[2 + index][0] for index in range(first, 12, 2)] for first in (0, 1))
+    boxes = (BOX, BOX, *(HEXAGON,) * 12)
+    layout = lay_out(boxes, tuple((2 + index, index // 2 % 2) for index in range(12)))
+    ones, others = ([layout.centres[2 + index][0] for index in range(12) if index // 2 % 2 == head] for head in (0, 1))
     assert max(ones) < min(others) or max(others) < min(ones)
 
 
