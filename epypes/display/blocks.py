@@ -142,26 +142,32 @@ def _block(boxes: Sequence[Box], members: tuple[int, ...]) -> Block:
     height += _MEETING_PX if pairs > 1 else 0.0
     offsets: list[Point] = []
     ways: list[tuple[Point, ...]] = []
+    middles: list[float] = []
     y = -height / 2
     for row in rows:
         tall = max(boxes[member].height for member in row)
+        middles.append(y + tall / 2)
+        y += tall + _ROW_GAP_PX
+    for number, row in enumerate(rows):
         for place, member in enumerate(row):
             side = 1 if place % 2 else -1
             lane = pitch * (place // 2 - (pairs - 1) / 2)
             out = lane + side * _LANE_PX / 2
-            offsets.append((out + side * boxes[member].width / 2, y + tall / 2))
-            ways.append(_way((out, y + tall / 2), lane, height / 2))
-        y += tall + _ROW_GAP_PX
+            offsets.append((out + side * boxes[member].width / 2, middles[number]))
+            ways.append(_way(out, lane, middles[number:], height / 2))
     return Block(Box("box", pitch * pairs - _COLUMN_GAP_PX, height), members, tuple(offsets), tuple(ways))
 
 
-def _way(start: Point, lane: float, bottom: float) -> tuple[Point, ...]:
-    """Return a way from the side of a vertex around a bend into its lane, down, and to the middle of the bottom."""
-    x, y = start
-    bend, end = y + _BEND_PX, bottom - (_MEETING_PX if lane else 0.0)
-    way: tuple[Point, ...] = (start, ((x + lane) / 2, y), (lane, y), (lane, bend))
-    way += ((lane, bend), (lane, end), (lane, end))
-    if not lane:
-        return way
-    middle = bottom - _MEETING_PX / 2
-    return (*way, (lane, middle), (0.0, middle), (0.0, bottom))
+def _way(side: float, lane: float, rows: Sequence[float], bottom: float) -> tuple[Point, ...]:
+    """Return a way from the side of a vertex around a bend into its lane, down, and to the middle of the bottom.
+
+    It runs down from row to row, so that ways which meet go on in the same curves, which are painted once.
+    """
+    way: list[Point] = [(side, rows[0]), ((side + lane) / 2, rows[0]), (lane, rows[0]), (lane, rows[0] + _BEND_PX)]
+    stops = [row + _BEND_PX for row in rows[1:]] + [bottom - (_MEETING_PX if lane else 0.0)]
+    for stop in stops:
+        way += [way[-1], (lane, stop), (lane, stop)]
+    if lane:
+        middle = bottom - _MEETING_PX / 2
+        way += [(lane, middle), (0.0, middle), (0.0, bottom)]
+    return tuple(way)

@@ -47,7 +47,6 @@ STYLE: Final = """
 .epypes-graph .shape{fill:var(--jp-layout-color1,#fff);stroke:#80868f}
 .epypes-graph .function .shape{fill:var(--jp-layout-color2,#e9eef6);stroke-width:1.4}
 .epypes-graph .function .shape{stroke:var(--jp-brand-color1,#1976d2)}
-.epypes-graph .function .inner{fill:none;stroke-width:1}
 .epypes-graph .hyperparameter .shape{fill:var(--jp-layout-color3,#dcdfe4)}
 .epypes-graph .bar{fill:var(--jp-brand-color1,#1976d2)}
 .epypes-graph .planned .shape{stroke-width:3}
@@ -59,6 +58,7 @@ STYLE: Final = """
 .epypes-graph .stale .shape,.epypes-graph .not-computed .shape,.epypes-graph .not-run .shape{stroke-dasharray:2 3}
 .epypes-graph .placeholder .shape{stroke-dasharray:7 4}
 .epypes-graph .stale image{opacity:.35}
+.epypes-graph .function .inner{fill:none;stroke-width:1}
 .epypes-graph .edge{fill:none;stroke:#80868f}
 .epypes-graph .dense{stroke-width:.5}
 .epypes-graph .tip{fill:#80868f}

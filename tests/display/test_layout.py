@@ -1,10 +1,13 @@
 from __future__ import annotations
 
 import itertools
+import re
 
 import pytest
 
+from epypes.display.edges import paint_edges
 from epypes.display.geometry import Box
+from epypes.display.graphview import EdgeView
 from epypes.display.layout import lay_out
 
 BOX = Box("box", 60.0, 30.0)
@@ -110,12 +113,34 @@ def test_the_edges_of_a_block_pass_none_of_its_vertices(count, functions):
         assert max(steps) < HEXAGON.width, "without gaps"
 
 
-def test_the_edges_of_a_block_leave_it_together_and_without_a_bend():
-    boxes, edges = sources_of(9, 2)
+@pytest.mark.parametrize("count", [9, 17])
+def test_the_edges_of_a_block_leave_it_together_and_without_a_bend(count):
+    boxes, edges = sources_of(count, 2)
     splines = lay_out(boxes, edges).splines
-    assert len({spline[6] for spline in splines}) == 1
-    for spline in splines:
-        assert abs(spline[7][0] - spline[6][0]) < 1, "downwards, as they came"
+    ends = [spline[:-1] for spline, (_, head) in zip(splines, edges, strict=True) if head == 0]
+    shared = next(place for place, points in enumerate(zip(*map(reversed, ends), strict=False)) if len(set(points)) > 1)
+    (x, _), (x1, _), *_ = common = ends[0][-shared:]
+    assert abs(x1 - x) < 1, "downwards, as they came"
+    assert common[0] in splines[-1], "the edges to the other function have come there too"
+
+
+def test_what_several_edges_share_is_painted_once():
+    (boxes, edges) = sources_of(9, 2)
+    views = tuple(EdgeView(head, tail - 2, True, is_live=False) for tail, head in edges)
+    curves, tips = re.findall(r' d="([^"]*)"', "".join(paint_edges(views, edges, lay_out(boxes, edges))))
+    painted, at = [], ""
+    for move, points in re.findall(r"M([^C]*)C([^M]*)", curves):
+        at, left = move, points.split()
+        for place in range(0, len(left), 3):
+            painted.append((at, *left[place : place + 3]))
+            at = left[place + 2]
+    assert len(painted) == len(set(painted)) <= 9 + 5 + 4, (
+        "a bend for each source, a way down from row to row, two ends"
+    )
+    assert {curve[0] for curve in painted} - {curve[-1] for curve in painted} == {
+        f"{x:.1f},{y:.1f}" for (x, y), *_ in lay_out(boxes, edges).splines
+    }, "each edge begins at its source, and goes on somewhere"
+    assert tips.count("M") == 2
 
 
 def test_few_sources_stand_in_one_row():
