@@ -5,6 +5,7 @@ import re
 
 import pytest
 
+from epypes.display.blocks import fold
 from epypes.display.edges import paint_edges
 from epypes.display.geometry import Box
 from epypes.display.graphview import EdgeView
@@ -116,12 +117,14 @@ def test_the_edges_of_a_block_pass_none_of_its_vertices(count, functions):
 @pytest.mark.parametrize("count", [9, 17])
 def test_the_edges_of_a_block_leave_it_together_and_without_a_bend(count):
     boxes, edges = sources_of(count, 2)
-    splines = lay_out(boxes, edges).splines
-    ends = [spline[:-1] for spline, (_, head) in zip(splines, edges, strict=True) if head == 0]
-    shared = next(place for place, points in enumerate(zip(*map(reversed, ends), strict=False)) if len(set(points)) > 1)
-    (x, _), (x1, _), *_ = common = ends[0][-shared:]
-    assert abs(x1 - x) < 1, "downwards, as they came"
-    assert common[0] in splines[-1], "the edges to the other function have come there too"
+    splines = dict(zip(edges, lay_out(boxes, edges).splines, strict=True))
+    (block,) = fold(boxes, edges).blocks.values()
+    doors = set()
+    for (tail, _), spline in splines.items():
+        inside = len(block.ways[block.members.index(tail)])
+        doors.add(spline[inside - 1])
+        assert abs(spline[inside][0] - spline[inside - 1][0]) < 1, "downwards, as they came"
+    assert len(doors) == 1
 
 
 def test_what_several_edges_share_is_painted_once():
