@@ -35,7 +35,9 @@ _AXES: Final = ("h", "w", "c")
 class Image:
     """What an image must be: the contract of an input or output, and the order of its colours.
 
-    Only what is given is checked.
+    Only what is given is checked. It is written into the annotation of a parameter or of what is returned:
+    ``Annotated[np.ndarray, ep.Image("uint8", ("h", "w"))]``, which a type checker reads as an array, or by itself,
+    ``image: ep.Image("uint8", ("h", "w"))``.
 
     Attributes
     ----------

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 
+from epypes.display.geometry import Layout, Point
 from epypes.display.graphview import EdgeView
-from epypes.display.layout import Layout, Point
 
 
 def paint_edges(edges: Sequence[EdgeView], ends: Sequence[tuple[int, int]], layout: Layout) -> Iterator[str]:
@@ -33,12 +33,26 @@ def paint_edges(edges: Sequence[EdgeView], ends: Sequence[tuple[int, int]], layo
 
 def _paint_splines(splines: Iterable[tuple[Point, ...]], kind: str) -> str:
     """Paint edges as one path of curves and one of their tips."""
-    curves, tips = [], []
+    painted: set[str] = set()
+    curves: list[str] = []
+    tips: dict[str, None] = {}
     for *spline, tip in splines:
-        start, *controls = spline
-        curves.append(f"M{start[0]:.1f},{start[1]:.1f}C" + " ".join(f"{x:.1f},{y:.1f}" for x, y in controls))
-        tips.append(f"M{_arrow(controls[-1] if controls else start, tip)}Z")
+        curves += _curves(spline, painted)
+        tips[f"M{_arrow(spline[-1], tip)}Z"] = None
     return f'<path class="edge{kind}" d="{"".join(curves)}"/><path class="tip{kind}" d="{"".join(tips)}"/>'
+
+
+def _curves(spline: Sequence[Point], painted: set[str]) -> Iterator[str]:
+    """Give the curves of a spline but for those that are painted already: dashes over dashes would be a line."""
+    at = ""
+    for first in range(0, len(spline) - 1, 3):
+        start, *controls = (f"{x:.1f},{y:.1f}" for x, y in spline[first : first + 4])
+        curve = " ".join(controls)
+        if f"{start} {curve}" in painted:
+            continue
+        painted.add(f"{start} {curve}")
+        yield f" {curve}" if start == at else f"M{start}C{curve}"
+        at = controls[-1]
 
 
 def _paint_lines(ends: Iterable[tuple[int, int]], layout: Layout, kind: str) -> str:

@@ -10,7 +10,7 @@ from epypes.images import Order
 
 TokenRole = Literal["payload", "hyperparameter"]
 TokenState = Literal["static", "not computed", "fresh", "stale", "missing", "left out"]
-FunctionKind = Literal["function", "switch", "placeholder"]
+FunctionKind = Literal["function", "pipeline", "switch", "placeholder"]
 FunctionState = Literal["static", "not run", "ran", "reused", "stale", "failed", "planned", "missing", "left out"]
 
 
@@ -36,9 +36,10 @@ class FunctionView:
     message
         Why it failed, would run or is left out.
     notes
-        Short lines that are true of it in any state: the branch that a switch has chosen, that it is to be written.
+        Short lines that are true of it in any state: the branch that a switch has chosen, that it is to be written, how
+        many functions are inside a pipeline.
     is_redefined
-        Whether its name now means another function.
+        Whether its name now means another function, or that of a function inside it does.
     """
 
     name: str

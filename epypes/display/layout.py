@@ -14,13 +14,11 @@ import shutil
 import subprocess
 import threading
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final
 
+from epypes.display.blocks import fold, unfold
+from epypes.display.geometry import Box, Edge, Layout, Point
 from epypes.errors import LayoutUnavailable
-
-Shape = Literal["box", "ellipse", "hexagon"]
-Point = tuple[float, float]
 
 _POINTS_PER_INCH: Final = 72.0
 _GAP_PX: Final = 14.0
@@ -34,37 +32,8 @@ _DOT_TIMEOUT_S: Final = 30.0
 _engine_lock = threading.Lock()
 
 
-@dataclass(frozen=True, slots=True)
-class Box:
-    """A vertex to be placed: its shape and size, in pixels."""
-
-    shape: Shape
-    width: float
-    height: float
-
-
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """A laid-out graph; all lengths in pixels, y downwards.
-
-    Attributes
-    ----------
-    width, height
-        Of the whole picture.
-    centres
-        By vertex.
-    splines
-        By edge: the control points of a cubic Bézier spline, then the tip of the arrow; none in a dense graph.
-    """
-
-    width: float
-    height: float
-    centres: tuple[Point, ...]
-    splines: tuple[tuple[Point, ...], ...]
-
-
 @functools.lru_cache(maxsize=128)
-def lay_out(boxes: tuple[Box, ...], edges: tuple[tuple[int, int], ...], is_dense: bool = False) -> Layout:
+def lay_out(boxes: tuple[Box, ...], edges: tuple[Edge, ...], is_dense: bool = False) -> Layout:
     """Place vertices and edges from top to bottom.
 
     Parameters
@@ -82,13 +51,17 @@ def lay_out(boxes: tuple[Box, ...], edges: tuple[tuple[int, int], ...], is_dense
     """
     if is_dense:
         return _in_rows(boxes, edges)
-    arcs = _long_edges(len(boxes), edges)
-    routed = [edge for edge in edges if edge not in arcs]
-    layout = _read(json.loads(_run_engine(_dot_source(boxes, routed))), len(boxes), routed)
+    graph = fold(boxes, edges)
+    unrouted = _long_edges(len(graph.boxes), graph.edges)
+    routed = [edge for edge in graph.edges if edge not in unrouted]
+    source = _dot_source(graph.boxes, routed, graph.blocks)
+    layout = _read(json.loads(_run_engine(source)), len(graph.boxes), routed)
+    arcs = {edge for edge in edges if graph.folded(edge) in unrouted}
+    layout = unfold(layout, graph, [edge for edge in edges if edge not in arcs], routed)
     return _with_arcs(layout, boxes, edges, arcs) if arcs else layout
 
 
-def _ranks(count: int, edges: Iterable[tuple[int, int]]) -> list[int]:
+def _ranks(count: int, edges: Iterable[Edge]) -> list[int]:
     """Return the row of each vertex: the first one below all that lead to it."""
     rank = [0] * count
     # Functions come in run order, so going over their edges in that order settles each before it is used.
@@ -97,7 +70,7 @@ def _ranks(count: int, edges: Iterable[tuple[int, int]]) -> list[int]:
     return rank
 
 
-def _long_edges(count: int, edges: Sequence[tuple[int, int]]) -> set[tuple[int, int]]:
+def _long_edges(count: int, edges: Sequence[Edge]) -> set[Edge]:
     """Return edges that skip so many rows, taken together, that Graphviz would search minutes for their ways.
 
     Those of a hyperparameter that each function of a long chain takes: all but the one to the first of them.
@@ -119,9 +92,7 @@ def _long_edges(count: int, edges: Sequence[tuple[int, int]]) -> set[tuple[int, 
     return {(tail, head) for tail, head in edges if tail in worst and rank[head] - 1 > first[tail]}
 
 
-def _with_arcs(
-    layout: Layout, boxes: Sequence[Box], edges: Sequence[tuple[int, int]], arcs: Collection[tuple[int, int]]
-) -> Layout:
+def _with_arcs(layout: Layout, boxes: Sequence[Box], edges: Sequence[Edge], arcs: Collection[Edge]) -> Layout:
     """Add the edges that were not routed, as arcs from side to side; the picture becomes wider by them."""
     margin = max(_bulge(layout.centres[tail], layout.centres[head]) for tail, head in arcs)
     centres = tuple((x + margin, y) for x, y in layout.centres)
@@ -137,7 +108,7 @@ def _bulge(start: Point, end: Point) -> float:
     return min(_LEAST_BULGE_PX + 0.1 * math.dist(start, end), _MOST_BULGE_PX)
 
 
-def _arc(boxes: Sequence[Box], centres: Sequence[Point], edge: tuple[int, int]) -> tuple[Point, ...]:
+def _arc(boxes: Sequence[Box], centres: Sequence[Point], edge: Edge) -> tuple[Point, ...]:
     tail, head = edge
     side = -1 if centres[tail][0] <= centres[head][0] else 1
     (x0, y0), (x1, y1) = ((centres[end][0] + side * boxes[end].width / 2, centres[end][1]) for end in edge)
@@ -147,7 +118,7 @@ def _arc(boxes: Sequence[Box], centres: Sequence[Point], edge: tuple[int, int]) 
     return (x0, y0), (x0 + out, y0), (end[0] + out, y1), end, tip
 
 
-def _in_rows(boxes: Sequence[Box], edges: Sequence[tuple[int, int]]) -> Layout:
+def _in_rows(boxes: Sequence[Box], edges: Sequence[Edge]) -> Layout:
     """Place vertices in rows, each below all that lead to it, without any search."""
     rows: dict[int, list[int]] = {}
     for vertex, row in enumerate(_ranks(len(boxes), edges)):
@@ -164,7 +135,7 @@ def _in_rows(boxes: Sequence[Box], edges: Sequence[tuple[int, int]]) -> Layout:
     return Layout(width, y, tuple(centres[vertex] for vertex in range(len(boxes))), ())
 
 
-def _dot_source(boxes: Sequence[Box], edges: Sequence[tuple[int, int]]) -> str:
+def _dot_source(boxes: Sequence[Box], edges: Sequence[Edge], blocks: Collection[int]) -> str:
     try:
         import graphviz
     except ImportError as error:
@@ -182,7 +153,8 @@ def _dot_source(boxes: Sequence[Box], edges: Sequence[tuple[int, int]]) -> str:
             height=f"{box.height / _POINTS_PER_INCH:.4f}",
         )
     for tail, head in edges:
-        dot.edge(f"v{tail}", f"v{head}")
+        # The edges of a block leave it where those of its members meet.
+        dot.edge(f"v{tail}:s" if tail in blocks else f"v{tail}", f"v{head}")
     return str(dot.source)
 
 
@@ -219,7 +191,7 @@ def _dot_on_path(source: str) -> str:
     return done.stdout
 
 
-def _read(drawn: dict[str, Any], vertices: int, edges: Sequence[tuple[int, int]]) -> Layout:
+def _read(drawn: dict[str, Any], vertices: int, edges: Sequence[Edge]) -> Layout:
     _, _, width, height = map(float, drawn["bb"].split(","))
     centres = [(0.0, 0.0)] * vertices
     number: dict[int, int] = {}

@@ -9,10 +9,11 @@ from epypes.display.graphview import EdgeView, FunctionState, FunctionView, Grap
 from epypes.display.markup import cut
 from epypes.display.preview import preview
 from epypes.graph import CompGraph, Switch, as_switch, colour_order
-from epypes.graph.redefined import redefined
+from epypes.graph.redefined import inner_graph, is_redefined_inside, redefined
 
 TO_BE_WRITTEN: Final = "to be written"
 _REDEFINED: Final = "redefined since: build the graph again"
+_REDEFINED_INSIDE: Final = "a function inside was redefined: build again"
 _SELECTOR_CHARACTERS: Final = 20
 _KEY_CHARACTERS: Final = 16
 _NAMED: Final = 3
@@ -34,7 +35,7 @@ def structure_of(cg: CompGraph, branches: Mapping[str, Any], left_out: Collectio
         tuple(_function_view(cg, name, branches, name in left_out, name in old) for name in cg.functions),
         tuple(_token_view(cg, token, branches, left_out, unread) for token in cg.tokens),
         tuple(_edges(cg, left_out, unread)),
-        _redefined_caption([name for name in cg.functions if name in old]),
+        _redefined_caption(cg, [name for name in cg.functions if name in old]),
     )
 
 
@@ -57,7 +58,12 @@ def _function_view(
         return FunctionView(name, state, kind="switch", notes=(_choice(cg, name, function, branches),))
     if name in cg.placeholders:
         return FunctionView(name, state, kind="placeholder", notes=(TO_BE_WRITTEN,))
-    return FunctionView(name, state, notes=(_REDEFINED,) * is_redefined, is_redefined=is_redefined)
+    inner, inside = inner_graph(cg.functions[name]), is_redefined and is_redefined_inside(cg.functions[name])
+    old = (_REDEFINED_INSIDE if inside else _REDEFINED,) * is_redefined
+    if inner is None:
+        return FunctionView(name, state, notes=old, is_redefined=is_redefined)
+    note = f"pipeline of {len(inner.functions)} function{'s' * (len(inner.functions) != 1)}"
+    return FunctionView(name, state, kind="pipeline", notes=(note, *old), is_redefined=is_redefined)
 
 
 def _choice(cg: CompGraph, name: str, function: Switch, branches: Mapping[str, Any]) -> str:
@@ -95,10 +101,16 @@ def _edges(cg: CompGraph, left_out: Collection[str], unread: Mapping[str, frozen
             yield EdgeView(index, place[token], False, is_needed)
 
 
-def _redefined_caption(names: list[str]) -> str:
+def _redefined_caption(cg: CompGraph, names: list[str]) -> str:
     if not names:
         return ""
-    some = ", ".join(repr(cut(name, _SELECTOR_CHARACTERS)) for name in names[:_NAMED])
+    some = ", ".join(_redefined_name(cg, name) for name in names[:_NAMED])
+    some = some[0].upper() + some[1:]
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     verb = "was" if len(names) == 1 else "were"
     return f"{some}{more} {verb} redefined since the graph was built: run the cell that builds it again"
+
+
+def _redefined_name(cg: CompGraph, name: str) -> str:
+    inside = "a function inside " * is_redefined_inside(cg.functions[name])
+    return f"{inside}{cut(name, _SELECTOR_CHARACTERS)!r}"

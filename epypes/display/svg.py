@@ -13,8 +13,9 @@ from collections.abc import Iterable
 from typing import Final
 
 from epypes.display.edges import paint_edges
+from epypes.display.geometry import Box, Layout, Point
 from epypes.display.graphview import FunctionView, GraphView, TokenView
-from epypes.display.layout import Box, Layout, Point, lay_out
+from epypes.display.layout import lay_out
 from epypes.display.markup import cut, cut_name, escape
 from epypes.display.view import duration_text
 
@@ -33,6 +34,8 @@ _THUMB_HEIGHT: Final = 96
 _MARGIN: Final = 6
 # A switch is drawn like a multiplexer, narrower at its output, by this much on each side.
 _SLOPE_PX: Final = 14
+# Between the two borders of a pipeline.
+_INSIDE_PX: Final = 4
 
 # The fallbacks serve where the page has no Jupyter theme: dark text on light vertices, grey edges, readable on white
 # and on black paper alike.
@@ -55,6 +58,7 @@ STYLE: Final = """
 .epypes-graph .stale .shape,.epypes-graph .not-computed .shape,.epypes-graph .not-run .shape{stroke-dasharray:2 3}
 .epypes-graph .placeholder .shape{stroke-dasharray:7 4}
 .epypes-graph .stale image{opacity:.35}
+.epypes-graph .function .inner{fill:none;stroke-width:1}
 .epypes-graph .edge{fill:none;stroke:#80868f}
 .epypes-graph .dense{stroke-width:.5}
 .epypes-graph .tip{fill:#80868f}
@@ -96,7 +100,8 @@ def alt_text(graph: GraphView) -> str:
     """Return the graph in one sentence, for screen readers."""
     order = ", ".join(_cut(function.name) for function in graph.functions[:12])
     more = ", ..." if len(graph.functions) > 12 else ""
-    return f"Computational graph of {len(graph.functions)} functions: {order}{more}. {graph.caption}".strip()
+    functions = f"{len(graph.functions)} function{'s' * (len(graph.functions) != 1)}"
+    return f"Computational graph of {functions}: {order}{more}. {graph.caption}".strip()
 
 
 def _paint_vertices(graph: GraphView, boxes: tuple[Box, ...], layout: Layout) -> Iterable[str]:
@@ -182,6 +187,8 @@ def _paint_function(function: FunctionView, box: Box, centre: Point) -> str:
         body = f'<polygon class="shape" points="{_trapezium(x, y, box)}"/>'
     else:
         body = f'<rect class="shape" x="{x:.1f}" y="{y:.1f}" width="{box.width:.1f}" height="{box.height:.1f}" rx="3"/>'
+    if function.kind == "pipeline":
+        body += _inner_border(x, y, box)
     if function.share > 0:
         body += (
             f'<rect class="bar" x="{x + slope:.1f}" y="{y + box.height - 4:.1f}" '
@@ -191,6 +198,13 @@ def _paint_function(function: FunctionView, box: Box, centre: Point) -> str:
     said = "; ".join((function.state, *function.notes))
     title = f"{function.kind} {function.name}: {said}. {function.message}".removesuffix(" ")
     return _group("function", function.name, _classes(function), title[:600], body)
+
+
+def _inner_border(x: float, y: float, box: Box) -> str:
+    """Draw a second border inside that of a pipeline, so far away that the bar stands between them."""
+    width, height = box.width - 2 * _INSIDE_PX, box.height - 2 * _INSIDE_PX
+    at = f'x="{x + _INSIDE_PX:.1f}" y="{y + _INSIDE_PX:.1f}"'
+    return f'<rect class="shape inner" {at} width="{width:.1f}" height="{height:.1f}" rx="2"/>'
 
 
 def _classes(function: FunctionView) -> tuple[str, ...]:

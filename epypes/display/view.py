@@ -150,7 +150,8 @@ def _planned_view(function: FunctionView, plan: Plan) -> FunctionView:
 
 def _plan_caption(plan: Plan) -> str:
     placeholders = len(plan.placeholders)
-    parts = [f"{len(plan.order) - placeholders} functions to run, {len(plan.reused)} reused"]
+    to_run = len(plan.order) - placeholders
+    parts = [f"{to_run} function{'s' * (to_run != 1)} to run, {len(plan.reused)} reused"]
     if plan.left_out:
         parts.append(f"{len(plan.left_out)} left out")
     if placeholders:

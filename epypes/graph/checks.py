@@ -162,9 +162,9 @@ def _arity_findings(
 ) -> Iterable[Finding]:
     least, most, required = parameters.least, parameters.most, parameters.required_by_keyword
     if not least <= len(tokens) <= most:
-        takes = f"{least}" if least == most else f"{least} to {most:g}"
+        takes = f"{least} input{'s' * (least != 1)}" if least == most else f"{least} to {most:g} inputs"
         text = (
-            f"Function {name!r} takes {takes} inputs {signature_of(function)}, "
+            f"Function {name!r} takes {takes} {signature_of(function)}, "
             f"but its io names {len(tokens)}: ({', '.join(tokens)})."
         )
         yield Finding("arity", text, (name, *tokens))

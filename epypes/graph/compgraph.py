@@ -23,7 +23,7 @@ from epypes.graph.contracts import check_colours, check_images, read_contracts
 from epypes.graph.declared import read_functions
 from epypes.graph.parts import Default, Parts, check_defaults
 from epypes.graph.placeholder import is_placeholder
-from epypes.graph.redefined import redefined
+from epypes.graph.redefined import is_redefined_inside, redefined
 from epypes.graph.switch import as_switch
 from epypes.graph.typecheck import check_types
 from epypes.images import Contracts
@@ -61,6 +61,9 @@ class CompGraph:
     Notes
     -----
     Semeniuta and Falkman 2019, PeerJ Computer Science 5:e176, "Computational graphs".
+
+    Every token that ``func_io`` names is a token of its own: defaults in the signatures of functions are read by
+    ``from_functions`` only.
 
     Examples
     --------
@@ -287,7 +290,7 @@ class CompGraph:
     def __repr__(self) -> str:
         count = len(self._functions)
         start = f"<CompGraph: {count} function{'s' * (count != 1)}, {len(self._tokens)} tokens; "
-        end = _redefined_text(redefined(self)) + ">"
+        end = _redefined_text(self) + ">"
         width = min(18, (95 - len(start) - len(end)) // 2)
         return f"{start}{_some(self._sources, width)} -> {_some(self._sinks, width)}{end}"
 
@@ -306,10 +309,12 @@ def _is_source(digraph: BipartiteDigraph, token: str) -> bool:
     return token in digraph.consumers and token not in digraph.producer
 
 
-def _redefined_text(names: tuple[str, ...]) -> str:
-    if not names:
-        return ""
-    return f"; {_some(names, 18)!r} was redefined" if len(names) == 1 else f"; {len(names)} functions were redefined"
+def _redefined_text(cg: CompGraph) -> str:
+    names = redefined(cg)
+    if len(names) != 1:
+        return f"; {len(names)} functions were redefined" * bool(names)
+    inside = "a function inside " * is_redefined_inside(cg.functions[names[0]])
+    return f"; {inside}{_some(names, 18)!r} was redefined"
 
 
 def _some(tokens: tuple[str, ...], width: int) -> str:

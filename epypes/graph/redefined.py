@@ -28,10 +28,15 @@ def redefined(cg: CompGraph) -> tuple[str, ...]:
     return tuple(name for name, function in cg.functions.items() if _is_redefined(function))
 
 
+def is_redefined_inside(function: Any) -> bool:
+    """Whether a function is a pipeline, and a function of its graph is redefined. Never raises."""
+    inner = inner_graph(function)
+    return inner is not None and bool(redefined(inner))
+
+
 def _is_redefined(function: Any) -> bool:
     try:
-        inner = _inner_graph(function)
-        if inner is not None and redefined(inner):
+        if is_redefined_inside(function):
             return True
         old = _unwrapped(function)
         if not isinstance(old, FunctionType):
@@ -42,14 +47,17 @@ def _is_redefined(function: Any) -> bool:
         return False
 
 
-def _inner_graph(function: Any) -> CompGraph | None:
-    """Return the graph that a pipeline runs, None for anything else."""
+def inner_graph(function: Any) -> CompGraph | None:
+    """Return the graph that a pipeline runs, None for anything else. Never raises."""
     if type(function) is FunctionType:
         return None
     from epypes.graph.compgraph import CompGraph
 
-    inner = getattr(function, "cg", None)
-    return inner if isinstance(inner, CompGraph) else None
+    try:
+        inner = getattr(function, "cg", None)
+        return inner if isinstance(inner, CompGraph) else None
+    except Exception:  # whatever an object's __getattr__ raises
+        return None
 
 
 def _unwrapped(function: Any) -> Any:

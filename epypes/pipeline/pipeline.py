@@ -93,7 +93,8 @@ class Pipeline(Node):
     def _by_name(self, args: tuple[Any, ...]) -> dict[str, Any]:
         free = self.runner.free_source_tokens
         if len(args) != len(free):
-            text = f"Pipeline {self.name!r} takes {len(free)} inputs ({', '.join(free)}), not {len(args)}."
+            inputs = f"{len(free)} input{'s' * (len(free) != 1)}"
+            text = f"Pipeline {self.name!r} takes {inputs} ({', '.join(free)}), not {len(args)}."
             raise PayloadError(free, text)
         return dict(zip(free, args, strict=True))
 

@@ -54,7 +54,8 @@ class Plan:
 
     def __repr__(self) -> str:
         missing = f", {len(self.missing) + len(self.placeholders)} missing" * bool(self.missing or self.placeholders)
-        return f"<Plan: {len(self.order)} functions to run, {len(self.reused)} reused{missing}>"
+        count = len(self.order)
+        return f"<Plan: {count} function{'s' * (count != 1)} to run, {len(self.reused)} reused{missing}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         from epypes.display import mimebundle

@@ -327,9 +327,10 @@ class CompGraphRunner:
             state = f"failed in {self._last.failure.function!r:.{24 - len(old)}}"
         else:
             stale = len(self.stale)
-            state = f"{stale} functions stale" if stale else "up to date"
-        count = len(self.cg.functions)
-        return f"<CompGraphRunner: {count} functions{old}, {len(self.hyperparameters)} hyperparameters; {state}>"
+            state = f"{stale} function{'s' * (stale != 1)} stale" if stale else "up to date"
+        functions, frozen = len(self.cg.functions), len(self.hyperparameters)
+        counts = f"{functions} function{'s' * (functions != 1)}{old}, {frozen} hyperparameter{'s' * (frozen != 1)}"
+        return f"<CompGraphRunner: {counts}; {state}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         from epypes.display import mimebundle

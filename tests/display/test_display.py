@@ -168,6 +168,33 @@ def test_without_any_engine_the_text_form_shows_with_a_way_out(
     assert "pip install 'epypes[notebook]'" in bundle["text/plain"]
 
 
+def test_a_pipeline_inside_a_graph_shows_that_it_is_one():
+    inner = ep.Pipeline("inner", ep.CompGraph({"f": abs, "g": abs}, {"f": ("x", "y"), "g": ("y", "z")}))
+    small = ep.Pipeline("small", ep.CompGraph({"f": abs}, {"f": ("x", "y")}))
+    functions = {"both": inner, "one": small, "plain": abs}
+    cg = ep.CompGraph(functions, {"both": ("a", "b"), "one": ("b", "c"), "plain": ("c", "d")})
+    runner = ep.CompGraphRunner(cg)
+    runner.run(a=-1)
+    for shown in (cg, runner, runner.plan(), ep.Pipeline("outer", cg).runner):
+        found = vertices(to_svg(shown))
+        assert texts(found["function-both"])[1] == "pipeline of 2 functions"
+        assert texts(found["function-one"])[1] == "pipeline of 1 function"
+        borders = [len(found[f"function-{name}"].findall(f"{SVG}rect[@class]")) for name in ("both", "one", "plain")]
+        bars = [len(found[f"function-{name}"].findall(f"{SVG}rect[@class='bar']")) for name in ("both", "one", "plain")]
+        assert [border - bar for border, bar in zip(borders, bars, strict=True)] == [2, 2, 1]
+        assert found["function-both"].find(f"{SVG}title").text.startswith("pipeline both: ")
+
+
+def test_one_is_not_many():
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": abs}, {"f": ("x", "y")}), {"x": 1})
+    assert repr(runner) == "<CompGraphRunner: 1 function, 1 hyperparameter; not run yet>"
+    assert repr(runner.plan()) == "<Plan: 1 function to run, 0 reused>"
+    assert "1 function to run, 0 reused" in mimebundle(runner.plan())["text/html"]
+    runner.run()
+    runner["x"] = 2
+    assert repr(runner) == "<CompGraphRunner: 1 function, 1 hyperparameter; 1 function stale>"
+
+
 def test_names_and_values_are_escaped():
     evil = "<script>alert(1)</script>"
     cg = ep.CompGraph({evil: lambda x: x}, {evil: ('a"b&<c', "y")})

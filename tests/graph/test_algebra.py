@@ -204,7 +204,7 @@ def test_extend_fills_placeholders_and_keeps_their_io_unless_another_is_given():
     other = ep.extend(sketch, {"f": identity}, {"f": ("x", "y")})
     assert dict(other.func_io) == {"f": ("x", "y"), "g": ("y", "z")}
     assert sketch.placeholders == ("f",)
-    with pytest.raises(GraphError, match="takes 1 inputs"):
+    with pytest.raises(GraphError, match="takes 1 input"):
         ep.extend(sketch, {"f": identity})
 
 

@@ -149,7 +149,7 @@ def test_the_number_of_inputs_of_a_pipeline_is_checked_when_the_graph_is_made():
     with pytest.raises(GraphError, match="Function 'f' takes 2 inputs"):
         ep.CompGraph({"f": open_pipe}, {"f": ("a", "c")})
     ep.CompGraph({"f": frozen_pipe}, {"f": ("a", "c")})
-    with pytest.raises(GraphError, match="Function 'f' takes 1 inputs"):
+    with pytest.raises(GraphError, match="Function 'f' takes 1 input"):
         ep.CompGraph({"f": frozen_pipe}, {"f": (("a", "b"), "c")})
 
 

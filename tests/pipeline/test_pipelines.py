@@ -54,7 +54,7 @@ def test_a_node_that_fails_is_counted_and_raises_what_its_function_raised():
 def test_a_graph_of_nodes_is_checked_like_one_of_functions(edge_graph):
     network = ep.NodeBasedCompGraph(edge_graph)
     assert list(network.nodes) == ["grayscale", "blur", "canny"]
-    with pytest.raises(ep.errors.GraphError, match="takes 1 inputs"):
+    with pytest.raises(ep.errors.GraphError, match="takes 1 input"):
         ep.CompGraph({"f": ep.Node("f", lambda x: x)}, {"f": (("a", "b"), "c")})
 
 
@@ -72,7 +72,7 @@ def test_a_pipeline_takes_its_free_source_tokens_in_order_and_returns_its_sink(e
 
 def test_a_pipeline_called_with_another_number_of_inputs_says_which_it_takes():
     pipe = ep.Pipeline("squares", square_graph(), {"n": 1})
-    with pytest.raises(PayloadError, match=r"takes 1 inputs \(x\), not 2"):
+    with pytest.raises(PayloadError, match=r"takes 1 input \(x\), not 2"):
         pipe(1, 2)
 
 

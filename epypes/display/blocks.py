@@ -1,0 +1,173 @@
+"""Which vertices stand together in a block, and where in it?
+
+A function with nine hyperparameters would have them all in one row, so wide that a page shrinks the picture until
+nothing can be read. Sources that lead to exactly the same vertices stand in a block instead: pairs of columns, each
+around a lane in which their edges run down together. For Graphviz a block is one vertex.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from epypes.display.geometry import Box, Edge, Layout, Point
+
+# So many still stand well in one row.
+_MOST_IN_ROW: Final = 4
+# More would be wider than a page.
+_MOST_PAIRS: Final = 3
+_LANE_PX: Final = 30.0
+_ROW_GAP_PX: Final = 9.0
+_COLUMN_GAP_PX: Final = 14.0
+_BEND_PX: Final = 10.0
+# Under the last row, where the lanes of a block meet.
+_MEETING_PX: Final = 18.0
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Sources that stand together.
+
+    Attributes
+    ----------
+    box
+        The whole block.
+    members
+        The vertices.
+    offsets
+        By member, from the block's centre to its own.
+    ways
+        By member, from its side to the middle of the block's bottom: the control points of a spline, from the centre.
+    """
+
+    box: Box
+    members: tuple[int, ...]
+    offsets: tuple[Point, ...]
+    ways: tuple[tuple[Point, ...], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Folded:
+    """A graph in which each block is one vertex; they come after the others.
+
+    Attributes
+    ----------
+    boxes, edges
+        The vertices that are left, and their edges, each once.
+    blocks
+        By their vertices.
+    place
+        By vertex of the whole graph, that of this one.
+    """
+
+    boxes: tuple[Box, ...]
+    edges: tuple[Edge, ...]
+    blocks: Mapping[int, Block]
+    place: tuple[int, ...]
+
+    def folded(self, edge: Edge) -> Edge:
+        """Return the edge of this graph that stands for an edge of the whole one."""
+        return self.place[edge[0]], self.place[edge[1]]
+
+
+def fold(boxes: Sequence[Box], edges: Sequence[Edge]) -> Folded:
+    """Put sources of one shape that lead to exactly the same vertices into blocks, if they are many."""
+    blocks = [_block(boxes, members) for members in _alike(boxes, edges)]
+    hidden = {member for block in blocks for member in block.members}
+    left = [vertex for vertex in range(len(boxes)) if vertex not in hidden]
+    place = {vertex: index for index, vertex in enumerate(left)}
+    numbered = dict(enumerate(blocks, start=len(left)))
+    place |= {member: number for number, block in numbered.items() for member in block.members}
+    small = dict.fromkeys((place[tail], place[head]) for tail, head in edges)
+    return Folded(
+        (*(boxes[vertex] for vertex in left), *(block.box for block in blocks)),
+        tuple(small),
+        numbered,
+        tuple(place[vertex] for vertex in range(len(boxes))),
+    )
+
+
+def unfold(layout: Layout, graph: Folded, edges: Sequence[Edge], routed: Sequence[Edge]) -> Layout:
+    """Return the layout of the whole graph.
+
+    Parameters
+    ----------
+    layout
+        Of the folded graph, with splines of the edges that are routed.
+    edges
+        Those of the whole graph that get a spline.
+    routed
+        The edges of the folded graph in the order of the layout's splines.
+    """
+    if not graph.blocks:
+        return layout
+    centres = [layout.centres[place] for place in graph.place]
+    ways: dict[int, tuple[Point, ...]] = {}
+    for number, block in graph.blocks.items():
+        for member, offset, way in zip(block.members, block.offsets, block.ways, strict=True):
+            x, y = layout.centres[number]
+            centres[member] = (x + offset[0], y + offset[1])
+            ways[member] = tuple((x + dx, y + dy) for dx, dy in way)
+    found = dict(zip(routed, layout.splines, strict=True))
+    splines = tuple(_joined(ways.get(edge[0], ()), found[graph.folded(edge)]) for edge in edges)
+    return Layout(layout.width, layout.height, tuple(centres), splines)
+
+
+def _joined(way: tuple[Point, ...], spline: tuple[Point, ...]) -> tuple[Point, ...]:
+    """Let a spline begin with the way out of the block; it starts where that ends, but for Graphviz's rounding."""
+    return (*way, *spline[1:]) if way else spline
+
+
+def _alike(boxes: Sequence[Box], edges: Sequence[Edge]) -> list[tuple[int, ...]]:
+    """Return the sources that lead to the same vertices and have the same shape, where they are many."""
+    heads: dict[int, set[int]] = {}
+    for tail, head in edges:
+        heads.setdefault(tail, set()).add(head)
+    inner = {head for _, head in edges}
+    groups: dict[tuple[str, frozenset[int]], list[int]] = {}
+    for vertex in sorted(heads.keys() - inner):
+        groups.setdefault((boxes[vertex].shape, frozenset(heads[vertex])), []).append(vertex)
+    return [tuple(members) for members in groups.values() if len(members) > _MOST_IN_ROW]
+
+
+def _block(boxes: Sequence[Box], members: tuple[int, ...]) -> Block:
+    """Arrange vertices, row by row, in pairs of columns; in all about as many columns as the root of their number."""
+    pairs = min(max(1, int(math.sqrt(len(members)) / 2)), _MOST_PAIRS)
+    column = max(boxes[member].width for member in members)
+    pitch = 2 * column + _LANE_PX + _COLUMN_GAP_PX
+    rows = [members[start : start + 2 * pairs] for start in range(0, len(members), 2 * pairs)]
+    height = sum(max(boxes[member].height for member in row) + _ROW_GAP_PX for row in rows)
+    height += _MEETING_PX if pairs > 1 else 0.0
+    offsets: list[Point] = []
+    ways: list[tuple[Point, ...]] = []
+    middles: list[float] = []
+    y = -height / 2
+    for row in rows:
+        tall = max(boxes[member].height for member in row)
+        middles.append(y + tall / 2)
+        y += tall + _ROW_GAP_PX
+    for number, row in enumerate(rows):
+        for place, member in enumerate(row):
+            side = 1 if place % 2 else -1
+            lane = pitch * (place // 2 - (pairs - 1) / 2)
+            out = lane + side * _LANE_PX / 2
+            offsets.append((out + side * boxes[member].width / 2, middles[number]))
+            ways.append(_way(out, lane, middles[number:], height / 2))
+    return Block(Box("box", pitch * pairs - _COLUMN_GAP_PX, height), members, tuple(offsets), tuple(ways))
+
+
+def _way(side: float, lane: float, rows: Sequence[float], bottom: float) -> tuple[Point, ...]:
+    """Return a way from the side of a vertex around a bend into its lane, down, and to the middle of the bottom.
+
+    It runs down from row to row, so that ways which meet go on in the same curves, which are painted once.
+    """
+    way: list[Point] = [(side, rows[0]), ((side + lane) / 2, rows[0]), (lane, rows[0]), (lane, rows[0] + _BEND_PX)]
+    stops = [row + _BEND_PX for row in rows[1:]] + [bottom - (_MEETING_PX if lane else 0.0)]
+    for stop in stops:
+        way += [way[-1], (lane, stop), (lane, stop)]
+    if lane:
+        middle = bottom - _MEETING_PX / 2
+        way += [(lane, middle), (0.0, middle), (0.0, bottom)]
+    return tuple(way)

@@ -1,0 +1,39 @@
+"""What does a layout consist of?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Shape = Literal["box", "ellipse", "hexagon"]
+Point = tuple[float, float]
+Edge = tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A vertex to be placed: its shape and size, in pixels."""
+
+    shape: Shape
+    width: float
+    height: float
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """A laid-out graph; all lengths in pixels, y downwards.
+
+    Attributes
+    ----------
+    width, height
+        Of the whole picture.
+    centres
+        By vertex.
+    splines
+        By edge: the control points of a cubic Bézier spline, then the tip of the arrow; none in a dense graph.
+    """
+
+    width: float
+    height: float
+    centres: tuple[Point, ...]
+    splines: tuple[tuple[Point, ...], ...]
