@@ -209,5 +209,5 @@ def test_code_that_was_put_into_a_function_is_refused():
 
 
 def test_an_asynchronous_function_is_refused_as_such():
-    with pytest.raises(SourceRefused, match="'f' is asynchronous"):
-        written(notebook("async def f(x):\n    return x\n")["f"])
+    with pytest.raises(SourceRefused, match="'g', which function 'f' calls, is asynchronous"):
+        written(notebook("async def g(x):\n    return x\n\n\ndef f(x):\n    return g(x)\n")["f"])
