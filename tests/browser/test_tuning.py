@@ -8,7 +8,6 @@ import re
 import statistics
 from typing import Any
 
-import nbformat
 import pytest
 
 from tests.browser.conftest import SCREENSHOTS, TUTORIAL
@@ -182,6 +181,8 @@ def test_another_token_can_be_chosen(panel: PanelOnScreen) -> None:
 
 
 def test_showing_a_panel_changes_no_value(browser: Any, lab: JupyterLab) -> None:
+    import nbformat  # takes seconds
+
     cells = (
         "import numpy as np, epypes as ep\nfrom epypes_widgets import tune\n"
         "cg = ep.CompGraph({'f': lambda im, a, b, c: im + a + b + c}, {'f': (('im', 'a', 'b', 'c'), 'y')})\n"

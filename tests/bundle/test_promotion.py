@@ -12,7 +12,6 @@ import tomllib
 from pathlib import Path
 
 import cv2
-import nbformat
 import numpy as np
 import pytest
 
@@ -321,6 +320,8 @@ def test_a_value_agrees_with_itself(value):
 
 
 def cells(path, *sources):
+    import nbformat  # takes seconds
+
     nbformat.write(nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source) for source in sources]), path)
     return path
 

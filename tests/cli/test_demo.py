@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import nbformat
 import numpy as np
 import pytest
 
@@ -63,6 +62,8 @@ def test_an_answer_that_differs_ends_the_demo_with_an_error(tutorial, tmp_path, 
 
 
 def test_a_notebook_that_cannot_be_promoted_ends_the_demo_with_exit_status_1(tmp_path):
+    import nbformat  # takes seconds
+
     notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell("runner = 3")])
     nbformat.write(notebook, tmp_path / "n.ipynb")
     done = run_cli("demo", tmp_path / "n.ipynb", "--to", tmp_path / "out")

@@ -338,7 +338,7 @@ def test_looking_computes_nothing(edge_graph, photograph):
     assert calls == []
 
 
-@pytest.mark.parametrize("name", ["\ud800", "a\0b", "a\x1b[31mb", "two\nlines", "x" * 100_000, "数え", " "])
+@pytest.mark.parametrize("name", ["\ud800", "a\0b", "a\x1b[31mb", "two\nlines", "x" * 100_000, "数え", " "], ids=ascii)
 def test_any_name_can_be_shown(name):
     cg = ep.CompGraph({name: lambda x: x}, {name: ("x", name)})
     runner = ep.CompGraphRunner(cg)
