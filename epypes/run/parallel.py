@@ -56,12 +56,16 @@ class _Shift:
         with self._changed:
             try:
                 self._work()
-                while self._running:
+                while self._running and not self._is_interrupted():
                     self._changed.wait()
                     self._work()
             except BaseException as exception:  # an interrupt while waiting; what the others still make is dropped
                 self.failed = StepFailed(min(self._running, default=0), exception, 0)
             self._is_over = True
+
+    def _is_interrupted(self) -> bool:
+        """Whether a function was stopped by Ctrl-C or an exit: then nobody waits for the others."""
+        return self.failed is not None and not isinstance(self.failed.exception, Exception)
 
     def undo_what_comes_after(self) -> None:
         """Leave the tokens as if nothing after the failed step had run."""
