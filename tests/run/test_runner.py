@@ -622,7 +622,7 @@ def stop(*_):
 signal.signal(signal.SIGVTALRM, stop)
 runner = ep.CompGraphRunner(ep.CompGraph({"f": abs}, {"f": ("k", "y")}), {"k": 0})
 runner.run()
-for _ in range(500):
+for _ in range(150):
     with contextlib.suppress(KeyboardInterrupt):
         signal.setitimer(signal.ITIMER_VIRTUAL, 0.0003)
         for k in range(20_000):
