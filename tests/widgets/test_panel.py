@@ -275,3 +275,12 @@ def test_values_set_from_many_threads_leave_panel_and_runner_agreed(runner: ep.C
         panel.wait(10)
         assert runner[name] == panel[name]
     panel.close()
+
+
+def test_a_value_that_is_set_is_submitted_once(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> None:
+    submitted: list[Any] = []
+    monkeypatch.setattr(panel._worker, "submit", submitted.append)
+    panel["threshold"] = 60
+    panel["threshold"] = 60
+    panel._controls["threshold"].widget.value = 61
+    assert submitted == [{"threshold": 60}, {"threshold": 60}, {"threshold": 61}]

@@ -99,6 +99,7 @@ class Panel:
         self._asked = token
         self._seq = count(1).__next__
         self._moving = threading.RLock()
+        self._is_writing = False
         self._result: Run | None = None
         self._failed: set[str] = set()
         self._worker = Worker(self._compute)
@@ -184,8 +185,13 @@ class Panel:
         if self._worker.closed:
             raise RuntimeError("This panel is closed. Make a new one: tune(runner).")
         with self._moving:
-            entry.write(value)
-            # A widget that shows the same for two values (a label, a slider between its steps) tells nobody.
+            # A widget tells of what is written to it, unless it shows the same as before (a label, a slider between its
+            # steps); so it is not listened to, and the value is submitted here, once.
+            self._is_writing = True
+            try:
+                entry.write(value)
+            finally:
+                self._is_writing = False
             self._moved(name, value)
 
     def __repr__(self) -> str:
@@ -208,7 +214,8 @@ class Panel:
     def _moved(self, name: str, _value: Any) -> None:
         # Read and submitted in one step, so that of two threads the one whose value stands submits last.
         with self._moving:
-            self._worker.submit({name: self._controls[name].read()})
+            if not self._is_writing:
+                self._worker.submit({name: self._controls[name].read()})
 
     def _chosen(self, _change: object) -> None:
         self._worker.submit({})
