@@ -31,7 +31,7 @@ The user's own exceptions are never wrapped: they keep their type and traceback 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -109,6 +109,12 @@ class StaleToken(NotComputed):
     def __init__(self, token: str) -> None:
         text = f"Token {token!r} is stale: something it depends on has changed."
         super().__init__(token, f"{text} Call rerun() first, or rerun({token!r}) for it alone.")
+
+
+def require_mapping(what: str, given: object, of: str) -> None:
+    """Raise TypeError unless this is a mapping; ``of`` says of what, as ``"by function name"``."""
+    if not isinstance(given, Mapping):
+        raise TypeError(f"{what} must be a mapping {of}, such as a dict, not {type(given).__name__!r}.")
 
 
 def run_call(tokens: Iterable[str]) -> str:

@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MethodType
 from typing import TYPE_CHECKING, Any
 
-from epypes.errors import Finding, UnknownName
+from epypes.errors import Finding, require_mapping
 from epypes.graph.compgraph import CompGraph
 from epypes.graph.parts import Default, Parts, defaults_of
 from epypes.graph.placeholder import is_placeholder
 from epypes.graph.redefined import have_one_name, is_defined_alike
-from epypes.graph.renaming import names_of, require_graph, suffixed
+from epypes.graph.renaming import names_of, require_graph, require_names, suffixed
 
 if TYPE_CHECKING:
     from epypes.graph.compgraph import FuncIO
@@ -49,20 +49,12 @@ def union(*graphs: CompGraph, suffixes: Sequence[str] | None = None, keep: str |
     for cg in graphs:
         require_graph("union()", cg)
     kept = names_of("keep", keep)
-    _require_names(kept, graphs)
+    require_names(kept, graphs, "to keep in these graphs")
     parts = [Parts.of(cg) for cg in graphs] if suffixes is None else _suffixed(graphs, suffixes, kept)
     merged = Parts()
     for part in parts:
         _merge(merged, part)
     return CompGraph._assemble(merged, all(cg.types for cg in graphs))
-
-
-def _require_names(names: Sequence[str], graphs: Sequence[CompGraph]) -> None:
-    known = {name for cg in graphs for name in (*cg.functions, *cg.tokens)} if names else set()
-    for name in names:
-        if name not in known:
-            every = dict.fromkeys(name for cg in graphs for name in (*cg.functions, *cg.tokens))
-            raise UnknownName("function or token", name, every, "to keep in these graphs")
 
 
 def _suffixed(graphs: Sequence[CompGraph], suffixes: Sequence[str], keep: Sequence[str]) -> list[Parts]:
@@ -129,9 +121,7 @@ def extend(cg: CompGraph, func_dict: Mapping[str, Callable[..., Any]], func_io: 
     require_graph("extend()", cg)
     func_io = {} if func_io is None else func_io
     for what, given in (("func_dict", func_dict), ("func_io", func_io)):
-        if not isinstance(given, Mapping):
-            kind = type(given).__name__
-            raise TypeError(f"{what} must be a mapping by function name, such as a dict, not {kind!r}.")
+        require_mapping(what, given, "by function name")
     parts = Parts.of(cg)
     for name in dict.fromkeys([*func_dict, *func_io]):
         if name in cg.functions and not is_placeholder(cg.functions[name]):

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from types import FunctionType, MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from epypes.errors import Finding, GraphError, UnknownName
+from epypes.errors import Finding, GraphError, UnknownName, require_mapping
 from epypes.graph.bipartite import BipartiteDigraph
 from epypes.graph.checks import (
     check_arity,
@@ -79,9 +79,7 @@ class CompGraph:
 
     def __init__(self, func_dict: Mapping[str, Callable[..., Any]], func_io: FuncIO, *, types: bool = True) -> None:
         for what, given in (("func_dict", func_dict), ("func_io", func_io)):
-            if not isinstance(given, Mapping):
-                kind = type(given).__name__
-                raise TypeError(f"{what} must be a mapping by function name, such as a dict, not {kind!r}.")
+            require_mapping(what, given, "by function name")
         self._build(func_dict, func_io, (), [], types)
 
     @classmethod

@@ -39,15 +39,18 @@ def check_colours(contracts: Mapping[str, Contracts], graph: BipartiteDigraph) -
 
 def check_images(contracts: Mapping[str, Contracts], graph: BipartiteDigraph) -> Iterable[Finding]:
     """Find tokens that one function makes as an image that another one can't take."""
-    made = {token: (name, mark) for name, token, mark, verb in _marks(contracts, graph) if verb == "makes"}
-    for taker, token, taken, verb in _marks(contracts, graph):
-        maker, mark = made.get(token, ("", taken))
-        if verb == "takes" and not mark.fits(taken):
+    made: dict[str, tuple[str, Image]] = {}
+    for name, token, mark, verb in _marks(contracts, graph):
+        if verb == "makes":
+            made[token] = name, mark
+            continue
+        maker, as_made = made.get(token, ("", mark))
+        if not as_made.fits(mark):
             text = (
-                f"Function {maker!r} makes token {token!r} as {mark}, but {taker!r} takes it as {taken}, and no image "
+                f"Function {maker!r} makes token {token!r} as {as_made}, but {name!r} takes it as {mark}, and no image "
                 "is both. Change one of the annotations, or build the graph with types=False."
             )
-            yield Finding("types", text, (token, maker, taker))
+            yield Finding("types", text, (token, maker, name))
 
 
 def _marks(contracts: Mapping[str, Contracts], graph: BipartiteDigraph) -> Iterator[tuple[str, str, Image, str]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from epypes.errors import Finding, GraphError, UnknownName
+from epypes.errors import Finding, GraphError, UnknownName, require_mapping
 from epypes.graph.compgraph import CompGraph
 from epypes.graph.parts import Default, Parts, defaults_of
 
@@ -75,9 +75,7 @@ def suffix(cg: CompGraph, ending: str, keep: str | Iterable[str] = ()) -> CompGr
     """
     require_graph("suffix()", cg)
     kept = names_of("keep", keep)
-    for name in kept:
-        if name not in cg.functions and not cg.has_token(name):
-            raise UnknownName("function or token", name, dict.fromkeys((*cg.functions, *cg.tokens)))
+    require_names(kept, [cg], "in this graph")
     parts = suffixed(cg, ending, kept)
     if parts.findings:
         raise GraphError(parts.findings)
@@ -127,10 +125,7 @@ def _collisions(kind: str, names: Iterable[str], new: Mapping[str, str]) -> Iter
 def _checked(what: str, names: Mapping[str, str] | None) -> Mapping[str, str]:
     if names is None:
         return {}
-    if not isinstance(names, Mapping):
-        raise TypeError(
-            f"{what} must be a mapping from old to new names, such as a dict, not {type(names).__name__!r}."
-        )
+    require_mapping(what, names, "from old to new names")
     for old, new in names.items():
         if not isinstance(new, str) or not new:
             raise TypeError(f"The new name of {old!r} must be a string that is not empty, not {new!r}.")
@@ -144,6 +139,14 @@ def names_of(what: str, names: str | Iterable[str]) -> tuple[str, ...]:
     if not isinstance(names, Iterable):
         raise TypeError(f"{what} must be a name or an iterable of names, not {type(names).__name__!r}.")
     return tuple(names)
+
+
+def require_names(names: Iterable[str], graphs: Iterable[CompGraph], where: str) -> None:
+    """Raise UnknownName, with the nearest name, unless each is that of a function or token in one of the graphs."""
+    known = dict.fromkeys(name for cg in graphs for name in (*cg.functions, *cg.tokens)) if names else {}
+    for name in names:
+        if name not in known:
+            raise UnknownName("function or token", name, known, where)
 
 
 def require_graph(what: str, cg: object) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Hashable, Mapping
 from numbers import Number
 from typing import TYPE_CHECKING, Any
 
-from epypes.errors import UnknownName
+from epypes.errors import UnknownName, require_mapping
 from epypes.graph.placeholder import innermost
 
 if TYPE_CHECKING:
@@ -115,9 +115,7 @@ def switch(name: str, branches: Mapping[Any, str], by: str, output: str) -> Comp
     """
     from epypes.graph.compgraph import CompGraph
 
-    if not isinstance(branches, Mapping):
-        kind = type(branches).__name__
-        raise TypeError(f"branches must be a mapping from selector values to tokens, such as a dict, not {kind!r}.")
+    require_mapping("branches", branches, "from selector values to tokens")
     if not branches:
         raise ValueError(f"Switch {name!r} has no branches. Give at least one: {{value of {by!r}: token}}.")
     if not isinstance(output, str):

@@ -148,11 +148,15 @@ def compile_run(program: Program, steps: list[Step], plain: Collection[int], cha
     CompiledRun or CompiledRerun
         A rerun if there are ``changed`` slots.
     """
+    # The new values of a rerun are stored first.
+    parameters, stored = (
+        ("v, given", [f"{', '.join(f'v[{slot}]' for slot in changed)}, = given"]) if changed else ("v", [])
+    )
     lines = [
         f"def make(program, steps, {', '.join(_NAMES)}, array):",
         *(f"    f{step.place} = steps[{step.place}].function" for step in steps),
-        f"    def run(v{', given' if changed else ''}):",
-        *(f"        {', '.join(f'v[{slot}]' for slot in changed)}, = given" for _ in range(bool(changed))),
+        f"    def run({parameters}):",
+        *(f"        {line}" for line in stored),
         "        at = start = 0",
         "        try:",
         *(f"            {line}" for line in _body(program, steps, plain, set(changed))),

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from time import perf_counter_ns
 from typing import Any
 
-from epypes.errors import NotComputed, PayloadError, StaleToken, UnknownName, run_call
+from epypes.errors import NotComputed, PayloadError, StaleToken, UnknownName, require_mapping, run_call
 from epypes.graph import CompGraph
 from epypes.graph.redefined import redefined
 from epypes.run.attempt import AttemptsByKind, Outcome
@@ -65,9 +65,8 @@ class CompGraphRunner:
         if not isinstance(cg, CompGraph):
             kind = type(cg).__name__
             raise TypeError(f"A CompGraphRunner runs a CompGraph, not {kind!r}: CompGraphRunner(cg, hparams).")
-        if hparams is not None and not isinstance(hparams, Mapping):
-            kind = type(hparams).__name__
-            raise TypeError(f"hparams must be a mapping of tokens to values, such as a dict, not {kind!r}.")
+        hparams = {} if hparams is None else hparams
+        require_mapping("hparams", hparams, "of tokens to values")
         if type(workers) is not int or workers < 1:
             raise ValueError(f"workers is how many functions may run at once, 1 or more, not {workers!r}.")
         self.cg = cg
@@ -78,7 +77,7 @@ class CompGraphRunner:
         self._attempts = AttemptsByKind(self._program, workers)
         self._lock = threading.Lock()
         self._last: Run | None = None
-        given = {**cg.defaults, **({} if hparams is None else hparams)}
+        given = {**cg.defaults, **hparams}
         self._hparams = Hyperparameters(self._program, {}).frozen(given)
 
     # -- running ------------------------------------------------------------------------------------------------

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import functools
 import linecache
-import os
 import re
-import subprocess
-import sys
 import types
 from typing import Annotated
 
@@ -22,6 +19,7 @@ from epypes.bundle.emit import emit_module
 from epypes.bundle.settings import Settings
 from epypes.bundle.slicer import slice_graph
 from epypes.bundle.source import Importable, importable
+from tests.seeds import printed
 
 _CELLS = 0
 SETTINGS = Settings("case", ("x0",), ("y",), {})
@@ -212,13 +210,8 @@ def test_library_functions_have_a_public_name(value, expected):
 
 def test_a_set_has_the_same_source_under_any_hash_seed():
     code = "from epypes.bundle.literal import literal; print(literal({'a': ({'x', 'y', 'z', 'w'}, [1], (2,), ())}))"
-    texts = {
-        subprocess.run(
-            [sys.executable, "-c", code], env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, check=True
-        ).stdout
-        for seed in "0123"
-    }
-    assert texts == {b"{'a': ({'w', 'x', 'y', 'z'}, [1], (2,), ())}\n"}
+    texts = printed(code, "0123")
+    assert texts == {"{'a': ({'w', 'x', 'y', 'z'}, [1], (2,), ())}\n"}
 
 
 def test_a_module_is_imported_once_under_the_notebooks_name():

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import enum
 import math
-import os
-import subprocess
-import sys
 import time
 
 import cv2
@@ -18,6 +15,7 @@ from epypes.errors import HyperparameterError, PlaceholderNeeded, SourceRefused,
 from tests.bundle.test_slicer import notebook
 from tests.conftest import EDGE_HPARAMS, EDGE_IO
 from tests.properties.test_straight_line import ruff_says
+from tests.seeds import printed
 
 EDGE_CELL = """
 # Weighs the channels as people see them.
@@ -404,12 +402,7 @@ def test_the_text_is_the_same_under_any_hash_seed():
         "b = a | ep.switch('c', {'a': 'y_z', 'b': 'x'}, by='k', output='o')\n"
         "print(ep.to_source(b, {'s': {'a', 'b', 'c', 'd'}, 'k': 'a'}))"
     )
-    texts = {
-        subprocess.run(
-            [sys.executable, "-c", code], env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, check=True
-        ).stdout
-        for seed in "0123"
-    }
+    texts = printed(code, "0123")
     assert len(texts) == 1
 
 

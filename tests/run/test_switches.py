@@ -43,6 +43,16 @@ class Branches:
         return calls
 
 
+def switched_to_sobel(way):
+    """Return the branches and a runner that ran canny, then sobel."""
+    graph = Branches()
+    runner = way.runner(graph.cg, graph.hparams)
+    runner.run(image=4)
+    runner.rerun(method="sobel")
+    graph.called()
+    return graph, runner
+
+
 def test_only_the_chosen_branch_runs_and_the_other_is_not_computed(way):
     graph = Branches()
     runner = way.runner(graph.cg, graph.hparams)
@@ -74,11 +84,7 @@ def test_switching_back_and_forth_runs_what_has_become_needed_and_nothing_else(w
 
 
 def test_a_change_in_the_branch_that_is_not_chosen_waits_until_it_is(way):
-    graph = Branches()
-    runner = way.runner(graph.cg, graph.hparams)
-    runner.run(image=4)
-    runner.rerun(method="sobel")
-    graph.called()
+    graph, runner = switched_to_sobel(way)
     for lo in range(10, 10 + way.runs):
         run = runner.rerun(lo=lo)
         assert (graph.called(), run["out"], run.report.ran) == ([], -2, ())
@@ -91,11 +97,7 @@ def test_a_change_in_the_branch_that_is_not_chosen_waits_until_it_is(way):
 
 
 def test_a_branch_that_is_asked_for_by_name_disturbs_the_chosen_one_in_nothing(way):
-    graph = Branches()
-    runner = way.runner(graph.cg, graph.hparams)
-    runner.run(image=4)
-    runner.rerun(method="sobel")
-    graph.called()
+    graph, runner = switched_to_sobel(way)
     for lo in range(10, 10 + way.runs):
         assert runner.rerun(lo=lo).report.ran == ()
         assert (runner.rerun("edges_canny")["edges_canny"], graph.called()) == (5 * lo, ["canny"])
