@@ -227,9 +227,10 @@ def image_contracts(function: Callable[..., Any]) -> Contracts:
     there is no mark, or where the annotations can't be resolved.
     """
     read = _read(function)
-    if read is None:
-        return (), ()
-    signature, hints = read
+    return _marks(*read) if read is not None else ((), ())
+
+
+def _marks(signature: inspect.Signature, hints: Mapping[str, Any]) -> Contracts:
     positional = [
         parameter.name
         for parameter in signature.parameters.values()
@@ -250,7 +251,7 @@ def contracts_of(function: Callable[..., Any], inputs: int, outputs: int) -> Con
     if read is None:
         return (), ()
     signature, hints = read
-    taken, made = image_contracts(function)
+    taken, made = _marks(signature, hints)
     rest = [parameter.name for parameter in signature.parameters.values() if parameter.kind == parameter.VAR_POSITIONAL]
     filler = _mark(hints.get(rest[0])) if rest else None
     taken = (*taken, *(filler for _ in range(inputs - len(taken))))[:inputs]
