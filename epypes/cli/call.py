@@ -30,7 +30,7 @@ def call(
     from epypes.bundle.load import SETTINGS
     from epypes.bundle.seal import check_seal
     from epypes.bundle.settings import read_settings
-    from epypes.display.preview import preview
+    from epypes.display.previews.preview import preview
     from epypes.service import Client
 
     check_seal(bundle)

@@ -34,7 +34,7 @@ def print_answer(title: str, answer: Answer) -> None:
     """Print the times of a service's answer as a table."""
     from rich.table import Table
 
-    from epypes.display.view import duration_text
+    from epypes.display.durations import duration_text
 
     table = Table(title=title, title_justify="left")
     table.add_column("where")

@@ -6,6 +6,8 @@ import html
 import re
 from typing import Final
 
+# detect_and_describe_features_1, of the paper's figure 13, is to fit.
+_NAME_CHARACTERS: Final = 32
 # What XML 1.0 allows; a control character or half a surrogate pair in a name would make the whole picture unreadable.
 _NOT_XML: Final = re.compile("[^\\t\\n\\r\\x20-\\ud7ff\\ue000-\\ufffd\\U00010000-\\U0010ffff]")
 
@@ -28,3 +30,8 @@ def cut_name(name: str, characters: int) -> str:
         return name
     end = characters // 3
     return f"{name[: characters - end - 1]}…{name[len(name) - end :]}"
+
+
+def short_name(name: str) -> str:
+    """Return a name as it stands on a vertex."""
+    return cut_name(name, _NAME_CHARACTERS)

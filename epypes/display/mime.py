@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any, Final
 from urllib.parse import quote
 
-from epypes.display.graphview import GraphView
 from epypes.display.markup import escape
-from epypes.display.svg import alt_text, paint_svg
-from epypes.display.tables import paint_plan, paint_report, paint_summary, paint_twin
-from epypes.display.text import paint_text
-from epypes.display.view import Shown, view
+from epypes.display.paint.svg import alt_text, paint_svg
+from epypes.display.paint.tables import paint_plan, paint_report, paint_summary, paint_twin
+from epypes.display.paint.text import paint_text
+from epypes.display.views.graphview import GraphView
+from epypes.display.views.view import Shown, view
 from epypes.errors import LayoutUnavailable
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner, Plan, Run, RunReport, TimingSummary

@@ -9,7 +9,7 @@ from skimage import data
 
 import epypes as ep
 from epypes.display import encode_image, to_svg
-from epypes.display.layout import lay_out
+from epypes.display.layout.place import lay_out
 from tests.benchmarks.row import OURS, Row, row
 from tests.benchmarks.timing import Effort
 

@@ -34,7 +34,7 @@ DIGEST = """async () => {
 }"""
 KERNEL_DIGEST = """
 import hashlib
-from epypes.display.raster import encode_image
+from epypes.display.previews.raster import encode_image
 panel.wait(10)
 print(hashlib.sha256(encode_image(panel.result[panel.token], max_side_px=1400).data).hexdigest())
 """

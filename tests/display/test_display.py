@@ -17,9 +17,9 @@ from PIL import Image
 
 import epypes as ep
 from epypes.display import encode_image, is_image, mimebundle, to_svg, view
-from epypes.display.layout import lay_out
-from epypes.display.preview import preview
-from epypes.display.view import THUMBNAIL_CHARACTERS
+from epypes.display.layout.place import lay_out
+from epypes.display.previews.preview import preview
+from epypes.display.views.tokens import THUMBNAIL_CHARACTERS
 from tests.colours import red_image, red_runner
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -378,7 +378,7 @@ def test_a_value_whose_class_lies_can_be_run_and_shown():
 
 
 def test_graphviz_is_not_asked_for_what_would_take_it_minutes(monkeypatch):
-    monkeypatch.setattr("epypes.display.layout._run_engine", lambda source: pytest.fail("asked"))
+    monkeypatch.setattr("epypes.display.layout.place._run_engine", lambda source: pytest.fail("asked"))
     sources = tuple(f"s{index}" for index in range(100))
     io = {f"f{index}": (sources, f"t{index}") for index in range(100)}
     svg = to_svg(ep.CompGraph(dict.fromkeys(io, lambda *xs: 1), io))

@@ -5,11 +5,11 @@ import re
 
 import pytest
 
-from epypes.display.blocks import fold
-from epypes.display.edges import paint_edges
-from epypes.display.geometry import Box
-from epypes.display.graphview import EdgeView
-from epypes.display.layout import lay_out
+from epypes.display.layout.blocks import fold
+from epypes.display.layout.geometry import Box
+from epypes.display.layout.place import lay_out
+from epypes.display.paint.edges import paint_edges
+from epypes.display.views.graphview import EdgeView
 
 BOX = Box("box", 60.0, 30.0)
 HEXAGON = Box("hexagon", 110.0, 28.0)

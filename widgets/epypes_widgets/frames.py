@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from epypes.display.raster import encode_image, is_image
+from epypes.display.previews.raster import encode_image, is_image
 from epypes.graph import colour_order
 from epypes.run import Run
 

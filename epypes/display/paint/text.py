@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from epypes.display.graphview import FunctionView, GraphView
-from epypes.display.view import duration_text
+from epypes.display.durations import duration_text
+from epypes.display.views.graphview import FunctionView, GraphView
 
 _MOST_LINES = 40
 _STATES = {"planned": "[to run]", "reused": "[reused]", "stale": "[stale]", "left out": "[left out]"}

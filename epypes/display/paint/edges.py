@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 
-from epypes.display.geometry import Layout, Point
-from epypes.display.graphview import EdgeView
+from epypes.display.layout.geometry import Layout, Point
+from epypes.display.views.graphview import EdgeView
 
 
 def paint_edges(edges: Sequence[EdgeView], ends: Sequence[tuple[int, int]], layout: Layout) -> Iterator[str]:

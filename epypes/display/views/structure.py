@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any, Final
 
-from epypes.display.graphview import EdgeView, FunctionState, FunctionView, GraphView, TokenView
 from epypes.display.markup import cut
-from epypes.display.preview import preview
+from epypes.display.previews.preview import preview
+from epypes.display.views.graphview import EdgeView, FunctionState, FunctionView, GraphView, TokenView
 from epypes.graph import CompGraph, Switch, as_switch, colour_order
 from epypes.graph.redefined import inner_graph, is_redefined_inside, redefined
 
@@ -114,3 +114,8 @@ def _redefined_caption(cg: CompGraph, names: list[str]) -> str:
 def _redefined_name(cg: CompGraph, name: str) -> str:
     inside = "a function inside " * is_redefined_inside(cg.functions[name])
     return f"{inside}{cut(name, _SELECTOR_CHARACTERS)!r}"
+
+
+def with_caption(text: str, structure: GraphView) -> str:
+    """Return a caption that begins with this text and goes on with the structure's own."""
+    return f"{text}. {structure.caption}" if structure.caption else text

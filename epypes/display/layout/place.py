@@ -16,8 +16,8 @@ import threading
 from collections.abc import Collection, Iterable, Sequence
 from typing import Any, Final
 
-from epypes.display.blocks import fold, unfold
-from epypes.display.geometry import Box, Edge, Layout, Point
+from epypes.display.layout.blocks import fold, unfold
+from epypes.display.layout.geometry import Box, Edge, Layout, Point
 from epypes.errors import LayoutUnavailable
 
 _POINTS_PER_INCH: Final = 72.0

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from epypes.display.geometry import Box, Edge, Layout, Point
+from epypes.display.layout.geometry import Box, Edge, Layout, Point
 
 # So many still stand well in one row.
 _MOST_IN_ROW: Final = 4

@@ -6,9 +6,9 @@ import enum
 import math
 import reprlib
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Literal
 
-from epypes.display.raster import Picture, encode_image, is_image, sampled
+from epypes.display.previews.raster import Picture, encode_image, is_image, sampled
 from epypes.images import Order
 
 THUMBNAIL_PX: Final = 128
@@ -20,6 +20,22 @@ _CONTAINERS = (tuple, list, dict, set, frozenset)
 
 
 @dataclass(frozen=True, slots=True)
+class Chart:
+    """A drawing of lines, bars or points: a thumbnail that is painted, not encoded.
+
+    Attributes
+    ----------
+    kind
+        ``"line"``: each series is a polyline; ``"bars"``: from the bottom up to each point; ``"points"``: dots.
+    series
+        Points by series; x from 0 to 1 to the right, y from 0 to 1 upwards. At most 128 points in all.
+    """
+
+    kind: Literal["line", "bars", "points"]
+    series: tuple[tuple[tuple[float, float], ...], ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Preview:
     """What is shown of a value.
 
@@ -28,14 +44,20 @@ class Preview:
     text
         A short line; for arrays dtype and shape.
     detail
-        A longer line: dtype, shape and range.
+        A longer line: dtype, shape, range and other statistics, parted by commas.
     picture
         A thumbnail of at most 128 x 128 pixels, or None.
+    chart
+        A thumbnail that is drawn, or None; there is one of the two at most.
+    rows
+        At most 4 short lines of what is inside, such as the first rows of a table.
     """
 
     text: str
     detail: str
     picture: Picture | None = None
+    chart: Chart | None = None
+    rows: tuple[str, ...] = ()
 
 
 def preview(value: Any, order: Order = "bgr") -> Preview:

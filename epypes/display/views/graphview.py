@@ -5,24 +5,38 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-from epypes.display.preview import Preview
+from epypes.display.previews.preview import Preview
 from epypes.images import Order
 
 TokenRole = Literal["payload", "hyperparameter"]
 TokenState = Literal["static", "not computed", "fresh", "stale", "missing", "left out"]
-FunctionKind = Literal["function", "pipeline", "switch", "placeholder"]
-FunctionState = Literal["static", "not run", "ran", "reused", "stale", "failed", "planned", "missing", "left out"]
+FunctionKind = Literal["function", "pipeline", "switch", "placeholder", "group"]
+FunctionState = Literal[
+    "static", "not run", "running", "ran", "reused", "stale", "failed", "planned", "missing", "left out"
+]
+Direction = Literal["down", "right"]
 
 
 @dataclass(frozen=True, slots=True)
 class TokenView:
-    """What is to be seen of a token; ``preview`` is None if it has no value, ``order`` is that of its colours."""
+    """What is to be seen of a token.
+
+    Attributes
+    ----------
+    preview
+        None if it has no value.
+    order
+        That of its colours.
+    first
+        The text of the first value of a hyperparameter that has another one now; empty for all other tokens.
+    """
 
     name: str
     role: TokenRole
     state: TokenState
     preview: Preview | None = None
     order: Order = "bgr"
+    first: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +54,8 @@ class FunctionView:
         many functions are inside a pipeline.
     is_redefined
         Whether its name now means another function, or that of a function inside it does.
+    signature, source
+        Its parameters, and the first lines of its source; empty where they can't be found.
     """
 
     name: str
@@ -50,6 +66,26 @@ class FunctionView:
     kind: FunctionKind = "function"
     notes: tuple[str, ...] = ()
     is_redefined: bool = False
+    signature: str = ""
+    source: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class StageView:
+    """What is to be seen of one stage of a reactive pipeline, outside its graph.
+
+    Attributes
+    ----------
+    name
+        Such as ``"q_in"``.
+    notes
+        Short lines: what it is, its counts.
+    """
+
+    kind: Literal["queue", "loop", "function"]
+    name: str
+    state: Literal["static", "running", "stopped", "failed"] = "static"
+    notes: tuple[str, ...] = ()
 
 
 class EdgeView(NamedTuple):
@@ -83,12 +119,25 @@ class GraphView:
         By function, inputs before outputs.
     caption
         What stands under the picture: the run's time and graph overhead, and what was left out.
+    title
+        What stands on the frame around it; empty if there is no frame.
+    before, after
+        The stages that an event passes before and after the graph.
+    groups
+        What is inside the vertices of kind ``"group"``, by their names.
+    direction
+        Where the data flows to on the page.
     """
 
     functions: tuple[FunctionView, ...]
     tokens: tuple[TokenView, ...]
     edges: tuple[EdgeView, ...]
     caption: str = ""
+    title: str = ""
+    before: tuple[StageView, ...] = ()
+    after: tuple[StageView, ...] = ()
+    groups: tuple[GroupView, ...] = ()
+    direction: Direction = "down"
 
     def io(self) -> list[tuple[list[str], list[str]]]:
         """Return by function, in order, the names of its input and of its output tokens."""
@@ -96,3 +145,11 @@ class GraphView:
         for edge in self.edges:
             found[edge.function][0 if edge.is_input else 1].append(self.tokens[edge.token].name)
         return found
+
+
+@dataclass(frozen=True, slots=True)
+class GroupView:
+    """What is inside a group: a graph of its own, whose tokens are those that its functions take and make."""
+
+    name: str
+    graph: GraphView

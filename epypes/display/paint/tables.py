@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Final
 
-from epypes.display.graphview import FunctionView, GraphView
+from epypes.display.durations import duration_text, overhead_text
 from epypes.display.markup import cut, escape
-from epypes.display.view import duration_text, overhead_text
+from epypes.display.views.graphview import FunctionView, GraphView
 from epypes.run import FunctionTime, LogNormal, RunReport, TimingSummary
 
 # Below them stand the rest, the total and the graph overhead: a hundred rows in all.

@@ -1,0 +1,1 @@
+"""How is a view painted, as SVG, as tables and as text?"""

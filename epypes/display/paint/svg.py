@@ -1,0 +1,70 @@
+"""How is a GraphView painted as SVG?
+
+Graphviz gives the geometry only; every mark is painted here, so that names, values, thumbnails and states change
+without a new layout, and colours follow the page's theme.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Final
+
+from epypes.display.layout.geometry import Box, Layout
+from epypes.display.layout.place import lay_out
+from epypes.display.markup import escape, short_name
+from epypes.display.paint.edges import paint_edges
+from epypes.display.paint.functionmarks import function_box, paint_function
+from epypes.display.paint.style import STYLE
+from epypes.display.paint.tokenmarks import paint_token, token_box
+from epypes.display.views.graphview import GraphView
+
+# Beyond this many edges, and this many for each vertex, curves and arrows can't be followed by the eye, would take
+# Graphviz minutes and would fill the picture.
+_MANY_EDGES: Final = 150
+_DENSE: Final = 1.6
+_MARGIN: Final = 6
+
+
+def paint_svg(graph: GraphView) -> str:
+    """Paint a graph; the same view gives the same text.
+
+    Raises
+    ------
+    LayoutUnavailable
+        No Graphviz engine answered.
+    """
+    functions = len(graph.functions)
+    boxes = (*map(function_box, graph.functions), *map(token_box, graph.tokens))
+    edges = tuple(
+        (functions + edge.token, edge.function) if edge.is_input else (edge.function, functions + edge.token)
+        for edge in graph.edges
+    )
+    is_dense = len(edges) > max(_MANY_EDGES, _DENSE * len(boxes))
+    layout = lay_out(boxes, edges, is_dense)
+    size = f"{layout.width + 2 * _MARGIN:.0f}", f"{layout.height + 2 * _MARGIN:.0f}"
+    box = f"{-_MARGIN} {-_MARGIN} {size[0]} {size[1]}"
+    head = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" class="epypes-graph" role="figure" '
+        f'aria-label="{escape(alt_text(graph))}" width="{size[0]}" height="{size[1]}" viewBox="{box}">'
+    )
+    parts = [head, f"<style>{STYLE}</style>"]
+    parts += paint_edges(graph.edges, edges, layout)
+    parts += _paint_vertices(graph, boxes, layout)
+    parts.append("</svg>")
+    return "\n".join(parts)
+
+
+def alt_text(graph: GraphView) -> str:
+    """Return the graph in one sentence, for screen readers."""
+    order = ", ".join(short_name(function.name) for function in graph.functions[:12])
+    more = ", ..." if len(graph.functions) > 12 else ""
+    functions = f"{len(graph.functions)} function{'s' * (len(graph.functions) != 1)}"
+    return f"Computational graph of {functions}: {order}{more}. {graph.caption}".strip()
+
+
+def _paint_vertices(graph: GraphView, boxes: tuple[Box, ...], layout: Layout) -> Iterable[str]:
+    functions = len(graph.functions)
+    for function, box, centre in zip(graph.functions, boxes, layout.centres, strict=False):
+        yield paint_function(function, box, centre)
+    for token, box, centre in zip(graph.tokens, boxes[functions:], layout.centres[functions:], strict=True):
+        yield paint_token(token, box, centre)
