@@ -24,6 +24,9 @@ from epypes.run.program import Program, Step
 CompiledRun = Callable[[list[Any]], Mapping[int, int] | Sequence[int]]
 CompiledRerun = Callable[[list[Any], Iterable[Any]], Mapping[int, int]]
 
+# Marks the frames of compiled runs; the program that they run is among their globals.
+FILE_NAME: Final = "<epypes: a compiled run>"
+
 # Compiling takes some 40 us per function, once: worth it for what is repeated, and a pause below 20 ms.
 _RUNS_BEFORE: Final = 3
 _MOST_STEPS: Final = 400
@@ -164,8 +167,8 @@ def compile_run(program: Program, steps: list[Step], plain: Collection[int], cha
         "            failed(error, start and clock() - start, locals())",
         "    return run",
     ]
-    names: dict[str, Any] = {}
-    exec(compile("\n".join(lines), "<epypes: a compiled run>", "exec"), names)  # noqa: S102 - made of numbers only
+    names: dict[str, Any] = {"program": program}
+    exec(compile("\n".join(lines), FILE_NAME, "exec"), names)  # noqa: S102 - made of numbers only
     return names["make"](program, program.steps, *_NAMES.values(), array_type())
 
 

@@ -20,7 +20,8 @@ class Hyperparameters:
     Attributes
     ----------
     entries
-        By token, a tuple that holds its value. Setting a token makes a new tuple: it is the token's version.
+        By token, a tuple that holds its value, and the first one that it had since it was frozen. Setting a token
+        makes a new tuple: it is the token's version.
     revision
         How often they have changed.
     changed
@@ -44,7 +45,7 @@ class Hyperparameters:
     def __init__(
         self,
         program: Program,
-        entries: dict[str, tuple[Any]],
+        entries: dict[str, tuple[Any, Any]],
         revision: int = 0,
         changed: Mapping[str, Any] = _NOTHING,
         follows: int = -1,
@@ -61,6 +62,11 @@ class Hyperparameters:
     def values(self) -> Mapping[str, Any]:
         """The values by token."""
         return MappingProxyType({token: entry[0] for token, entry in self.entries.items()})
+
+    @property
+    def first_values(self) -> Mapping[str, Any]:
+        """The values that the tokens were frozen with, by token."""
+        return MappingProxyType({token: entry[1] for token, entry in self.entries.items()})
 
     def __getattr__(self, name: str) -> Any:
         """Make ``base`` and ``free_slots`` when they are asked for first; every run asks for them."""
@@ -109,7 +115,7 @@ class Hyperparameters:
                 plain = plain if (type(value) in ARRAYLESS) == (token in plain) else plain ^ {token}
                 value = lend(value) if program.guard else value
             new[token] = value
-            entries[token] = (value,)
+            entries[token] = (value, value if entry is None else entry[1])
         return Hyperparameters(program, entries, revision + 1, new, follows, plain) if new else self
 
     def unfrozen(self, token: str) -> Hyperparameters:

@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from epypes.graph import CompGraph
+from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.need import chosen_branches, missing_sources, needed_placeholders, wanted_steps
 from epypes.run.tokens import NOT_COMPUTED, TokenManager
 
@@ -37,6 +38,8 @@ class Plan:
         By switch whose selector has a value, the key of the chosen branch.
     hyperparameters
         The values that it was planned with.
+    first_hyperparameters
+        The values that they had when they were made or frozen.
     cg
         The graph.
     """
@@ -50,6 +53,7 @@ class Plan:
     why: Mapping[str, str]
     branches: Mapping[str, Hashable]
     hyperparameters: Mapping[str, Any] = field(repr=False, compare=False)
+    first_hyperparameters: Mapping[str, Any] = field(repr=False, compare=False)
     cg: CompGraph = field(repr=False, compare=False)
 
     def __repr__(self) -> str:
@@ -64,7 +68,7 @@ class Plan:
 
 
 def plan(
-    manager: TokenManager, targets: Sequence[str], changed: Collection[str], hyperparameters: Mapping[str, Any]
+    manager: TokenManager, targets: Sequence[str], changed: Collection[str], hparams: Hyperparameters
 ) -> Plan:
     """Plan a run that starts from these token values; changes nothing.
 
@@ -76,8 +80,8 @@ def plan(
         Tokens of the graph; empty for all.
     changed
         The hyperparameters that have changed since the last run; for the reasons.
-    hyperparameters
-        The values of all hyperparameters now.
+    hparams
+        All hyperparameters now.
     """
     program = manager.program
     wanted = wanted_steps(program, manager.values, targets)
@@ -94,7 +98,8 @@ def plan(
             {step.name: _reason(manager, step.place, changed) for step in needed if step.place in stale}
         ),
         branches=MappingProxyType(chosen_branches(program, manager.values)),
-        hyperparameters=hyperparameters,
+        hyperparameters=hparams.values,
+        first_hyperparameters=hparams.first_values,
         cg=program.cg,
     )
 

@@ -20,6 +20,7 @@ from epypes.run.program import Program
 from epypes.run.record import Run
 from epypes.run.report import Reports
 from epypes.run.tokens import TokenManager
+from epypes.run.underway import running_functions
 
 
 class CompGraphRunner:
@@ -199,7 +200,7 @@ class CompGraphRunner:
         self._check_targets(targets)
         last, hparams = self._last, self._hparams
         changed = () if last is None else tuple(hparams.changes_since(last.record[2]))
-        return plan(self._now(last, hparams), targets, changed, hparams.values)
+        return plan(self._now(last, hparams), targets, changed, hparams)
 
     def _check_targets(self, targets: Sequence[object]) -> None:
         for token in targets:
@@ -227,6 +228,11 @@ class CompGraphRunner:
     def hyperparameters(self) -> Mapping[str, Any]:
         """The values of the hyperparameters by token: a snapshot."""
         return self._hparams.values
+
+    @property
+    def first_hyperparameters(self) -> Mapping[str, Any]:
+        """The values that the hyperparameters had when they were made or frozen, by token: a snapshot."""
+        return self._hparams.first_values
 
     @property
     def revision(self) -> int:
@@ -263,7 +269,12 @@ class CompGraphRunner:
     def stale(self) -> tuple[str, ...]:
         """The functions that ``rerun()`` would run, in run order."""
         hparams = self._hparams
-        return plan(self._now(self._last, hparams), (), (), hparams.values).order
+        return plan(self._now(self._last, hparams), (), (), hparams).order
+
+    @property
+    def running(self) -> tuple[str, ...]:
+        """The functions that are being run at this moment, in whatever thread, in run order."""
+        return running_functions(self._program)
 
     def _draft(self, last: Run | None, hparams: Hyperparameters) -> Draft:
         """Return a run's tokens with these hyperparameters, to go on from.
