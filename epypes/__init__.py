@@ -37,6 +37,8 @@ if TYPE_CHECKING:
         Pipeline,
         SinkPipeline,
         SourcePipeline,
+        Stage,
+        Stages,
     )
     from epypes.run import (
         CompGraphRunner,
@@ -84,6 +86,8 @@ _HOMES = {
     "Pipeline": "epypes.pipeline",
     "SinkPipeline": "epypes.pipeline",
     "SourcePipeline": "epypes.pipeline",
+    "Stage": "epypes.pipeline",
+    "Stages": "epypes.pipeline",
     "ZMQPublisher": "epypes.transport",
     "ZMQSubscriber": "epypes.transport",
     "load": "epypes.bundle",
@@ -115,6 +119,8 @@ __all__ = [
     "RunReport",
     "SinkPipeline",
     "SourcePipeline",
+    "Stage",
+    "Stages",
     "TimingSummary",
     "TokenManager",
     "ZMQPublisher",

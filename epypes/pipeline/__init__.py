@@ -6,6 +6,7 @@ from epypes.pipeline.network import NodeBasedCompGraph
 from epypes.pipeline.node import Node
 from epypes.pipeline.pipeline import Pipeline
 from epypes.pipeline.reactive import FullPipeline, SinkPipeline, SourcePipeline
+from epypes.pipeline.stages import Stage, Stages
 from epypes.pipeline.view import EventView
 
 __all__ = [
@@ -18,4 +19,6 @@ __all__ = [
     "Pipeline",
     "SinkPipeline",
     "SourcePipeline",
+    "Stage",
+    "Stages",
 ]

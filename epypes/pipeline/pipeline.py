@@ -11,6 +11,7 @@ from epypes.errors import PayloadError
 from epypes.graph import CompGraph
 from epypes.pipeline.network import NodeBasedCompGraph
 from epypes.pipeline.node import Node
+from epypes.pipeline.stages import Stages
 from epypes.run import CompGraphRunner, Run
 
 
@@ -73,6 +74,11 @@ class Pipeline(Node):
     def cg(self) -> CompGraph:
         """The graph as it was given, with the user's own functions."""
         return self.source_cg
+
+    @property
+    def stages(self) -> Stages:
+        """What an event passes before and after the graph, as it is at this moment; the hook for subclasses."""
+        return Stages()
 
     def run(self, /, **payload: Any) -> Run:
         """Run the graph on a payload; see ``CompGraphRunner.run``. It counts as a call of the node."""

@@ -15,8 +15,10 @@ from epypes.errors import EpypesError
 from epypes.graph import CompGraph
 from epypes.pipeline.loop import EventLoop
 from epypes.pipeline.pipeline import Pipeline
+from epypes.pipeline.stages import Stage, Stages, function_stage, loop_stage, queue_stage
 from epypes.pipeline.view import EventView
 from epypes.run import Failure, Run
+from epypes.run.underway import locals_under_way
 
 FIn = Callable[[Any], Mapping[str, Any]]
 FOut = Callable[[EventView], Any]
@@ -53,6 +55,11 @@ class SourcePipeline(Pipeline):
         run = super().run(**payload)
         _emit(self, self.f_out, self.q_out, None, run)
         return run
+
+    @property
+    def stages(self) -> Stages:
+        """f_out and q_out, as they are at this moment."""
+        return Stages(after=_stages_after(self, self.f_out, self.q_out, ""))
 
 
 class SinkPipeline(Pipeline):
@@ -92,6 +99,8 @@ class SinkPipeline(Pipeline):
         self.failed = 0
         self.working_on: Any = None
         self._stage = ""
+        # Where the last event that failed did so, what was raised, and how many had been worked on.
+        self._failed_last = ("", "", 0)
         self.loop = EventLoop(q_in, self.handle, lambda event: {"event": event}, name=name, busy=self._busy)
 
     def handle(self, event: Any) -> None:
@@ -118,6 +127,23 @@ class SinkPipeline(Pipeline):
         """Return what has not returned: functions of the graph, or f_in, or f_out with its put on q_out."""
         return self.network.running or (self._stage,)
 
+    @property
+    def stages(self) -> Stages:
+        """q_in, the event loop and f_in, as they are at this moment."""
+        is_in_f_in = any(found["self"] is self for found in locals_under_way(SinkPipeline._payload.__code__))
+        return Stages(
+            before=(
+                queue_stage("q_in", self.q_in),
+                loop_stage(self.loop, self.failed),
+                function_stage("f_in", self.f_in, is_under_way=is_in_f_in, failure=self._failure_in("f_in")),
+            )
+        )
+
+    def _failure_in(self, function: str) -> str:
+        """Return what f_in or f_out raised for the last event; empty if none did, or that was another event."""
+        failed_in, message, count = self._failed_last
+        return message if failed_in == function and count == self.run_count else ""
+
     def emit(self, event: Any, run: Run) -> None:
         """Do something with an event's run; a SinkPipeline does nothing. The hook for subclasses."""
 
@@ -137,6 +163,8 @@ class SinkPipeline(Pipeline):
 
     def _fail(self, event: Any, failure: Failure) -> None:
         self.failed += 1
+        # The text alone: the exception would keep the event and all its tokens.
+        self._failed_last = failure.function, f"{type(failure.exception).__name__}: {failure.message}", self.run_count
         failure = replace(failure, event_id=_event_id(event))
         if self.on_error is None:
             expected = isinstance(failure.exception, EpypesError)
@@ -226,6 +254,12 @@ class FullPipeline(SinkPipeline):
         """Put what f_out makes of the event's run on q_out."""
         _emit(self, self.f_out, self.q_out, event, run)
 
+    @property
+    def stages(self) -> Stages:
+        """q_in, the event loop, f_in, f_out and q_out, as they are at this moment."""
+        after = _stages_after(self, self.f_out, self.q_out, self._failure_in("f_out"))
+        return replace(super().stages, after=after)
+
 
 def _event_id(event: Any) -> str:
     """Return an event's id, if it has one that is a string."""
@@ -238,4 +272,13 @@ def _event_id(event: Any) -> str:
 
 def _emit(pipeline: Pipeline, f_out: FOut, q_out: Any, event: Any, run: Run) -> None:
     view = EventView(pipeline.name, event, run, pipeline.attributes)
-    q_out.put(f_out(view))
+    answer = f_out(view)
+    q_out.put(answer)
+
+
+def _stages_after(pipeline: Pipeline, f_out: FOut, q_out: Any, failure: str) -> tuple[Stage, Stage]:
+    calls = [found for found in locals_under_way(_emit.__code__) if found["pipeline"] is pipeline]
+    return (
+        function_stage("f_out", f_out, is_under_way=any("answer" not in found for found in calls), failure=failure),
+        queue_stage("q_out", q_out, is_waited_for=any("answer" in found for found in calls)),
+    )

@@ -49,6 +49,11 @@ class Run(Mapping[str, Any]):
         return self.record[2].values
 
     @property
+    def first_hyperparameters(self) -> Mapping[str, Any]:
+        """The values that they had when they were made or frozen, by token."""
+        return self.record[2].first_values
+
+    @property
     def revision(self) -> int:
         """The runner's count of hyperparameter changes when the run began."""
         return self.record[2].revision
