@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import re
+import textwrap
 from typing import Final
 
 # detect_and_describe_features_1, of the paper's figure 13, is to fit.
@@ -21,6 +22,12 @@ def cut(text: str, characters: int) -> str:
     """Return text on one line, of at most so many characters."""
     text = " ".join(text.split())
     return text if len(text) <= characters else text[: characters - 1] + "…"
+
+
+def wrapped(text: str, characters: int, lines: int) -> tuple[str, ...]:
+    """Return text on at most so many lines, each of at most so many characters."""
+    beginning = cut(text[: 4 * characters * lines], 2 * characters * lines)
+    return tuple(textwrap.wrap(beginning, characters, max_lines=lines, placeholder="…"))
 
 
 def cut_name(name: str, characters: int) -> str:

@@ -12,8 +12,7 @@ from epypes.display.paint.text import paint_text
 from epypes.display.views.graphview import GraphView
 from epypes.display.views.view import Shown, view
 from epypes.errors import LayoutUnavailable
-from epypes.graph import CompGraph
-from epypes.run import CompGraphRunner, Plan, Run, RunReport, TimingSummary
+from epypes.run import Plan, RunReport, TimingSummary
 
 _SVG_URI: Final = "data:image/svg+xml,"
 _INLINE: Final = (
@@ -33,7 +32,7 @@ def mimebundle(shown: Any) -> dict[str, str]:
     try:
         return {"text/plain": plain, **_painted(shown)}
     except LayoutUnavailable as error:
-        return {"text/plain": f"{plain}\n{paint_text(view(_subject(shown)))}\n{error}"}
+        return {"text/plain": f"{plain}\n{paint_text(view(shown))}\n{error}"}
     except Exception as error:
         return {"text/plain": f"{plain}\n(no picture: {type(error).__name__}: {error!s:.200})"}
 
@@ -43,18 +42,10 @@ def _painted(shown: Any) -> dict[str, str]:
         return {"text/html": paint_report(shown)}
     if isinstance(shown, TimingSummary):
         return {"text/html": paint_summary(shown)}
-    graph = view(_subject(shown))
+    graph = view(shown)
     svg = paint_svg(graph)
     table = paint_plan(graph) if isinstance(shown, Plan) else ""
     return {"text/html": _figure(svg, graph) + table, "image/svg+xml": svg}
-
-
-def _subject(shown: Any) -> Shown:
-    """Return what is to be seen of an object: of a pipeline, its runner."""
-    if isinstance(shown, CompGraph | CompGraphRunner | Run | Plan):
-        return shown
-    runner: CompGraphRunner = shown.runner
-    return runner
 
 
 def to_svg(shown: Shown) -> str:

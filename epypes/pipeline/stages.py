@@ -25,8 +25,8 @@ class Stage:
     name
         Such as ``"q_in"``.
     state
-        ``"running"``: of a loop that it listens, of a function that an event is in it, of a queue that somebody waits to
-        put something on it; ``"failed"``: of a function that the last event failed in it.
+        ``"running"``: of a loop that it listens, of a function that an event is in it, of a queue that somebody waits
+        to put something on it; ``"failed"``: of a function that the last event failed in it.
     notes
         Short lines: what it is, its counts.
     """
@@ -65,13 +65,14 @@ def queue_stage(name: str, queue: Any, *, is_waited_for: bool = False) -> Stage:
 def loop_stage(loop: EventLoop, failed: int) -> Stage:
     """Look at an event loop, ``failed`` of whose events failed."""
     events = f"{loop.handled} event{'s' * (loop.handled != 1)}"
-    return Stage("loop", "EventLoop", "running" if loop.is_running else "stopped", (events, f"{failed} failed"))
+    return Stage("loop", "EventLoop", "running" if loop.is_running else "stopped", (f"{events}, {failed} failed",))
 
 
 def function_stage(name: str, function: Any, *, is_under_way: bool = False, failure: str = "") -> Stage:
     """Look at f_in or f_out; ``failure`` is what it raised for the last event, if it did."""
     state: StageState = "running" if is_under_way else "failed" if failure else "static"
-    return Stage("function", name, state, (_function_name(function), *((failure,) if failure else ())))
+    its_own = _function_name(function)
+    return Stage("function", name, state, tuple(note for note in (its_own, failure) if note and note != name))
 
 
 def _function_name(function: Any) -> str:

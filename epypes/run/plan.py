@@ -67,9 +67,7 @@ class Plan:
         return mimebundle(self)
 
 
-def plan(
-    manager: TokenManager, targets: Sequence[str], changed: Collection[str], hparams: Hyperparameters
-) -> Plan:
+def plan(manager: TokenManager, targets: Sequence[str], changed: Collection[str], hparams: Hyperparameters) -> Plan:
     """Plan a run that starts from these token values; changes nothing.
 
     Parameters

@@ -73,7 +73,7 @@ def test_a_plan_shows_what_would_run_and_why():
     ]
     found = vertices(bundle["image/svg+xml"])
     assert found["function-canny"].get("class") == "function planned"
-    assert texts(found["function-canny"]) == ["canny", "to run"]
+    assert texts(found["function-canny"]) == ["canny", "to run", "'lo' changed"]
     assert found["function-gray"].get("class") == "function reused"
     assert found["function-sobel"].get("class") == "function left-out"
     assert texts(found["token-lo"]) == ["lo = 5"]

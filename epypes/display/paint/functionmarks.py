@@ -6,11 +6,13 @@ from typing import Final
 
 from epypes.display.durations import duration_text
 from epypes.display.layout.geometry import Box, Point
-from epypes.display.markup import cut, short_name
+from epypes.display.markup import cut, short_name, wrapped
 from epypes.display.paint.marks import LINE_PX, text_lines, text_width, vertex
 from epypes.display.views.graphview import FunctionView
 
-_MESSAGE_CHARACTERS: Final = 48
+_MESSAGE_CHARACTERS: Final = 36
+_MESSAGE_LINES: Final = 3
+_REASON_CHARACTERS: Final = 30
 # A switch is drawn like a multiplexer, narrower at its output, by this much on each side.
 _SLOPE_PX: Final = 14
 # Between the two borders of a pipeline.
@@ -58,8 +60,10 @@ def _state_line(function: FunctionView) -> tuple[str, ...]:
     if function.state == "ran" and function.duration_ns is not None:
         return (f"{duration_text(function.duration_ns)}, {function.share:.0%}",)
     if function.state == "failed":
-        return (cut(function.message, _MESSAGE_CHARACTERS),)
-    return ("to run" if function.state == "planned" else function.state,)
+        return ("failed", *wrapped(function.message, _MESSAGE_CHARACTERS, _MESSAGE_LINES))
+    if function.state == "planned":
+        return "to run", cut(function.message, _REASON_CHARACTERS)
+    return (function.state,)
 
 
 def _inner_border(x: float, y: float, box: Box) -> str:

@@ -12,8 +12,8 @@ STYLE: Final = """
 .epypes-graph .small{font-size:10px}
 .epypes-graph .name{font-weight:600}
 .epypes-graph .shape{fill:var(--jp-layout-color1,#fff);stroke:#80868f}
-.epypes-graph .function .shape{fill:var(--jp-layout-color2,#e9eef6);stroke-width:1.4}
-.epypes-graph .function .shape{stroke:var(--jp-brand-color1,#1976d2)}
+.epypes-graph .function .shape,.epypes-graph .call .shape{fill:var(--jp-layout-color2,#e9eef6);stroke-width:1.4}
+.epypes-graph .function .shape,.epypes-graph .call .shape{stroke:var(--jp-brand-color1,#1976d2)}
 .epypes-graph .hyperparameter .shape{fill:var(--jp-layout-color3,#dcdfe4)}
 .epypes-graph .bar{fill:var(--jp-brand-color1,#1976d2)}
 .epypes-graph .planned .shape{stroke-width:3}
@@ -31,4 +31,12 @@ STYLE: Final = """
 .epypes-graph .tip{fill:#80868f}
 .epypes-graph .off{opacity:.6}
 .epypes-graph .edge.off{stroke-dasharray:4 4}
+.epypes-graph .running .shape{stroke:var(--jp-success-color1,#2e7d32);stroke-width:2.5}
+.epypes-graph .reused .shape{stroke-dasharray:9 2}
+.epypes-graph .frame{fill:none;stroke:#80868f}
+.epypes-graph .mark{fill:none;stroke:#80868f;stroke-width:1.4}
+.epypes-graph .stage .open{stroke:none}
+.epypes-graph .queue.running .mark{stroke:var(--jp-success-color1,#2e7d32)}
+.epypes-graph .stopped .shape{stroke-dasharray:2 3}
+.epypes-graph .changed .dot{fill:var(--jp-warn-color1,#e65100)}
 """.replace("\n", "")

@@ -14,6 +14,7 @@ from epypes.display.layout.place import lay_out
 from epypes.display.markup import escape, short_name
 from epypes.display.paint.edges import paint_edges
 from epypes.display.paint.functionmarks import function_box, paint_function
+from epypes.display.paint.stages import paint_around
 from epypes.display.paint.style import STYLE
 from epypes.display.paint.tokenmarks import paint_token, token_box
 from epypes.display.views.graphview import GraphView
@@ -41,13 +42,17 @@ def paint_svg(graph: GraphView) -> str:
     )
     is_dense = len(edges) > max(_MANY_EDGES, _DENSE * len(boxes))
     layout = lay_out(boxes, edges, is_dense)
-    size = f"{layout.width + 2 * _MARGIN:.0f}", f"{layout.height + 2 * _MARGIN:.0f}"
-    box = f"{-_MARGIN} {-_MARGIN} {size[0]} {size[1]}"
+    around, bounds = paint_around(graph, layout)
+    size = (
+        f"{bounds.right - bounds.left + 2 * _MARGIN:.0f}",
+        f"{bounds.bottom - bounds.top + 2 * _MARGIN:.0f}",
+    )
+    box = f"{bounds.left - _MARGIN:.4g} {bounds.top - _MARGIN:.4g} {size[0]} {size[1]}"
     head = (
         f'<svg xmlns="http://www.w3.org/2000/svg" class="epypes-graph" role="figure" '
         f'aria-label="{escape(alt_text(graph))}" width="{size[0]}" height="{size[1]}" viewBox="{box}">'
     )
-    parts = [head, f"<style>{STYLE}</style>"]
+    parts = [head, f"<style>{STYLE}</style>", *around]
     parts += paint_edges(graph.edges, edges, layout)
     parts += _paint_vertices(graph, boxes, layout)
     parts.append("</svg>")
@@ -59,7 +64,13 @@ def alt_text(graph: GraphView) -> str:
     order = ", ".join(short_name(function.name) for function in graph.functions[:12])
     more = ", ..." if len(graph.functions) > 12 else ""
     functions = f"{len(graph.functions)} function{'s' * (len(graph.functions) != 1)}"
-    return f"Computational graph of {functions}: {order}{more}. {graph.caption}".strip()
+    said = f"Computational graph of {functions}: {order}{more}. {graph.caption}".strip()
+    if not graph.title:
+        return said
+    stages = [short_name(stage.name) for stage in graph.before] + ["the graph"] * bool(graph.before or graph.after)
+    stages += [short_name(stage.name) for stage in graph.after]
+    through = f", events go through {', '.join(stages)}" if stages else ""
+    return f"Pipeline {short_name(graph.title)}{through}. {said}"
 
 
 def _paint_vertices(graph: GraphView, boxes: tuple[Box, ...], layout: Layout) -> Iterable[str]:

@@ -8,7 +8,8 @@ from typing import Final
 
 from epypes.display.durations import duration_text, overhead_text
 from epypes.display.markup import cut, escape
-from epypes.display.views.graphview import FunctionView, GraphView
+from epypes.display.paint.stagemarks import stage_words
+from epypes.display.views.graphview import FunctionView, GraphView, StageView
 from epypes.run import FunctionTime, LogNormal, RunReport, TimingSummary
 
 # Below them stand the rest, the total and the graph overhead: a hundred rows in all.
@@ -25,14 +26,22 @@ def paint_twin(graph: GraphView, title: str) -> str:
     rows = "".join(
         "<tr>" + "".join(f"<td>{escape(cell[:_CELL_CHARACTERS])}</td>" for cell in cells) + "</tr>"
         for cells in (
-            (function.name, ", ".join(inputs), ", ".join(outputs), "; ".join((function.state, *function.notes)))
-            for (inputs, outputs), function in zip(graph.io(), graph.functions, strict=True)
+            *map(_stage_cells, graph.before),
+            *(
+                (function.name, ", ".join(inputs), ", ".join(outputs), "; ".join((function.state, *function.notes)))
+                for (inputs, outputs), function in zip(graph.io(), graph.functions, strict=True)
+            ),
+            *map(_stage_cells, graph.after),
         )
     )
     return (
         f'<table style="{_HIDDEN}"><caption>{escape(title)}</caption>'
         f"<tr><th>function</th><th>inputs</th><th>outputs</th><th>state</th></tr>{rows}</table>"
     )
+
+
+def _stage_cells(stage: StageView) -> tuple[str, ...]:
+    return f"{stage.kind} {stage.name}", "", "", "; ".join(stage_words(stage))
 
 
 def paint_plan(graph: GraphView) -> str:

@@ -3,22 +3,32 @@
 from __future__ import annotations
 
 from epypes.display.durations import duration_text
-from epypes.display.views.graphview import FunctionView, GraphView
+from epypes.display.paint.stagemarks import stage_words
+from epypes.display.views.graphview import FunctionView, GraphView, StageView
 
 _MOST_LINES = 40
-_STATES = {"planned": "[to run]", "reused": "[reused]", "stale": "[stale]", "left out": "[left out]"}
+_STATES = {
+    "planned": "[to run]",
+    "reused": "[reused]",
+    "stale": "[stale]",
+    "left out": "[left out]",
+    "running": "[running]",
+    "failed": "[failed]",
+}
 
 
 def paint_text(graph: GraphView) -> str:
     """Paint a graph as one line per function, in run order: ``canny(image_blurred, canny_lo, canny_hi) -> edges``."""
-    lines = []
+    lines = [f"pipeline {graph.title}"] if graph.title else []
+    lines += map(_stage_line, graph.before)
     for (inputs, outputs), function in zip(graph.io(), graph.functions[:_MOST_LINES], strict=False):
         line = f"{function.name}({', '.join(inputs)}) -> {', '.join(outputs) or 'nothing'}"
         lines.append("  ".join(filter(None, (line, _state(function), *function.notes, function.message))))
     if len(graph.functions) > _MOST_LINES:
         lines.append(f"... and {len(graph.functions) - _MOST_LINES} functions more")
+    lines += map(_stage_line, graph.after)
     values = [
-        f"{token.name} = {token.preview.text}"
+        f"{token.name} = {token.preview.text}{f' (first {token.first})' * bool(token.first)}"
         for token in graph.tokens
         if token.role == "hyperparameter" and token.preview
     ]
@@ -27,6 +37,10 @@ def paint_text(graph: GraphView) -> str:
         if names:
             lines.append(f"{start} {', '.join(names[:_MOST_LINES])}")
     return "\n".join(lines)
+
+
+def _stage_line(stage: StageView) -> str:
+    return f"{stage.kind} {stage.name}  [{'; '.join(stage_words(stage))}]"
 
 
 def _state(function: FunctionView) -> str:

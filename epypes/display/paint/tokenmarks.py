@@ -42,7 +42,12 @@ def paint_token(token: TokenView, box: Box, centre: Point) -> str:
         ) + text_lines(lines, centre)
     detail = token.preview.detail if token.preview else "no value"
     state = "" if token.state == "static" else f": {detail}, {token.state}"
-    return vertex("token", token.name, (token.role, token.state), _title(token, state), body)
+    if token.first:
+        # A dot, since a line of text would change the size of the box with the value.
+        body += f'<circle class="dot" cx="{x + box.width - 11:.1f}" cy="{y + 3:.1f}" r="3.5"/>'
+        state += f", first {token.first}"
+    states = (token.role, token.state, *(("changed",) if token.first else ()))
+    return vertex("token", token.name, states, _title(token, state), body)
 
 
 def _token_lines(token: TokenView) -> tuple[str, ...]:
