@@ -6,13 +6,16 @@ from typing import Any, Final
 from urllib.parse import quote
 
 from epypes.display.markup import escape
+from epypes.display.paint.bars import paint_bars, times_alt_text
+from epypes.display.paint.rows import NO_REPORTS, plan_table, table_of
 from epypes.display.paint.svg import alt_text, paint_svg
-from epypes.display.paint.tables import paint_plan, paint_report, paint_summary, paint_twin
+from epypes.display.paint.tables import paint_table, paint_twin
 from epypes.display.paint.text import paint_text
-from epypes.display.views.graphview import GraphView
+from epypes.display.views.times import report_times, summary_times
 from epypes.display.views.view import Shown, view
 from epypes.errors import LayoutUnavailable
-from epypes.run import Plan, RunReport, TimingSummary
+from epypes.run import Plan, RunReport, TimingSummary, summarize
+from epypes.run.report import Reports
 
 _SVG_URI: Final = "data:image/svg+xml,"
 _INLINE: Final = (
@@ -24,7 +27,7 @@ _INLINE: Final = (
 
 
 def mimebundle(shown: Any) -> dict[str, str]:
-    """Return ``text/plain``, ``text/html`` and ``image/svg+xml`` of what shows itself; of reports without SVG.
+    """Return ``text/plain``, ``text/html`` and ``image/svg+xml`` of what shows itself.
 
     Never raises: what can't be painted is shown as text, with the reason and the way out.
     """
@@ -38,14 +41,20 @@ def mimebundle(shown: Any) -> dict[str, str]:
 
 
 def _painted(shown: Any) -> dict[str, str]:
-    if isinstance(shown, RunReport):
-        return {"text/html": paint_report(shown)}
-    if isinstance(shown, TimingSummary):
-        return {"text/html": paint_summary(shown)}
+    if isinstance(shown, Reports) and not len(shown):
+        return {"text/html": f"<p>{NO_REPORTS}</p>"}
+    if isinstance(shown, RunReport | TimingSummary | Reports):
+        return _painted_times(summarize(shown) if isinstance(shown, Reports) else shown)
     graph = view(shown)
-    svg = paint_svg(graph)
-    table = paint_plan(graph) if isinstance(shown, Plan) else ""
-    return {"text/html": _figure(svg, graph) + table, "image/svg+xml": svg}
+    svg, alt = paint_svg(graph), alt_text(graph)
+    table = paint_table(plan_table(graph)._replace(caption="")) if isinstance(shown, Plan) else ""
+    return {"text/html": _figure(svg, alt, graph.caption, paint_twin(graph, alt)) + table, "image/svg+xml": svg}
+
+
+def _painted_times(shown: RunReport | TimingSummary) -> dict[str, str]:
+    times = report_times(shown) if isinstance(shown, RunReport) else summary_times(shown)
+    svg, table = paint_bars(times), paint_table(table_of(shown))
+    return {"text/html": _figure(svg, times_alt_text(times), "", "") + table, "image/svg+xml": svg}
 
 
 def to_svg(shown: Shown) -> str:
@@ -59,16 +68,15 @@ def to_svg(shown: Shown) -> str:
     return paint_svg(view(shown))
 
 
-def _figure(svg: str, graph: GraphView) -> str:
+def _figure(svg: str, alt: str, caption: str, twin: str) -> str:
     """Return the picture as an image that a script replaces by the SVG itself.
 
     A page that does not trust the notebook strips the script and would strip inline SVG down to its loose words, but
     keeps the image. Where the script runs, the picture takes the page's colours and its vertices tell their titles.
     """
     source = quote(svg, safe=" <>/=:;,.()!?+*'@|^~-_{}[]$")
-    twin = paint_twin(graph, alt_text(graph))
     return (
-        f'<figure style="margin:0"><img src="{_SVG_URI}{source}" alt="{escape(alt_text(graph))}" '
+        f'<figure style="margin:0"><img src="{_SVG_URI}{source}" alt="{escape(alt)}" '
         f'style="max-width:100%"><script>{_INLINE}</script>'
-        f'<figcaption style="font-size:11px">{escape(graph.caption)}</figcaption>{twin}</figure>'
+        f'<figcaption style="font-size:11px">{escape(caption)}</figcaption>{twin}</figure>'
     )

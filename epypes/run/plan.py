@@ -61,6 +61,11 @@ class Plan:
         count = len(self.order)
         return f"<Plan: {count} function{'s' * (count != 1)} to run, {len(self.reused)} reused{missing}>"
 
+    def __str__(self) -> str:
+        from epypes.display import to_text
+
+        return to_text(self)
+
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         from epypes.display import mimebundle
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 # The program, the steps that were wanted, nanoseconds by step that ran, nanoseconds in all, whether side by side.
 Times = tuple[Program, bytes | None, Mapping[int, int] | Sequence[int], int, bool]
 
+_COLUMNS: Final = ("function", "ran", "time_ms", "share")
 _KEPT: Final = 1_000
 # Above so many functions kept times are packed: a thousand reports of a large graph would hold a gigabyte of integers.
 _PACKED_ABOVE: Final = 400
@@ -111,16 +112,23 @@ class RunReport:
         """Return a table: function, ran, time_ms, share (of the total)."""
         import pandas as pd
 
-        return pd.DataFrame(
-            [
-                (entry.function, entry.ran, entry.duration_ns / 1e6, entry.duration_ns / max(self.total_ns, 1))
-                for entry in self.functions
-            ],
-            columns=["function", "ran", "time_ms", "share"],
-        )
+        return pd.DataFrame(self._rows(), columns=list(_COLUMNS))
+
+    def _rows(self) -> list[tuple[str, bool, float, float]]:
+        """Return what ``to_frame`` has as rows."""
+        total_ns = max(self.total_ns, 1)
+        return [
+            (entry.function, entry.ran, entry.duration_ns / 1e6, entry.duration_ns / total_ns)
+            for entry in self.functions
+        ]
 
     def __repr__(self) -> str:
         return f"<RunReport: {len(self.ran)} functions ran, {len(self.reused)} reused>"
+
+    def __str__(self) -> str:
+        from epypes.display import to_text
+
+        return to_text(self)
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         from epypes.display import mimebundle
@@ -152,11 +160,28 @@ class Reports(Sequence[RunReport]):
     def __len__(self) -> int:
         return len(self.kept)
 
+    def to_frame(self) -> pd.DataFrame:
+        """Return a table: run (0 is the oldest), function, ran, time_ms, share (of that run's total)."""
+        import pandas as pd
+
+        rows = [(place, *row) for place, report in enumerate(self) for row in report._rows()]
+        return pd.DataFrame(rows, columns=["run", *_COLUMNS])
+
     def __iter__(self) -> Iterator[RunReport]:
         return (RunReport(*times) for times in tuple(self.kept))
 
     def __repr__(self) -> str:
-        return f"<Reports of {len(self)} runs>"
+        return f"<Reports of {len(self)} run{'s' * (len(self) != 1)}>"
+
+    def __str__(self) -> str:
+        from epypes.display import to_text
+
+        return to_text(self)
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
+        from epypes.display import mimebundle
+
+        return mimebundle(self)
 
 
 def _packed(times: Times) -> Times:

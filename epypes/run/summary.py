@@ -111,7 +111,7 @@ class LogNormal:
 
 @dataclass(frozen=True, slots=True)
 class TimingSummary:
-    """The times of many runs; shows itself as a table.
+    """The times of many runs; shows itself as bars and as a table.
 
     Attributes
     ----------
@@ -151,6 +151,11 @@ class TimingSummary:
     def __repr__(self) -> str:
         functions = len(self.functions)
         return f"<TimingSummary: {self.runs} run{'s' * (self.runs != 1)}, {functions} function{'s' * (functions != 1)}>"
+
+    def __str__(self) -> str:
+        from epypes.display import to_text
+
+        return to_text(self)
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         from epypes.display import mimebundle

@@ -6,7 +6,7 @@ from typing import Final
 
 from epypes.display.durations import duration_text
 from epypes.display.layout.geometry import Box, Point
-from epypes.display.markup import cut, short_name, wrapped
+from epypes.display.markup import cut_name, short_name, wrapped
 from epypes.display.paint.marks import LINE_PX, text_lines, text_width, vertex
 from epypes.display.views.graphview import FunctionView
 
@@ -55,14 +55,14 @@ def _function_lines(function: FunctionView) -> tuple[str, ...]:
 
 def _state_line(function: FunctionView) -> tuple[str, ...]:
     """Say in which state a function is, where that is more than its shape and its notes say."""
-    if function.state in ("static", "not run", "missing"):
+    if function.state in ("static", "missing"):
         return ()
     if function.state == "ran" and function.duration_ns is not None:
         return (f"{duration_text(function.duration_ns)}, {function.share:.0%}",)
     if function.state == "failed":
         return ("failed", *wrapped(function.message, _MESSAGE_CHARACTERS, _MESSAGE_LINES))
     if function.state == "planned":
-        return "to run", cut(function.message, _REASON_CHARACTERS)
+        return "to run", cut_name(function.message, _REASON_CHARACTERS)
     return (function.state,)
 
 

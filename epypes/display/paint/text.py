@@ -1,9 +1,12 @@
-"""How does a graph look where nothing but text can be shown?"""
+"""How do a graph and a table look where nothing but text can be shown?"""
 
 from __future__ import annotations
 
 from epypes.display.durations import duration_text
+from epypes.display.markup import cut
+from epypes.display.paint.rows import Table
 from epypes.display.paint.stagemarks import stage_words
+from epypes.display.paint.tables import CELL_CHARACTERS
 from epypes.display.views.graphview import FunctionView, GraphView, StageView
 
 _MOST_LINES = 40
@@ -37,6 +40,28 @@ def paint_text(graph: GraphView) -> str:
         if names:
             lines.append(f"{start} {', '.join(names[:_MOST_LINES])}")
     return "\n".join(lines)
+
+
+def text_table(table: Table) -> str:
+    """Write a table as aligned lines: its caption, its head, its rows."""
+    if not table.head:
+        return table.caption
+    lines = [[_printable(cut(cell, CELL_CHARACTERS)) for cell in cells] for cells in (table.head, *table.rows)]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    lines.insert(1, ["-" * width for width in widths])
+    aligned = [
+        "  ".join(
+            cell.ljust(width) if column < table.texts else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(cells, widths, strict=True))
+        ).rstrip()
+        for cells in lines
+    ]
+    return "\n".join([*([_printable(table.caption)] if table.caption else []), *aligned])
+
+
+def _printable(text: str) -> str:
+    """Return text without what would steer a terminal."""
+    return "".join(character if character.isprintable() else "\ufffd" for character in text)
 
 
 def _stage_line(stage: StageView) -> str:

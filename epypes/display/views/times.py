@@ -1,0 +1,158 @@
+"""What is to be seen of the times of one run, and of many?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+from epypes.display.durations import duration_text, overhead_text
+from epypes.display.markup import cut_name, short_name
+from epypes.run import FunctionTime, LogNormal, RunReport, TimingSummary
+
+BarKind = Literal["function", "rest", "overhead", "total"]
+
+# More don't fit on a screen.
+MOST_BARS: Final = 60
+_TITLE_CHARACTERS: Final = 100
+# A range that is so many times as long as the longest median would leave nothing to be seen of the rest; it is cut.
+_LONGEST_RANGE: Final = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class TimeBar:
+    """What is to be seen of one time, or of many of one kind.
+
+    Attributes
+    ----------
+    text
+        Stands beside the bar.
+    title
+        Says all of it in words.
+    length
+        From 0 to 1, the longest one.
+    low, high
+        The range of many times, on the same scale; both 0 for a single one.
+    is_reused
+        Whether the function did not run.
+    """
+
+    kind: BarKind
+    name: str
+    text: str
+    title: str
+    length: float = 0.0
+    low: float = 0.0
+    high: float = 0.0
+    is_reused: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class TimesView:
+    """What is to be seen of times: bars in run order, then graph overhead and total."""
+
+    caption: str
+    bars: tuple[TimeBar, ...]
+
+
+def functions_text(count: int) -> str:
+    """Return a number of functions in words."""
+    return f"{count} function{'s' * (count != 1)}"
+
+
+def report_caption(report: RunReport) -> str:
+    """Return how many functions of a run ran, and how many were reused."""
+    entries = report.functions
+    ran = sum(entry.ran for entry in entries)
+    return f"{functions_text(ran)} ran, {len(entries) - ran} reused"
+
+
+def summary_caption(summary: TimingSummary) -> str:
+    """Return how many runs were summarized, and how."""
+    return f"{summary.runs} run{'s' * (summary.runs != 1)}; log-normal distributions"
+
+
+def report_times(report: RunReport) -> TimesView:
+    """Look at the times of a run; of many functions at those that took longest, and at the rest as one."""
+    entries, total_ns = report.functions, max(report.total_ns, 1)
+    longest = sorted(entries, key=lambda entry: -entry.duration_ns)
+    kept = {entry.function for entry in longest[:MOST_BARS]}
+    bars = [_function_bar(entry, total_ns) for entry in entries if entry.function in kept]
+    bars += _rest_bar(longest[MOST_BARS:], total_ns)
+    bars.append(_bar("overhead", overhead_text(report.side_by_side), report.overhead_ns, total_ns))
+    scale = max((bar.length for bar in bars), default=0.0) or 1.0
+    scaled = [replace(bar, length=bar.length / scale) for bar in bars]
+    total = duration_text(report.total_ns)
+    return TimesView(report_caption(report), (*scaled, TimeBar("total", "in all", total, f"in all: {total}")))
+
+
+def _function_bar(entry: FunctionTime, total_ns: int) -> TimeBar:
+    if entry.ran:
+        return _bar("function", entry.function, entry.duration_ns, total_ns)
+    return TimeBar(
+        "function", short_name(entry.function), "reused", f"{_named(entry.function)}: reused", is_reused=True
+    )
+
+
+def _bar(kind: BarKind, name: str, spent_ns: int, total_ns: int) -> TimeBar:
+    """Return a bar whose length is its part of the run's time."""
+    text = f"{duration_text(spent_ns)}, {spent_ns / total_ns:.0%}"
+    shown, named = (short_name(name), _named(name)) if kind == "function" else (name, name)
+    return TimeBar(kind, shown, text, f"{named}: {text} of the run", max(spent_ns / total_ns, 0.0))
+
+
+def _named(name: str) -> str:
+    return f"function {cut_name(name, _TITLE_CHARACTERS)}"
+
+
+def _rest_bar(rest: Sequence[FunctionTime], total_ns: int) -> Iterable[TimeBar]:
+    if rest:
+        yield _bar("rest", rest_text(rest), sum(entry.duration_ns for entry in rest), total_ns)
+
+
+def rest_text(rest: Sequence[FunctionTime]) -> str:
+    """Return what is said of functions that are not shown one by one."""
+    return f"{functions_text(len(rest))} more, {sum(not entry.ran for entry in rest)} of them reused"
+
+
+def summary_times(summary: TimingSummary) -> TimesView:
+    """Look at the times of many runs; of many functions at those that take longest."""
+    functions = summary.functions
+    kept = set(sorted(functions, key=lambda name: -median_ns(functions[name]))[:MOST_BARS])
+    scale = _scale_ns(fitted for fitted in (*functions.values(), summary.overhead) if fitted.is_fitted)
+    bars = [_fitted_bar("function", name, functions[name], scale) for name in functions if name in kept]
+    if len(functions) > len(kept):
+        said = f"{functions_text(len(functions) - len(kept))} more, which take less"
+        bars.append(TimeBar("rest", said, "", said))
+    bars.append(_fitted_bar("overhead", overhead_text(summary.side_by_side), summary.overhead, scale))
+    total = _fitted_bar("total", "in all", summary.total, scale)
+    return TimesView(summary_caption(summary), (*bars, replace(total, length=0.0, low=0.0, high=0.0)))
+
+
+def median_ns(fitted: LogNormal) -> float:
+    """Return the median, 0 where nothing was fitted."""
+    return fitted.median_ns if fitted.is_fitted else 0.0
+
+
+def range_text(fitted: LogNormal) -> str:
+    """Return between which times nine of ten are."""
+    low, high = (duration_text(round(fitted.quantile_ns(share))) for share in (0.05, 0.95))
+    return f"{low} to {high}"
+
+
+def _scale_ns(fitted: Iterable[LogNormal]) -> float:
+    every = list(fitted)
+    longest = max((one.quantile_ns(0.95) for one in every), default=1.0)
+    return min(longest, _LONGEST_RANGE * max((one.median_ns for one in every), default=1.0))
+
+
+def _fitted_bar(kind: BarKind, name: str, fitted: LogNormal, scale_ns: float) -> TimeBar:
+    shown, named = (short_name(name), _named(name)) if kind == "function" else (name, name)
+    if not fitted.is_fitted:
+        return TimeBar(kind, shown, "no positive value", f"{named}: no positive value")
+    median = duration_text(round(fitted.median_ns))
+    runs = f"in {fitted.count} run{'s' * (fitted.count != 1)}"
+    title = f"{named}: median {median}, 5 % to 95 % {range_text(fitted)}, {runs}"
+    low, high = (min(fitted.quantile_ns(share) / scale_ns, 1.0) for share in (0.05, 0.95))
+    length = min(fitted.median_ns / scale_ns, 1.0)
+    return TimeBar(kind, shown, f"{median} ({range_text(fitted)})", title, length, low, high)
