@@ -55,7 +55,8 @@ def _function_lines(function: FunctionView) -> tuple[str, ...]:
 
 def _state_line(function: FunctionView) -> tuple[str, ...]:
     """Say in which state a function is, where that is more than its shape and its notes say."""
-    if function.state in ("static", "missing"):
+    is_said = function.kind == "placeholder" and function.state == "not run"
+    if is_said or function.state in ("static", "missing"):
         return ()
     if function.state == "ran" and function.duration_ns is not None:
         return (f"{duration_text(function.duration_ns)}, {function.share:.0%}",)
