@@ -76,6 +76,10 @@ def test_a_pipeline_is_drawn_with_what_it_has(pipe, before, after):
     root = ET.fromstring(bundle["image/svg+xml"])
     (label,) = (group for group in root.iter(f"{SVG}g") if group.get("class") == "label")
     assert texts(label) == ["edges"]
+    left, top, _, _ = box_of(label)
+    x0, y0, _, _ = map(float, root.get("viewBox").split())
+    assert x0 < left
+    assert y0 < top
 
 
 def box_of(group: ET.Element) -> tuple[float, float, float, float]:
@@ -203,6 +207,7 @@ def test_functions_tell_their_names_and_what_they_raised_for_the_last_event():
     assert stages(pipe)["f_out"].notes == ("<lambda>", "ZeroDivisionError: division by zero")
     pipe.handle("text")
     assert {stage.state for stage in pipe.stages.after} == {"static"}, "this one failed in the graph"
+    pipe.handle("bad")
     pipe.handle(1)
     assert {stage.state for stage in (*pipe.stages.before, *pipe.stages.after)} == {"static", "stopped"}
 
@@ -236,11 +241,13 @@ def test_an_answer_that_waits_for_room_is_told():
     assert stages(pipe)["q_out"].state == "static"
 
 
-def test_another_pipeline_with_the_same_functions_is_not_told_as_running():
+@pytest.mark.parametrize("place", ["f_in", "f_out"])
+def test_another_pipeline_with_the_same_functions_is_not_told_as_running(place):
     gate = Gate()
-    pipe, other = (full(into=lambda event: gate({"x": event})) for _ in range(2))
+    more = {"f_in": {"into": lambda event: gate({"x": event})}, "f_out": {"out": lambda pipe: gate(1)}}[place]
+    pipe, other = full(**more), full(**more)
     with gate.holding(lambda: pipe.handle(1)):
-        assert (stages(pipe)["f_in"].state, stages(other)["f_in"].state) == ("running", "static")
+        assert (stages(pipe)[place].state, stages(other)[place].state) == ("running", "static")
 
 
 def test_a_source_pipeline_tells_f_out_and_q_out_on_whatever_thread_it_runs():

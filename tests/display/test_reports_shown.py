@@ -12,6 +12,7 @@ import pytest
 
 import epypes as ep
 from epypes.display import mimebundle
+from epypes.display.views.times import report_times
 from epypes.run.program import Program
 from epypes.run.report import Reports
 from tests.display.test_display import SVG, texts
@@ -88,6 +89,7 @@ def test_durations_that_can_not_be_do_not_break_the_picture(times, total):
     shown = report(times, total)
     for group in bars(shown).values():
         assert 0 <= length(group) <= 280
+    assert all(0 <= bar.length <= 1 for bar in report_times(shown).bars)
     assert "nan" not in mimebundle(shown)["image/svg+xml"]
     assert str(shown)
 

@@ -117,9 +117,13 @@ def test_a_run_in_two_threads_tells_each_function_once(gate):
     other.join(TIMEOUT_S)
 
 
-def test_only_the_runner_that_runs_tells_it(gate):
+@pytest.mark.parametrize("runs_before", [1, 8], ids=["loop", "compiled"])
+def test_only_the_runner_that_runs_tells_it(gate, runs_before):
     runner = gated(gate)
     other = ep.CompGraphRunner(runner.cg, {"k": 1})
+    for _ in range(runs_before):
+        runner.run(x=1)
+        other.run(x=1)
     with gate.holding(lambda: runner.run(x=1)):
         assert (runner.running, other.running) == (("slow",), ())
 
