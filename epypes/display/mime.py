@@ -54,7 +54,7 @@ def _painted(shown: Any) -> dict[str, str]:
 def _painted_times(shown: RunReport | TimingSummary) -> dict[str, str]:
     times = report_times(shown) if isinstance(shown, RunReport) else summary_times(shown)
     svg, table = paint_bars(times), paint_table(table_of(shown))
-    return {"text/html": _figure(svg, times_alt_text(times), "", "") + table, "image/svg+xml": svg}
+    return {"text/html": _figure(svg, times_alt_text(times), times.legend, "") + table, "image/svg+xml": svg}
 
 
 def to_svg(shown: Shown) -> str:

@@ -135,6 +135,7 @@ def test_a_summary_is_a_picture_with_the_median_as_a_bar_and_the_range_as_a_line
     summary = summarized(8, 9, 10, 11, 12)
     found = bars(summary)
     assert list(found) == ["a", "b", "graph overhead", "in all"]
+    assert "Bars: the median time of each function; lines: 5 % to 95 %" in mimebundle(summary)["text/html"]
     assert length(found["a"]) == pytest.approx(length(found["b"]) * summary.functions["a"].median_ns / MS, rel=0.01)
     low, high = range_of(found["a"])
     left = float(found["a"].find(f"{SVG}rect").get("x"))

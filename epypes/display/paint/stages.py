@@ -141,16 +141,16 @@ class _Row:
         )
 
     def _placed(self, over: float) -> list[float]:
-        """Return where each stage begins: the one beside the frame over the tokens, or moved to where all fit best."""
+        """Return where each stage begins: the one beside the frame over the tokens, or moved so that all are over it."""
         frame, nearest = self._frame, -1 if self._is_before else 0
         length = sum(self._widths) + _GAP_PX * (len(self._widths) - 1)
         half = self._widths[nearest] / 2
         least, most = self._free_from + _PADDING_PX, frame.right - _PADDING_PX
-        # Between these two the whole row is over the frame, if it is not longer.
-        if self._is_before:
-            least = min(max(least, frame.left + length - half), most)
-        else:
-            most = max(min(most, frame.right - length + half), least)
+        leftmost, rightmost = frame.left + length - half, frame.right - length + half
+        if self._is_before and leftmost <= most:
+            least = max(least, leftmost)
+        elif not self._is_before and rightmost >= least:
+            most = min(most, rightmost)
         middle = min(max(over, least), most)
         left = middle + half - length if self._is_before else middle - half
         lefts = []

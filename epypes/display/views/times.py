@@ -15,6 +15,8 @@ BarKind = Literal["function", "rest", "overhead", "total"]
 # More don't fit on a screen.
 MOST_BARS: Final = 60
 _TITLE_CHARACTERS: Final = 100
+_REPORT_LEGEND: Final = "Bars: time of each function; the longest is drawn in full."
+_SUMMARY_LEGEND: Final = "Bars: the median time of each function; lines: 5 % to 95 % of its times."
 # A range that is so many times as long as the longest median would leave nothing to be seen of the rest; it is cut.
 _LONGEST_RANGE: Final = 4.0
 
@@ -49,9 +51,10 @@ class TimeBar:
 
 @dataclass(frozen=True, slots=True)
 class TimesView:
-    """What is to be seen of times: bars in run order, then graph overhead and total."""
+    """What is to be seen of times: bars in run order, then graph overhead and total; ``legend`` says what bars mean."""
 
     caption: str
+    legend: str
     bars: tuple[TimeBar, ...]
 
 
@@ -83,7 +86,8 @@ def report_times(report: RunReport) -> TimesView:
     scale = max((bar.length for bar in bars), default=0.0) or 1.0
     scaled = [replace(bar, length=bar.length / scale) for bar in bars]
     total = duration_text(report.total_ns)
-    return TimesView(report_caption(report), (*scaled, TimeBar("total", "in all", total, f"in all: {total}")))
+    bars = [*scaled, TimeBar("total", "in all", total, f"in all: {total}")]
+    return TimesView(report_caption(report), _REPORT_LEGEND, tuple(bars))
 
 
 def _function_bar(entry: FunctionTime, total_ns: int) -> TimeBar:
@@ -126,7 +130,8 @@ def summary_times(summary: TimingSummary) -> TimesView:
         bars.append(TimeBar("rest", said, "", said))
     bars.append(_fitted_bar("overhead", overhead_text(summary.side_by_side), summary.overhead, scale))
     total = _fitted_bar("total", "in all", summary.total, scale)
-    return TimesView(summary_caption(summary), (*bars, replace(total, length=0.0, low=0.0, high=0.0)))
+    bars.append(replace(total, length=0.0, low=0.0, high=0.0))
+    return TimesView(summary_caption(summary), _SUMMARY_LEGEND, tuple(bars))
 
 
 def median_ns(fitted: LogNormal) -> float:
