@@ -141,7 +141,7 @@ class _Row:
         )
 
     def _placed(self, over: float) -> list[float]:
-        """Return where each stage begins: the one beside the frame over the tokens, or moved so that all are over it."""
+        """Return where each stage begins: that beside the frame over the tokens, or moved so that all are over it."""
         frame, nearest = self._frame, -1 if self._is_before else 0
         length = sum(self._widths) + _GAP_PX * (len(self._widths) - 1)
         half = self._widths[nearest] / 2
