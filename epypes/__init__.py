@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from epypes import errors
     from epypes.bundle import load, load_pipeline, promote, to_source, verify
-    from epypes.graph import CompGraph, Placeholder, extend, outputs, rename, subgraph, suffix, switch, union
+    from epypes.graph import CompGraph, Placeholder, extend, group, outputs, rename, subgraph, suffix, switch, union
     from epypes.hints import Param
     from epypes.images import Image
     from epypes.pipeline import (
@@ -57,6 +57,7 @@ _HOMES = {
     "CompGraph": "epypes.graph",
     "Placeholder": "epypes.graph",
     "extend": "epypes.graph",
+    "group": "epypes.graph",
     "outputs": "epypes.graph",
     "rename": "epypes.graph",
     "subgraph": "epypes.graph",
@@ -121,6 +122,7 @@ __all__ = [
     "ZMQSubscriber",
     "errors",
     "extend",
+    "group",
     "load",
     "load_pipeline",
     "outputs",
