@@ -14,10 +14,13 @@ from typing import Final
 
 from epypes.display.layout.geometry import Box, Edge, Layout, Point
 
-# So many still stand well in one row.
+# So many still stand well in one row, and as many as fit into this width.
 _MOST_IN_ROW: Final = 4
+_ROW_PX: Final = 500.0
 # More would be wider than a page.
-_MOST_PAIRS: Final = 3
+_MOST_BLOCK_PX: Final = 830.0
+# How much wider a block is than high, if its members are not: they are read in rows.
+_ASPECT: Final = 3.5
 _LANE_PX: Final = 30.0
 _ROW_GAP_PX: Final = 9.0
 _COLUMN_GAP_PX: Final = 14.0
@@ -129,12 +132,25 @@ def _alike(boxes: Sequence[Box], edges: Sequence[Edge]) -> list[tuple[int, ...]]
     groups: dict[tuple[str, frozenset[int]], list[int]] = {}
     for vertex in sorted(heads.keys() - inner):
         groups.setdefault((boxes[vertex].shape, frozenset(heads[vertex])), []).append(vertex)
-    return [tuple(members) for members in groups.values() if len(members) > _MOST_IN_ROW]
+    return [tuple(members) for members in groups.values() if _are_many([boxes[member] for member in members])]
+
+
+def _are_many(members: Sequence[Box]) -> bool:
+    width = sum(box.width + _COLUMN_GAP_PX for box in members)
+    return len(members) > _MOST_IN_ROW and width > _ROW_PX
+
+
+def _pairs(members: Sequence[Box]) -> int:
+    """Return how many pairs of columns a block has, so that it looks the same whatever the shape of its members."""
+    width = max(box.width for box in members) + (_LANE_PX + _COLUMN_GAP_PX) / 2
+    height = max(box.height for box in members) + _ROW_GAP_PX
+    columns = math.sqrt(len(members) * _ASPECT * height / width)
+    return max(1, min(int(columns / 2), int(_MOST_BLOCK_PX / (2 * width)), -(-len(members) // 2)))
 
 
 def _block(boxes: Sequence[Box], members: tuple[int, ...]) -> Block:
-    """Arrange vertices, row by row, in pairs of columns; in all about as many columns as the root of their number."""
-    pairs = min(max(1, int(math.sqrt(len(members)) / 2)), _MOST_PAIRS)
+    """Arrange vertices, row by row, in pairs of columns."""
+    pairs = _pairs([boxes[member] for member in members])
     column = max(boxes[member].width for member in members)
     pitch = 2 * column + _LANE_PX + _COLUMN_GAP_PX
     rows = [members[start : start + 2 * pairs] for start in range(0, len(members), 2 * pairs)]

@@ -34,13 +34,16 @@ def paint_svg(graph: GraphView) -> str:
         No Graphviz engine answered.
     """
     functions = len(graph.functions)
-    boxes = (*map(function_box, graph.functions), *map(token_box, graph.tokens))
+    boxes = (
+        *(function_box(function, graph.direction) for function in graph.functions),
+        *map(token_box, graph.tokens),
+    )
     edges = tuple(
         (functions + edge.token, edge.function) if edge.is_input else (edge.function, functions + edge.token)
         for edge in graph.edges
     )
     is_dense = len(edges) > max(_MANY_EDGES, _DENSE * len(boxes))
-    layout = lay_out(boxes, edges, is_dense)
+    layout = lay_out(boxes, edges, is_dense, graph.direction)
     size = f"{layout.width + 2 * _MARGIN:.0f}", f"{layout.height + 2 * _MARGIN:.0f}"
     box = f"{-_MARGIN} {-_MARGIN} {size[0]} {size[1]}"
     head = (
@@ -65,6 +68,6 @@ def alt_text(graph: GraphView) -> str:
 def _paint_vertices(graph: GraphView, boxes: tuple[Box, ...], layout: Layout) -> Iterable[str]:
     functions = len(graph.functions)
     for function, box, centre in zip(graph.functions, boxes, layout.centres, strict=False):
-        yield paint_function(function, box, centre)
+        yield paint_function(function, box, centre, graph.direction)
     for token, box, centre in zip(graph.tokens, boxes[functions:], layout.centres[functions:], strict=True):
         yield paint_token(token, box, centre)
