@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from epypes import errors
     from epypes.bundle import load, load_pipeline, promote, to_source, verify
+    from epypes.display import show
     from epypes.graph import CompGraph, Placeholder, extend, group, outputs, rename, subgraph, suffix, switch, union
     from epypes.hints import Param
     from epypes.images import Image
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "errors": "epypes",
+    "show": "epypes.display",
     "CompGraph": "epypes.graph",
     "Placeholder": "epypes.graph",
     "extend": "epypes.graph",
@@ -128,6 +130,7 @@ __all__ = [
     "outputs",
     "promote",
     "rename",
+    "show",
     "subgraph",
     "suffix",
     "summarize",

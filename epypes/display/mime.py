@@ -5,16 +5,22 @@ from __future__ import annotations
 from typing import Any, Final
 from urllib.parse import quote
 
-from epypes.display.markup import escape
-from epypes.display.paint.svg import alt_text, paint_svg
+from epypes.display.markup import cut, escape
+from epypes.display.paint.svg import alt_text, least_width, paint_svg
 from epypes.display.paint.tables import paint_plan, paint_report, paint_summary, paint_twin
 from epypes.display.paint.text import paint_text
 from epypes.display.views.graphview import GraphView
+from epypes.display.views.groups import counted
+from epypes.display.views.tokens import THUMBNAIL_CHARACTERS
 from epypes.display.views.view import Shown, view
 from epypes.errors import LayoutUnavailable
-from epypes.graph import CompGraph
-from epypes.run import CompGraphRunner, Plan, Run, RunReport, TimingSummary
+from epypes.run import Plan, RunReport, TimingSummary
 
+# What a picture in a page may take: so many characters, and more for every vertex and for thumbnails.
+_LEAST_CHARACTERS: Final = 20_000
+_VERTEX_CHARACTERS: Final = 600
+_NAMED_CHARACTERS: Final = 200
+_NOTICE_CHARACTERS: Final = 1_500
 _SVG_URI: Final = "data:image/svg+xml,"
 _INLINE: Final = (
     "(()=>{const s=document.currentScript,i=s&&s.previousElementSibling;if(!i||i.tagName!=='IMG')return;"
@@ -33,7 +39,7 @@ def mimebundle(shown: Any) -> dict[str, str]:
     try:
         return {"text/plain": plain, **_painted(shown)}
     except LayoutUnavailable as error:
-        return {"text/plain": f"{plain}\n{paint_text(view(_subject(shown)))}\n{error}"}
+        return {"text/plain": f"{plain}\n{paint_text(view(shown))}\n{error}"}
     except Exception as error:
         return {"text/plain": f"{plain}\n(no picture: {type(error).__name__}: {error!s:.200})"}
 
@@ -43,18 +49,26 @@ def _painted(shown: Any) -> dict[str, str]:
         return {"text/html": paint_report(shown)}
     if isinstance(shown, TimingSummary):
         return {"text/html": paint_summary(shown)}
-    graph = view(_subject(shown))
+    html, svg = html_and_svg(view(shown))
+    return {"text/html": html + plan_table(shown), "image/svg+xml": svg}
+
+
+def plan_table(shown: Any) -> str:
+    """Return the table below the picture of a plan, with all functions of its groups; nothing for anything else."""
+    return paint_plan(view(shown, collapse=False)) if isinstance(shown, Plan) else ""
+
+
+def html_and_svg(graph: GraphView) -> tuple[str, str]:
+    """Return a picture for a page, with the insides of its groups, and as the text of an SVG file.
+
+    Raises
+    ------
+    LayoutUnavailable
+        No Graphviz engine answered.
+    """
     svg = paint_svg(graph)
-    table = paint_plan(graph) if isinstance(shown, Plan) else ""
-    return {"text/html": _figure(svg, graph) + table, "image/svg+xml": svg}
-
-
-def _subject(shown: Any) -> Shown:
-    """Return what is to be seen of an object: of a pipeline, its runner."""
-    if isinstance(shown, CompGraph | CompGraphRunner | Run | Plan):
-        return shown
-    runner: CompGraphRunner = shown.runner
-    return runner
+    figure = _figure(svg, graph)
+    return figure + _insides(graph, len(figure)), svg
 
 
 def to_svg(shown: Shown) -> str:
@@ -76,8 +90,30 @@ def _figure(svg: str, graph: GraphView) -> str:
     """
     source = quote(svg, safe=" <>/=:;,.()!?+*'@|^~-_{}[]$")
     twin = paint_twin(graph, alt_text(graph))
+    caption = f'<figcaption style="font-size:11px">{escape(graph.caption)}</figcaption>' if graph.caption else ""
     return (
-        f'<figure style="margin:0"><img src="{_SVG_URI}{source}" alt="{escape(alt_text(graph))}" '
-        f'style="max-width:100%"><script>{_INLINE}</script>'
-        f'<figcaption style="font-size:11px">{escape(graph.caption)}</figcaption>{twin}</figure>'
+        f'<figure style="margin:0"><div style="overflow-x:auto"><img src="{_SVG_URI}{source}" '
+        f'alt="{escape(alt_text(graph))}" style="max-width:100%;min-width:{least_width(svg)}px">'
+        f"<script>{_INLINE}</script></div>{caption}{twin}</figure>"
     )
+
+
+def _insides(graph: GraphView, characters: int) -> str:
+    """Return what is inside the groups, each to be opened in place, as far as the page has room beside its figure."""
+    vertices = sum(len(part.functions) + len(part.tokens) for part in (graph, *(group.graph for group in graph.groups)))
+    room = _LEAST_CHARACTERS + _VERTEX_CHARACTERS * vertices + THUMBNAIL_CHARACTERS - _NOTICE_CHARACTERS - characters
+    details, too_large = [], []
+    for group in graph.groups:
+        name = escape(group.name)
+        summary = f"<summary>{name}: {counted(len(group.graph.functions), 'function')}</summary>"
+        inside = _figure(paint_svg(group.graph), group.graph)
+        part = f'<details class="epypes-inside" data-group="{name}">{summary}{inside}</details>'
+        if len(part) > room:
+            too_large.append(group.name)
+        else:
+            details.append(part)
+            room -= len(part)
+    if too_large:
+        names = cut(", ".join(too_large), _NAMED_CHARACTERS)
+        details.append(f"<p>Not shown here: the inside of {escape(names)}. Call ep.show(..., open=[...]).</p>")
+    return "".join(details)

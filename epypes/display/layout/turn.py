@@ -7,7 +7,6 @@ layout whose inputs mostly stand in the wrong order is turned over.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Sequence
 
 from epypes.display.layout.geometry import Box, Edge, Layout, Point
@@ -29,16 +28,18 @@ def transposed(layout: Layout) -> Layout:
 
 
 def in_order(layout: Layout, edges: Sequence[Edge]) -> Layout:
-    """Exchange left and right, if the neighbours of vertices stand in the reverse of the edges' order more often."""
+    """Exchange left and right, if the neighbours of vertices stand in the reverse of the edges' order.
+
+    What counts is how far it is from the first neighbour of a vertex to its last, summed up: so two branches, which
+    stand far from each other, have more weight than the hyperparameters beside a function.
+    """
     above: dict[int, list[float]] = {}
     below: dict[int, list[float]] = {}
     for tail, head in edges:
         above.setdefault(head, []).append(layout.centres[tail][0])
         below.setdefault(tail, []).append(layout.centres[head][0])
-    pairs = [pair for xs in (*above.values(), *below.values()) for pair in itertools.pairwise(xs)]
-    kept = sum(left < right for left, right in pairs)
-    is_reversed = sum(left > right for left, right in pairs) > kept
-    return _mirrored(layout) if is_reversed else layout
+    to_the_right = sum(xs[-1] - xs[0] for xs in (*above.values(), *below.values()))
+    return _mirrored(layout) if to_the_right < 0 else layout
 
 
 def _mirrored(layout: Layout) -> Layout:

@@ -23,6 +23,9 @@ from epypes.display.views.graphview import GraphView
 _MANY_EDGES: Final = 150
 _DENSE: Final = 1.6
 _MARGIN: Final = 6
+# A page may shrink a picture that is too wide to this part of its size; smaller, its text could not be read, so it
+# is scrolled.
+_LEAST_SCALE: Final = 0.6
 
 
 def paint_svg(graph: GraphView) -> str:
@@ -44,17 +47,24 @@ def paint_svg(graph: GraphView) -> str:
     )
     is_dense = len(edges) > max(_MANY_EDGES, _DENSE * len(boxes))
     layout = lay_out(boxes, edges, is_dense, graph.direction)
-    size = f"{layout.width + 2 * _MARGIN:.0f}", f"{layout.height + 2 * _MARGIN:.0f}"
+    width = layout.width + 2 * _MARGIN
+    size = f"{width:.0f}", f"{layout.height + 2 * _MARGIN:.0f}"
     box = f"{-_MARGIN} {-_MARGIN} {size[0]} {size[1]}"
     head = (
         f'<svg xmlns="http://www.w3.org/2000/svg" class="epypes-graph" role="figure" '
-        f'aria-label="{escape(alt_text(graph))}" width="{size[0]}" height="{size[1]}" viewBox="{box}">'
+        f'aria-label="{escape(alt_text(graph))}" width="{size[0]}" height="{size[1]}" viewBox="{box}" '
+        f'style="min-width:{_LEAST_SCALE * width:.0f}px">'
     )
     parts = [head, f"<style>{STYLE}</style>"]
     parts += paint_edges(graph.edges, edges, layout)
     parts += _paint_vertices(graph, boxes, layout)
     parts.append("</svg>")
     return "\n".join(parts)
+
+
+def least_width(svg: str) -> str:
+    """Return the width in pixels that a painted graph asks for at least."""
+    return svg.partition("min-width:")[2].partition("px")[0]
 
 
 def alt_text(graph: GraphView) -> str:
