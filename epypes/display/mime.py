@@ -102,18 +102,16 @@ def _insides(graph: GraphView, characters: int) -> str:
     """Return what is inside the groups, each to be opened in place, as far as the page has room beside its figure."""
     vertices = sum(len(part.functions) + len(part.tokens) for part in (graph, *(group.graph for group in graph.groups)))
     room = _LEAST_CHARACTERS + _VERTEX_CHARACTERS * vertices + THUMBNAIL_CHARACTERS - _NOTICE_CHARACTERS - characters
-    details, too_large = [], []
-    for group in graph.groups:
-        name = escape(group.name)
-        summary = f"<summary>{name}: {counted(len(group.graph.functions), 'function')}</summary>"
+    details: list[str] = []
+    for place, group in enumerate(graph.groups):
+        name, count = escape(group.name), counted(len(group.graph.functions), "function")
+        summary = f'<summary style="font-size:12px;cursor:pointer">{name}: {count}</summary>'
         inside = _figure(paint_svg(group.graph), group.graph)
         part = f'<details class="epypes-inside" data-group="{name}">{summary}{inside}</details>'
-        if len(part) > room:
-            too_large.append(group.name)
-        else:
-            details.append(part)
-            room -= len(part)
-    if too_large:
-        names = cut(", ".join(too_large), _NAMED_CHARACTERS)
-        details.append(f"<p>Not shown here: the inside of {escape(names)}. Call ep.show(..., open=[...]).</p>")
+        room -= len(part)
+        if room < 0:
+            names = cut(", ".join(group.name for group in graph.groups[place:]), _NAMED_CHARACTERS)
+            details.append(f"<p>Not shown here: the inside of {escape(names)}. Call ep.show(..., open=[...]).</p>")
+            break
+        details.append(part)
     return "".join(details)

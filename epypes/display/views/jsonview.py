@@ -31,9 +31,9 @@ def from_json(written: Mapping[str, Any]) -> GraphView:
     TypeError, ValueError
         This is not a view.
     """
-    graph = _read(GraphView, written)
-    if not isinstance(graph, GraphView):
+    if not isinstance(written, Mapping):
         raise TypeError(f"A view in JSON is an object, not {type(written).__name__!r}.")
+    graph: GraphView = _read(GraphView, written)
     return graph
 
 
