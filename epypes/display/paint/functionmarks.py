@@ -17,8 +17,8 @@ _SLOPE_PX: Final = 14
 _SLANT_PX: Final = 7
 # Between the two borders of a pipeline.
 _INSIDE_PX: Final = 4
-# How far the boxes behind that of a group stick out.
-_STACK_PX: Final = 4
+# How far each box behind that of a group sticks out.
+_STACK_PX: Final = 3
 
 
 def function_box(function: FunctionView, direction: Direction = "down") -> Box:
@@ -34,7 +34,7 @@ def _extra(function: FunctionView, direction: Direction) -> Point:
     """Return how much wider and higher than its text and bar a function is, for its shape's sake."""
     if function.kind == "switch":
         return (2 * _SLOPE_PX, 0) if direction == "down" else (0, 2 * _SLANT_PX)
-    return (2 * _STACK_PX, 2 * _STACK_PX) if function.kind == "group" else (0, 0)
+    return (0, 2 * _STACK_PX) if function.kind == "group" else (0, 0)
 
 
 def paint_function(function: FunctionView, box: Box, centre: Point, direction: Direction = "down") -> str:
@@ -44,7 +44,7 @@ def paint_function(function: FunctionView, box: Box, centre: Point, direction: D
         body = f'<polygon class="shape" points="{_trapezium(x, y, box, direction)}"/>'
     elif function.kind == "group":
         body = _stack(x, y, box)
-        centre = centre[0] - _STACK_PX, centre[1] - _STACK_PX
+        centre = centre[0], centre[1] - _STACK_PX
     else:
         body = _rectangle(x, y, box.width, box.height)
     if function.kind == "pipeline":
@@ -87,9 +87,9 @@ def _rectangle(x: float, y: float, width: float, height: float) -> str:
 
 
 def _stack(x: float, y: float, box: Box) -> str:
-    """Draw three boxes behind each other, the front one left and above."""
-    width, height = box.width - 2 * _STACK_PX, box.height - 2 * _STACK_PX
-    return "".join(_rectangle(x + out, y + out, width, height) for out in (2 * _STACK_PX, _STACK_PX, 0))
+    """Draw three boxes behind each other; those behind stick out below, so that edges end at the front one's sides."""
+    height = box.height - 2 * _STACK_PX
+    return "".join(_rectangle(x + out, y + out, box.width - 2 * out, height) for out in (2 * _STACK_PX, _STACK_PX, 0))
 
 
 def _inner_border(x: float, y: float, box: Box) -> str:
