@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
 from epypes.display.paint.svg import paint_svg
-from epypes.display.views.graphview import FunctionView, GraphView
+from epypes.display.views.graphview import EdgeView, FunctionView, GraphView, TokenView
 from epypes.display.views.groups import collapsed, groups_of
 from epypes.display.views.jsonview import from_json, to_json
 
@@ -116,12 +116,24 @@ def test_a_thumbnail_is_carried_once(runner):
     }
 
 
-def test_thumbnails_that_are_seen_at_once_are_kept_before_those_inside():
-    cg = ep.group(two_branches(), "all", functions=["blur", "canny", "corners", "join"])
-    run = ep.CompGraphRunner(cg, {"kernel": 3, "lo": 70}).run(image=IMAGE)
-    graph = view(run, thumbnails=2)
-    assert all(token.preview.picture for token in graph.tokens)
+@pytest.mark.parametrize("kind", ["run", "runner"])
+def test_thumbnails_that_are_seen_at_once_are_kept_before_those_inside(kind):
+    io = {"f": ("a", "b"), "g": ("b", "c"), "h": ("c", "d")}
+    cg = ep.group(ep.CompGraph(dict.fromkeys(io, passed), io), "first", functions=["f", "g"])
+    runner = ep.CompGraphRunner(cg)
+    run = runner.run(a=IMAGE)
+    graph = view(run if kind == "run" else runner, thumbnails=3)
+    assert [token.name for token in graph.tokens if token.preview.picture] == ["a", "c", "d"]
     assert not any(token.preview.picture for token in graph.groups[0].graph.tokens)
+
+
+def test_an_edge_of_a_box_is_live_if_it_is_so_for_one_of_its_functions():
+    functions = (FunctionView("f", "ran"), FunctionView("g", "left out"), FunctionView("h", "ran"))
+    for lives in ((True, False), (False, True), (False, False)):
+        edges = tuple(EdgeView(place, 0, True, is_live) for place, is_live in enumerate(lives))
+        graph = GraphView(functions, (TokenView("t", "payload", "fresh"),), edges)
+        (edge,) = collapsed(graph, {"both": ["f", "g"]}).edges
+        assert edge.is_live == any(lives)
 
 
 # -- states -----------------------------------------------------------------------------------------------------------
@@ -234,6 +246,39 @@ def test_a_page_has_the_inside_of_each_group_to_be_opened(runner):
     assert {group.get("id") for group in inside.iter(f"{SVG}g")} >= {"function-blur", "function-canny", "token-lo"}
     assert "function-blur" not in bundle["image/svg+xml"], "the file has the closed picture only"
     assert "function-blur" not in unquote(start)
+
+
+@pytest.mark.parametrize("direction", ["down", "right"])
+def test_the_box_of_a_group_is_a_stack_and_holds_its_text_and_its_bar(runner, direction):
+    svg = ET.fromstring(paint_svg(view(runner.run(image=IMAGE), direction=direction)))
+    found = {group.get("id"): group for group in svg.iter(f"{SVG}g")}
+    boxes = {
+        name: [rect for rect in group.iter(f"{SVG}rect") if rect.get("class") == "shape"]
+        for name, group in found.items()
+    }
+    assert len(boxes["function-corners"]) == 1
+    (*behind, front) = boxes["function-edge:20:detection"]
+    assert len(behind) == 2
+    top, bottom = float(front.get("y")), float(front.get("y")) + float(front.get("height"))
+    rows = [float(text.get("y")) for text in found["function-edge:20:detection"].iter(f"{SVG}text")]
+    assert all(top < row < bottom for row in rows)
+    (bar,) = (rect for rect in found["function-edge:20:detection"].iter(f"{SVG}rect") if rect.get("class") == "bar")
+    assert float(bar.get("y")) + float(bar.get("height")) == pytest.approx(bottom, abs=0.2)
+
+
+@pytest.mark.parametrize("direction", ["down", "right"])
+def test_a_switch_is_narrower_where_the_data_leaves_it(direction):
+    choice = ep.switch("pick", {"a": "x", "b": "y"}, by="way", output="z")
+    runner = ep.CompGraphRunner(choice, {"way": "a"})
+    svg = ET.fromstring(paint_svg(view(runner, direction=direction)))
+    (shape,) = (group.find(f"{SVG}polygon") for group in svg.iter(f"{SVG}g") if group.get("id") == "function-pick")
+    points = [tuple(map(float, point.split(","))) for point in shape.get("points").split()]
+    axis = 0 if direction == "down" else 1
+    first, last = (
+        [point[axis] for point in points if point[1 - axis] == end]
+        for end in (min(point[1 - axis] for point in points), max(point[1 - axis] for point in points))
+    )
+    assert max(last) - min(last) < max(first) - min(first)
 
 
 def test_the_table_of_a_plan_has_the_functions_inside_groups(runner):

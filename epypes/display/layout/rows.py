@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
 
 from epypes.display.layout.geometry import Box, Edge, Layout, Point
@@ -22,20 +22,28 @@ def ranks(count: int, edges: Iterable[Edge]) -> list[int]:
         heads[tail].append(head)
         waiting[head] += 1
     rank, is_placed = [0] * count, [False] * count
-    ready = deque(vertex for vertex in range(count) if not waiting[vertex])
-    for first in range(count):
-        if not ready and not is_placed[first]:
+    for tail in _topological(heads, waiting, is_placed):
+        for head in heads[tail]:
+            if not is_placed[head]:
+                rank[head] = max(rank[head], rank[tail] + 1)
+    return rank
+
+
+def _topological(heads: Sequence[Sequence[int]], waiting: list[int], is_placed: list[bool]) -> Iterator[int]:
+    """Give each vertex after all that lead to it, or, where that can't be, the first that is left."""
+    ready = deque(vertex for vertex, count in enumerate(waiting) if not count)
+    # -1: at first, those that nothing leads to.
+    for first in (-1, *range(len(heads))):
+        if first >= 0 and not is_placed[first]:
             ready.append(first)
         while ready:
             tail = ready.popleft()
             is_placed[tail] = True
+            yield tail
             for head in heads[tail]:
                 waiting[head] -= 1
-                if not is_placed[head]:
-                    rank[head] = max(rank[head], rank[tail] + 1)
-                    if not waiting[head]:
-                        ready.append(head)
-    return rank
+                if not waiting[head] and not is_placed[head]:
+                    ready.append(head)
 
 
 def in_rows(boxes: Sequence[Box], edges: Iterable[Edge]) -> Layout:
