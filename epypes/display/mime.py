@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Final
 from urllib.parse import quote
 
@@ -35,11 +36,25 @@ def mimebundle(shown: Any) -> dict[str, str]:
 
     Never raises: what can't be painted is shown as text, with the reason and the way out.
     """
-    plain = repr(shown)
+    return bundle_of(repr(shown), lambda: _painted(shown), lambda: view(shown))
+
+
+def bundle_of(plain: str, paint: Callable[[], dict[str, str]], look: Callable[[], GraphView]) -> dict[str, str]:
+    """Return a text and what is painted, or, where that can't be, the text with the reason.
+
+    Parameters
+    ----------
+    plain
+        The text.
+    paint
+        Paints the other forms.
+    look
+        Looks at the graph, which is shown as text where no Graphviz engine answers.
+    """
     try:
-        return {"text/plain": plain, **_painted(shown)}
+        return {"text/plain": plain, **paint()}
     except LayoutUnavailable as error:
-        return {"text/plain": f"{plain}\n{paint_text(view(shown))}\n{error}"}
+        return {"text/plain": f"{plain}\n{paint_text(look())}\n{error}"}
     except Exception as error:
         return {"text/plain": f"{plain}\n(no picture: {type(error).__name__}: {error!s:.200})"}
 

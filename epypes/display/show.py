@@ -10,15 +10,13 @@ from typing import Any
 
 from epypes.display.layout.geometry import Direction
 from epypes.display.markup import escape
-from epypes.display.mime import html_and_svg, plan_table
+from epypes.display.mime import bundle_of, html_and_svg, plan_table
 from epypes.display.paint.svg import alt_text, paint_svg
-from epypes.display.paint.text import paint_text
 from epypes.display.views.graphview import GraphView
-from epypes.display.views.groups import counted
+from epypes.display.views.groups import counted, function_count
 from epypes.display.views.jsonview import to_json
 from epypes.display.views.tokens import MOST_THUMBNAILS
 from epypes.display.views.view import view
-from epypes.errors import LayoutUnavailable
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,16 +66,15 @@ class Figure:
         return path
 
     def __repr__(self) -> str:
-        count = len(self.view.functions) + sum(len(group.graph.functions) - 1 for group in self.view.groups)
-        groups = f" in {counted(len(self.view.groups), 'group')} and alone" * bool(self.view.groups)
-        return f"<Figure: {counted(count, 'function')}{groups}, {self.view.direction}>"
+        groups = f", {counted(len(self.view.groups), 'closed group')}" * bool(self.view.groups)
+        return f"<Figure: {counted(function_count(self.view), 'function')}{groups}; {self.view.direction}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        try:
-            html, svg = html_and_svg(self.view)
-        except LayoutUnavailable as error:
-            return {"text/plain": f"{self!r}\n{paint_text(self.view)}\n{error}"}
-        return {"text/plain": repr(self), "text/html": html + self.table, "image/svg+xml": svg}
+        return bundle_of(repr(self), self._painted, lambda: self.view)
+
+    def _painted(self) -> dict[str, str]:
+        html, svg = html_and_svg(self.view)
+        return {"text/html": html + self.table, "image/svg+xml": svg}
 
 
 def show(
@@ -120,7 +117,7 @@ def show(
     --------
     >>> from epypes.graph import CompGraph
     >>> show(CompGraph({"f": abs}, {"f": ("x", "y")}), direction="right")
-    <Figure: 1 function, right>
+    <Figure: 1 function; right>
     """
     graph = view(shown, direction=direction, thumbnails=thumbnails, open=open, collapse=collapse)
     return Figure(graph, plan_table(shown))

@@ -83,6 +83,11 @@ def test_what_is_only_inside_disappears_and_what_others_see_stays(runner):
     }
 
 
+def test_the_picture_is_told_with_the_number_of_all_functions(runner):
+    assert "Computational graph of 4 functions: edge detection, corners, join." in to_svg(runner)
+    assert repr(ep.show(runner)) == "<Figure: 4 functions, 1 closed group; down>"
+
+
 def test_free_source_tokens_and_sinks_stay_outside():
     cg = ep.group(two_branches(), "all", functions=["blur", "canny", "corners", "join"])
     runner = ep.CompGraphRunner(cg, {"kernel": 3, "lo": 70})

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
+from epypes.display.layout.place import lay_out
 from epypes.display.paint.svg import paint_svg
 from epypes.display.views.jsonview import from_json, to_json
 from epypes.errors import UnknownName
@@ -121,6 +123,14 @@ def test_a_figure_stays_as_it_was_when_it_was_shown(edge_runner, photograph):
     before = figure.svg
     edge_runner.rerun(canny_lo=90)
     assert figure.svg == before != to_svg(edge_runner)
+
+
+def test_without_an_engine_a_figure_is_text(edge_graph, monkeypatch):
+    monkeypatch.setitem(sys.modules, "graphviz", None)
+    lay_out.cache_clear()
+    bundle = ep.show(edge_graph, direction="right")._repr_mimebundle_()
+    assert set(bundle) == {"text/plain"}
+    assert "canny(image_blurred, canny_lo, canny_hi) -> edges" in bundle["text/plain"]
 
 
 # -- files ------------------------------------------------------------------------------------------------------------

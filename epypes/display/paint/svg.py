@@ -17,6 +17,7 @@ from epypes.display.paint.functionmarks import function_box, paint_function
 from epypes.display.paint.style import STYLE
 from epypes.display.paint.tokenmarks import paint_token, token_box
 from epypes.display.views.graphview import GraphView
+from epypes.display.views.groups import counted, function_count
 
 # Beyond this many edges, and this many for each vertex, curves and arrows can't be followed by the eye, would take
 # Graphviz minutes and would fill the picture.
@@ -71,7 +72,7 @@ def alt_text(graph: GraphView) -> str:
     """Return the graph in one sentence, for screen readers."""
     order = ", ".join(short_name(function.name) for function in graph.functions[:12])
     more = ", ..." if len(graph.functions) > 12 else ""
-    functions = f"{len(graph.functions)} function{'s' * (len(graph.functions) != 1)}"
+    functions = counted(function_count(graph), "function")
     return f"Computational graph of {functions}: {order}{more}. {graph.caption}".strip()
 
 

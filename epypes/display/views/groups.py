@@ -189,6 +189,11 @@ def _without_thumbnail(token: TokenView) -> TokenView:
     return replace(token, preview=replace(token.preview, picture=None, chart=None, rows=()))
 
 
+def function_count(graph: GraphView) -> int:
+    """Return how many functions there are, those inside groups included."""
+    return len(graph.functions) + sum(len(group.graph.functions) - 1 for group in graph.groups)
+
+
 def counted(count: int, noun: str) -> str:
     """Return how many of something there are, such as ``3 functions``."""
     return f"{count} {noun}{'s' * (count != 1)}"
