@@ -11,7 +11,7 @@ from epypes.display.paint.svg import alt_text, least_width, paint_svg
 from epypes.display.paint.tables import paint_plan, paint_report, paint_summary, paint_twin
 from epypes.display.paint.text import paint_text
 from epypes.display.views.graphview import GraphView
-from epypes.display.views.groups import counted
+from epypes.display.views.groups import counted, function_count
 from epypes.display.views.tokens import THUMBNAIL_CHARACTERS
 from epypes.display.views.view import Shown, view
 from epypes.errors import LayoutUnavailable
@@ -115,7 +115,8 @@ def _figure(svg: str, graph: GraphView) -> str:
 
 def _insides(graph: GraphView, characters: int) -> str:
     """Return what is inside the groups, each to be opened in place, as far as the page has room beside its figure."""
-    vertices = sum(len(part.functions) + len(part.tokens) for part in (graph, *(group.graph for group in graph.groups)))
+    parts = (graph, *(group.graph for group in graph.groups))
+    vertices = function_count(graph) + len({token.name for part in parts for token in part.tokens})
     room = _LEAST_CHARACTERS + _VERTEX_CHARACTERS * vertices + THUMBNAIL_CHARACTERS - _NOTICE_CHARACTERS - characters
     details: list[str] = []
     for place, group in enumerate(graph.groups):
