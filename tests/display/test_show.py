@@ -12,6 +12,8 @@ import epypes as ep
 from epypes.display import mimebundle, to_svg, view
 from epypes.display.layout.place import lay_out
 from epypes.display.paint.svg import paint_svg
+from epypes.display.previews.preview import Chart, Preview
+from epypes.display.views.graphview import EdgeView, FunctionView, GraphView, StageView, TokenView
 from epypes.display.views.jsonview import from_json, to_json
 from epypes.errors import UnknownName
 
@@ -175,6 +177,18 @@ def test_what_is_painted_from_json_is_the_same_picture(grouped_runner, kind):
     assert again == graph
     assert paint_svg(again) == paint_svg(graph)
     assert [paint_svg(group.graph) for group in again.groups] == [paint_svg(group.graph) for group in graph.groups]
+
+
+def test_stages_charts_and_rows_survive_json():
+    chart = Chart("points", (((0.0, 0.5), (1.0, 0.25)), ()))
+    graph = GraphView(
+        (FunctionView("f", "running", 12, 0.5, "m", notes=("a", "b"), is_redefined=True),),
+        (TokenView("t", "payload", "fresh", Preview("x", "y", None, chart, ("1", "2")), "rgb", "3"),),
+        (EdgeView(0, 0, False, False),),
+        before=(StageView("queue", "q_in", "running", ("2 wait",)),),
+        direction="right",
+    )
+    assert from_json(json.loads(json.dumps(to_json(graph)))) == graph
 
 
 def test_pictures_are_data_uris_in_json(edge_runner, photograph):
