@@ -258,7 +258,7 @@ def test_the_box_of_a_group_is_a_stack_and_holds_its_text_and_its_bar(runner, di
     svg = ET.fromstring(paint_svg(view(runner.run(image=IMAGE), direction=direction)))
     found = {group.get("id"): group for group in svg.iter(f"{SVG}g")}
     boxes = {
-        name: [rect for rect in group.iter(f"{SVG}rect") if rect.get("class") == "shape"]
+        name: [rect for rect in group.iter(f"{SVG}rect") if rect.get("class").startswith("shape")]
         for name, group in found.items()
     }
     assert len(boxes["function-corners"]) == 1

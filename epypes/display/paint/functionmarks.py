@@ -18,7 +18,7 @@ _SLANT_PX: Final = 7
 # Between the two borders of a pipeline.
 _INSIDE_PX: Final = 4
 # How far each box behind that of a group sticks out.
-_STACK_PX: Final = 3
+_STACK_PX: Final = 4
 
 
 def function_box(function: FunctionView, direction: Direction = "down") -> Box:
@@ -82,14 +82,17 @@ def _bar(function: FunctionView, box: Box, centre: Point, direction: Direction) 
     )
 
 
-def _rectangle(x: float, y: float, width: float, height: float) -> str:
-    return f'<rect class="shape" x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}" rx="3"/>'
+def _rectangle(x: float, y: float, width: float, height: float, kind: str = "shape") -> str:
+    return f'<rect class="{kind}" x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}" rx="3"/>'
 
 
 def _stack(x: float, y: float, box: Box) -> str:
     """Draw three boxes behind each other; those behind stick out below, so that edges end at the front one's sides."""
     height = box.height - 2 * _STACK_PX
-    return "".join(_rectangle(x + out, y + out, box.width - 2 * out, height) for out in (2 * _STACK_PX, _STACK_PX, 0))
+    behind = (
+        _rectangle(x + out, y + out, box.width - 2 * out, height, "shape inner") for out in (2 * _STACK_PX, _STACK_PX)
+    )
+    return "".join(behind) + _rectangle(x, y, box.width, height)
 
 
 def _inner_border(x: float, y: float, box: Box) -> str:
