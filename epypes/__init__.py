@@ -24,7 +24,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from epypes import errors
     from epypes.bundle import load, load_pipeline, promote, to_source, verify
-    from epypes.graph import CompGraph, Placeholder, extend, outputs, rename, subgraph, suffix, switch, union
+    from epypes.display import show
+    from epypes.graph import CompGraph, Placeholder, extend, group, outputs, rename, subgraph, suffix, switch, union
     from epypes.hints import Param
     from epypes.images import Image
     from epypes.pipeline import (
@@ -56,9 +57,11 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "errors": "epypes",
+    "show": "epypes.display",
     "CompGraph": "epypes.graph",
     "Placeholder": "epypes.graph",
     "extend": "epypes.graph",
+    "group": "epypes.graph",
     "outputs": "epypes.graph",
     "rename": "epypes.graph",
     "subgraph": "epypes.graph",
@@ -127,11 +130,13 @@ __all__ = [
     "ZMQSubscriber",
     "errors",
     "extend",
+    "group",
     "load",
     "load_pipeline",
     "outputs",
     "promote",
     "rename",
+    "show",
     "subgraph",
     "suffix",
     "summarize",

@@ -2,6 +2,7 @@
 
 from epypes.graph.algebra import extend, subgraph, union, with_defaults, with_functions
 from epypes.graph.compgraph import CompGraph
+from epypes.graph.group import group
 from epypes.graph.hinted import annotated_params, colour_order, image_hint
 from epypes.graph.outputs import outputs
 from epypes.graph.placeholder import Placeholder, is_placeholder, layers
@@ -16,6 +17,7 @@ __all__ = [
     "as_switch",
     "colour_order",
     "extend",
+    "group",
     "image_hint",
     "is_placeholder",
     "layers",

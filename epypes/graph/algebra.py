@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from epypes.errors import Finding, require_mapping
 from epypes.graph.compgraph import CompGraph
-from epypes.graph.parts import Default, Parts, defaults_of
+from epypes.graph.parts import Default, Parts, defaults_of, groups_of
 from epypes.graph.placeholder import is_placeholder
 from epypes.graph.redefined import have_one_name, is_defined_alike
 from epypes.graph.renaming import names_of, require_graph, require_names, suffixed
@@ -68,6 +68,7 @@ def _merge(merged: Parts, part: Parts) -> None:
     """Add a part; a function that is there already is added to the findings unless it is the same."""
     merged.findings.extend(part.findings)
     merged.defaults.extend(part.defaults)
+    _merge_groups(merged, part)
     for name, function in part.functions.items():
         if name not in merged.functions:
             merged.functions[name], merged.func_io[name] = function, part.func_io[name]
@@ -79,6 +80,18 @@ def _merge(merged: Parts, part: Parts) -> None:
                 text += "It was defined again in between: build both graphs anew. If both are meant: "
             text += "Rename one of them with ep.rename(), or give union() suffixes."
             merged.findings.append(Finding("two functions", text, (name,)))
+
+
+def _merge_groups(merged: Parts, part: Parts) -> None:
+    """Add the groups of a part; those of one name are one."""
+    for function, name in part.groups.items():
+        other = merged.groups.setdefault(function, name)
+        if other != name:
+            text = (
+                f"Function {function!r} is in the group {other!r} of one graph and in {name!r} of another. "
+                "Group the functions after the union, or rename one of the functions with ep.rename()."
+            )
+            merged.findings.append(Finding("groups", text, (function, other, name)))
 
 
 def _is_same_io(left: Any, right: Any) -> bool:
@@ -175,6 +188,7 @@ def subgraph(cg: CompGraph, targets: str | Iterable[str]) -> CompGraph:
         {name: function for name, function in whole.functions.items() if name in needed},
         {name: io for name, io in whole.func_io.items() if name in needed},
         whole.defaults,
+        groups={name: group for name, group in whole.groups.items() if name in needed},
     )
     return CompGraph._assemble(parts, cg.types)
 
@@ -189,7 +203,9 @@ def with_functions(cg: CompGraph, functions: Mapping[str, Callable[..., Any]]) -
     functions
         A callable for every function, by name.
     """
-    return CompGraph._assemble(Parts(dict(functions), dict(cg.func_io), defaults_of(cg)), cg.types)
+    return CompGraph._assemble(
+        Parts(dict(functions), dict(cg.func_io), defaults_of(cg), groups=groups_of(cg)), cg.types
+    )
 
 
 def with_defaults(cg: CompGraph, values: Mapping[str, Any]) -> CompGraph:
@@ -204,4 +220,4 @@ def with_defaults(cg: CompGraph, values: Mapping[str, Any]) -> CompGraph:
     """
     readers = cg.digraph.consumers
     defaults = [Default(token, value, readers[token][0]) for token, value in values.items() if token in readers]
-    return CompGraph._assemble(Parts(dict(cg.functions), dict(cg.func_io), defaults), cg.types)
+    return CompGraph._assemble(Parts(dict(cg.functions), dict(cg.func_io), defaults, groups=groups_of(cg)), cg.types)

@@ -21,7 +21,7 @@ from epypes.graph.checks import (
 )
 from epypes.graph.contracts import check_colours, check_images, read_contracts
 from epypes.graph.declared import read_functions
-from epypes.graph.parts import Default, Parts, check_defaults
+from epypes.graph.parts import Default, Parts, check_defaults, check_groups, groups_of
 from epypes.graph.placeholder import is_placeholder
 from epypes.graph.redefined import is_redefined_inside, redefined
 from epypes.graph.switch import as_switch
@@ -73,14 +73,14 @@ class CompGraph:
     """
 
     __slots__ = (
-        "__weakref__", "_contracts", "_defaults", "_digraph", "_func_io", "_functions", "_known", "_placeholders",
-        "_sinks", "_sources", "_switches", "_tokens", "_types",
+        "__weakref__", "_contracts", "_defaults", "_digraph", "_func_io", "_functions", "_groups", "_known",
+        "_placeholders", "_sinks", "_sources", "_switches", "_tokens", "_types",
     )  # fmt: skip
 
     def __init__(self, func_dict: Mapping[str, Callable[..., Any]], func_io: FuncIO, *, types: bool = True) -> None:
         for what, given in (("func_dict", func_dict), ("func_io", func_io)):
             require_mapping(what, given, "by function name")
-        self._build(func_dict, func_io, (), [], types)
+        self._build(func_dict, func_io, (), [], {}, types)
 
     @classmethod
     def from_functions(cls, *functions: Callable[..., Any], types: bool = True) -> CompGraph:
@@ -117,7 +117,7 @@ class CompGraph:
     def _assemble(cls, parts: Parts, types: bool) -> CompGraph:
         """Make a graph of parts, whose findings are reported with its own; for this package."""
         self = cls.__new__(cls)
-        self._build(parts.functions, parts.func_io, parts.defaults, parts.findings, types)
+        self._build(parts.functions, parts.func_io, parts.defaults, parts.findings, parts.groups, types)
         return self
 
     def _build(
@@ -126,6 +126,7 @@ class CompGraph:
         func_io: FuncIO,
         defaults: Iterable[Default],
         found: Iterable[Finding],
+        groups: Mapping[str, str],
         types: bool,
     ) -> None:
         findings = list(found)
@@ -145,6 +146,7 @@ class CompGraph:
             findings += check_images(contracts, digraph)
         kept = [default for default in defaults if _is_source(digraph, default.token)]
         findings += check_defaults(kept)
+        findings += check_groups(func_dict, groups)
         if findings:
             raise GraphError(findings)
         if order != tuple(digraph.inputs):
@@ -154,6 +156,7 @@ class CompGraph:
         self._digraph, self._types, self._contracts = digraph, types, contracts
         self._functions = MappingProxyType({name: func_dict[name] for name in order})
         self._func_io = MappingProxyType(written)
+        self._groups = MappingProxyType(_members(order, groups))
         self._look_up()
         values = {default.token: default.value for default in reversed(kept)}
         self._defaults = MappingProxyType({token: values[token] for token in self._sources if token in values})
@@ -215,6 +218,11 @@ class CompGraph:
     def switches(self) -> tuple[str, ...]:
         """The names of the functions that are switches, in run order; the first input of each is its selector."""
         return self._switches
+
+    @property
+    def groups(self) -> Mapping[str, tuple[str, ...]]:
+        """The functions of each group, in run order, and the groups by their first ones; see ``ep.group``."""
+        return self._groups
 
     @property
     def types(self) -> bool:
@@ -279,7 +287,7 @@ class CompGraph:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Give what a copy or a pickle is made of; functions are pickled by name."""
-        return _again, (dict(self._functions), dict(self._func_io), dict(self._defaults), self._types)
+        return _again, (dict(self._functions), dict(self._func_io), dict(self._defaults), self._types, groups_of(self))
 
     def __deepcopy__(self, memo: object) -> CompGraph:
         """Return the graph itself, which does not change."""
@@ -298,9 +306,20 @@ class CompGraph:
         return mimebundle(self)
 
 
-def _again(functions: dict[str, Any], func_io: dict[str, Any], defaults: dict[str, Any], types: bool) -> CompGraph:
+def _again(
+    functions: dict[str, Any], func_io: dict[str, Any], defaults: dict[str, Any], types: bool, groups: dict[str, str]
+) -> CompGraph:
     given = [Default(token, value, "") for token, value in defaults.items()]
-    return CompGraph._assemble(Parts(functions, func_io, given), types)
+    return CompGraph._assemble(Parts(functions, func_io, given, groups=groups), types)
+
+
+def _members(order: Iterable[str], groups: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
+    """Return the functions by group, both in run order."""
+    found: dict[str, list[str]] = {}
+    for function in order:
+        if function in groups:
+            found.setdefault(groups[function], []).append(function)
+    return {name: tuple(functions) for name, functions in found.items()}
 
 
 def _is_source(digraph: BipartiteDigraph, token: str) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -33,22 +33,42 @@ class Parts:
         Every default, several for one token included.
     findings
         What is wrong.
+    groups
+        By function, the group that it is in.
     """
 
     functions: dict[str, Callable[..., Any]] = field(default_factory=dict)
     func_io: dict[str, Any] = field(default_factory=dict)
     defaults: list[Default] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
+    groups: dict[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, cg: CompGraph) -> Parts:
         """Return the parts of a graph."""
-        return cls(dict(cg.functions), dict(cg.func_io), defaults_of(cg))
+        return cls(dict(cg.functions), dict(cg.func_io), defaults_of(cg), groups=groups_of(cg))
 
 
 def defaults_of(cg: CompGraph) -> list[Default]:
     """Return the defaults of a graph, each with the first function that takes its token."""
     return [Default(token, value, cg.digraph.consumers[token][0]) for token, value in cg.defaults.items()]
+
+
+def groups_of(cg: CompGraph) -> dict[str, str]:
+    """Return by function, in run order, the group that it is in."""
+    found = {function: name for name, functions in cg.groups.items() for function in functions}
+    return {function: found[function] for function in cg.functions if function in found}
+
+
+def check_groups(functions: Container[str], groups: Mapping[str, str]) -> Iterable[Finding]:
+    """Find groups that are called like a function outside them: both would be one vertex of the picture."""
+    for name in dict.fromkeys(groups.values()):
+        if name in functions and groups.get(name) != name:
+            text = (
+                f"A group and a function outside it are both called {name!r}. "
+                "Give the group another name, or rename the function with ep.rename()."
+            )
+            yield Finding("groups", text, (name,))
 
 
 def check_defaults(defaults: Iterable[Default]) -> Iterable[Finding]:

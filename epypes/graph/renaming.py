@@ -7,7 +7,7 @@ from typing import Any
 
 from epypes.errors import Finding, GraphError, UnknownName, require_mapping
 from epypes.graph.compgraph import CompGraph
-from epypes.graph.parts import Default, Parts, defaults_of
+from epypes.graph.parts import Default, Parts, defaults_of, groups_of
 
 
 def rename(
@@ -87,11 +87,15 @@ def suffixed(cg: CompGraph, ending: str, keep: Iterable[str]) -> Parts:
     if not isinstance(ending, str):
         raise TypeError(f'A suffix must be a string, such as "_1", not {ending!r}.')
     kept = frozenset(keep)
-    return _renamed(
+    parts = _renamed(
         cg,
         {name: name + ending for name in cg.functions if name not in kept},
         {token: token + ending for token in cg.tokens if token not in kept},
     )
+    # A function that is kept is shared with other graphs, so it stays in the group of the old name.
+    groups = {name: group + ending * (name not in kept) for name, group in groups_of(cg).items()}
+    parts.groups.update((name if name in kept else name + ending, group) for name, group in groups.items())
+    return parts
 
 
 def _renamed(cg: CompGraph, functions: Mapping[str, str], tokens: Mapping[str, str]) -> Parts:
@@ -103,6 +107,7 @@ def _renamed(cg: CompGraph, functions: Mapping[str, str], tokens: Mapping[str, s
         {new[name]: (_side(given, tokens), _side(made, tokens)) for name, (given, made) in cg.func_io.items()},
         [Default(tokens.get(token, token), value, new[name]) for token, value, name in defaults_of(cg)],
         findings,
+        {new[name]: group for name, group in groups_of(cg).items()},
     )
 
 

@@ -5,9 +5,12 @@ import re
 
 import pytest
 
+import epypes as ep
+from epypes.display import mimebundle, to_svg
 from epypes.display.layout.blocks import fold
 from epypes.display.layout.geometry import Box
 from epypes.display.layout.place import lay_out
+from epypes.display.layout.rows import ranks
 from epypes.display.paint.edges import paint_edges
 from epypes.display.views.graphview import EdgeView
 
@@ -183,3 +186,134 @@ def test_a_block_that_every_function_of_a_long_chain_takes_is_joined_by_arcs():
             assert abs(point[1] - y) <= boxes[vertex].height / 2 + 1
     middles = [x for x, _ in layout.centres[: 2 * count]]
     assert max(middles[1:]) - min(middles[1:]) < HEXAGON.width
+
+
+@pytest.mark.parametrize("count", [5, 8, 11])
+def test_narrow_sources_stand_in_one_row_and_their_edges_meet_below_it(count):
+    lying = Box("hexagon", 28.0, 110.0)
+    boxes, edges = sources_of(count, 2, lying)
+    layout = lay_out(boxes, edges)
+    xs = [x for x, _ in layout.centres[2:]]
+    assert xs == sorted(xs)
+    assert len({y for _, y in layout.centres[2:]}) == 1
+    assert layout.width < 500
+    doors = set()
+    for (tail, _), spline in zip(edges, layout.splines, strict=True):
+        x, y = layout.centres[tail]
+        assert abs(spline[0][0] - x) < 1
+        assert abs(spline[0][1] - y - lying.height / 2) < 1
+        doors.add(spline[3])
+        assert not any(
+            is_in(place, vertex, boxes, layout) for place in points_on(spline) for vertex in range(2, len(boxes))
+        )
+    assert len(doors) == 1
+
+
+# -- directions -------------------------------------------------------------------------------------------------------
+
+
+def lying(boxes):
+    return tuple(Box(box.shape, box.height, box.width) for box in boxes)
+
+
+CASES = {
+    "a block": sources_of(9, 2),
+    "a chain with arcs": chain_with_a_shared_token(45),
+    "a row": sources_of(3),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("is_dense", [False, True])
+def test_a_picture_to_the_right_is_one_downwards_seen_over_the_diagonal(case, is_dense):
+    boxes, edges = CASES[case]
+    right, down = lay_out(boxes, edges, is_dense, "right"), lay_out(lying(boxes), edges, is_dense)
+    assert (right.width, right.height) == (down.height, down.width)
+    assert right.centres == tuple((y, x) for x, y in down.centres)
+    assert right.splines == tuple(tuple((y, x) for x, y in spline) for spline in down.splines)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_to_the_right_every_edge_leads_to_the_right_and_no_vertices_overlap(case):
+    boxes, edges = CASES[case]
+    layout = lay_out(boxes, edges, direction="right")
+    assert all(layout.centres[tail][0] < layout.centres[head][0] for tail, head in edges)
+    for one, other in itertools.combinations(range(len(boxes)), 2):
+        assert not overlap(one, other, boxes, layout)
+    for (tail, head), spline in zip(edges, layout.splines, strict=True):
+        for point, vertex in ((spline[0], tail), (spline[-1], head)):
+            x, y = layout.centres[vertex]
+            assert abs(point[0] - x) <= boxes[vertex].width / 2 + 1
+            assert abs(point[1] - y) <= boxes[vertex].height / 2 + 1
+
+
+@pytest.mark.parametrize("direction", ["down", "right"])
+def test_inputs_and_branches_stand_in_their_order(direction):
+    """Two branches of two functions each, and what joins them; the joining function takes them in this order."""
+    axis = 0 if direction == "down" else 1
+    for first, second in ((5, 8), (8, 5)):
+        edges = [(5, 0), (0, 6), (6, 1), (1, 7), (8, 2), (2, 9), (9, 3), (3, 10), (7, 4), (10, 4), (4, 11)]
+        if first == 8:
+            edges[8:10] = edges[9], edges[8]
+        layout = lay_out((BOX,) * 12, tuple(edges), direction=direction)
+        assert layout.centres[first][axis] < layout.centres[second][axis]
+
+
+def test_the_images_of_the_orb_graph_stand_in_their_order():
+    io = {"match": (("descriptors_1", "descriptors_2", "normType", "crossCheck"), "matches")}
+    for index in (1, 2):
+        shared = ("nfeatures", "scaleFactor", "nlevels", "edgeThreshold", "WTA_K", "scoreType", "patchSize")
+        inputs = (f"image_{index}", f"mask_{index}", *shared)
+        io[f"detect_and_describe_features_{index}"] = (inputs, (f"keypoints_{index}", f"descriptors_{index}"))
+    io["gather_keypoints"] = (("keypoints_1", "keypoints_2", "matches"), "keypoints_paired")
+    svg = to_svg(ep.CompGraph(dict.fromkeys(io, ep.Placeholder()), io))
+    one, two = (float(re.search(rf'id="token-image_{index}".*?<text[^>]* x="([^"]*)"', svg)[1]) for index in (1, 2))
+    assert one < two
+
+
+# -- rings and large graphs -------------------------------------------------------------------------------------------
+
+
+RING = (BOX,) * 6, ((4, 0), (0, 2), (2, 1), (1, 3), (3, 0), (1, 5))
+
+
+@pytest.mark.parametrize("direction", ["down", "right"])
+@pytest.mark.parametrize("is_dense", [False, True])
+def test_boxes_that_lead_to_each_other_in_a_ring_are_placed(direction, is_dense):
+    boxes, edges = RING
+    layout = lay_out(boxes, edges, is_dense, direction)
+    for one, other in itertools.combinations(range(len(boxes)), 2):
+        assert not overlap(one, other, boxes, layout)
+    assert len(layout.splines) == (0 if is_dense else len(edges))
+
+
+def test_a_ring_is_cut_at_its_first_vertex():
+    assert ranks(3, [(0, 1), (1, 2), (2, 0)]) == [0, 1, 2]
+    assert ranks(*(len(RING[0]), RING[1])) == [1, 3, 2, 4, 0, 4], "where it is entered"
+
+
+def test_rows_do_not_depend_on_the_order_of_edges():
+    edges = [(0, 1), (1, 2), (2, 3), (0, 3), (4, 2)]
+    for shuffled in itertools.permutations(edges):
+        assert ranks(5, shuffled) == [0, 1, 2, 3, 0]
+
+
+def test_a_very_large_graph_is_drawn_in_rows_without_a_word(capfd):
+    count = 600
+    io = {f"f{index}": (f"t{index}", f"t{index + 1}") for index in range(count)}
+    cg = ep.CompGraph(dict.fromkeys(io, abs), io)
+    svg = to_svg(cg)
+    assert svg.count("<g ") == len(cg.functions) + len(cg.tokens) == 1201
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_graph_of_200_functions_is_laid_out_once_whatever_its_values():
+    io = {f"f{index}": ((f"t{index - index % 4}", f"k{index}"), f"t{index + 1}") for index in range(200)}
+    runner = ep.CompGraphRunner(
+        ep.CompGraph(dict.fromkeys(io, lambda x, k: x + k), io), {f"k{index}": 1 for index in range(200)}
+    )
+    lay_out.cache_clear()
+    mimebundle(runner.run(t0=100_000))
+    for value in (2, 3, 4):
+        mimebundle(runner.rerun(k100=value))
+    assert lay_out.cache_info().misses == 1

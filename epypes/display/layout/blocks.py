@@ -1,8 +1,9 @@
 """Which vertices stand together in a block, and where in it?
 
 A function with nine hyperparameters would have them all in one row, so wide that a page shrinks the picture until
-nothing can be read. Sources that lead to exactly the same vertices stand in a block instead: pairs of columns, each
-around a lane in which their edges run down together. For Graphviz a block is one vertex.
+nothing can be read. Sources that lead to exactly the same vertices stand in a block instead: a row whose edges meet
+below it, or, if that is too wide, pairs of columns, each around a lane in which their edges run down together. For
+Graphviz a block is one vertex.
 """
 
 from __future__ import annotations
@@ -14,10 +15,16 @@ from typing import Final
 
 from epypes.display.layout.geometry import Box, Edge, Layout, Point
 
-# So many still stand well in one row.
-_MOST_IN_ROW: Final = 4
+# The edges of so many are still told apart.
+_MOST_APART: Final = 4
+# What fits into this width stands in one row.
+_ROW_PX: Final = 500.0
+# Under a row, where its edges meet.
+_FUNNEL_PX: Final = 30.0
 # More would be wider than a page.
-_MOST_PAIRS: Final = 3
+_MOST_BLOCK_PX: Final = 830.0
+# How much wider a block is than high, if its members are not: they are read in rows.
+_ASPECT: Final = 3.5
 _LANE_PX: Final = 30.0
 _ROW_GAP_PX: Final = 9.0
 _COLUMN_GAP_PX: Final = 14.0
@@ -129,12 +136,40 @@ def _alike(boxes: Sequence[Box], edges: Sequence[Edge]) -> list[tuple[int, ...]]
     groups: dict[tuple[str, frozenset[int]], list[int]] = {}
     for vertex in sorted(heads.keys() - inner):
         groups.setdefault((boxes[vertex].shape, frozenset(heads[vertex])), []).append(vertex)
-    return [tuple(members) for members in groups.values() if len(members) > _MOST_IN_ROW]
+    return [tuple(members) for members in groups.values() if len(members) > _MOST_APART]
 
 
 def _block(boxes: Sequence[Box], members: tuple[int, ...]) -> Block:
-    """Arrange vertices, row by row, in pairs of columns; in all about as many columns as the root of their number."""
-    pairs = min(max(1, int(math.sqrt(len(members)) / 2)), _MOST_PAIRS)
+    width = sum(boxes[member].width + _COLUMN_GAP_PX for member in members) - _COLUMN_GAP_PX
+    return _row(boxes, members, width) if width <= _ROW_PX else _columns(boxes, members)
+
+
+def _row(boxes: Sequence[Box], members: tuple[int, ...], width: float) -> Block:
+    """Arrange vertices in one row, on one line at the bottom, whose edges meet below it."""
+    tall = max(boxes[member].height for member in members)
+    bottom = (tall + _FUNNEL_PX) / 2
+    start, x = bottom - _FUNNEL_PX, -width / 2
+    offsets: list[Point] = []
+    ways: list[tuple[Point, ...]] = []
+    for member in members:
+        x += boxes[member].width / 2
+        offsets.append((x, start - boxes[member].height / 2))
+        ways.append(((x, start), (x, bottom - _FUNNEL_PX / 4), (0.0, start + _FUNNEL_PX / 4), (0.0, bottom)))
+        x += boxes[member].width / 2 + _COLUMN_GAP_PX
+    return Block(Box("box", width, 2 * bottom), members, tuple(offsets), tuple(ways))
+
+
+def _pairs(members: Sequence[Box]) -> int:
+    """Return how many pairs of columns a block has, so that it looks the same whatever the shape of its members."""
+    width = max(box.width for box in members) + (_LANE_PX + _COLUMN_GAP_PX) / 2
+    height = max(box.height for box in members) + _ROW_GAP_PX
+    columns = math.sqrt(len(members) * _ASPECT * height / width)
+    return max(1, min(int(columns / 2), int(_MOST_BLOCK_PX / (2 * width)), -(-len(members) // 2)))
+
+
+def _columns(boxes: Sequence[Box], members: tuple[int, ...]) -> Block:
+    """Arrange vertices, row by row, in pairs of columns."""
+    pairs = _pairs([boxes[member] for member in members])
     column = max(boxes[member].width for member in members)
     pitch = 2 * column + _LANE_PX + _COLUMN_GAP_PX
     rows = [members[start : start + 2 * pairs] for start in range(0, len(members), 2 * pairs)]

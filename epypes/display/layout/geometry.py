@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+Direction = Literal["down", "right"]
 Shape = Literal["box", "ellipse", "hexagon"]
 Point = tuple[float, float]
 Edge = tuple[int, int]

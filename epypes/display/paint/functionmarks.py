@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from epypes.display.durations import duration_text
-from epypes.display.layout.geometry import Box, Point
+from epypes.display.layout.geometry import Box, Direction, Point
 from epypes.display.markup import cut_name, short_name, wrapped
 from epypes.display.paint.marks import LINE_PX, text_lines, text_width, vertex
 from epypes.display.views.graphview import FunctionView
@@ -15,34 +15,44 @@ _MESSAGE_LINES: Final = 3
 _REASON_CHARACTERS: Final = 30
 # A switch is drawn like a multiplexer, narrower at its output, by this much on each side.
 _SLOPE_PX: Final = 14
+# In a picture from left to right, where its height matters, by less.
+_SLANT_PX: Final = 7
 # Between the two borders of a pipeline.
 _INSIDE_PX: Final = 4
+# How far each box behind that of a group sticks out.
+_STACK_PX: Final = 4
 
 
-def function_box(function: FunctionView) -> Box:
+def function_box(function: FunctionView, direction: Direction = "down") -> Box:
     """Return the shape and size of a function."""
     lines = _function_lines(function)
     # The widest time is reserved for, so that another run's times do not move anything.
     widest = "000.0 ms, 100%" if len(lines) > 1 and function.state != "failed" else ""
-    slope = 2 * _SLOPE_PX if function.kind == "switch" else 0
-    return Box("box", max(text_width(*lines, widest), 64) + slope, LINE_PX * len(lines) + 14)
+    across, down = _extra(function, direction)
+    return Box("box", max(text_width(*lines, widest), 64) + across, LINE_PX * len(lines) + 14 + down)
 
 
-def paint_function(function: FunctionView, box: Box, centre: Point) -> str:
+def _extra(function: FunctionView, direction: Direction) -> Point:
+    """Return how much wider and higher than its text and bar a function is, for its shape's sake."""
+    if function.kind == "switch":
+        return (2 * _SLOPE_PX, 0) if direction == "down" else (0, 2 * _SLANT_PX)
+    return (0, 2 * _STACK_PX) if function.kind == "group" else (0, 0)
+
+
+def paint_function(function: FunctionView, box: Box, centre: Point, direction: Direction = "down") -> str:
     """Paint a function as an element with its title."""
     x, y = centre[0] - box.width / 2, centre[1] - box.height / 2
-    slope = _SLOPE_PX if function.kind == "switch" else 0
-    if slope:
-        body = f'<polygon class="shape" points="{_trapezium(x, y, box)}"/>'
+    if function.kind == "switch":
+        body = f'<polygon class="shape" points="{_trapezium(x, y, box, direction)}"/>'
+    elif function.kind == "group":
+        body = _stack(x, y, box)
+        centre = centre[0], centre[1] - _STACK_PX
     else:
-        body = f'<rect class="shape" x="{x:.1f}" y="{y:.1f}" width="{box.width:.1f}" height="{box.height:.1f}" rx="3"/>'
+        body = _rectangle(x, y, box.width, box.height)
     if function.kind == "pipeline":
         body += _inner_border(x, y, box)
     if function.share > 0:
-        body += (
-            f'<rect class="bar" x="{x + slope:.1f}" y="{y + box.height - 4:.1f}" '
-            f'width="{(box.width - 2 * slope) * min(function.share, 1):.1f}" height="4"/>'
-        )
+        body += _bar(function, box, centre, direction)
     body += text_lines(_function_lines(function), centre)
     said = "; ".join((function.state, *function.notes))
     title = f"{function.kind} {function.name}: {said}. {function.message}".removesuffix(" ")
@@ -67,6 +77,29 @@ def _state_line(function: FunctionView) -> tuple[str, ...]:
     return (function.state,)
 
 
+def _bar(function: FunctionView, box: Box, centre: Point, direction: Direction) -> str:
+    """Draw the share of the run's time, as long as the text is wide and at the bottom."""
+    across, down = _extra(function, direction)
+    width, height = box.width - across, box.height - down
+    return (
+        f'<rect class="bar" x="{centre[0] - width / 2:.1f}" y="{centre[1] + height / 2 - 4:.1f}" '
+        f'width="{width * min(function.share, 1):.1f}" height="4"/>'
+    )
+
+
+def _rectangle(x: float, y: float, width: float, height: float, kind: str = "shape") -> str:
+    return f'<rect class="{kind}" x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}" rx="3"/>'
+
+
+def _stack(x: float, y: float, box: Box) -> str:
+    """Draw three boxes behind each other; those behind stick out below, so that edges end at the front one's sides."""
+    height = box.height - 2 * _STACK_PX
+    behind = (
+        _rectangle(x + out, y + out, box.width - 2 * out, height, "shape inner") for out in (2 * _STACK_PX, _STACK_PX)
+    )
+    return "".join(behind) + _rectangle(x, y, box.width, height)
+
+
 def _inner_border(x: float, y: float, box: Box) -> str:
     """Draw a second border inside that of a pipeline, so far away that the bar stands between them."""
     width, height = box.width - 2 * _INSIDE_PX, box.height - 2 * _INSIDE_PX
@@ -79,7 +112,10 @@ def _classes(function: FunctionView) -> tuple[str, ...]:
     return (*kind, *(("redefined",) if function.is_redefined else ()), function.state)
 
 
-def _trapezium(x: float, y: float, box: Box) -> str:
+def _trapezium(x: float, y: float, box: Box, direction: Direction) -> str:
     right, bottom = x + box.width, y + box.height
-    points = ((x, y), (right, y), (right - _SLOPE_PX, bottom), (x + _SLOPE_PX, bottom))
+    if direction == "down":
+        points = ((x, y), (right, y), (right - _SLOPE_PX, bottom), (x + _SLOPE_PX, bottom))
+    else:
+        points = ((x, y), (right, y + _SLANT_PX), (right, bottom - _SLANT_PX), (x, bottom))
     return " ".join(f"{a:.1f},{b:.1f}" for a, b in points)

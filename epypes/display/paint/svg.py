@@ -18,12 +18,16 @@ from epypes.display.paint.stages import paint_around
 from epypes.display.paint.style import STYLE
 from epypes.display.paint.tokenmarks import paint_token, token_box
 from epypes.display.views.graphview import GraphView
+from epypes.display.views.groups import counted, function_count
 
 # Beyond this many edges, and this many for each vertex, curves and arrows can't be followed by the eye, would take
 # Graphviz minutes and would fill the picture.
 _MANY_EDGES: Final = 150
 _DENSE: Final = 1.6
 _MARGIN: Final = 6
+# A page may shrink a picture that is too wide to this part of its size; smaller, its text could not be read, so it
+# is scrolled.
+_LEAST_SCALE: Final = 0.6
 
 
 def paint_svg(graph: GraphView) -> str:
@@ -35,22 +39,24 @@ def paint_svg(graph: GraphView) -> str:
         No Graphviz engine answered.
     """
     functions = len(graph.functions)
-    boxes = (*map(function_box, graph.functions), *map(token_box, graph.tokens))
+    boxes = (
+        *(function_box(function, graph.direction) for function in graph.functions),
+        *map(token_box, graph.tokens),
+    )
     edges = tuple(
         (functions + edge.token, edge.function) if edge.is_input else (edge.function, functions + edge.token)
         for edge in graph.edges
     )
     is_dense = len(edges) > max(_MANY_EDGES, _DENSE * len(boxes))
-    layout = lay_out(boxes, edges, is_dense)
+    layout = lay_out(boxes, edges, is_dense, graph.direction)
     around, bounds = paint_around(graph, layout)
-    size = (
-        f"{bounds.right - bounds.left + 2 * _MARGIN:.0f}",
-        f"{bounds.bottom - bounds.top + 2 * _MARGIN:.0f}",
-    )
+    width, height = bounds.right - bounds.left + 2 * _MARGIN, bounds.bottom - bounds.top + 2 * _MARGIN
+    size = f"{width:.0f}", f"{height:.0f}"
     box = f"{bounds.left - _MARGIN:.4g} {bounds.top - _MARGIN:.4g} {size[0]} {size[1]}"
     head = (
         f'<svg xmlns="http://www.w3.org/2000/svg" class="epypes-graph" role="figure" '
-        f'aria-label="{escape(alt_text(graph))}" width="{size[0]}" height="{size[1]}" viewBox="{box}">'
+        f'aria-label="{escape(alt_text(graph))}" width="{size[0]}" height="{size[1]}" viewBox="{box}" '
+        f'style="min-width:{_LEAST_SCALE * width:.0f}px">'
     )
     parts = [head, f"<style>{STYLE}</style>", *around]
     parts += paint_edges(graph.edges, edges, layout)
@@ -59,11 +65,16 @@ def paint_svg(graph: GraphView) -> str:
     return "\n".join(parts)
 
 
+def least_width(svg: str) -> str:
+    """Return the width in pixels that a painted graph asks for at least."""
+    return svg.partition("min-width:")[2].partition("px")[0]
+
+
 def alt_text(graph: GraphView) -> str:
     """Return the graph in one sentence, for screen readers."""
     order = ", ".join(short_name(function.name) for function in graph.functions[:12])
     more = ", ..." if len(graph.functions) > 12 else ""
-    functions = f"{len(graph.functions)} function{'s' * (len(graph.functions) != 1)}"
+    functions = counted(function_count(graph), "function")
     said = f"Computational graph of {functions}: {order}{more}. {graph.caption}".strip()
     if not graph.title:
         return said
@@ -76,6 +87,6 @@ def alt_text(graph: GraphView) -> str:
 def _paint_vertices(graph: GraphView, boxes: tuple[Box, ...], layout: Layout) -> Iterable[str]:
     functions = len(graph.functions)
     for function, box, centre in zip(graph.functions, boxes, layout.centres, strict=False):
-        yield paint_function(function, box, centre)
+        yield paint_function(function, box, centre, graph.direction)
     for token, box, centre in zip(graph.tokens, boxes[functions:], layout.centres[functions:], strict=True):
         yield paint_token(token, box, centre)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
+from epypes.display.layout.geometry import Direction as Direction
 from epypes.display.previews.preview import Preview
 from epypes.images import Order
 
@@ -14,7 +15,6 @@ FunctionKind = Literal["function", "pipeline", "switch", "placeholder", "group"]
 FunctionState = Literal[
     "static", "not run", "running", "ran", "reused", "stale", "failed", "planned", "missing", "left out"
 ]
-Direction = Literal["down", "right"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,15 +7,15 @@ from typing import Final
 
 from epypes.display.views.graphview import FunctionView, GraphView
 from epypes.display.views.structure import structure_of, with_caption
-from epypes.display.views.tokens import valueless_view, within_budget
+from epypes.display.views.tokens import MOST_THUMBNAILS, valueless_view, within_budget
 from epypes.errors import run_call
 from epypes.run import Plan
 
 _NAMED: Final = 8
 
 
-def plan_view(plan: Plan) -> GraphView:
-    """Look at a plan."""
+def plan_view(plan: Plan, most: int = MOST_THUMBNAILS) -> GraphView:
+    """Look at a plan; hyperparameters may be images, of which so many are shown."""
     structure = structure_of(plan.cg, plan.branches, plan.left_out)
     functions = tuple(_planned_view(function, plan) for function in structure.functions)
     missing = frozenset(plan.missing)
@@ -23,7 +23,7 @@ def plan_view(plan: Plan) -> GraphView:
         valueless_view(token, plan.hyperparameters, "missing" if token.name in missing else "static")
         for token in structure.tokens
     ]
-    tokens, _ = within_budget(every, plan.targets)
+    tokens, _ = within_budget(every, plan.targets, most)
     return replace(structure, functions=functions, tokens=tokens, caption=with_caption(_plan_caption(plan), structure))
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from epypes.display.durations import duration_text, overhead_text
 from epypes.display.views.graphview import FunctionView, GraphView
 from epypes.display.views.structure import structure_of, with_caption
-from epypes.display.views.tokens import token_view, within_budget
+from epypes.display.views.tokens import MOST_THUMBNAILS, token_view, within_budget
 from epypes.run import FunctionTime, Run
 from epypes.run.need import chosen_branches, wanted_steps
 
@@ -23,8 +23,18 @@ def run_structure(run: Run) -> GraphView:
     return structure_of(run.cg, chosen_branches(program, values), left_out)
 
 
-def with_run(structure: GraphView, run: Run, hparams: Mapping[str, Any], stale: frozenset[str]) -> GraphView:
-    """Add a run to a graph's structure; ``stale`` are functions out of date since the run."""
+def with_run(
+    structure: GraphView,
+    run: Run,
+    hparams: Mapping[str, Any],
+    stale: frozenset[str],
+    most: int = MOST_THUMBNAILS,
+    seen: Sequence[str] = (),
+) -> GraphView:
+    """Add a run to a graph's structure; ``stale`` are functions out of date since the run.
+
+    Of its thumbnails at most so many are kept: those of sinks, of the tokens that are ``seen`` at once, of the others.
+    """
     steps, report = run.tokens.program.steps, run.report
     stale |= {steps[index].name for index in run.tokens.stale}
     spent = {entry.function: entry for entry in report.functions}
@@ -32,7 +42,7 @@ def with_run(structure: GraphView, run: Run, hparams: Mapping[str, Any], stale: 
         _function_view(function, run, stale, spent.get(function.name)) for function in structure.functions
     )
     every = [token_view(token, run, hparams, stale) for token in structure.tokens]
-    tokens, dropped = within_budget(every, run.cg.sink_tokens)
+    tokens, dropped = within_budget(every, (*run.cg.sink_tokens, *seen), most)
     overhead = f"{overhead_text(report.side_by_side)} {duration_text(report.overhead_ns)}"
     caption = f"{duration_text(report.total_ns)} in all, {overhead}"
     if dropped:

@@ -12,6 +12,8 @@ from epypes.run import Run
 
 # Base64 makes four characters of three bytes; together the thumbnails of one picture take at most this many.
 THUMBNAIL_CHARACTERS: Final = 80_000
+# More are no overview.
+MOST_THUMBNAILS: Final = 24
 
 
 def token_view(token: TokenView, run: Run, hparams: Mapping[str, Any], stale: frozenset[str]) -> TokenView:
@@ -36,24 +38,27 @@ def _in_state(token: TokenView, state: TokenState) -> TokenView:
     return token if token.state == "left out" else replace(token, state=state)
 
 
-def within_budget(tokens: list[TokenView], first: Iterable[str]) -> tuple[tuple[TokenView, ...], int]:
-    """Drop thumbnails until the rest fit; those of ``first`` are kept longest, then the others in order.
+def within_budget(
+    tokens: list[TokenView], first: Iterable[str], most: int = MOST_THUMBNAILS
+) -> tuple[tuple[TokenView, ...], int]:
+    """Drop thumbnails until the rest fit, and are ``most``; those of ``first`` are kept longest, then others in order.
 
     Returns
     -------
     tuple
         The tokens, and how many thumbnails were dropped.
     """
-    important = set(first)
-    spent = dropped = 0
+    rank = {name: place for place, name in enumerate(dict.fromkeys(first))}
+    spent = dropped = count = 0
     kept: dict[str, TokenView] = {}
-    for token in sorted(tokens, key=lambda token: token.name not in important):
+    for token in sorted(tokens, key=lambda token: rank.get(token.name, len(rank))):
         picture = token.preview.picture if token.preview else None
         size = len(picture.data) * 4 // 3 + 100 if picture else 0
-        if token.preview and picture and spent + size > THUMBNAIL_CHARACTERS:
+        if token.preview and picture and (count == most or spent + size > THUMBNAIL_CHARACTERS):
             dropped += 1
             token = replace(token, preview=replace(token.preview, picture=None))
         else:
             spent += size
+            count += picture is not None
         kept[token.name] = token
     return tuple(kept[token.name] for token in tokens), dropped

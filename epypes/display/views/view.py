@@ -5,57 +5,137 @@ Painters read the frozen GraphView and nothing else, so their colours and labels
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any, get_args
 
-from epypes.display.views.graphview import GraphView
+from epypes.display.views.graphview import Direction, GraphView
+from epypes.display.views.groups import collapsed, groups_of, outside_tokens
 from epypes.display.views.pipelines import PipelineLike, in_pipeline
 from epypes.display.views.plans import plan_view
 from epypes.display.views.runs import run_structure, with_run
 from epypes.display.views.states import with_first, with_running
 from epypes.display.views.structure import structure_of, with_caption
-from epypes.display.views.tokens import valueless_view, within_budget
+from epypes.display.views.tokens import MOST_THUMBNAILS, valueless_view, within_budget
+from epypes.errors import UnknownName
 from epypes.graph import CompGraph
+from epypes.graph.renaming import names_of
 from epypes.run import CompGraphRunner, Plan, Run
 
 Shown = CompGraph | CompGraphRunner | Run | Plan | PipelineLike
 
 
-def view(shown: Shown) -> GraphView:
-    """Look at a graph, a runner, a run, a plan or a pipeline; nothing is computed but previews."""
+def view(
+    shown: Any,
+    *,
+    direction: Direction = "down",
+    thumbnails: int = MOST_THUMBNAILS,
+    open: str | Iterable[str] = (),  # noqa: A002 - the word for what is done to a box
+    collapse: bool = True,
+) -> GraphView:
+    """Look at a graph, a runner, a run, a plan or a pipeline; nothing is computed but previews.
+
+    Parameters
+    ----------
+    shown
+        What is looked at.
+    direction
+        Where the data flows to on the page: ``"down"`` or ``"right"``.
+    thumbnails
+        How many there are at most.
+    open
+        The groups whose functions are drawn one by one.
+    collapse
+        Whether groups are drawn as one box each, but for those that are open.
+
+    Raises
+    ------
+    TypeError, ValueError
+        An argument is of another kind, or none of these.
+    UnknownName
+        There is no such group.
+    """
+    _require_options(direction, thumbnails)
+    cg = _graph_of(shown)
+    groups = groups_of(cg.functions, cg.groups)
+    opened = names_of("open", open)
+    for name in opened:
+        if name not in groups:
+            raise UnknownName("group", name, groups, "in this picture")
+    closed = {name: inside for name, inside in groups.items() if collapse and name not in opened}
+    return collapsed(replace(_whole(shown, thumbnails, closed), direction=direction), closed)
+
+
+def _require_options(direction: object, thumbnails: object) -> None:
+    if direction not in get_args(Direction):
+        raise ValueError(f'direction must be "down" or "right", not {direction!r}.')
+    if isinstance(thumbnails, bool) or not isinstance(thumbnails, int):
+        raise TypeError(f"thumbnails must be a number, of how many there are at most, not {thumbnails!r}.")
+    if thumbnails < 0:
+        raise ValueError(f"thumbnails must be 0 or more, not {thumbnails}.")
+
+
+def _graph_of(shown: Any) -> CompGraph:
+    """Return the graph of what is shown; raise TypeError if it can't be shown."""
     if isinstance(shown, CompGraph):
-        return _graph_view(shown)
+        return shown
+    runner = shown if isinstance(shown, CompGraphRunner | Run | Plan) else getattr(shown, "runner", None)
+    if not isinstance(runner, CompGraphRunner | Run | Plan) or isinstance(shown, type):
+        text = "What can be shown is a CompGraph, a CompGraphRunner, a Run, a Plan or a Pipeline"
+        raise TypeError(f"{text}, not {type(shown).__name__!r}.")
+    return runner.cg
+
+
+def _whole(shown: Shown, most: int, closed: Mapping[str, Sequence[str]]) -> GraphView:
+    """Look at all functions; thumbnails that are in closed groups are dropped first."""
+    if isinstance(shown, CompGraph):
+        return _graph_view(shown, most)
     if isinstance(shown, CompGraphRunner):
-        return _runner_view(shown)
+        return _runner_view(shown, most, closed)
     if isinstance(shown, Plan):
-        return with_first(plan_view(shown), shown.hyperparameters, shown.first_hyperparameters)
+        return with_first(plan_view(shown, most), shown.hyperparameters, shown.first_hyperparameters)
     if isinstance(shown, Run):
-        graph = with_run(run_structure(shown), shown, shown.hyperparameters, frozenset())
-        return with_first(graph, shown.hyperparameters, shown.first_hyperparameters)
-    return in_pipeline(_runner_view(shown.runner), shown)
+        return _run_view(shown, most, closed)
+    return in_pipeline(_runner_view(shown.runner, most, closed), shown)
 
 
-def _graph_view(cg: CompGraph) -> GraphView:
+def _run_view(run: Run, most: int, closed: Mapping[str, Sequence[str]]) -> GraphView:
+    structure = run_structure(run)
+    graph = with_run(structure, run, run.hyperparameters, frozenset(), most, _seen(structure, closed))
+    return with_first(graph, run.hyperparameters, run.first_hyperparameters)
+
+
+def _seen(structure: GraphView, closed: Mapping[str, Sequence[str]]) -> Sequence[str]:
+    if not closed:
+        return ()
+    outside = outside_tokens(structure, closed)
+    return [token.name for token in structure.tokens if token.name in outside]
+
+
+def _graph_view(cg: CompGraph, most: int) -> GraphView:
     """Look at a graph; tokens with a default are shown as the hyperparameters that a runner makes of them."""
     structure = structure_of(cg, {}, ())
     every = [valueless_view(token, cg.defaults, "static") for token in structure.tokens]
-    tokens, _ = within_budget(every, ())
+    tokens, _ = within_budget(every, (), most)
     return replace(structure, tokens=tokens)
 
 
-def _runner_view(runner: CompGraphRunner) -> GraphView:
+def _runner_view(runner: CompGraphRunner, most: int, closed: Mapping[str, Sequence[str]]) -> GraphView:
     # First, so that what ends meanwhile shows as running, not as never run.
     running, last, plan = runner.running, runner.last, runner.plan()
-    graph = _between_runs(last, plan)
+    graph = _between_runs(last, plan, most, closed)
     return with_running(with_first(graph, plan.hyperparameters, plan.first_hyperparameters), running)
 
 
-def _between_runs(last: Run | None, plan: Plan) -> GraphView:
+def _between_runs(last: Run | None, plan: Plan, most: int, closed: Mapping[str, Sequence[str]]) -> GraphView:
     structure = structure_of(plan.cg, plan.branches, plan.left_out)
     if last is not None:
-        return with_run(structure, last, plan.hyperparameters, frozenset(plan.order))
+        seen = _seen(structure, closed)
+        return with_run(structure, last, plan.hyperparameters, frozenset(plan.order), most, seen)
     functions = tuple(
         function if function.state == "left out" else replace(function, state="not run")
         for function in structure.functions
     )
-    tokens = tuple(valueless_view(token, plan.hyperparameters, "not computed") for token in structure.tokens)
+    every = [valueless_view(token, plan.hyperparameters, "not computed") for token in structure.tokens]
+    tokens, _ = within_budget(every, (), most)
     return replace(structure, functions=functions, tokens=tokens, caption=with_caption("not run yet", structure))
