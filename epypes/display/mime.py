@@ -2,27 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
-from urllib.parse import quote
+from typing import Any
 
-from epypes.display.markup import escape
-from epypes.display.paint.svg import alt_text, paint_svg
-from epypes.display.paint.tables import paint_plan, paint_report, paint_summary, paint_twin
+from epypes.display.paint.page import paint_graph, paint_page
+from epypes.display.paint.svg import paint_svg
+from epypes.display.paint.tables import paint_plan, paint_report, paint_summary
 from epypes.display.paint.text import paint_text
-from epypes.display.views.graphview import GraphView
 from epypes.display.views.view import Shown, view
 from epypes.errors import LayoutUnavailable
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner, Plan, Run, RunReport, TimingSummary
-
-_SVG_URI: Final = "data:image/svg+xml,"
-_INLINE: Final = (
-    "(()=>{const s=document.currentScript,i=s&&s.previousElementSibling;if(!i||i.tagName!=='IMG')return;"
-    f"const t=decodeURIComponent(i.getAttribute('src').slice({len(_SVG_URI)}));"
-    "const d=new DOMParser().parseFromString(t,'image/svg+xml').documentElement;"
-    "if(d.tagName==='svg')i.replaceWith(document.importNode(d,true))})()"
-)
-
 
 def mimebundle(shown: Any) -> dict[str, str]:
     """Return ``text/plain``, ``text/html`` and ``image/svg+xml`` of what shows itself; of reports without SVG.
@@ -46,7 +35,7 @@ def _painted(shown: Any) -> dict[str, str]:
     graph = view(_subject(shown))
     svg = paint_svg(graph)
     table = paint_plan(graph) if isinstance(shown, Plan) else ""
-    return {"text/html": _figure(svg, graph) + table, "image/svg+xml": svg}
+    return {"text/html": paint_page(paint_graph(svg, graph), table), "image/svg+xml": svg}
 
 
 def _subject(shown: Any) -> Shown:
@@ -66,18 +55,3 @@ def to_svg(shown: Shown) -> str:
         No Graphviz engine answered.
     """
     return paint_svg(view(shown))
-
-
-def _figure(svg: str, graph: GraphView) -> str:
-    """Return the picture as an image that a script replaces by the SVG itself.
-
-    A page that does not trust the notebook strips the script and would strip inline SVG down to its loose words, but
-    keeps the image. Where the script runs, the picture takes the page's colours and its vertices tell their titles.
-    """
-    source = quote(svg, safe=" <>/=:;,.()!?+*'@|^~-_{}[]$")
-    twin = paint_twin(graph, alt_text(graph))
-    return (
-        f'<figure style="margin:0"><img src="{_SVG_URI}{source}" alt="{escape(alt_text(graph))}" '
-        f'style="max-width:100%"><script>{_INLINE}</script>'
-        f'<figcaption style="font-size:11px">{escape(graph.caption)}</figcaption>{twin}</figure>'
-    )

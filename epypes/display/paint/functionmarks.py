@@ -42,7 +42,7 @@ def paint_function(function: FunctionView, box: Box, centre: Point) -> str:
             f'width="{(box.width - 2 * slope) * min(function.share, 1):.1f}" height="4"/>'
         )
     body += text_lines(_function_lines(function), centre)
-    said = "; ".join((function.state, *function.notes))
+    said = "; ".join((*_said_state(function), *function.notes))
     title = f"{function.kind} {function.name}: {said}. {function.message}".removesuffix(" ")
     return vertex("function", function.name, _classes(function), title[:600], body)
 
@@ -60,6 +60,14 @@ def _state_line(function: FunctionView) -> tuple[str, ...]:
     if function.state == "failed":
         return (cut(function.message, _MESSAGE_CHARACTERS),)
     return ("to run" if function.state == "planned" else function.state,)
+
+
+def _said_state(function: FunctionView) -> tuple[str, ...]:
+    """Say the state in words, with the time that was spent."""
+    if function.duration_ns is None:
+        return (function.state,)
+    share = f", {function.share:.0%}" if function.state == "ran" else ""
+    return function.state, f"{duration_text(function.duration_ns)}{share}"
 
 
 def _inner_border(x: float, y: float, box: Box) -> str:

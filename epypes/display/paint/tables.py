@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from epypes.display.durations import duration_text, overhead_text
-from epypes.display.markup import cut, escape
-from epypes.display.views.graphview import FunctionView, GraphView
+from epypes.display.markup import cut, cut_name, escape
+from epypes.display.views.graphview import FunctionView, GraphView, TokenView
 from epypes.run import FunctionTime, LogNormal, RunReport, TimingSummary
 
 # Below them stand the rest, the total and the graph overhead: a hundred rows in all.
@@ -17,22 +17,52 @@ _LEFT: Final = ' style="text-align:left"'
 _CELL_CHARACTERS: Final = 200
 _NAME_CHARACTERS: Final = 60
 _DONE: Final = {"missing": "placeholder", "planned": "runs"}
+_TWIN_CHARACTERS: Final = 200
+# What is kept for saying how many rows do not fit.
+_LAST_ROW: Final = 60
 _HIDDEN: Final = "position:absolute;width:1px;height:1px;overflow:hidden;clip-path:inset(50%);white-space:nowrap"
 
 
-def paint_twin(graph: GraphView, title: str) -> str:
-    """Paint a graph as a table for screen readers; it also stays where a page strips the picture."""
-    rows = "".join(
-        "<tr>" + "".join(f"<td>{escape(cell[:_CELL_CHARACTERS])}</td>" for cell in cells) + "</tr>"
-        for cells in (
-            (function.name, ", ".join(inputs), ", ".join(outputs), "; ".join((function.state, *function.notes)))
-            for (inputs, outputs), function in zip(graph.io(), graph.functions, strict=True)
-        )
+def paint_twin(graph: GraphView, title: str, room: int) -> str:
+    """Paint a graph as tables for screen readers; they also stay where a page strips the picture.
+
+    First the functions, then the tokens, so many of them as fit in ``room`` characters; how many don't is said.
+    """
+    functions = (
+        (function.name, ", ".join(inputs), ", ".join(outputs), "; ".join((*_state(function), *function.notes)))
+        for (inputs, outputs), function in zip(graph.io(), graph.functions, strict=True)
     )
-    return (
-        f'<table style="{_HIDDEN}"><caption>{escape(title)}</caption>'
-        f"<tr><th>function</th><th>inputs</th><th>outputs</th><th>state</th></tr>{rows}</table>"
-    )
+    tokens = ((token.name, *_value(token)) for token in graph.tokens)
+    first = _twin(title, ("function", "inputs", "outputs", "state"), functions, room)
+    return first + _twin("Its tokens", ("token", "value", "state"), tokens, room - len(first))
+
+
+def _twin(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], room: int) -> str:
+    start = f'<table style="{_HIDDEN}"><caption>{escape(caption)}</caption>{_row("th", head, 0)}'
+    room -= len(start) + _LAST_ROW
+    kept: list[str] = []
+    left_out = 0
+    for cells in rows:
+        row = _row("td", [escape(cut_name(cell, _TWIN_CHARACTERS)) for cell in cells], 0)
+        room -= len(row)
+        if room >= 0 and not left_out:
+            kept.append(row)
+        else:
+            left_out += 1
+    more = _row("td", [f"and {left_out} more"], 0) if left_out else ""
+    return f"{start}{''.join(kept)}{more}</table>" if kept or not left_out else ""
+
+
+def _state(function: FunctionView) -> Iterable[str]:
+    yield function.state
+    if function.duration_ns is not None:
+        yield duration_text(function.duration_ns)
+    if function.message:
+        yield function.message
+
+
+def _value(token: TokenView) -> tuple[str, str]:
+    return token.preview.detail if token.preview else "", f"{token.role}, {token.state}"
 
 
 def paint_plan(graph: GraphView) -> str:
