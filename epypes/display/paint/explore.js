@@ -183,14 +183,12 @@
 
   function story(label, data, place, functions) {
     const [name, rest] = parts(label);
-    const made = [make("b", "", name), make("span", "", rest)];
-    if (place >= functions) return made;
-    const [signature, source] = data.texts[data.about[place]] ?? ["", ""];
-    if (signature) made.push(make("code", "", signature));
+    const [signature, source] = (place < functions && data.texts[data.about[place]]) || ["", ""];
+    const made = [make("b", "", name), make("code", "", signature), make("div", "", rest)];
     if (source) {
       made.push(make("pre", "", source));
       made.at(-1).tabIndex = 0;
-    } else if (data.about[place] === null) made.push(make("i", "", "source left out to keep the picture small"));
+    } else if (data.about[place] === null) made.push(make("div", "", "source left out to keep the picture small"));
     return made;
   }
 

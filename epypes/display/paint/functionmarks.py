@@ -6,15 +6,18 @@ from typing import Final
 
 from epypes.display.durations import duration_text
 from epypes.display.layout.geometry import Box, Point
-from epypes.display.markup import cut, short_name
-from epypes.display.paint.marks import LINE_PX, text_lines, text_width, vertex
+from epypes.display.markup import cut, cut_name, short_name
+from epypes.display.paint.marks import LINE_PX, TITLE_CHARACTERS, text_lines, text_width, vertex
 from epypes.display.views.graphview import FunctionView
 
 _MESSAGE_CHARACTERS: Final = 48
 # A switch is drawn like a multiplexer, narrower at its output, by this much on each side.
 _SLOPE_PX: Final = 14
 # Between the two borders of a pipeline.
-_INSIDE_PX: Final = 4
+_INSIDE_PX: Final = 3
+# From the border of a function to the bar of its time.
+_BAR_INSET_PX: Final = 10
+_TOLD_CHARACTERS: Final = 600
 
 
 def function_box(function: FunctionView) -> Box:
@@ -33,18 +36,15 @@ def paint_function(function: FunctionView, box: Box, centre: Point) -> str:
     if slope:
         body = f'<polygon class="shape" points="{_trapezium(x, y, box)}"/>'
     else:
-        body = f'<rect class="shape" x="{x:.1f}" y="{y:.1f}" width="{box.width:.1f}" height="{box.height:.1f}" rx="3"/>'
+        body = f'<rect class="shape" x="{x:.1f}" y="{y:.1f}" width="{box.width:.1f}" height="{box.height:.1f}" rx="6"/>'
     if function.kind == "pipeline":
         body += _inner_border(x, y, box)
-    if function.share > 0:
-        body += (
-            f'<rect class="bar" x="{x + slope:.1f}" y="{y + box.height - 4:.1f}" '
-            f'width="{(box.width - 2 * slope) * min(function.share, 1):.1f}" height="4"/>'
-        )
+    if function.state == "ran":
+        body += _time_bar(x + slope, y, box.width - 2 * slope, box.height, min(function.share, 1))
     body += text_lines(_function_lines(function), centre)
-    said = "; ".join((*_said_state(function), *function.notes))
-    title = f"{function.kind} {function.name}: {said}. {function.message}".removesuffix(" ")
-    return vertex("function", function.name, _classes(function), title[:600], body)
+    said = "; ".join(filter(None, (*_said_state(function), *function.notes, function.message[:_TOLD_CHARACTERS])))
+    title = f"{function.kind} {cut_name(function.name, TITLE_CHARACTERS)}: {said}"
+    return vertex("function", function.name, _classes(function), title, body)
 
 
 def _function_lines(function: FunctionView) -> tuple[str, ...]:
@@ -70,11 +70,20 @@ def _said_state(function: FunctionView) -> tuple[str, ...]:
     return function.state, f"{duration_text(function.duration_ns)}{share}"
 
 
+def _time_bar(x: float, y: float, width: float, height: float, share: float) -> str:
+    """Draw which part of the run's time a function took, as a bar on its track near the lower border."""
+    across = width - 2 * _BAR_INSET_PX
+    return (
+        f'<path class="track" d="M{x + _BAR_INSET_PX:.0f},{y + height - 6:.0f}h{across:.0f}"/><rect class="bar" '
+        f'x="{x + _BAR_INSET_PX - 1.5:.1f}" y="{y + height - 7.5:.1f}" width="{(across + 3) * share:.1f}" height="3" rx="1.5"/>'
+    )
+
+
 def _inner_border(x: float, y: float, box: Box) -> str:
     """Draw a second border inside that of a pipeline, so far away that the bar stands between them."""
     width, height = box.width - 2 * _INSIDE_PX, box.height - 2 * _INSIDE_PX
     at = f'x="{x + _INSIDE_PX:.1f}" y="{y + _INSIDE_PX:.1f}"'
-    return f'<rect class="shape inner" {at} width="{width:.1f}" height="{height:.1f}" rx="2"/>'
+    return f'<rect class="shape inner" {at} width="{width:.1f}" height="{height:.1f}" rx="4"/>'
 
 
 def _classes(function: FunctionView) -> tuple[str, ...]:

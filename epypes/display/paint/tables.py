@@ -33,12 +33,14 @@ def paint_twin(graph: GraphView, title: str, room: int) -> str:
         for (inputs, outputs), function in zip(graph.io(), graph.functions, strict=True)
     )
     tokens = ((token.name, *_value(token)) for token in graph.tokens)
+    start, end = f'<div style="{_HIDDEN}">', "</div>"
+    room -= len(start) + len(end)
     first = _twin(title, ("function", "inputs", "outputs", "state"), functions, room)
-    return first + _twin("Its tokens", ("token", "value", "state"), tokens, room - len(first))
+    return start + first + _twin("Its tokens", ("token", "value", "state"), tokens, room - len(first)) + end
 
 
 def _twin(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], room: int) -> str:
-    start = f'<table style="{_HIDDEN}"><caption>{escape(caption)}</caption>{_row("th", head, 0)}'
+    start = f"<table><caption>{escape(caption)}</caption>{_row('th', head, 0)}"
     room -= len(start) + _LAST_ROW
     kept: list[str] = []
     left_out = 0
