@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from epypes.display.paint.page import paint_graph, paint_page
+from epypes.display.paint.page import paint_graph, paint_page, room_of
 from epypes.display.paint.svg import paint_svg
 from epypes.display.paint.tables import paint_plan, paint_report, paint_summary
 from epypes.display.paint.text import paint_text
@@ -12,6 +12,7 @@ from epypes.display.views.view import Shown, view
 from epypes.errors import LayoutUnavailable
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner, Plan, Run, RunReport, TimingSummary
+
 
 def mimebundle(shown: Any) -> dict[str, str]:
     """Return ``text/plain``, ``text/html`` and ``image/svg+xml`` of what shows itself; of reports without SVG.
@@ -35,7 +36,8 @@ def _painted(shown: Any) -> dict[str, str]:
     graph = view(_subject(shown))
     svg = paint_svg(graph)
     table = paint_plan(graph) if isinstance(shown, Plan) else ""
-    return {"text/html": paint_page(paint_graph(svg, graph), table), "image/svg+xml": svg}
+    figure = paint_graph(svg, graph, room_of(graph, svg) - len(table))
+    return {"text/html": paint_page(figure, table), "image/svg+xml": svg}
 
 
 def _subject(shown: Any) -> Shown:

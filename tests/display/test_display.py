@@ -132,7 +132,9 @@ def test_a_notebook_gets_text_html_and_svg(edge_runner, photograph):
         assert len(bundle["text/plain"]) < 100
         ET.fromstring(bundle["image/svg+xml"])
         source = re.search(r'<img src="data:image/svg\+xml,([^"]*)"', bundle["text/html"])[1]
-        assert ET.canonicalize(unquote(unescape(source))) == ET.canonicalize(bundle["image/svg+xml"]), "where scripts are stripped the picture stays"
+        assert ET.canonicalize(unquote(unescape(source))) == ET.canonicalize(bundle["image/svg+xml"]), (
+            "where scripts are stripped the picture stays"
+        )
         assert "<table" in bundle["text/html"], "the twin for screen readers"
     assert "graph overhead" in run.report._repr_mimebundle_()["text/html"]
 

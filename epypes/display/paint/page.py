@@ -1,8 +1,8 @@
 """What does a page get besides the picture: how it is explored, its twin for screen readers, its functions' sources?
 
-The picture is an ``<img>`` of the SVG, which the script replaces by the SVG itself: a page that does not trust a notebook
-strips scripts and would strip inline SVG down to its loose words, but keeps the image. Where the script runs, the picture
-takes the page's colours and can be explored (``explore.js``).
+The picture is an ``<img>`` of the SVG, which the script replaces by the SVG itself: a page that does not trust a
+notebook strips scripts and would strip inline SVG down to its loose words, but keeps the image. Where the script runs,
+the picture takes the page's colours and can be explored (``explore.js``).
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ _WEIGHTS: Final = {"failed": -2.0, "running": -1.5}
 
 def paint_page(*parts: str) -> str:
     """Return what is shown together, such as a figure and the tables below it, with what it takes to explore it."""
-    return f'<div class="epypes-sheet">{"".join(parts)}<style>{_asset("css")}</style><script>{_asset("js")}</script></div>'
+    return (
+        f'<div class="epypes-sheet">{"".join(parts)}<style>{_asset("css")}</style><script>{_asset("js")}</script></div>'
+    )
 
 
 def paint_figure(svg: str, alt: str, caption: str = "", more: str = "") -> str:
@@ -49,7 +51,7 @@ def paint_figure(svg: str, alt: str, caption: str = "", more: str = "") -> str:
     )
 
 
-def paint_graph(svg: str, graph: GraphView, room: int | None = None) -> str:
+def paint_graph(svg: str, graph: GraphView, room: int) -> str:
     """Return the picture of a graph as a figure, with its table twin and with what the script needs to know.
 
     Parameters
@@ -57,12 +59,12 @@ def paint_graph(svg: str, graph: GraphView, room: int | None = None) -> str:
     svg
         What was painted of the graph.
     room
-        How many characters it may take, if not as many as one picture may. Rows of the twin and sources of functions are
-        left out where they don't fit; what was left out is said.
+        How many characters it may take. Rows of the twin and sources of functions are left out where they don't fit;
+        what was left out is said.
     """
     alt = alt_text(graph)
     figure = paint_figure(svg, alt, graph.caption).removesuffix(_END)
-    room = (room_of(graph, svg) if room is None else room) - len(figure) - len(_END) - len(_data(graph, {}))
+    room -= len(figure) + len(_END) + len(_data(graph, {}))
     twin = paint_twin(graph, alt, room)
     return f"{figure}{_data(graph, _fitting(graph, room - len(twin)))}{twin}{_END}"
 
@@ -110,8 +112,8 @@ def _relevance(function: FunctionView) -> float:
 def _data(graph: GraphView, kept: Texts) -> str:
     """Return what the script needs to know, as text that does nothing by itself.
 
-    Edges by function, a token that no run reads as its complement; then by function which of the texts are its own, null
-    if they were left out.
+    Edges by function, a token that no run reads as its complement; then by function which of the texts are its own,
+    null if they were left out.
     """
     owner = {place: index for index, places in enumerate(kept.values()) for place in places}
     about = [

@@ -27,8 +27,8 @@ _known: WeakKeyDictionary[Any, tuple[str, str]] = WeakKeyDictionary()
 def signature_and_source(function: Any) -> tuple[str, str]:
     """Return a function's parameters, and the first lines of its source; never raises.
 
-    Of what is decorated, partial or a node the user's own function is told. What has no source in Python has the first lines
-    of its documentation instead, marked so.
+    Of what is decorated, partial or a node the user's own function is told. What has no source in Python has the first
+    lines of its documentation instead, marked so.
 
     Returns
     -------
@@ -47,7 +47,7 @@ def signature_and_source(function: Any) -> tuple[str, str]:
 
 
 def graph_lines(cg: CompGraph) -> str:
-    """Return the first functions of a graph as lines, ``canny(image, low, high) -> edges``: the source of a pipeline."""
+    """Return the first functions of a pipeline's graph as lines: ``canny(image, low, high) -> edges``."""
     lines = [
         f"{name}({', '.join(cg.func_inputs(name))}) -> {', '.join(cg.func_outputs(name)) or 'nothing'}"
         for name in islice(cg.functions, SOURCE_LINES + 1)
@@ -99,7 +99,7 @@ def _code_lines(function: Any) -> Sequence[str]:
     Found by the positions in its code: to parse the file, as ``inspect.getsource`` does, takes a hundred times longer.
     """
     if not isinstance(function, FunctionType):
-        function = getattr(type(function), "__call__", None)
+        function = getattr(type(function), "__call__", None)  # noqa: B004 - the method itself is wanted
     if not isinstance(function, FunctionType):
         return ()
     code = function.__code__
