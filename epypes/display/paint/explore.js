@@ -6,6 +6,7 @@
 (() => {
   const WANTED = "figure.epypes-figure:not([data-alive])";
   const VERTEX = "[id^=function-],[id^=token-]";
+  const OWN_KEYS = "data-lm-suppress-shortcuts";
   const LARGER = 3, GAP = 10;
 
   const home = document.currentScript?.parentElement;
@@ -110,13 +111,14 @@
     });
   }
 
-  // A title would show a second, slower card; what it says becomes the vertex's name.
+  // A title would show a second, slower card; what it says becomes the vertex's name. JupyterLab takes keys for its
+  // own shortcuts (d d deletes a cell) unless the very element that has the focus forbids it.
   function labelled(vertex) {
     const title = vertex.querySelector("title");
     const label = title?.textContent ?? vertex.id;
     title?.remove();
-    for (const [name, value] of [["aria-label", label], ["aria-pressed", "false"], ["role", "button"], ["tabindex", "0"]])
-      vertex.setAttribute(name, value);
+    const marks = { "aria-label": label, "aria-pressed": "false", role: "button", tabindex: "0", [OWN_KEYS]: "true" };
+    for (const [name, value] of Object.entries(marks)) vertex.setAttribute(name, value);
     return label;
   }
 
@@ -188,6 +190,7 @@
     if (source) {
       made.push(make("pre", "", source));
       made.at(-1).tabIndex = 0;
+      made.at(-1).setAttribute(OWN_KEYS, "true");
     } else if (data.about[place] === null) made.push(make("div", "", "source left out to keep the picture small"));
     return made;
   }

@@ -75,7 +75,8 @@ def _time_bar(x: float, y: float, width: float, height: float, share: float) -> 
     left, across = x + _BAR_INSET_PX, width - 2 * _BAR_INSET_PX
     return (
         f'<path class="track" d="M{left:.0f},{y + height - 6:.0f}h{across:.0f}"/>'
-        f'<rect class="bar" x="{left - 1.5:.1f}" y="{y + height - 7.5:.1f}" width="{(across + 3) * share:.1f}" height="3" rx="1.5"/>'
+        f'<rect class="bar" x="{left - 1.5:.1f}" y="{y + height - 7.5:.1f}" '
+        f'width="{(across + 3) * share:.1f}" height="3" rx="1.5"/>'
     )
 
 

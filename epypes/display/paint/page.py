@@ -45,7 +45,7 @@ def paint_figure(svg: str, alt: str, caption: str = "", more: str = "") -> str:
     for sign, encoded in _IN_URI.items():
         source = source.replace(sign, encoded)
     return (
-        f'<figure class="epypes-figure" data-lm-suppress-shortcuts="true" style="margin:0">'
+        f'<figure class="epypes-figure" style="margin:0">'
         f'<img src="{_SVG_URI}{source}" alt="{escape(alt)}" style="max-width:100%">'
         f'<figcaption style="font-size:12px">{escape(caption)}</figcaption>{more}</figure>'
     )
