@@ -318,6 +318,30 @@ _AS_LAB = """html => {
 }"""
 
 
+def test_a_picture_that_is_taken_away_and_put_back_shows_its_card_again(sheet: Sheet, edges: str) -> None:
+    sheet.put(edges)
+    sheet.page.hover("#token-edges")
+    sheet.page.evaluate("window.kept = document.querySelector('.epypes-sheet'); window.kept.remove()")
+    sheet.page.wait_for_function("!window.kept.querySelector('.epypes-card.open')")
+    sheet.page.evaluate("document.querySelector('.output').append(window.kept)")
+    sheet.page.hover("#token-edges")
+    assert sheet.card[0] == "token edges"
+
+
+def test_the_card_follows_its_vertex_when_the_page_scrolls(sheet: Sheet, edges: str) -> None:
+    sheet.put(edges)
+    sheet.page.keyboard.press("Tab")
+    beside = """() => {
+        const [card, vertex] = ['.epypes-card', '#function-grayscale']
+            .map(each => document.querySelector(each).getBoundingClientRect());
+        return Math.abs(card.top + card.height / 2 - vertex.top - vertex.height / 2) < 2;
+    }"""
+    sheet.page.wait_for_function(beside)
+    sheet.page.evaluate("scrollBy(0, 90)")
+    sheet.page.wait_for_function(beside)
+    assert sheet.page.evaluate("scrollY") == 90
+
+
 @pytest.mark.parametrize("run_scripts", [_AS_VS_CODE, _AS_LAB], ids=["VS Code", "JupyterLab"])
 def test_a_notebook_that_runs_scripts_later_or_elsewhere_has_live_pictures(
     sheet: Sheet, edges: str, run_scripts: str

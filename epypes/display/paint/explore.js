@@ -58,7 +58,7 @@
     about.setAttribute("aria-live", "polite");
     (figure.querySelector("figcaption") ?? figure.lastChild).after(about, card);
     const placeOf = (target) => vertices.indexOf(target?.closest?.(VERTEX));
-    let near = -1, chosen = -1;
+    let near = -1, chosen = -1, frame = 0;
 
     function show(place) {
       if (place === near) return;
@@ -66,14 +66,15 @@
       if (place >= 0) card.replaceChildren(...enlarged(vertices[place]), ...facts(labels[place]));
       card.classList.toggle("open", place >= 0);
       if (card.isConnected) card.togglePopover?.(place >= 0);
-      follow();
+      cancelAnimationFrame(frame);
+      if (place >= 0) follow();
     }
 
     // Whatever scrolls, the card stays beside its vertex; no listener is needed outside the figure.
     function follow() {
-      if (near < 0 || !figure.isConnected) return;
+      if (!figure.isConnected) return show(-1);
       stand(card, vertices[near], figure);
-      requestAnimationFrame(follow);
+      frame = requestAnimationFrame(follow);
     }
 
     function choose(place) {
