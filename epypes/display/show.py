@@ -42,7 +42,7 @@ class Figure:
     @property
     def html(self) -> str:
         """The picture for a page, with its caption and the insides of its groups."""
-        return html_and_svg(self.view)[0] + self.table
+        return html_and_svg(self.view, self.table)["text/html"]
 
     def save(self, path: str | Path) -> Path:
         """Write the picture as ``.svg``, as a page of its own as ``.html``, or what is to be seen as ``.json``.
@@ -70,11 +70,7 @@ class Figure:
         return f"<Figure: {counted(function_count(self.view), 'function')}{groups}; {self.view.direction}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        return bundle_of(repr(self), self._painted, lambda: self.view)
-
-    def _painted(self) -> dict[str, str]:
-        html, svg = html_and_svg(self.view)
-        return {"text/html": html + self.table, "image/svg+xml": svg}
+        return bundle_of(repr(self), lambda: html_and_svg(self.view, self.table), lambda: self.view)
 
 
 def show(

@@ -38,10 +38,10 @@ def _is_redefined(function: Any) -> bool:
     try:
         if is_redefined_inside(function):
             return True
-        old = _unwrapped(function)
+        old = unwrapped(function)
         if not isinstance(old, FunctionType):
             return False
-        new = _unwrapped(_bound_now(old.__module__, old.__qualname__))
+        new = unwrapped(_bound_now(old.__module__, old.__qualname__))
         return isinstance(new, FunctionType) and new is not old and not is_defined_alike(old, new)
     except Exception:  # a repr shows this; whatever odd objects do, it must not fail
         return False
@@ -60,7 +60,7 @@ def inner_graph(function: Any) -> CompGraph | None:
         return None
 
 
-def _unwrapped(function: Any) -> Any:
+def unwrapped(function: Any) -> Any:
     """Return the Python function in a decorated one, a node, a partial or a method."""
     for _ in range(_DEEPEST):
         if type(function) is FunctionType and not function.__dict__:

@@ -44,6 +44,8 @@ def test_the_wheel_holds_both_packages_and_their_data(wheel):
     for name in (
         "epypes/py.typed",
         "epypes/wire/schema.binpb",
+        "epypes/display/paint/explore.js",
+        "epypes/display/paint/explore.css",
         "epypes_widgets/picture.js",
         "epypes_widgets/picture.css",
     ):

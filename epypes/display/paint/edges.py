@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from typing import Final
 
 from epypes.display.layout.geometry import Layout, Point
 from epypes.display.views.graphview import EdgeView
+
+_OFF: Final = " off"
 
 
 def paint_edges(edges: Sequence[EdgeView], ends: Sequence[tuple[int, int]], layout: Layout) -> Iterator[str]:
@@ -23,7 +26,7 @@ def paint_edges(edges: Sequence[EdgeView], ends: Sequence[tuple[int, int]], layo
     layout
         Without splines in a dense graph.
     """
-    for is_live, kind in ((False, " off"), (True, "")):
+    for is_live, kind in ((False, _OFF), (True, "")):
         places = [place for place, edge in enumerate(edges) if edge.is_live == is_live]
         if places and layout.splines:
             yield _paint_splines([layout.splines[place] for place in places], kind)
@@ -32,27 +35,39 @@ def paint_edges(edges: Sequence[EdgeView], ends: Sequence[tuple[int, int]], layo
 
 
 def _paint_splines(splines: Iterable[tuple[Point, ...]], kind: str) -> str:
-    """Paint edges as one path of curves and one of their tips."""
-    painted: set[str] = set()
-    curves: list[str] = []
-    tips: dict[str, None] = {}
+    """Paint edges as one path of curves and one of their tips; each edge is a piece of both that begins with M."""
+    curves, tips = [], []
     for *spline, tip in splines:
-        curves += _curves(spline, painted)
-        tips[f"M{_arrow(spline[-1], tip)}Z"] = None
-    return f'<path class="edge{kind}" d="{"".join(curves)}"/><path class="tip{kind}" d="{"".join(tips)}"/>'
+        curves.append(_curves(spline))
+        tips.append(f"M{_arrow(spline[-1], tip)}Z")
+    if kind == _OFF:
+        # Dashes over dashes would be a line.
+        curves, tips = _each_once(curves), list(dict.fromkeys(tips))
+    return f'<path class="edge{kind}" d="{"".join(map(_path, curves))}"/><path class="tip{kind}" d="{"".join(tips)}"/>'
 
 
-def _curves(spline: Sequence[Point], painted: set[str]) -> Iterator[str]:
-    """Give the curves of a spline but for those that are painted already: dashes over dashes would be a line."""
-    at = ""
-    for first in range(0, len(spline) - 1, 3):
-        start, *controls = (f"{x:.1f},{y:.1f}" for x, y in spline[first : first + 4])
-        curve = " ".join(controls)
-        if f"{start} {curve}" in painted:
-            continue
-        painted.add(f"{start} {curve}")
-        yield f" {curve}" if start == at else f"M{start}C{curve}"
-        at = controls[-1]
+def _curves(spline: Sequence[Point]) -> list[tuple[str, str]]:
+    """Return the curves of a spline: where each starts, and its controls."""
+    at = [f"{x:.1f},{y:.1f}" for x, y in spline]
+    return [(at[first], " ".join(at[first + 1 : first + 4])) for first in range(0, len(at) - 1, 3)]
+
+
+def _each_once(splines: Iterable[list[tuple[str, str]]]) -> list[list[tuple[str, str]]]:
+    painted: set[tuple[str, str]] = set()
+    kept: list[list[tuple[str, str]]] = []
+    for curves in splines:
+        kept.append([curve for curve in curves if curve not in painted])
+        painted.update(curves)
+    return kept
+
+
+def _path(curves: list[tuple[str, str]]) -> str:
+    """Return curves as part of a path; where one starts at the end of the last one, that is not said again."""
+    path, at = "", ""
+    for start, controls in curves:
+        path += f" {controls}" if start == at else f"M{start}C{controls}"
+        at = controls.rpartition(" ")[2]
+    return path
 
 
 def _paint_lines(ends: Iterable[tuple[int, int]], layout: Layout, kind: str) -> str:

@@ -7,7 +7,7 @@ from typing import Final
 from epypes.display.durations import duration_text
 from epypes.display.layout.geometry import Box, Direction, Point
 from epypes.display.markup import cut_name, short_name, wrapped
-from epypes.display.paint.marks import LINE_PX, text_lines, text_width, vertex
+from epypes.display.paint.marks import LINE_PX, TITLE_CHARACTERS, text_lines, text_width, vertex
 from epypes.display.views.graphview import FunctionView
 
 _MESSAGE_CHARACTERS: Final = 36
@@ -18,9 +18,12 @@ _SLOPE_PX: Final = 14
 # In a picture from left to right, where its height matters, by less.
 _SLANT_PX: Final = 7
 # Between the two borders of a pipeline.
-_INSIDE_PX: Final = 4
+_INSIDE_PX: Final = 3
 # How far each box behind that of a group sticks out.
 _STACK_PX: Final = 4
+# From the border of a function to the bar of its time.
+_BAR_INSET_PX: Final = 10
+_TOLD_CHARACTERS: Final = 600
 
 
 def function_box(function: FunctionView, direction: Direction = "down") -> Box:
@@ -51,12 +54,12 @@ def paint_function(function: FunctionView, box: Box, centre: Point, direction: D
         body = _rectangle(x, y, box.width, box.height)
     if function.kind == "pipeline":
         body += _inner_border(x, y, box)
-    if function.share > 0:
-        body += _bar(function, box, centre, direction)
+    if function.state == "ran":
+        body += _time_bar(function, box, centre, direction)
     body += text_lines(_function_lines(function), centre)
-    said = "; ".join((function.state, *function.notes))
-    title = f"{function.kind} {function.name}: {said}. {function.message}".removesuffix(" ")
-    return vertex("function", function.name, _classes(function), title[:600], body)
+    said = "; ".join(filter(None, (*_said_state(function), *function.notes, function.message[:_TOLD_CHARACTERS])))
+    title = f"{function.kind} {cut_name(function.name, TITLE_CHARACTERS)}: {said}"
+    return vertex("function", function.name, _classes(function), title, body)
 
 
 def _function_lines(function: FunctionView) -> tuple[str, ...]:
@@ -77,18 +80,8 @@ def _state_line(function: FunctionView) -> tuple[str, ...]:
     return (function.state,)
 
 
-def _bar(function: FunctionView, box: Box, centre: Point, direction: Direction) -> str:
-    """Draw the share of the run's time, as long as the text is wide and at the bottom."""
-    across, down = _extra(function, direction)
-    width, height = box.width - across, box.height - down
-    return (
-        f'<rect class="bar" x="{centre[0] - width / 2:.1f}" y="{centre[1] + height / 2 - 4:.1f}" '
-        f'width="{width * min(function.share, 1):.1f}" height="4"/>'
-    )
-
-
 def _rectangle(x: float, y: float, width: float, height: float, kind: str = "shape") -> str:
-    return f'<rect class="{kind}" x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}" rx="3"/>'
+    return f'<rect class="{kind}" x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}" rx="6"/>'
 
 
 def _stack(x: float, y: float, box: Box) -> str:
@@ -100,11 +93,30 @@ def _stack(x: float, y: float, box: Box) -> str:
     return "".join(behind) + _rectangle(x, y, box.width, height)
 
 
+def _said_state(function: FunctionView) -> tuple[str, ...]:
+    """Say the state in words, with the time that was spent."""
+    if function.duration_ns is None:
+        return (function.state,)
+    share = f", {function.share:.0%}" if function.state == "ran" else ""
+    return function.state, f"{duration_text(function.duration_ns)}{share}"
+
+
+def _time_bar(function: FunctionView, box: Box, centre: Point, direction: Direction) -> str:
+    """Draw which part of the run's time a function took, as a bar on its track below its text."""
+    across, down = _extra(function, direction)
+    length = box.width - across - 2 * _BAR_INSET_PX
+    left, y = centre[0] - length / 2, centre[1] + (box.height - down) / 2 - 6
+    return (
+        f'<path class="track" d="M{left:.0f},{y:.0f}h{length:.0f}"/><rect class="bar" x="{left - 1.5:.1f}" '
+        f'y="{y - 1.5:.1f}" width="{(length + 3) * min(function.share, 1):.1f}" height="3" rx="1.5"/>'
+    )
+
+
 def _inner_border(x: float, y: float, box: Box) -> str:
     """Draw a second border inside that of a pipeline, so far away that the bar stands between them."""
     width, height = box.width - 2 * _INSIDE_PX, box.height - 2 * _INSIDE_PX
     at = f'x="{x + _INSIDE_PX:.1f}" y="{y + _INSIDE_PX:.1f}"'
-    return f'<rect class="shape inner" {at} width="{width:.1f}" height="{height:.1f}" rx="2"/>'
+    return f'<rect class="shape inner" {at} width="{width:.1f}" height="{height:.1f}" rx="4"/>'
 
 
 def _classes(function: FunctionView) -> tuple[str, ...]:

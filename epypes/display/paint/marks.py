@@ -12,6 +12,8 @@ from epypes.display.markup import escape
 LINE_PX: Final = 16
 _CHARACTER_PX: Final = 6.9
 _ID_CHARACTERS: Final = 40
+# A title tells a name in full, unless it is so long that the titles of many vertices would fill the picture.
+TITLE_CHARACTERS: Final = 120
 
 
 def text_width(*lines: str) -> float:

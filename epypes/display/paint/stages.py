@@ -184,7 +184,7 @@ class _Row:
             (x0, y0), (x1, y1) = (start[::-1], end[::-1]) if self._is_turned else (start, end)
             lines += f"M{x0:.1f},{y0:.1f}L{x1:.1f},{y1:.1f}"
             tips += _tip(x1, y1, is_across=x0 != x1)
-        return f'<path class="edge" d="{lines}"/><path class="tip" d="{tips}"/>'
+        return f'<path class="edge around" d="{lines}"/><path class="tip around" d="{tips}"/>'
 
 
 def _tip(x: float, y: float, is_across: bool) -> str:

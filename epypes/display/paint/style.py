@@ -2,41 +2,92 @@
 
 from __future__ import annotations
 
+import re
 from typing import Final
 
-# The fallbacks serve where the page has no Jupyter theme: dark text on light vertices, grey edges, readable on white
-# and on black paper alike.
-STYLE: Final = """
-.epypes-graph{max-width:100%;height:auto;font:12px var(--jp-ui-font-family,system-ui,sans-serif)}
-.epypes-graph text{fill:var(--jp-ui-font-color1,#1f2328);text-anchor:middle;stroke:none}
-.epypes-graph .small{font-size:10px}
-.epypes-graph .name{font-weight:600}
-.epypes-graph .shape{fill:var(--jp-layout-color1,#fff);stroke:#80868f}
-.epypes-graph .function .shape,.epypes-graph .call .shape{fill:var(--jp-layout-color2,#e9eef6);stroke-width:1.4}
-.epypes-graph .function .shape,.epypes-graph .call .shape{stroke:var(--jp-brand-color1,#1976d2)}
-.epypes-graph .hyperparameter .shape{fill:var(--jp-layout-color3,#dcdfe4)}
-.epypes-graph .bar{fill:var(--jp-brand-color1,#1976d2)}
-.epypes-graph .planned .shape{stroke-width:3}
-.epypes-graph .redefined .shape{stroke:var(--jp-warn-color1,#e65100);stroke-width:3}
-.epypes-graph .missing .shape{stroke:var(--jp-error-color1,#d32f2f);stroke-width:2}
-.epypes-graph .left-out .shape{stroke-dasharray:2 3}
-.epypes-graph .left-out{opacity:.6}
-.epypes-graph .failed .shape{stroke:var(--jp-error-color1,#d32f2f);stroke-width:3}
-.epypes-graph .stale .shape,.epypes-graph .not-computed .shape,.epypes-graph .not-run .shape{stroke-dasharray:2 3}
-.epypes-graph .placeholder .shape{stroke-dasharray:7 4}
-.epypes-graph .stale image{opacity:.35}
-.epypes-graph .function .inner{fill:none;stroke-width:1}
-.epypes-graph .edge{fill:none;stroke:#80868f}
-.epypes-graph .dense{stroke-width:.5}
-.epypes-graph .tip{fill:#80868f}
-.epypes-graph .off{opacity:.6}
-.epypes-graph .edge.off{stroke-dasharray:4 4}
-.epypes-graph .running .shape{stroke:var(--jp-success-color1,#2e7d32);stroke-width:2.5}
-.epypes-graph .reused .shape{stroke-dasharray:9 2}
-.epypes-graph .frame{fill:none;stroke:#80868f}
-.epypes-graph .mark{fill:none;stroke:#80868f;stroke-width:1.4}
-.epypes-graph .stage .open{stroke:none}
-.epypes-graph .queue.running .mark{stroke:var(--jp-success-color1,#2e7d32)}
-.epypes-graph .stopped .shape{stroke-dasharray:2 3}
-.epypes-graph .changed .dot{fill:var(--jp-warn-color1,#e65100)}
-""".replace("\n", "")
+# What a colour is called in the rules below -> what it is on paper, and what it is in a page: the theme of JupyterLab,
+# else that of VS Code, else as on paper. Tints are mixed, so they suit any theme, and text is as readable on them as on
+# their ground. On paper they are dark text on light shapes between grey edges: readable on white and on black.
+_COLOURS: Final = {
+    "text": ("#1f2328", "var(--jp-ui-font-color1,var(--vscode-editor-foreground,#1f2328))"),
+    "ground": ("#fff", "var(--jp-layout-color1,var(--vscode-editor-background,#fff))"),
+    "accent": ("#1769c2", "var(--jp-brand-color1,var(--vscode-textLink-foreground,#1769c2))"),
+    "error": ("#cf222e", "var(--jp-error-color1,var(--vscode-errorForeground,#cf222e))"),
+    "warn": ("#bc4c00", "var(--jp-warn-color1,var(--vscode-editorWarning-foreground,#bc4c00))"),
+    "good": ("#2e7d32", "var(--jp-success-color1,var(--vscode-testing-iconPassed,#2e7d32))"),
+    "quiet": ("#525a64", "color-mix(in srgb,@text 82%,@ground)"),
+    "line": ("#868e98", "color-mix(in srgb,@text 50%,@ground)"),
+    "track": ("#d3dfef", "color-mix(in srgb,@accent 22%,@ground)"),
+    "cool": ("#eaf2fc", "color-mix(in srgb,@accent 9%,@ground)"),
+    "grey": ("#e6e8eb", "color-mix(in srgb,@text 12%,@ground)"),
+    "alarm": ("#fcebec", "color-mix(in srgb,@error 10%,@ground)"),
+}
+
+# Selector -> declarations. What a state says stands after what a kind says.
+_RULES: Final = {
+    "": "max-width:100%;height:auto;font:12px var(--jp-ui-font-family,system-ui,sans-serif)",
+    " text": "fill:@text;text-anchor:middle;stroke:none",
+    " .small": "font-size:10px;fill:@quiet",
+    " .name": "font-weight:600",
+    " .shape": "fill:@ground;stroke:@line",
+    " image": "outline:1px solid @track",
+    " .function .shape": "fill:@cool;stroke:@accent;stroke-width:1.3",
+    " .call .shape": "fill:@cool;stroke:@accent;stroke-width:1.3",
+    " .hyperparameter .shape": "fill:@grey",
+    " .track": "stroke:@track;stroke-width:3;stroke-linecap:round",
+    " .bar": "fill:@accent",
+    " .planned .shape": "stroke-width:3",
+    " .redefined .shape": "stroke:@warn;stroke-width:3",
+    " .missing .shape": "stroke:@error;stroke-width:2",
+    " .failed .shape": "fill:@alarm;stroke:@error;stroke-width:3",
+    " .stale .shape": "fill:@ground;stroke-dasharray:2 3",
+    " .not-computed .shape": "stroke-dasharray:2 3",
+    " .not-run .shape": "stroke-dasharray:2 3",
+    " .left-out .shape": "fill:@ground;stroke:@line;stroke-dasharray:1 4",
+    " .left-out text": "fill:@quiet;font-weight:400",
+    " .running .shape": "stroke:@good;stroke-width:2.5",
+    " .reused .shape": "stroke-dasharray:9 2",
+    " .stopped .shape": "stroke-dasharray:2 3",
+    " .placeholder .shape": "stroke-dasharray:7 4",
+    " .stale image": "opacity:.35",
+    " .function .inner": "fill:none;stroke-width:1",
+    " .edge": "fill:none;stroke:@line",
+    " .dense": "stroke-width:.5",
+    " .tip": "fill:@line",
+    " .off": "opacity:.6",
+    " .edge.off": "stroke-dasharray:4 4",
+    " .changed .dot": "fill:@warn",
+    " .frame": "fill:none;stroke:@line",
+    " .mark": "fill:none;stroke:@line;stroke-width:1.4",
+    " .stage .open": "stroke:none",
+    " .queue.running .mark": "stroke:@good",
+}
+
+
+def _paper() -> str:
+    return "".join(f".epypes-graph{selector}{{{_coloured(declarations)}}}" for selector, declarations in _RULES.items())
+
+
+def _page() -> str:
+    rules = "".join(
+        f".epypes-graph{selector}{{{';'.join(coloured)}}}"
+        for selector, declarations in _RULES.items()
+        if (coloured := [_named(part) for part in declarations.split(";") if "@" in part or "none" in part])
+    )
+    names = "".join(f"--epypes-{name}:{_named(page)};" for name, (_, page) in _COLOURS.items())
+    return f"@supports(color:color-mix(in srgb,red,red)){{.epypes-graph,.epypes-sheet{{{names}}}{rules}}}"
+
+
+def _coloured(declarations: str) -> str:
+    return re.sub(r"@(\w+)", lambda name: _COLOURS[name[1]][0], declarations)
+
+
+def _named(declarations: str) -> str:
+    return re.sub(r"@(\w+)", r"var(--epypes-\1)", declarations)
+
+
+# The rules with the colours of paper; then, for what knows variables and mixes, with those of the page. A viewer that
+# does not know them skips these, and has what stands on paper.
+PAPER_STYLE: Final = _paper()
+PAGE_STYLE: Final = _page()
+STYLE: Final = PAPER_STYLE + PAGE_STYLE

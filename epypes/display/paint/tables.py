@@ -2,37 +2,67 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final
 
-from epypes.display.markup import cut, escape
+from epypes.display.durations import duration_text
+from epypes.display.markup import cut, cut_name, escape
 from epypes.display.paint.rows import Table
 from epypes.display.paint.stagemarks import stage_words
-from epypes.display.views.graphview import GraphView, StageView
+from epypes.display.views.graphview import FunctionView, GraphView, StageView, TokenView
 
 _LEFT: Final = ' style="text-align:left"'
-_TWIN_CHARACTERS: Final = 200
 CELL_CHARACTERS: Final = 60
+_TWIN_CHARACTERS: Final = 200
+# What is kept for saying how many rows do not fit.
+_LAST_ROW: Final = 60
 _HIDDEN: Final = "position:absolute;width:1px;height:1px;overflow:hidden;clip-path:inset(50%);white-space:nowrap"
 
 
-def paint_twin(graph: GraphView, title: str) -> str:
-    """Paint a graph as a table for screen readers; it also stays where a page strips the picture."""
-    rows = "".join(
-        "<tr>" + "".join(f"<td>{escape(cell[:_TWIN_CHARACTERS])}</td>" for cell in cells) + "</tr>"
-        for cells in (
-            *map(_stage_cells, graph.before),
-            *(
-                (function.name, ", ".join(inputs), ", ".join(outputs), "; ".join((function.state, *function.notes)))
-                for (inputs, outputs), function in zip(graph.io(), graph.functions, strict=True)
-            ),
-            *map(_stage_cells, graph.after),
-        )
+def paint_twin(graph: GraphView, title: str, room: int) -> str:
+    """Paint a graph as tables for screen readers; they also stay where a page strips the picture.
+
+    First the functions, with the stages around them, then the tokens, so many of them as fit in ``room`` characters;
+    how many don't is said.
+    """
+    functions = (
+        (function.name, ", ".join(inputs), ", ".join(outputs), "; ".join((*_state(function), *function.notes)))
+        for (inputs, outputs), function in zip(graph.io(), graph.functions, strict=True)
     )
-    return (
-        f'<table style="{_HIDDEN}"><caption>{escape(title)}</caption>'
-        f"<tr><th>function</th><th>inputs</th><th>outputs</th><th>state</th></tr>{rows}</table>"
-    )
+    rows = (*map(_stage_cells, graph.before), *functions, *map(_stage_cells, graph.after))
+    tokens = ((token.name, *_value(token)) for token in graph.tokens)
+    start, end = f'<div style="{_HIDDEN}">', "</div>"
+    room -= len(start) + len(end)
+    first = _twin(title, ("function", "inputs", "outputs", "state"), rows, room)
+    return start + first + _twin("Its tokens", ("token", "value", "state"), tokens, room - len(first)) + end
+
+
+def _twin(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], room: int) -> str:
+    start = f"<table><caption>{escape(caption)}</caption>{_row('th', head, 0)}"
+    room -= len(start) + _LAST_ROW
+    kept: list[str] = []
+    left_out = 0
+    for cells in rows:
+        row = _row("td", [escape(cut_name(cell, _TWIN_CHARACTERS)) for cell in cells], 0)
+        room -= len(row)
+        if room >= 0 and not left_out:
+            kept.append(row)
+        else:
+            left_out += 1
+    more = _row("td", [f"and {left_out} more"], 0) if left_out else ""
+    return f"{start}{''.join(kept)}{more}</table>" if kept or not left_out else ""
+
+
+def _state(function: FunctionView) -> Iterable[str]:
+    yield function.state
+    if function.duration_ns is not None:
+        yield duration_text(function.duration_ns)
+    if function.message:
+        yield function.message
+
+
+def _value(token: TokenView) -> tuple[str, str]:
+    return token.preview.detail if token.preview else "", f"{token.role}, {token.state}"
 
 
 def _stage_cells(stage: StageView) -> tuple[str, ...]:

@@ -6,8 +6,8 @@ import base64
 from typing import Final
 
 from epypes.display.layout.geometry import Box, Point
-from epypes.display.markup import short_name
-from epypes.display.paint.marks import LINE_PX, text_lines, text_width, vertex
+from epypes.display.markup import cut_name, short_name
+from epypes.display.paint.marks import LINE_PX, TITLE_CHARACTERS, text_lines, text_width, vertex
 from epypes.display.views.graphview import TokenView
 
 _THUMB_WIDTH: Final = 128
@@ -61,7 +61,7 @@ def _token_lines(token: TokenView) -> tuple[str, ...]:
 
 def _title(token: TokenView, state: str) -> str:
     kind = "hyperparameter token" if token.role == "hyperparameter" else "token"
-    return f"{kind} {token.name}{state}"[:600]
+    return f"{kind} {cut_name(token.name, TITLE_CHARACTERS)}{state}"
 
 
 def _hexagon(x: float, y: float, box: Box) -> str:

@@ -8,6 +8,7 @@ from typing import Any, Final
 from epypes.display.markup import cut
 from epypes.display.previews.preview import preview
 from epypes.display.views.graphview import EdgeView, FunctionState, FunctionView, GraphView, TokenView
+from epypes.display.views.source import graph_lines, signature_and_source
 from epypes.graph import CompGraph, Switch, as_switch, colour_order
 from epypes.graph.redefined import inner_graph, is_redefined_inside, redefined
 
@@ -61,9 +62,12 @@ def _function_view(
     inner, inside = inner_graph(cg.functions[name]), is_redefined and is_redefined_inside(cg.functions[name])
     old = (_REDEFINED_INSIDE if inside else _REDEFINED,) * is_redefined
     if inner is None:
-        return FunctionView(name, state, notes=old, is_redefined=is_redefined)
+        signature, source = signature_and_source(cg.functions[name])
+        return FunctionView(name, state, notes=old, is_redefined=is_redefined, signature=signature, source=source)
     note = f"pipeline of {len(inner.functions)} function{'s' * (len(inner.functions) != 1)}"
-    return FunctionView(name, state, kind="pipeline", notes=(note, *old), is_redefined=is_redefined)
+    return FunctionView(
+        name, state, kind="pipeline", notes=(note, *old), is_redefined=is_redefined, source=graph_lines(inner)
+    )
 
 
 def _choice(cg: CompGraph, name: str, function: Switch, branches: Mapping[str, Any]) -> str:

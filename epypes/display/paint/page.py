@@ -1,0 +1,186 @@
+"""What does a page get besides the picture: how it is explored, its twin for screen readers, its functions' sources?
+
+The picture is an ``<img>`` of the SVG, which the script replaces by the SVG itself: a page that does not trust a
+notebook strips scripts and would strip inline SVG down to its loose words, but keeps the image. Where the script runs,
+the picture takes the page's colours and can be explored (``explore.js``).
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Sequence
+from functools import cache
+from importlib import resources
+from typing import Any, Final
+
+from epypes.display.markup import cut, escape
+from epypes.display.paint.style import PAGE_STYLE
+from epypes.display.paint.svg import alt_text, least_width, paint_svg
+from epypes.display.paint.tables import paint_twin
+from epypes.display.views.graphview import FunctionView, GraphView
+from epypes.display.views.groups import counted, function_count
+from epypes.display.views.tokens import THUMBNAIL_CHARACTERS
+
+# A picture, as SVG and as HTML, takes at most so many characters, and as many more as its thumbnails do.
+CHARACTERS: Final = 20_000
+CHARACTERS_OF_A_VERTEX: Final = 600
+
+_NAMED_CHARACTERS: Final = 200
+_SVG_URI: Final = "data:image/svg+xml,"
+# What would end the attribute, the address or a line of it; all else may stand as it is, in any language.
+_IN_URI: Final = {sign: f"%{ord(sign):02X}" for sign in '%#&"\n\r\t'}  # % comes first
+_END: Final = "</figure>"
+_WEIGHTS: Final = {"failed": -2.0, "running": -1.5}
+
+
+def paint_page(*parts: str) -> str:
+    """Return what is shown together, such as a figure and the tables below it, with what it takes to explore it."""
+    return (
+        f'<div class="epypes-sheet">{"".join(parts)}<style>{PAGE_STYLE}{_asset("css")}</style>'
+        f"<script>{_asset('js')}</script></div>"
+    )
+
+
+def paint_figure(svg: str, alt: str, caption: str = "") -> str:
+    """Return a picture as a figure."""
+    # An image knows nothing of the page; where the script puts the picture itself, the page's style is there already.
+    source = svg.replace(PAGE_STYLE, "", 1)
+    # Between single quotes a picture needs none of its quotes encoded; in its texts there are none of either kind.
+    source = source if "'" in source else source.replace('"', "'")
+    for sign, encoded in _IN_URI.items():
+        source = source.replace(sign, encoded)
+    below = f'<figcaption style="font-size:12px">{escape(caption)}</figcaption>' if caption else ""
+    return (
+        f'<figure class="epypes-figure" style="margin:0"><div style="overflow-x:auto">'
+        f'<img src="{_SVG_URI}{source}" alt="{escape(alt)}" style="max-width:100%;min-width:{least_width(svg)}px">'
+        f"</div>{below}{_END}"
+    )
+
+
+def paint_graph(graph: GraphView, svg: str, taken: int = 0) -> list[str]:
+    """Return the picture of a graph as a figure, and what is inside each of its groups, to be opened below it.
+
+    Each figure has a table twin and what the script needs to know. Rows of the twins, sources of functions and the
+    insides of groups are left out where they don't fit, and what was left out is said.
+
+    Parameters
+    ----------
+    svg
+        What was painted of the graph.
+    taken
+        How many characters the page has already.
+    """
+    names = [group.name for group in graph.groups]
+    pictures = [(graph, svg), *((group.graph, paint_svg(group.graph)) for group in graph.groups)]
+    room = _room_of(pictures) - taken - len("".join(_left_out(names)))
+    least: list[int] = []
+    for name, (part, picture) in zip(("", *names), pictures, strict=True):
+        figure = _figure_of(part, picture, 0)
+        characters = len(_inside(name, part, figure) if least else figure)
+        if least and characters > room:
+            break
+        room -= characters
+        least.append(len(figure))
+    shown = pictures[: len(least)]
+    # What is left is for twins and sources: as much for each function and token.
+    each = max(room, 0) / max(sum(_vertices(part) for part, _ in shown), 1)
+    figures = [
+        _figure_of(part, picture, characters + int(each * _vertices(part)))
+        for (part, picture), characters in zip(shown, least, strict=True)
+    ]
+    insides = zip(names, shown[1:], figures[1:], strict=False)
+    details = [_inside(name, part, figure) for name, (part, _), figure in insides]
+    return [figures[0], *details, *_left_out(names[len(details) :])]
+
+
+def _figure_of(graph: GraphView, svg: str, room: int) -> str:
+    alt = alt_text(graph)
+    figure = paint_figure(svg, alt, graph.caption).removesuffix(_END)
+    room -= len(figure) + len(_END) + len(_data(graph, {}))
+    twin = paint_twin(graph, alt, room)
+    return f"{figure}{_data(graph, _fitting(graph, room - len(twin)))}{twin}{_END}"
+
+
+def _inside(name: str, graph: GraphView, figure: str) -> str:
+    summary = f"<summary>{escape(cut(name, _NAMED_CHARACTERS))}: {counted(len(graph.functions), 'function')}</summary>"
+    return f'<details class="epypes-inside" data-group="{escape(name)}">{summary}{figure}</details>'
+
+
+def _left_out(names: Sequence[str]) -> Iterator[str]:
+    if names:
+        some = escape(cut(", ".join(names), _NAMED_CHARACTERS))
+        yield f"<p>Not shown here: the inside of {some}. Call ep.show(..., open=[...]).</p>"
+
+
+def _vertices(graph: GraphView) -> int:
+    return len(graph.functions) + len(graph.tokens)
+
+
+def _room_of(pictures: Sequence[tuple[GraphView, str]]) -> int:
+    """Return how many characters figures may take on a page of their own; a token that several show counts once."""
+    thumbnails = sum(len(found) for _, svg in pictures for found in re.findall(r'href="data:[^"]*"', svg))
+    vertices = function_count(pictures[0][0]) + len({token.name for part, _ in pictures for token in part.tokens})
+    fixed = CHARACTERS - len(paint_page())
+    return fixed + CHARACTERS_OF_A_VERTEX * vertices + min(thumbnails, THUMBNAIL_CHARACTERS)
+
+
+@cache
+def _asset(kind: str) -> str:
+    """Return the script or the style without what is there for people: comments, and blanks at the start of lines."""
+    text = (resources.files("epypes.display.paint") / f"explore.{kind}").read_text("utf-8")
+    text = re.sub(r"(?m)^\s*//.*\n|/\*.*?\*/", "", text)
+    text = re.sub(r"\n\s*", "\n", text).strip()
+    return re.sub(r"\s*([{};:,>])\s+", r"\1", text) if kind == "css" else text
+
+
+Texts = dict[tuple[str, str], list[int]]
+
+
+def _fitting(graph: GraphView, room: int) -> Texts:
+    """Return signatures and sources, with the functions that have them, so many as fit: the most relevant first."""
+    kept: Texts = {}
+    for place in sorted(range(len(graph.functions)), key=lambda place: _relevance(graph.functions[place])):
+        function = graph.functions[place]
+        texts = function.signature, function.source
+        if not any(texts):
+            continue
+        room -= 5 + (0 if texts in kept else len(_json(texts)))
+        if room >= 0:
+            kept.setdefault(texts, []).append(place)
+        elif texts not in kept:
+            room += 5 + len(_json(texts))
+    return kept
+
+
+def _relevance(function: FunctionView) -> float:
+    return _WEIGHTS.get(function.state, -function.share)
+
+
+def _data(graph: GraphView, kept: Texts) -> str:
+    """Return what the script needs to know, as text that does nothing by itself.
+
+    Edges by function, a token that no run reads as its complement; then by function which of the texts are its own,
+    null if they were left out.
+    """
+    owner = {place: index for index, places in enumerate(kept.values()) for place in places}
+    about = [
+        owner.get(place, None if function.signature or function.source else -1)
+        for place, function in enumerate(graph.functions)
+    ]
+    groups = {place: function.name for place, function in enumerate(graph.functions) if function.kind == "group"}
+    data = {"io": list(_io(graph)), "groups": groups, "about": about, "texts": list(kept)}
+    return f'<script type="application/json" class="epypes-data">{_json(data)}</script>'
+
+
+def _io(graph: GraphView) -> Iterator[tuple[list[int], list[int]]]:
+    found: list[tuple[list[int], list[int]]] = [([], []) for _ in graph.functions]
+    for edge in graph.edges:
+        found[edge.function][0 if edge.is_input else 1].append(edge.token if edge.is_live else ~edge.token)
+    yield from found
+
+
+def _json(value: Any) -> str:
+    """Return JSON in which nothing can end a script's element, and no half of a surrogate pair is left."""
+    text = json.dumps(value, ensure_ascii=False, separators=(",", ":"))
+    return text.encode("utf-8", "replace").decode().replace("<", "\\u003c")

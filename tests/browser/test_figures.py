@@ -1,0 +1,538 @@
+"""Can pictures be explored and read, on every kind of page they are shown on, in a real browser?"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import nbformat
+import numpy as np
+import pytest
+from nbconvert import HTMLExporter
+from skimage import data
+
+import epypes as ep
+from epypes.display import mimebundle, to_svg, view
+from epypes.display.paint.page import paint_graph, paint_page, room_of
+from epypes.display.paint.svg import paint_svg
+from tests.browser.contrast import ENOUGH, readings, unreadable
+from tests.browser.jupyter import Notebook
+from tests.conftest import EDGE_FUNCTIONS, EDGE_HPARAMS, EDGE_IO
+
+pytestmark = pytest.mark.browser
+
+_THEMES = Path(sys.prefix) / "share" / "jupyter" / "lab" / "themes" / "@jupyterlab"
+_CODE = {
+    "light": ("#000000", "#ffffff", "#006ab1", "#a1260d", "#bf8803"),
+    "dark": ("#d4d4d4", "#1e1e1e", "#3794ff", "#f48771", "#cca700"),
+}
+_NAMES = (
+    "editor-foreground",
+    "editor-background",
+    "textLink-foreground",
+    "errorForeground",
+    "editorWarning-foreground",
+)
+
+
+def _lab(theme: str) -> str:
+    rules = (_THEMES / f"theme-{theme}-extension" / "index.css").read_text()
+    return f"{rules} body{{background:var(--jp-layout-color0);color:var(--jp-content-font-color1)}}"
+
+
+def _code(theme: str) -> str:
+    values = ";".join(f"--vscode-{name}:{value}" for name, value in zip(_NAMES, _CODE[theme], strict=True))
+    ground = "background:var(--vscode-editor-background);color:var(--vscode-editor-foreground)"
+    return f":root{{{values}}} body{{{ground}}}"
+
+
+PAGES = {
+    "JupyterLab light": _lab("light"),
+    "JupyterLab dark": _lab("dark"),
+    "VS Code light": _code("light"),
+    "VS Code dark": _code("dark"),
+    "bare": "",
+    "bare and dark": "body{background:#111;color:#ddd}",
+}
+
+
+@dataclass
+class Sheet:
+    """A page with pictures, as an eye, a mouse and a keyboard have it."""
+
+    page: Any
+
+    def put(self, *htmls: str, style: str = "") -> None:
+        body = "".join(f'<div class="output">{html}</div>' for html in htmls)
+        self.page.set_content(f"<!doctype html><meta charset=utf-8><style>{style}</style>{body}")
+
+    @property
+    def card(self) -> list[str]:
+        """The lines of the card that is open; none if there is none."""
+        return (
+            str(self.page.locator(".epypes-card:popover-open").first.inner_text()).splitlines() if self.has_card else []
+        )
+
+    @property
+    def has_card(self) -> bool:
+        return bool(self.page.locator(".epypes-card:popover-open").count())
+
+    @property
+    def about(self) -> str:
+        return str(self.page.locator(".epypes-about").first.inner_text())
+
+    def vertices(self, kind: str) -> set[str]:
+        """The names of the vertices of a kind."""
+        ids = self.page.locator(f"svg .{kind}").evaluate_all("all => all.map(each => each.id)")
+        return {identity.partition("-")[2] for identity in ids}
+
+    def focused(self) -> str:
+        return str(self.page.evaluate("document.activeElement.id"))
+
+
+@pytest.fixture
+def sheet(browser: Any) -> Iterator[Sheet]:
+    """An empty page; whatever script of it fails, and whatever asks, fails the test."""
+    context = browser.new_context(viewport={"width": 1200, "height": 800}, reduced_motion="reduce")
+    page, wrong = context.new_page(), []
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.on("dialog", lambda dialog: (wrong.append(dialog.message), dialog.dismiss()))
+    yield Sheet(page)
+    context.close()
+    assert not wrong
+
+
+def edge_runner() -> ep.CompGraphRunner:
+    return ep.CompGraphRunner(ep.CompGraph(EDGE_FUNCTIONS, EDGE_IO), EDGE_HPARAMS)
+
+
+@pytest.fixture(scope="module")
+def photo() -> np.ndarray:
+    return cv2.cvtColor(data.coffee(), cv2.COLOR_RGB2BGR)
+
+
+@pytest.fixture(scope="module")
+def edges(photo: np.ndarray) -> str:
+    """The page of a run of the edge graph."""
+    return mimebundle(edge_runner().run(image=photo))["text/html"]
+
+
+# -- cards ------------------------------------------------------------------------------------------------------------
+
+
+def test_hovering_a_token_shows_its_thumbnail_larger_with_what_is_known_of_it(sheet: Sheet, edges: str) -> None:
+    sheet.put(edges)
+    small = sheet.page.locator("#token-edges image").bounding_box()
+    sheet.page.hover("#token-edges")
+    assert sheet.card == ["token edges", "uint8 400 x 600", "0 to 255", "fresh"]
+    large = sheet.page.locator(".epypes-card image").bounding_box()
+    assert large["width"] == pytest.approx(3 * small["width"], rel=0.05)
+    rendering = "img => getComputedStyle(img).imageRendering"
+    assert sheet.page.locator(".epypes-card image").evaluate(rendering) == "pixelated", "a mask keeps its edges"
+    sheet.page.hover("#token-image")
+    assert sheet.card[0] == "token image"
+    assert sheet.page.locator(".epypes-card image").evaluate(rendering) == "auto"
+    pictures = re.findall(r"base64,([A-Za-z0-9+/=]+)", edges)
+    assert len(pictures) == len(set(pictures)) == 4, "no picture is carried twice"
+
+
+def test_the_card_goes_with_the_pointer_and_with_escape(sheet: Sheet, edges: str) -> None:
+    sheet.put(edges)
+    sheet.page.hover("#token-edges")
+    assert sheet.has_card
+    sheet.page.mouse.move(1190, 10)
+    assert not sheet.has_card
+    sheet.page.keyboard.press("Tab")
+    assert sheet.card[0] == "function grayscale"
+    sheet.page.keyboard.press("Escape")
+    assert not sheet.has_card
+
+
+def test_the_card_stands_beside_its_vertex_within_the_window_whatever_clips_or_moves_the_output(
+    sheet: Sheet, edges: str
+) -> None:
+    sheet.put(edges, style=".output{overflow:hidden;transform:translate(30px,0);height:500px;width:520px}")
+    for token in ("image", "image_blurred", "canny_lo"):
+        sheet.page.hover(f"#token-{token}")
+        sheet.page.wait_for_function("document.querySelector('.epypes-card').style.top !== ''")
+        card, vertex = (sheet.page.locator(each).bounding_box() for each in (".epypes-card", f"#token-{token}"))
+        assert card["x"] >= vertex["x"] + vertex["width"] or card["x"] + card["width"] <= vertex["x"]
+        assert 0 <= card["x"] <= 1200 - card["width"]
+        assert 0 <= card["y"] <= 800 - card["height"]
+        top = """card => {
+            card.style.pointerEvents = 'auto';
+            const box = card.getBoundingClientRect();
+            const hit = document.elementFromPoint(box.right - 3, box.top + box.height / 2);
+            card.style.pointerEvents = '';
+            return card.contains(hit);
+        }"""
+        assert sheet.page.locator(".epypes-card").evaluate(top), "nothing cuts it"
+
+
+def test_without_popovers_there_is_a_card_too(sheet: Sheet, edges: str) -> None:
+    without = "delete HTMLElement.prototype.togglePopover; delete HTMLElement.prototype.popover"
+    sheet.page.add_init_script(without)
+    sheet.page.goto("about:blank")
+    plain = edges.replace('setAttribute("popover", "manual")', 'setAttribute("data-popover", "manual")')
+    sheet.put(plain)
+    sheet.page.hover("#token-edges")
+    card = sheet.page.locator(".epypes-card")
+    assert card.is_visible()
+    assert card.bounding_box()["x"] >= 0
+    sheet.page.mouse.move(1190, 10)
+    assert not card.is_visible()
+
+
+# -- choosing ---------------------------------------------------------------------------------------------------------
+
+
+def test_choosing_a_function_tells_its_source_and_marks_what_it_depends_on_and_what_depends_on_it(
+    sheet: Sheet, edges: str
+) -> None:
+    sheet.put(edges)
+    sheet.page.click("#function-blur")
+    assert re.match(r"function blur\s*\(img, k\)\s+ran; [\d.]+ (µs|ms), \d+%", sheet.about)
+    assert "def blur(img, k):\n    return cv2.GaussianBlur(img, (k, k), 0)" in sheet.about
+    kin = {"image", "grayscale", "image_gray", "blur_kernel", "blur", "image_blurred", "canny", "edges"}
+    assert sheet.vertices("kin") == kin
+    ways = [sheet.page.locator(each).get_attribute("d").count("M") for each in (".way", ".head")]
+    assert ways == [7, 7], "the edges between them, and no other"
+    for gone in (lambda: sheet.page.click("#function-blur"), lambda: sheet.page.keyboard.press("Escape")):
+        gone()
+        assert (sheet.vertices("kin"), sheet.about) == (set(), "")
+        assert sheet.page.locator("svg.lit").count() == 0
+        sheet.page.click("#token-image_gray")
+        assert sheet.vertices("kin") == kin - {"blur_kernel"}
+    sheet.page.locator("figure svg").first.click(position={"x": 5, "y": 5})
+    assert sheet.vertices("kin") == set(), "the background"
+
+
+def test_what_was_marked_is_marked_by_more_than_colour_and_all_else_stays(sheet: Sheet, edges: str) -> None:
+    sheet.put(edges)
+    sheet.page.click("#function-grayscale")
+    widths = sheet.page.evaluate(
+        "['function-grayscale', 'function-canny', 'token-canny_lo']"
+        ".map(id => getComputedStyle(document.getElementById(id).querySelector('.shape')).strokeWidth)"
+    )
+    assert widths == ["3px", "1.3px", "0.6px"], "what was chosen, its kin, and another"
+    assert sheet.page.locator("#token-canny_lo text").is_visible()
+
+
+def test_a_function_whose_source_did_not_fit_says_so(sheet: Sheet) -> None:
+    graph = view(edge_runner().cg)
+    svg = paint_svg(graph)
+    sheet.put(paint_page(paint_graph(svg, graph, room=0)))
+    sheet.page.click("#function-blur")
+    assert "source left out to keep the picture small" in sheet.about
+
+
+def test_choosing_a_group_opens_what_is_inside_it(sheet: Sheet) -> None:
+    graph = view(edge_runner().cg)
+    first, *others = graph.functions
+    graph = replace(graph, functions=(replace(first, kind="group"), *others))
+    inside = '<details class="epypes-inside" data-group="{}"><summary>{}</summary>inside</details>'
+    svg = paint_svg(graph)
+    below = "".join(inside.format(name, name) for name in ("other", "grayscale"))
+    sheet.put(paint_page(paint_graph(svg, graph, room_of(graph, svg)), below))
+    sheet.page.click("#function-grayscale")
+    opened = sheet.page.locator("details[open]").evaluate_all("all => all.map(each => each.dataset.group)")
+    assert opened == ["grayscale"]
+
+
+# -- keyboard and screen reader ---------------------------------------------------------------------------------------
+
+
+def test_the_keyboard_reaches_functions_in_run_order_and_does_what_the_mouse_does(sheet: Sheet, edges: str) -> None:
+    sheet.put(edges)
+    reached = []
+    for _ in range(4):
+        sheet.page.keyboard.press("Tab")
+        reached.append(sheet.focused())
+    assert reached == ["function-grayscale", "function-blur", "function-canny", "token-image"]
+    assert "fresh" in sheet.card
+    ring = "document.activeElement.matches(':focus-visible') && getComputedStyle(document.activeElement).outlineStyle"
+    assert sheet.page.evaluate(ring) == "solid"
+    sheet.page.keyboard.press("Shift+Tab")
+    before = sheet.page.evaluate("scrollY")
+    for key in ("Enter", " "):
+        sheet.page.keyboard.press(key)
+        assert sheet.about.startswith("function canny")
+        assert sheet.page.locator("#function-canny").get_attribute("aria-pressed") == "true"
+        sheet.page.keyboard.press("Escape")
+        assert sheet.about == ""
+    assert sheet.page.evaluate("scrollY") == before
+
+
+def test_a_screen_reader_is_told_every_vertex_the_panel_and_the_tables(sheet: Sheet, edges: str) -> None:
+    sheet.put(edges)
+    labels = sheet.page.locator("svg [role=button]").evaluate_all("all => all.map(each => each.ariaLabel)")
+    assert "token edges: uint8 400 x 600, 0 to 255, fresh" in labels
+    assert len(labels) == 10
+    assert sheet.page.locator("svg title").count() == 0, "a title would show a second card"
+    assert sheet.page.locator(".epypes-about").get_attribute("aria-live") == "polite"
+    assert sheet.page.get_by_role("table").count() == 2
+    assert sheet.page.evaluate("document.documentElement.scrollWidth <= innerWidth"), "tables for the ear take no room"
+
+
+# -- pages ------------------------------------------------------------------------------------------------------------
+
+
+def test_one_output_shown_twice_is_two_pictures_of_their_own(sheet: Sheet, edges: str) -> None:
+    sheet.put(edges, edges, edges.replace("grayscale", "greyscale"))
+    assert sheet.page.locator("figure svg.epypes-graph").count() == 3
+    sheet.page.locator("#function-blur").nth(1).click()
+    assert sheet.page.locator(".epypes-about").evaluate_all("all => all.map(each => each.innerText !== '')") == [
+        False, True, False,
+    ]  # fmt: skip
+    sheet.page.locator("#token-edges").nth(2).hover()
+    assert sheet.page.locator(".epypes-card:popover-open").count() == 1
+
+
+# As VS Code runs the scripts of an output: at its end, one by one, each taken out again.
+_AS_VS_CODE = """html => {
+    const output = document.querySelector('.output');
+    output.innerHTML = html;
+    for (const script of Array.from(output.getElementsByTagName('script'))) {
+        const again = document.createElement('script');
+        again.text = script.innerText;
+        if (script.type) again.type = script.type;
+        output.appendChild(again).parentNode.removeChild(again);
+    }
+}"""
+# As JupyterLab does: each script in its own place.
+_AS_LAB = """html => {
+    const output = document.querySelector('.output');
+    output.innerHTML = html;
+    for (const script of output.querySelectorAll('script')) {
+        const again = document.createElement('script');
+        for (const { name, value } of script.attributes) again.setAttribute(name, value);
+        again.textContent = script.textContent;
+        script.parentNode.replaceChild(again, script);
+    }
+}"""
+
+
+def test_a_picture_that_is_taken_away_and_put_back_shows_its_card_again(sheet: Sheet, edges: str) -> None:
+    sheet.put(edges)
+    sheet.page.hover("#token-edges")
+    sheet.page.evaluate("window.kept = document.querySelector('.epypes-sheet'); window.kept.remove()")
+    sheet.page.wait_for_function("!window.kept.querySelector('.epypes-card.open')")
+    sheet.page.evaluate("document.querySelector('.output').append(window.kept)")
+    sheet.page.hover("#token-edges")
+    assert sheet.card[0] == "token edges"
+
+
+def test_the_card_follows_its_vertex_when_the_page_scrolls(sheet: Sheet, edges: str) -> None:
+    sheet.put(edges)
+    sheet.page.keyboard.press("Tab")
+    beside = """() => {
+        const [card, vertex] = ['.epypes-card', '#function-grayscale']
+            .map(each => document.querySelector(each).getBoundingClientRect());
+        return Math.abs(card.top + card.height / 2 - vertex.top - vertex.height / 2) < 2;
+    }"""
+    sheet.page.wait_for_function(beside)
+    sheet.page.evaluate("scrollBy(0, 90)")
+    sheet.page.wait_for_function(beside)
+    assert sheet.page.evaluate("scrollY") == 90
+
+
+@pytest.mark.parametrize("run_scripts", [_AS_VS_CODE, _AS_LAB], ids=["VS Code", "JupyterLab"])
+def test_a_notebook_that_runs_scripts_later_or_elsewhere_has_live_pictures(
+    sheet: Sheet, edges: str, run_scripts: str
+) -> None:
+    sheet.put("")
+    for _ in range(2):
+        sheet.page.evaluate(run_scripts, edges)
+        sheet.page.hover("#token-edges")
+        assert sheet.card[0] == "token edges"
+        sheet.page.click("#function-blur")
+        assert "def blur" in sheet.about
+
+
+def test_nothing_is_left_of_a_picture_that_was_taken_away(sheet: Sheet, edges: str) -> None:
+    heard = """window.heard = 0;
+        for (const target of [window, document]) {
+            const add = target.addEventListener;
+            target.addEventListener = function (...all) { window.heard++; return add.apply(this, all); };
+        }"""
+    sheet.page.add_init_script(heard)
+    sheet.page.goto("about:blank")
+    sheet.put("")
+    before = sheet.page.evaluate("window.heard")
+    sheet.page.evaluate(_AS_LAB, edges)
+    sheet.page.hover("#token-edges")
+    assert sheet.has_card
+    sheet.page.evaluate("document.querySelector('.output').replaceChildren()")
+    assert sheet.page.evaluate("window.heard") == before
+    assert not sheet.has_card
+    sheet.page.keyboard.press("Escape")
+
+
+EVIL = "</script><script>window.hit=1;alert(1)</script><img src=x onerror='window.hit=1;alert(1)'>"
+
+
+def test_no_script_in_a_name_a_value_a_source_or_a_message_ever_runs(sheet: Sheet, tmp_path: Path) -> None:
+    path = tmp_path / "evil.py"
+    path.write_text(f'def f(x, y="{EVIL}"):\n    """{EVIL}"""\n    raise ValueError("""{EVIL}""")\n')
+    names: dict[str, Any] = {}
+    exec(compile(path.read_text(), path, "exec"), names)
+    cg = ep.CompGraph({EVIL: names["f"]}, {EVIL: ((EVIL, "y"), f"{EVIL} z")})
+    runner = ep.CompGraphRunner(cg, {"y": EVIL})
+    with pytest.raises(ValueError, match="alert"):
+        runner.run(**{EVIL: EVIL})
+    sheet.put(mimebundle(runner)["text/html"])
+    for vertex in sheet.page.locator("svg [role=button]").all():
+        vertex.hover()
+        vertex.click()
+        assert EVIL[:9] in sheet.about or "hyperparameter token y" in sheet.about
+    sheet.page.locator("svg .function").click()
+    assert f'"""{EVIL}"""'[:100] in sheet.about, "the source, as text"
+    assert sheet.page.evaluate("window.hit") is None
+    assert sheet.page.locator("img").count() == 0
+
+
+# -- readable ---------------------------------------------------------------------------------------------------------
+
+
+def gray(image: np.ndarray) -> np.ndarray:
+    return image.mean(axis=2).astype(np.uint8)
+
+
+def many_states(photo: np.ndarray) -> str:
+    """Pictures in which every state of functions and tokens is to be seen."""
+    cg = ep.CompGraph(
+        {"gray": gray, "canny": cv2.Canny, "half": lambda g: g // 2, "count": np.count_nonzero, "tell": ep.Placeholder()},
+        {
+            "gray": ("image", "image_gray"), "canny": (("image_gray", "lo", "hi"), "by_canny"),
+            "half": ("image_gray", "by_half"), "count": ("edges", "n"), "tell": ("n", "page"),
+        },
+    )  # fmt: skip
+    cg = ep.union(cg, ep.switch("choose", {"canny": "by_canny", "half": "by_half"}, by="method", output="edges"))
+    runner = ep.CompGraphRunner(cg, {"lo": 70, "hi": 200, "method": "canny"})
+    bundles = [mimebundle(cg), mimebundle(runner), mimebundle(runner.plan())]
+    run = runner.run("n", image=photo)
+    runner["lo"] = 80
+    bundles += [mimebundle(run), mimebundle(runner), mimebundle(runner.plan("n"))]
+    with pytest.raises(cv2.error):
+        runner.rerun("n", lo="seventy")
+    bundles.append(mimebundle(runner))
+    bundles.append({"text/html": paint_page(_redefined(run))})
+    return "".join(bundle["text/html"] for bundle in bundles)
+
+
+def _redefined(run: ep.Run) -> str:
+    graph = view(run)
+    graph = replace(graph, functions=tuple(replace(each, is_redefined=True) for each in graph.functions))
+    svg = paint_svg(graph)
+    return paint_graph(svg, graph, room_of(graph, svg))
+
+
+@pytest.fixture(scope="module")
+def states(photo: np.ndarray) -> str:
+    return many_states(photo)
+
+
+@pytest.mark.parametrize("kind", PAGES)
+def test_every_text_is_readable_on_every_page(sheet: Sheet, states: str, kind: str) -> None:
+    sheet.put(states, style=PAGES[kind])
+    assert len(readings(sheet.page, ".output")) > 200
+    assert unreadable(sheet.page, ".output") == []
+    for figure in sheet.page.locator("figure").all():
+        figure.locator(".function").first.click()
+    assert sheet.page.locator(".epypes-about pre").count() >= 8, "with panels open and all else dimmed"
+    sheet.page.locator(".token").first.hover()
+    assert sheet.has_card
+    assert unreadable(sheet.page, ".output") == []
+
+
+@pytest.mark.parametrize("ground", ["#fff", "#111"])
+def test_the_svg_file_is_readable_on_white_and_on_black_paper(sheet: Sheet, photo: np.ndarray, ground: str) -> None:
+    runner = edge_runner()
+    runner.run(image=photo)
+    sheet.put(to_svg(runner), style=f"body{{background:{ground}}}")
+    assert unreadable(sheet.page, ".output") == []
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        ".epypes-graph .small{fill:#999}",
+        ".epypes-graph text{opacity:.5}",
+        ".epypes-graph .function .shape{fill:#1769c2}",
+        ".epypes-graph .shape{fill-opacity:0} body{background:#333}",
+        "figcaption{color:#aaa}",
+        ".epypes-about div{color:#0007}",
+    ],
+)
+def test_a_text_that_can_not_be_read_would_be_found(sheet: Sheet, edges: str, bad: str) -> None:
+    sheet.put(edges + f"<style>{bad}</style>")
+    sheet.page.click("#function-blur")
+    found = unreadable(sheet.page, ".output")
+    assert found
+    assert all(reading.ratio < ENOUGH for reading in found)
+
+
+def test_states_are_told_apart_without_colour(sheet: Sheet, states: str) -> None:
+    sheet.put(states)
+    drawn = sheet.page.locator("svg .function:not(.placeholder)").evaluate_all(
+        """all => all.map(each => { const style = getComputedStyle(each.querySelector('.shape'));
+            return [[...each.classList].at(-1), style.strokeDasharray, style.strokeWidth,
+                    [...each.querySelectorAll('text')].slice(1).map(text => text.textContent).join()]; })"""
+    )
+    looks: dict[str, set[str]] = {}
+    for state, dashes, width, text in drawn:
+        looks.setdefault(state, set()).add(json.dumps([dashes, width, re.sub(r"[\d.]+ .s, \d+%", "time", text)]))
+    assert {"static", "not-run", "ran", "stale", "failed", "planned", "reused", "left-out"} <= set(looks)
+    for state, own in looks.items():
+        for other, others in looks.items():
+            assert state == other or not own & others, f"{state} and {other} look alike"
+
+
+# -- where notebooks are read -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_a_notebook_that_was_converted_to_html_can_be_explored_and_read(
+    sheet: Sheet, photo: np.ndarray, tmp_path: Path, theme: str
+) -> None:
+    bundle = mimebundle(edge_runner().run(image=photo))
+    output = nbformat.v4.new_output("display_data", dict(bundle))
+    cell = nbformat.v4.new_code_cell("run", outputs=[output], execution_count=1)
+    html, _ = HTMLExporter(theme=theme).from_notebook_node(nbformat.v4.new_notebook(cells=[cell]))
+    path = tmp_path / "notebook.html"
+    path.write_text(html)
+    sheet.page.route(re.compile("^https?://"), lambda route: route.abort())
+    sheet.page.goto(path.as_uri(), wait_until="domcontentloaded")
+    assert sheet.page.locator("figure svg.epypes-graph").count() == 1
+    sheet.page.hover("#token-edges")
+    assert sheet.card[0] == "token edges"
+    sheet.page.click("#function-blur")
+    assert "def blur" in sheet.about
+    assert unreadable(sheet.page) == []
+
+
+def test_in_jupyterlab_pictures_are_explored_and_read_and_its_shortcuts_stay_out(notebook: Notebook) -> None:
+    sheet = Sheet(notebook.page)
+    figure = notebook.page.locator("figure:has(#token-edges image)").first
+    figure.scroll_into_view_if_needed()
+    figure.locator("#token-edges").hover()
+    assert sheet.card[0] == "token edges"
+    cells = notebook.page.evaluate("jupyterapp.shell.currentWidget.content.model.cells.length")
+    figure.locator("#function-canny").click()
+    figure.locator("#function-canny").focus()
+    for key in ("d", "d", "b", "x"):
+        notebook.page.keyboard.press(key)
+    assert notebook.page.evaluate("jupyterapp.shell.currentWidget.content.model.cells.length") == cells
+    assert figure.locator(".epypes-about").inner_text().startswith("function canny")
+    for place in range(notebook.page.locator(".epypes-sheet").count()):
+        notebook.page.locator(".epypes-sheet").nth(place).evaluate(f"each => each.id = 'sheet-{place}'")
+        assert unreadable(notebook.page, f"#sheet-{place}") == []
+    notebook.page.keyboard.press("Escape")
+    assert figure.locator(".epypes-about").inner_text() == ""
+    assert not notebook.page_errors
