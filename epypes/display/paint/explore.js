@@ -2,16 +2,14 @@
 //
 // Hovering or focusing a vertex shows its thumbnail larger and what is known of it; choosing one (click, Enter, Space)
 // marks its ancestors and descendants and tells of it below the picture; Escape ends both. All listeners are the
-// figure's, so nothing outlives it. VS Code runs a script at the end of its output, other pages where it stands.
+// figure's, so nothing outlives it. Where the script stands says nothing: VS Code runs it at the end of the output, and
+// a notebook may run it again.
 (() => {
-  const WANTED = "figure.epypes-figure:not([data-alive])";
   const VERTEX = "[id^=function-],[id^=token-]";
   const OWN_KEYS = "data-lm-suppress-shortcuts";
   const LARGER = 3, GAP = 10;
 
-  const home = document.currentScript?.parentElement;
-  const near = home?.querySelectorAll(WANTED);
-  (near?.length ? near : document.querySelectorAll(WANTED)).forEach(enliven);
+  document.querySelectorAll("figure.epypes-figure:not([data-alive])").forEach(enliven);
 
   function make(tag, kind, text = "") {
     const made = document.createElement(tag);
