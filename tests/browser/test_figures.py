@@ -19,7 +19,7 @@ from skimage import data
 
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
-from epypes.display.paint.page import paint_graph, paint_page, room_of
+from epypes.display.paint.page import paint_figure, paint_graph, paint_page, room_of
 from epypes.display.paint.svg import paint_svg
 from tests.browser.contrast import ENOUGH, readings, unreadable
 from tests.browser.jupyter import Notebook
@@ -353,6 +353,14 @@ def test_a_notebook_that_runs_scripts_later_or_elsewhere_has_live_pictures(
         assert sheet.card[0] == "token edges"
         sheet.page.click("#function-blur")
         assert "def blur" in sheet.about
+
+
+def test_a_picture_of_something_else_takes_the_pages_colours_too(sheet: Sheet) -> None:
+    svg = to_svg(edge_runner())
+    sheet.put(paint_page(paint_figure(svg, "a bar picture", "below it")), style=PAGES["JupyterLab dark"])
+    assert sheet.page.locator("figure svg.epypes-graph").count() == 1
+    assert sheet.page.locator("svg [role=button]").count() == 0, "nothing is told of it"
+    assert unreadable(sheet.page) == []
 
 
 def test_nothing_is_left_of_a_picture_that_was_taken_away(sheet: Sheet, edges: str) -> None:
