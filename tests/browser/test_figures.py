@@ -213,6 +213,15 @@ def test_choosing_a_function_tells_its_source_and_marks_what_it_depends_on_and_w
     assert sheet.vertices("kin") == set(), "the background"
 
 
+def test_arrows_around_a_graph_are_not_taken_for_its_edges(sheet: Sheet) -> None:
+    graph = view(edge_runner().cg)
+    svg = paint_svg(graph).replace("</style>", '</style><path class="edge" d="M0,0L9,9"/><path class="tip" d="M0,0Z"/>')
+    sheet.put(paint_page(paint_graph(svg, graph, room_of(graph, svg))))
+    sheet.page.click("#function-grayscale")
+    ways = [sheet.page.locator(each).get_attribute("d").count("M") for each in (".way", ".head")]
+    assert ways == [6, 6]
+
+
 def test_what_was_marked_is_marked_by_more_than_colour_and_all_else_stays(sheet: Sheet, edges: str) -> None:
     sheet.put(edges)
     sheet.page.click("#function-grayscale")

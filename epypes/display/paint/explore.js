@@ -121,10 +121,9 @@
     return label;
   }
 
-  // Edges are painted as few paths; the pieces of the path of those that a run uses stand in their order.
+  // Edges are painted as few paths; the pieces of the path of those that a run uses stand in their order. Arrows to and
+  // from what is around the graph are paths of their own.
   function edgesOf(svg, io, functions) {
-    const pieces = (kind) => svg.querySelector(`${kind}:not(.off)`)?.getAttribute("d").split(/(?=M)/) ?? [];
-    const lines = pieces(".edge"), tips = pieces(".tip");
     const edges = [];
     let live = 0;
     io.forEach(([inputs, outputs], place) => {
@@ -135,10 +134,10 @@
           edges.push({ from: ends[0], to: ends[1], piece: token < 0 ? -1 : live++ });
         }
     });
-    for (const edge of edges) {
-      edge.line = (lines.length === live && lines[edge.piece]) || "";
-      edge.tip = (tips.length === live && tips[edge.piece]) || "";
-    }
+    const pieces = (kind) => [...svg.querySelectorAll(`${kind}:not(.off)`)]
+      .map((path) => path.getAttribute("d").split(/(?=M)/)).find((found) => found.length === live) ?? [];
+    const lines = pieces(".edge"), tips = pieces(".tip");
+    for (const edge of edges) Object.assign(edge, { line: lines[edge.piece] ?? "", tip: tips[edge.piece] ?? "" });
     return edges;
   }
 
