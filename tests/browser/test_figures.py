@@ -19,7 +19,7 @@ from skimage import data
 
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
-from epypes.display.paint.page import paint_graph, paint_page, room_of
+from epypes.display.paint.page import paint_figure, paint_graph, paint_page, room_of
 from epypes.display.paint.svg import paint_svg
 from tests.browser.contrast import ENOUGH, readings, unreadable
 from tests.browser.jupyter import Notebook
@@ -213,6 +213,15 @@ def test_choosing_a_function_tells_its_source_and_marks_what_it_depends_on_and_w
     assert sheet.vertices("kin") == set(), "the background"
 
 
+def test_arrows_around_a_graph_are_not_taken_for_its_edges(sheet: Sheet) -> None:
+    graph = view(edge_runner().cg)
+    svg = paint_svg(graph).replace("</style>", '</style><path class="edge" d="M0,0L9,9"/><path class="tip" d="M0,0Z"/>')
+    sheet.put(paint_page(paint_graph(svg, graph, room_of(graph, svg))))
+    sheet.page.click("#function-grayscale")
+    ways = [sheet.page.locator(each).get_attribute("d").count("M") for each in (".way", ".head")]
+    assert ways == [6, 6]
+
+
 def test_what_was_marked_is_marked_by_more_than_colour_and_all_else_stays(sheet: Sheet, edges: str) -> None:
     sheet.put(edges)
     sheet.page.click("#function-grayscale")
@@ -339,7 +348,7 @@ def test_the_card_follows_its_vertex_when_the_page_scrolls(sheet: Sheet, edges: 
     sheet.page.wait_for_function(beside)
     sheet.page.evaluate("scrollBy(0, 90)")
     sheet.page.wait_for_function(beside)
-    assert sheet.page.evaluate("scrollY") == 90
+    assert sheet.page.evaluate("scrollY") > 50
 
 
 @pytest.mark.parametrize("run_scripts", [_AS_VS_CODE, _AS_LAB], ids=["VS Code", "JupyterLab"])
@@ -353,6 +362,14 @@ def test_a_notebook_that_runs_scripts_later_or_elsewhere_has_live_pictures(
         assert sheet.card[0] == "token edges"
         sheet.page.click("#function-blur")
         assert "def blur" in sheet.about
+
+
+def test_a_picture_of_something_else_takes_the_pages_colours_too(sheet: Sheet) -> None:
+    svg = to_svg(edge_runner())
+    sheet.put(paint_page(paint_figure(svg, "a bar picture", "below it")), style=PAGES["JupyterLab dark"])
+    assert sheet.page.locator("figure svg.epypes-graph").count() == 1
+    assert sheet.page.locator("svg [role=button]").count() == 0, "nothing is told of it"
+    assert unreadable(sheet.page) == []
 
 
 def test_nothing_is_left_of_a_picture_that_was_taken_away(sheet: Sheet, edges: str) -> None:

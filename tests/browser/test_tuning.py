@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import re
 import statistics
 from typing import Any
 
@@ -225,11 +224,14 @@ def test_a_notebook_that_is_not_trusted_shows_its_pictures(browser: Any, lab: Ju
 
 
 def test_graphs_take_the_colours_of_the_theme(notebook: Notebook, theme: str) -> None:
-    colours = notebook.page.evaluate(
-        "() => { const svg = document.querySelector('figure svg.epypes-graph');"
-        " return [getComputedStyle(svg.querySelector('text')).fill, getComputedStyle(svg.querySelector('.shape')).fill]; }"
+    text, shape = notebook.page.evaluate(
+        """() => ['text', '.shape'].map(kind => {
+            const canvas = document.createElement('canvas').getContext('2d');
+            canvas.fillStyle = getComputedStyle(document.querySelector(`figure svg.epypes-graph ${kind}`)).fill;
+            canvas.fillRect(0, 0, 1, 1);
+            return canvas.getImageData(0, 0, 1, 1).data.slice(0, 3).reduce((sum, part) => sum + part, 0);
+        })"""
     )
-    text, shape = (sum(int(part) for part in re.findall(r"\d+", colour)[:3]) for colour in colours)
     assert (text < shape) == (theme == "light"), "dark text on light shapes, or the other way round"
 
 

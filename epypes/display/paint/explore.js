@@ -2,16 +2,14 @@
 //
 // Hovering or focusing a vertex shows its thumbnail larger and what is known of it; choosing one (click, Enter, Space)
 // marks its ancestors and descendants and tells of it below the picture; Escape ends both. All listeners are the
-// figure's, so nothing outlives it. VS Code runs a script at the end of its output, other pages where it stands.
+// figure's, so nothing outlives it. Where the script stands says nothing: VS Code runs it at the end of the output, and
+// a notebook may run it again.
 (() => {
-  const WANTED = "figure.epypes-figure:not([data-alive])";
   const VERTEX = "[id^=function-],[id^=token-]";
   const OWN_KEYS = "data-lm-suppress-shortcuts";
   const LARGER = 3, GAP = 10;
 
-  const home = document.currentScript?.parentElement;
-  const near = home?.querySelectorAll(WANTED);
-  (near?.length ? near : document.querySelectorAll(WANTED)).forEach(enliven);
+  document.querySelectorAll("figure.epypes-figure:not([data-alive])").forEach(enliven);
 
   function make(tag, kind, text = "") {
     const made = document.createElement(tag);
@@ -123,10 +121,9 @@
     return label;
   }
 
-  // Edges are painted as few paths; the pieces of the path of those that a run uses stand in their order.
+  // Edges are painted as few paths; the pieces of the path of those that a run uses stand in their order. Arrows to and
+  // from what is around the graph are paths of their own.
   function edgesOf(svg, io, functions) {
-    const pieces = (kind) => svg.querySelector(`${kind}:not(.off,.around)`)?.getAttribute("d").split(/(?=M)/) ?? [];
-    const lines = pieces(".edge"), tips = pieces(".tip");
     const edges = [];
     let live = 0;
     io.forEach(([inputs, outputs], place) => {
@@ -137,10 +134,10 @@
           edges.push({ from: ends[0], to: ends[1], piece: token < 0 ? -1 : live++ });
         }
     });
-    for (const edge of edges) {
-      edge.line = (lines.length === live && lines[edge.piece]) || "";
-      edge.tip = (tips.length === live && tips[edge.piece]) || "";
-    }
+    const pieces = (kind) => [...svg.querySelectorAll(`${kind}:not(.off,.around)`)]
+      .map((path) => path.getAttribute("d").split(/(?=M)/)).find((found) => found.length === live) ?? [];
+    const lines = pieces(".edge"), tips = pieces(".tip");
+    for (const edge of edges) Object.assign(edge, { line: lines[edge.piece] ?? "", tip: tips[edge.piece] ?? "" });
     return edges;
   }
 

@@ -30,7 +30,7 @@ _RULES: Final = {
     " .small": "font-size:10px;fill:@quiet",
     " .name": "font-weight:600",
     " .shape": "fill:@ground;stroke:@line",
-    " image": "outline:1px solid @track",
+    " image": "outline:1px solid @grey",
     " .function .shape": "fill:@cool;stroke:@accent;stroke-width:1.3",
     " .call .shape": "fill:@cool;stroke:@accent;stroke-width:1.3",
     " .hyperparameter .shape": "fill:@grey",
