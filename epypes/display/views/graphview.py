@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-from epypes.display.previews.preview import Preview
+from epypes.display.previews.shown import Preview
 from epypes.images import Order
 
 TokenRole = Literal["payload", "hyperparameter"]

@@ -11,7 +11,7 @@ from epypes.display.views.graphview import GraphView
 from epypes.display.views.plans import plan_view
 from epypes.display.views.runs import run_structure, with_run
 from epypes.display.views.structure import structure_of, with_caption
-from epypes.display.views.tokens import valueless_view, within_budget
+from epypes.display.views.tokens import valueless_view, with_values
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner, Plan, Run
 
@@ -33,7 +33,7 @@ def _graph_view(cg: CompGraph) -> GraphView:
     """Look at a graph; tokens with a default are shown as the hyperparameters that a runner makes of them."""
     structure = structure_of(cg, {}, ())
     every = [valueless_view(token, cg.defaults, "static") for token in structure.tokens]
-    tokens, _ = within_budget(every, ())
+    tokens, _ = with_values(every, cg.defaults)
     return replace(structure, tokens=tokens)
 
 
@@ -46,5 +46,6 @@ def _runner_view(runner: CompGraphRunner) -> GraphView:
         function if function.state == "left out" else replace(function, state="not run")
         for function in structure.functions
     )
-    tokens = tuple(valueless_view(token, plan.hyperparameters, "not computed") for token in structure.tokens)
+    every = [valueless_view(token, plan.hyperparameters, "not computed") for token in structure.tokens]
+    tokens, _ = with_values(every, plan.hyperparameters)
     return replace(structure, functions=functions, tokens=tokens, caption=with_caption("not run yet", structure))
