@@ -25,6 +25,11 @@ STYLE: Final = """
 .epypes-graph .stale .shape,.epypes-graph .not-computed .shape,.epypes-graph .not-run .shape{stroke-dasharray:2 3}
 .epypes-graph .placeholder .shape{stroke-dasharray:7 4}
 .epypes-graph .stale image{opacity:.35}
+.epypes-graph .stale .chart,.epypes-graph .stale .row{opacity:.5}
+.epypes-graph .row{font:10px var(--jp-code-font-family,ui-monospace,monospace);text-anchor:start;white-space:pre}
+.epypes-graph .frame{fill:var(--jp-layout-color2,#f1f3f6)}
+.epypes-graph .chart path,.epypes-graph .chart polyline{fill:none;stroke:var(--jp-brand-color1,#1976d2)}
+.epypes-graph .chart .dots{stroke-width:3;stroke-linecap:round}
 .epypes-graph .function .inner{fill:none;stroke-width:1}
 .epypes-graph .edge{fill:none;stroke:#80868f}
 .epypes-graph .dense{stroke-width:.5}

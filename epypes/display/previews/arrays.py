@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display.markup import cut
 from epypes.display.previews.charts import bar_chart, line_chart
-from epypes.display.previews.features import pair_sketch, point_sketch, segment_sketch
+from epypes.display.previews.features import point_sketch, quad_sketch, segment_sketch
 from epypes.display.previews.imagekinds import image_kind, is_image, one_channel, sampled
 from epypes.display.previews.labels import label_text
 from epypes.display.previews.ranges import is_of_dtype
@@ -94,7 +94,7 @@ def _places(array: Array, look: Look) -> Sketch | None:
         return point_sketch(array, look, needs_image=array.ndim == 2 and len(array) <= _SMALL_SIDE)
     if shape[1:] == (1, 4):
         return segment_sketch(array, look)
-    return pair_sketch(array, look) if shape[1:] == (4,) else None
+    return quad_sketch(array, look) if shape[1:] == (4,) else None
 
 
 def _drawn_numbers(array: Array) -> Sketch | None:
@@ -102,10 +102,18 @@ def _drawn_numbers(array: Array) -> Sketch | None:
     if array.size != max(array.shape) or array.size <= _SMALL_SIDE:
         return None
     text = array_text(array)
-    is_histogram = array.ndim == 2 and array.shape[1] == 1 and array.dtype.str[1:] == "f4" and len(array) >= _LEAST_BINS
+    is_histogram = _are_counts(array)
     name = "histogram" if is_histogram else "signal"
     said = f"{text} {name}, {statistics_text(some_of(array), array)}"
     return Sketch(Preview(text, said), lambda most_bytes: bar_chart(array) if is_histogram else line_chart(array))
+
+
+def _are_counts(array: Array) -> bool:
+    """Whether numbers are what cv2.calcHist returns: whole, but float32; of one axis in newer OpenCV."""
+    if array.dtype.str[1:] != "f4" or len(array) < _LEAST_BINS or array.ndim > 2:
+        return False
+    some = some_of(array)
+    return array.ndim == 2 or bool(((some >= 0) & (some % 1 == 0)).all())
 
 
 def histogram_sketch(value: tuple[Any, Any]) -> Sketch:
@@ -142,5 +150,5 @@ def _rows(array: Array) -> tuple[str, ...]:
 
 def _numbers(row: Array) -> str:
     if row.dtype.kind == "f":
-        return " ".join(f"{value:.3g}" for value in row)
+        return " ".join(f"{value:.4g}" for value in row)
     return " ".join(short_repr(value.item() if hasattr(value, "item") else value) for value in row)

@@ -49,8 +49,7 @@ def place_chart(points: Floats, lines: tuple[Floats, ...]) -> Chart:
     """Draw places of an image without the image: in their own extent, both axes alike, y downwards."""
     import numpy as np
 
-    spread = np.linspace(0, len(points) - 1, drawn_in_chart(len(points), 0)).astype(int)
-    series = _shortened(lines) if lines else (points[spread],)
+    series = _shortened(lines) if lines else (points[spread(len(points), MOST_POINTS)],)
     every = np.concatenate([*series, np.empty((0, 2))])
     if not len(every):
         return Chart("points", ())
@@ -63,6 +62,13 @@ def place_chart(points: Floats, lines: tuple[Floats, ...]) -> Chart:
         y = 0.5 - (places[:, 1] - middle[1]) / size
         placed.append(_pairs(x, y))
     return Chart("line" if lines else "points", tuple(placed))
+
+
+def spread(count: int, most: int) -> npt.NDArray[np.intp]:
+    """Return the indices of some of so many, from the first to the last."""
+    import numpy as np
+
+    return np.linspace(0, max(count - 1, 0), min(count, most)).astype(np.intp)
 
 
 def drawn_in_chart(points: int, lines: int) -> int:

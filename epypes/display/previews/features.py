@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.display.previews.charts import drawn_in_chart
+from epypes.display.previews.charts import drawn_in_chart, spread
 from epypes.display.previews.marks import (
     MOST_MARKS,
     MOST_PAIRS,
@@ -16,6 +16,7 @@ from epypes.display.previews.marks import (
     lie_on,
     marks_lie_on,
     pair_drawer,
+    rectangles,
     some_lines,
     some_points,
 )
@@ -65,9 +66,34 @@ def point_sketch(array: Any, look: Look, *, needs_image: bool = False) -> Sketch
 
 def segment_sketch(array: Any, look: Look) -> Sketch:
     """Look at an array (n, 1, 4) of the two ends of line segments."""
-    marks = some_lines(list(array.reshape(-1, 2, 2)[:MOST_MARKS]), are_closed=False)
-    marks = replace(marks, total=len(array))
-    return _over(marks, array_text(array), f"{array_text(array)}, segments{_extent(array.reshape(-1, 2))}", look)
+    return _over(
+        _segments(array), array_text(array), f"{array_text(array)}, segments{_extent(array.reshape(-1, 2))}", look
+    )
+
+
+def _segments(array: Any) -> Marks:
+    lines = list(array.reshape(-1, 2, 2)[:MOST_MARKS])
+    return replace(some_lines(lines, are_closed=False), total=len(array))
+
+
+def quad_sketch(array: Any, look: Look) -> Sketch | None:
+    """Look at an array (n, 4): places in two images, boxes, or segments as newer OpenCV has them.
+
+    None if they lie on no image. The numbers do not tell which they are: boxes are what lies, with width and height,
+    within the image.
+    """
+    paired = pair_sketch(array, look)
+    backdrop = look.around.nearest_image()
+    if paired is not None or backdrop is None or array.dtype.kind not in "iu" or not len(array):
+        return paired
+    height, width = backdrop.image.shape[:2]
+    ends = array[:, :2].astype("i8") + array[:, 2:]
+    are_boxes = bool((array[:, 2:] > 0).all() and (ends <= (width, height)).all())
+    marks = rectangles(array.astype("i8")) if are_boxes else _segments(array)
+    if not marks_lie_on(marks, backdrop):
+        return None
+    said = "boxes (x, y, width, height)" if are_boxes else "segments"
+    return _over(marks, array_text(array), f"{array_text(array)}, {said}", look)
 
 
 def pair_sketch(array: Any, look: Look) -> Sketch | None:
@@ -77,7 +103,7 @@ def pair_sketch(array: Any, look: Look) -> Sketch | None:
     backdrops = look.around.image_pair()
     if backdrops is None or not len(array):
         return None
-    pairs = array[:: -(-len(array) // MOST_PAIRS)].astype(np.float64)
+    pairs = array[spread(len(array), MOST_PAIRS)].astype(np.float64)
     pairs = pairs[np.isfinite(pairs).all(axis=1)]
     first, second = backdrops
     if not len(pairs) or not lie_on(pairs[:, :2], first) or not lie_on(pairs[:, 2:], second):

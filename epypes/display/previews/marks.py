@@ -6,10 +6,10 @@ Without an image at hand they become a chart in their own extent.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.display.previews.charts import place_chart
+from epypes.display.previews.charts import place_chart, spread
 from epypes.display.previews.imagekinds import image_kind, sampled
 from epypes.display.previews.raster import THUMBNAIL_PX, Picture, encode_small, pillow_image
 from epypes.display.previews.shown import Backdrop, Chart
@@ -23,12 +23,13 @@ if TYPE_CHECKING:
 
 MOST_MARKS: Final = 200
 # More lines than that, from one image to another, cover both.
-MOST_PAIRS: Final = 60
+MOST_PAIRS: Final = 40
 # Marks are drawn at twice the size and made smaller with the image, which smooths their edges.
 _OVERSAMPLED: Final = 2
 _FARTHEST_PX: Final = 1e6
 _INSIDE: Final = 0.5
 _RADIUS_PX: Final = 3.0
+_PAIR_RADIUS_PX: Final = 2.0
 _LINE_PX: Final = 3
 _DARKER: Final = 0.75
 _GREEN: Final = (60, 255, 120)
@@ -63,11 +64,11 @@ class Marks:
 
 
 def some_points(points: Any, total: int | None = None) -> Marks:
-    """Return points as marks: of many every n-th, none that is not finite."""
+    """Return points as marks: of many some, evenly spread in their order, none that is not finite."""
     import numpy as np
 
     total = len(points) if total is None else total
-    kept = points[:: -(-len(points) // MOST_MARKS) or 1].reshape(-1, 2).astype(np.float64)
+    kept = points[spread(len(points), MOST_MARKS)].reshape(-1, 2).astype(np.float64)
     return Marks(kept[_is_drawable(kept)], total=total)
 
 
@@ -79,6 +80,15 @@ def some_lines(lines: Any, are_closed: bool) -> Marks:
     kept = [line[:: -(-len(line) // MOST_MARKS) or 1].reshape(-1, 2).astype(np.float64) for line in longest]
     drawable = tuple(line[_is_drawable(line)] for line in kept if len(line))
     return Marks(np.empty((0, 2)), tuple(line for line in drawable if len(line)), are_closed, len(lines))
+
+
+def rectangles(boxes: Any) -> Marks:
+    """Return boxes (n, 4) of x, y, width and height as marks."""
+    import numpy as np
+
+    x, y, width, height = boxes[:MOST_MARKS].T
+    corners = np.stack([x, y, x + width, y, x + width, y + height, x, y + height], axis=1)
+    return replace(some_lines(list(corners.reshape(-1, 4, 2)), are_closed=True), total=len(boxes))
 
 
 def lie_on(points: Floats, backdrop: Backdrop) -> bool:
@@ -144,8 +154,8 @@ def _drawn_between(backdrops: tuple[Backdrop, Backdrop], pairs: Floats) -> Image
         end = x1 * right_scale + side, y1 * right_scale
         colour = _COLOURS[index % len(_COLOURS)]
         pen.line((*start, *end), fill=colour, width=1)
-        _draw_point(pen, *start, colour)
-        _draw_point(pen, *end, colour)
+        _draw_point(pen, *start, colour, _PAIR_RADIUS_PX)
+        _draw_point(pen, *end, colour, _PAIR_RADIUS_PX)
     return canvas.reduce(_OVERSAMPLED)
 
 
@@ -171,5 +181,7 @@ def _draw_line(pen: ImageDraw.ImageDraw, line: Floats, is_closed: bool) -> None:
     pen.line(places + places[:1] * is_closed, fill=_GREEN, width=_LINE_PX)
 
 
-def _draw_point(pen: ImageDraw.ImageDraw, x: float, y: float, colour: tuple[int, int, int]) -> None:
-    pen.ellipse((x - _RADIUS_PX, y - _RADIUS_PX, x + _RADIUS_PX, y + _RADIUS_PX), fill=colour, outline=(0, 0, 0))
+def _draw_point(
+    pen: ImageDraw.ImageDraw, x: float, y: float, colour: tuple[int, int, int], radius: float = _RADIUS_PX
+) -> None:
+    pen.ellipse((x - radius, y - radius, x + radius, y + radius), fill=colour, outline=(0, 0, 0))
