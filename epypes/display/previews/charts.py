@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.display.previews.imagekinds import SAMPLE_PX
 from epypes.display.previews.shown import Chart
+from epypes.display.previews.statistics import some_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -87,8 +87,7 @@ def _finite_or_nan(values: Any) -> Floats:
     """Return values as floats; of very many every n-th."""
     import numpy as np
 
-    flat = values.reshape(-1)
-    flat = flat[:: -(-flat.size // SAMPLE_PX) or 1].astype(np.float64)
+    flat = some_of(values).reshape(-1).astype(np.float64)
     return np.where(np.isfinite(flat), flat, np.nan)
 
 

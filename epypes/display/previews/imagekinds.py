@@ -1,6 +1,6 @@
 """Is an array an image, and is it to be seen as a mask, as labels or as a photograph?
 
-What is decided from the values of a large image is decided from a strided sample of about a million pixels at most.
+What is decided from the values of a large image is decided from a strided sample.
 """
 
 from __future__ import annotations
@@ -16,7 +16,11 @@ if TYPE_CHECKING:
 ImageKind = Literal["mask", "labels", "photograph"]
 
 SMALLEST_SIDE_PX: Final = 8
-SAMPLE_PX: Final = 1_000_000
+# Beyond this many pixels some are looked at, and so many of them: to pick them takes longer than to look at them.
+EXACT_PX: Final = 1_000_000
+SAMPLE_PX: Final = 250_000
+# Of pixels and their neighbours fewer will do.
+_PAIRS_PX: Final = 60_000
 # Integers that are wide enough may be labels whatever they are; those of cameras only if they are small.
 _MOST_LABELS: Final = {1: 63, 2: 1023}
 _FEW_LABELS: Final = 7
@@ -42,11 +46,12 @@ def one_channel(image: Array) -> Array:
 
 def stride_of(image: Array) -> int:
     """Return the n whose every n-th row and column make a sample; 1 if the image is small enough."""
-    return math.ceil(math.sqrt(image.shape[0] * image.shape[1] / SAMPLE_PX)) or 1
+    pixels = image.shape[0] * image.shape[1]
+    return math.ceil(math.sqrt(pixels / SAMPLE_PX)) if pixels > EXACT_PX else 1
 
 
 def sampled(image: Array) -> Array:
-    """Return every n-th row and column, so that at most about a million pixels remain."""
+    """Return an image of at most a million pixels as it is, of a larger one every n-th row and column."""
     stride = stride_of(image)
     return image if stride == 1 else image[::stride, ::stride].copy()
 
@@ -95,7 +100,7 @@ def _has_pieces(image: Array, largest: int) -> bool:
     """
     import numpy as np
 
-    stride = stride_of(image)
+    stride = math.ceil(math.sqrt(image.size / _PAIRS_PX))
     at, right, below = image[:-1:stride, :-1:stride], image[:-1:stride, 1::stride], image[1::stride, :-1:stride]
     pairs = [(at, side[: at.shape[0], : at.shape[1]]) for side in (right, below)]
     counted = equal = by_one = 0
@@ -104,7 +109,12 @@ def _has_pieces(image: Array, largest: int) -> bool:
         counted += int(np.count_nonzero(is_inside))
         equal += int(np.count_nonzero(is_inside & (ours == theirs)))
         by_one += int(np.count_nonzero(np.maximum(ours, theirs) - np.minimum(ours, theirs) == 1))
-    if largest <= _FEW_LABELS:
-        return equal >= _EQUAL_OF_FEW * counted
-    is_smooth = image.dtype.itemsize <= 2 and by_one > _SMALL_STEPS * (counted - equal)
-    return equal >= _EQUAL_NEIGHBOURS * counted and not is_smooth
+    if image.dtype.itemsize <= 2 and (
+        equal == counted or (largest > _FEW_LABELS and _is_smooth(by_one, counted - equal))
+    ):
+        return False
+    return equal >= (_EQUAL_OF_FEW if largest <= _FEW_LABELS else _EQUAL_NEIGHBOURS) * counted
+
+
+def _is_smooth(by_one: int, unequal: int) -> bool:
+    return by_one > _SMALL_STEPS * unequal

@@ -28,7 +28,10 @@ MOST_PAIRS: Final = 40
 _OVERSAMPLED: Final = 2
 _FARTHEST_PX: Final = 1e6
 _INSIDE: Final = 0.5
+# Few points are larger than many.
+_FEW: Final = 50
 _RADIUS_PX: Final = 3.0
+_LARGE_RADIUS_PX: Final = 4.0
 _PAIR_RADIUS_PX: Final = 2.0
 _LINE_PX: Final = 3
 _DARKER: Final = 0.75
@@ -114,12 +117,12 @@ def drawer(marks: Marks, backdrop: Backdrop | None) -> Callable[[int], Picture |
     """Return what draws marks: over an image, or in their own extent."""
     if backdrop is None:
         return lambda most_bytes: place_chart(marks.points, marks.lines)
-    return lambda most_bytes: encode_small(_drawn_over(backdrop, marks), most_bytes)
+    return lambda most_bytes: encode_small(_drawn_over(backdrop, marks), most_bytes, has_small_marks=True)
 
 
 def pair_drawer(backdrops: tuple[Backdrop, Backdrop], pairs: Floats) -> Callable[[int], Picture | Chart]:
     """Return what draws two images side by side, with lines; ``pairs`` are (n, 4): x and y in both."""
-    return lambda most_bytes: encode_small(_drawn_between(backdrops, pairs), most_bytes)
+    return lambda most_bytes: encode_small(_drawn_between(backdrops, pairs), most_bytes, has_small_marks=True)
 
 
 def _is_drawable(places: Floats) -> npt.NDArray[np.bool_]:
@@ -135,8 +138,9 @@ def _drawn_over(backdrop: Backdrop, marks: Marks) -> Image.Image:
     pen = ImageDraw.Draw(canvas)
     for line in marks.lines:
         _draw_line(pen, (line + 0.5) * scale, marks.are_closed)
+    radius = _LARGE_RADIUS_PX if len(marks.points) <= _FEW else _RADIUS_PX
     for x, y in (marks.points + 0.5) * scale:
-        _draw_point(pen, x, y, _GREEN)
+        _draw_point(pen, x, y, _GREEN, radius)
     return canvas.reduce(_OVERSAMPLED)
 
 

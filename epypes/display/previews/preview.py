@@ -71,8 +71,8 @@ def _checked(found: Any, value: Any, look: Look) -> Sketch:
         return replace(found, shown=_trimmed(found.shown))
     if isinstance(found, Preview):
         draw = _drawing(found)
-        trimmed = _trimmed(replace(found, picture=None, chart=None, detail=found.detail or _kind(value)))
-        return Sketch(trimmed, draw)
+        detail = _kind(value) if found.detail == "" else found.detail
+        return Sketch(_trimmed(replace(found, picture=None, chart=None, detail=detail)), draw)
     if type(found) is str:
         return Sketch(_trimmed(Preview(found, f"{_kind(value)}, {found}")))
     if is_image(found):

@@ -91,13 +91,16 @@ def pillow_image(array: Array, max_side_px: int | None, order: Order, ends: Rang
     return _resized(_pillow(_as_bytes(_strided(image, max_side_px), black_to_white), order), max_side_px)
 
 
-def encode_small(picture: Image.Image, most_bytes: int = THUMBNAIL_BYTES) -> Picture:
-    """Encode a thumbnail within so many bytes: at a lower quality if need be, then smaller."""
-    encoded = _save(picture)
+def encode_small(picture: Image.Image, most_bytes: int = THUMBNAIL_BYTES, *, has_small_marks: bool = False) -> Picture:
+    """Encode a thumbnail within so many bytes: at a lower quality if need be, then smaller.
+
+    JPEG has colours at half the size, which makes small marks grey, unless they are said to be there.
+    """
+    encoded = _save(picture, full_colours=has_small_marks)
     for attempt, quality in _attempts(picture):
         if len(encoded.data) <= most_bytes:
             break
-        encoded = _save(attempt, quality)
+        encoded = _save(attempt, quality, full_colours=has_small_marks)
     return encoded
 
 
@@ -172,17 +175,26 @@ def _mask_picture(mask: Array, max_side_px: int | None) -> Image.Image:
     pool = 1 if max_side_px is None else -(-max(mask.shape) // max_side_px)
     bits = mask.view(np.uint8) if mask.dtype.kind == "b" else mask
     if pool > 1:
-        # Rows first: their bytes are side by side, so that many are compared at once.
-        bits = np.bitwise_or.reduceat(bits, range(0, bits.shape[0], pool), axis=0)
-        bits = np.bitwise_or.reduceat(bits, range(0, bits.shape[1], pool), axis=1)
+        # Every pixel counts, or lines between those of a sample would vanish; by whole rows, 12 MP take 0.4 ms.
+        bits = _pooled(np.ascontiguousarray(_pooled(bits, pool).T), pool).T
     return Image.fromarray(np.ascontiguousarray(bits != 0)).convert("1")
 
 
-def _save(picture: Image.Image, quality: int = JPEG_QUALITY) -> Picture:
+def _pooled(bits: Array, pool: int) -> Array:
+    """Return each so many rows as one, with what is set in any of them."""
+    import numpy as np
+
+    whole = bits.shape[0] // pool * pool
+    pooled = np.bitwise_or.reduce(bits[:whole].reshape(-1, pool, bits.shape[1]), axis=1)
+    rest = bits[whole:]
+    return np.concatenate([pooled, np.bitwise_or.reduce(rest, axis=0, keepdims=True)]) if len(rest) else pooled
+
+
+def _save(picture: Image.Image, quality: int = JPEG_QUALITY, *, full_colours: bool = False) -> Picture:
     stream = io.BytesIO()
     kind = "JPEG" if picture.mode in ("L", "RGB") else "PNG"
     if kind == "JPEG":
-        picture.save(stream, kind, quality=quality)
+        picture.save(stream, kind, quality=quality, subsampling=0 if full_colours else -1)
     else:
         picture.save(stream, kind, compress_level=1 if max(picture.size) > THUMBNAIL_PX else 9)
     return Picture(stream.getvalue(), f"image/{kind.lower()}", picture.width, picture.height)

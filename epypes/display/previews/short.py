@@ -68,9 +68,9 @@ class ShortRepr(reprlib.Repr):
         if getattr(kind, "__repr__", None) is object.__repr__ or issubclass(kind, _NAMED):
             # Their repr says where they are in memory, which is another place in each process.
             return str(getattr(x, "__qualname__", kind.__name__))
+        length = _length(x)
         # What is so long would take its own repr as long.
-        is_long = hasattr(kind, "__len__") and len(x) > _LONGEST
-        return f"{kind.__name__} of {len(x)}" if is_long else repr(x)
+        return f"{kind.__name__} of {length}" if length > _LONGEST else repr(x)
 
     def _items(self, x: Any, left: str, right: str, level: int) -> str:
         if level <= 0 and len(x):
@@ -93,6 +93,13 @@ class ShortRepr(reprlib.Repr):
 
     def _cut(self, text: str, characters: int) -> str:
         return cut(text, characters)
+
+
+def _length(x: Any) -> int:
+    try:
+        return len(x)
+    except Exception:  # whatever an object's __len__ raises
+        return 0
 
 
 _SHORT: Final = ShortRepr()

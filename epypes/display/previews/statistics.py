@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from epypes.display.previews.imagekinds import SAMPLE_PX
+from epypes.display.previews.imagekinds import EXACT_PX, SAMPLE_PX
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 
 def some_of(array: Array) -> Array:
-    """Return every n-th value of an array, so that at most about a million remain."""
-    step = -(-array.size // SAMPLE_PX)
-    if step <= 1:
+    """Return an array of at most a million values as it is, of a larger one every n-th."""
+    if array.size <= EXACT_PX:
         return array
+    step = -(-array.size // SAMPLE_PX)
     # Along the first axis, since an array that is not contiguous would be copied to be flattened.
     along = array[:: min(step, array.shape[0])]
     return along.reshape(-1)[:: -(-along.size // SAMPLE_PX)] if along.size > SAMPLE_PX else along
@@ -34,7 +34,9 @@ def _numbers(sample: Array, array: Array) -> list[str]:
         return ["empty"]
     if array.dtype.kind in "mM":
         return [f"{sample.min()} to {sample.max()}"]
-    if array.dtype.kind not in "biufc":
+    if array.dtype.kind == "b":
+        return [f"{np.mean(sample):.3g} of it true" + " in a sample" * (sample.size < array.size)]
+    if array.dtype.kind not in "iufc":
         return []
     with np.errstate(all="ignore"):
         values = np.abs(sample) if array.dtype.kind == "c" else sample
