@@ -13,6 +13,7 @@ from epypes.display.layout.geometry import Box, Point
 from epypes.display.markup import cut, escape, short_name
 from epypes.display.paint.marks import LINE_PX, text_lines, text_width, vertex
 from epypes.display.paint.thumbnails import THUMB_HEIGHT, THUMB_WIDTH, paint_thumbnail
+from epypes.display.previews.short import float_text
 from epypes.display.views.graphview import TokenView
 
 _ROW_PX: Final = 13
@@ -24,6 +25,7 @@ _SECOND_LINE_CHARACTERS: Final = 24
 _VALUE_CHARACTERS: Final = 18
 _INT_FIELD: Final = 5
 _FLOAT_FIELD: Final = 8
+_FLOAT_DIGITS: Final = 4
 _FIELD: Final = 6
 # A count that is shorter takes as much room, since the next one may be longer.
 _COUNT_DIGITS: Final = 4
@@ -107,7 +109,7 @@ def _second(token: TokenView) -> str:
     if _kind(token) in ("thumbnail", "rows"):
         return cut(token.preview.text, _SECOND_LINE_CHARACTERS)
     text = token.preview.text
-    return f"{float(text):.4g}" if _FLOAT.fullmatch(text) else cut(text, _VALUE_CHARACTERS)
+    return float_text(float(text), _FLOAT_DIGITS) if _FLOAT.fullmatch(text) else cut(text, _VALUE_CHARACTERS)
 
 
 def _field(text: str) -> int:

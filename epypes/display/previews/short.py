@@ -136,9 +136,9 @@ def fields_of(value: Any) -> dict[str, Any] | None:
     return {field.name: getattr(value, field.name, "missing") for field in dataclasses.fields(kind)}
 
 
-def float_text(value: float) -> str:
-    """Return a float to six digits; one without fraction with ``.0``, so that it can be told from an int."""
-    text = f"{float(value):.6g}"
+def float_text(value: float, digits: int = 6) -> str:
+    """Return a float to so many digits; one without fraction with ``.0``, so that it can be told from an int."""
+    text = f"{float(value):.{digits}g}"
     return text + ".0" * text.lstrip("-").isdigit()
 
 
