@@ -389,6 +389,20 @@ def test_a_preview_that_raises_shows_its_reason_and_never_breaks_the_picture():
     assert len(bundle["image/svg+xml"]) < 10_000
 
 
+def test_a_preview_function_can_not_spoil_what_it_shows():
+    class Frame(np.ndarray):
+        pass
+
+    @ep.register_preview(Frame)
+    def show(frame):
+        frame[:] = 0
+        return "spoilt"
+
+    image = red_image().view(Frame)
+    assert preview(image).text.startswith("no preview: ValueError")
+    assert image.max() == 200
+
+
 def test_the_nearest_class_decides_and_for_one_class_the_user():
     class Pathlike(dict):
         pass

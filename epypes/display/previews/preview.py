@@ -76,7 +76,7 @@ def _checked(found: Any, value: Any, look: Look) -> Sketch:
     if type(found) is str:
         return Sketch(_trimmed(Preview(found, f"{_kind(value)}, {found}")))
     if is_image(found):
-        image = arrays.image_sketch(found, Look(look.order))
+        image = arrays.image_sketch(found, look)
         detail = f"{_kind(value)}, shown as {image.shown.detail}"
         return replace(image, shown=_trimmed(replace(image.shown, text=_kind(value), detail=detail)))
     raise TypeError(f"a preview must be a text, an image or an ep.Preview, not {_kind(found)}")

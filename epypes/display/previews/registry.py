@@ -11,6 +11,7 @@ from typing import Any, Final, TypeVar, overload
 from weakref import WeakKeyDictionary
 
 from epypes.display.previews.shown import Look
+from epypes.run.guard import lend
 
 _Function = TypeVar("_Function", bound=Callable[[Any], Any])
 # What a preview function may return is checked where it is called.
@@ -76,7 +77,7 @@ def register_preview(kind: type | str, function: Callable[[Any], Any] | None = N
         The class, whose subclasses are then shown so too, or its dotted name, ``"package.module.Pose"``, which
         imports nothing.
     function
-        Takes a value, and returns a short text, an image (an array as OpenCV has it), or a ``Preview``. It is called
+        Takes a value, arrays read-only, and returns a short text, an image (an array as OpenCV has it), or a ``Preview``. It is called
         whenever a picture is made. If it raises, the reason is shown in place.
 
     Returns
@@ -103,5 +104,6 @@ def register_preview(kind: type | str, function: Callable[[Any], Any] | None = N
         return lambda given: register_preview(kind, given)
     if not callable(function):
         raise TypeError(f"The preview of {kind!r} must be a function that takes the value, not {function!r:.60}.")
-    _users.add(kind, lambda value, look: function(value))
+    # As for the functions of a graph: what is shown can't be spoilt.
+    _users.add(kind, lambda value, look: function(lend(value)))
     return function
