@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display.markup import cut
@@ -14,7 +15,7 @@ from epypes.display.previews.raster import THUMBNAIL_PX, encode_small, pillow_im
 from epypes.display.previews.registry import ours
 from epypes.display.previews.short import array_text, float_text, row_texts, short_repr
 from epypes.display.previews.shown import Look, Preview, Sketch
-from epypes.display.previews.statistics import some_of, statistics_text
+from epypes.display.previews.statistics import few_of, some_of, statistics_text
 from epypes.display.previews.tables import record_sketch
 
 if TYPE_CHECKING:
@@ -27,6 +28,8 @@ _SMALL_SIDE: Final = 4
 _MOST_COLUMNS: Final = 6
 _MOST_ROWS: Final = 4
 _LEAST_BINS: Final = 8
+# Of points, contours, segments, and pairs of points or boxes.
+_PLACES: Final = ((2,), (1, 2), (1, 4), (4,))
 
 
 @ours("numpy.generic")
@@ -51,9 +54,23 @@ def _array_sketch(array: Any, look: Look) -> Sketch | Preview:
         return record_sketch(array)
     if array.dtype.kind not in "biuf" or not array.size:
         return _plain(array)
+    closer = _closer(array)
+    if closer is None:
+        return _plain(array)
+    text = array_text(array)
+    said = f"{text}, {statistics_text(few_of(array), array)}"
+    brief = Preview(text, said, rows=_rows(array) if array.ndim > 1 else ())
+    return Sketch(brief, is_image=closer is image_sketch, closer=lambda: closer(array, look) or _plain(array))
+
+
+def _closer(array: Array) -> Callable[[Array, Look], Sketch | None] | None:
+    """Return what draws an array of its shape; None if nothing can be drawn."""
     if is_image(array) and not _is_strip(array):
-        return image_sketch(array, look)
-    return _places(array, look) or _drawn_numbers(array) or _plain(array)
+        return image_sketch
+    if array.shape[1:] in _PLACES:
+        return _places
+    is_line = array.size == max(array.shape) > _SMALL_SIDE
+    return _drawn_numbers if is_line else None
 
 
 def _is_strip(array: Array) -> bool:
@@ -87,20 +104,18 @@ def _order_text(array: Array, look: Look) -> str:
 
 
 def _places(array: Array, look: Look) -> Sketch | None:
-    """Look at an array of places in an image; None if its shape is another."""
+    """Look at an array of places in an image; None if the image is needed and there is none."""
     shape = array.shape
     if shape[1:] in ((2,), (1, 2)):
         # Four corners are a small matrix, too, where there is no image that they lie on.
         return point_sketch(array, look, needs_image=array.ndim == 2 and len(array) <= _SMALL_SIDE)
     if shape[1:] == (1, 4):
         return segment_sketch(array, look)
-    return quad_sketch(array, look) if shape[1:] == (4,) else None
+    return quad_sketch(array, look)
 
 
-def _drawn_numbers(array: Array) -> Sketch | None:
+def _drawn_numbers(array: Array, look: Look) -> Sketch:
     """Look at an array of one column, or one row, as a histogram or signal."""
-    if array.size != max(array.shape) or array.size <= _SMALL_SIDE:
-        return None
     text = array_text(array)
     is_histogram = _are_counts(array)
     name = "histogram" if is_histogram else "signal"

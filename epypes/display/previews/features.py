@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display.previews.charts import drawn_in_chart, spread
@@ -46,12 +47,11 @@ def are_keypoints(value: Any) -> bool:
 
 def list_sketch(value: Sequence[Any], look: Look) -> Sketch | None:
     """Look at a list or tuple of what can be drawn; None if it is any other."""
-    if are_keypoints(value):
-        return _keypoints(value, look)
-    if _are_all(value, _is_match) or _are_all(value, _is_match_list):
-        return _matches(value, look)
-    if _are_all(value, _is_contour):
-        return _contours(value, look)
+    name = type(value).__name__
+    for is_kind, noun, closer in _LISTS:
+        if is_kind(value):
+            text = f"{len(value)} {noun}{('es' if noun.endswith('ch') else 's') * (len(value) != 1)}"
+            return Sketch(Preview(text, f"{name} of {text}"), closer=partial(closer, value, text, look))
     return None
 
 
@@ -133,23 +133,21 @@ def _between(backdrops: tuple[Backdrop, Backdrop], pairs: Floats, total: int, te
     return Sketch(Preview(text, said), pair_drawer(backdrops, pairs))
 
 
-def _keypoints(value: Sequence[Any], look: Look) -> Sketch:
+def _keypoints(value: Sequence[Any], text: str, look: Look) -> Sketch:
     import numpy as np
 
     weighed = sorted(value[:_WEIGHED], key=lambda keypoint: -keypoint.response)[:MOST_MARKS]
     marks = some_points(np.array([keypoint.pt for keypoint in weighed], dtype=np.float64), len(value))
     sizes = [keypoint.size for keypoint in weighed]
-    text = f"{len(value)} keypoint{'s' * (len(value) != 1)}"
     said = f"{type(value).__name__} of {text}{_extent(marks.points)}, size {min(sizes):.4g} to {max(sizes):.4g}"
     return _over(marks, text, said, look)
 
 
-def _matches(value: Sequence[Any], look: Look) -> Sketch:
+def _matches(value: Sequence[Any], text: str, look: Look) -> Sketch:
     import numpy as np
 
     flat = [item if _is_match(item) else item[0] for item in value[:_WEIGHED] if _is_match(item) or item]
     distances = [match.distance for match in flat]
-    text = f"{len(value)} match{'es' * (len(value) != 1)}"
     said = f"{type(value).__name__} of {text}, distance {min(distances):.4g} to {max(distances):.4g}"
     backdrops, keypoints = look.around.image_pair(), look.around.keypoint_pair()
     if backdrops is None or keypoints is None or not _indices_fit(flat, *keypoints):
@@ -169,14 +167,13 @@ def _indices_fit(matches: Sequence[Any], first: Sequence[Any], second: Sequence[
     return all(0 <= m.queryIdx < len(first) and 0 <= m.trainIdx < len(second) for m in matches)
 
 
-def _contours(value: Sequence[Any], look: Look) -> Sketch:
+def _contours(value: Sequence[Any], text: str, look: Look) -> Sketch:
     are_rows = value[0].ndim == 2
     lines = [line[:, ::-1] for line in value] if are_rows else list(value)
     marks = some_lines(lines, are_closed=not are_rows)
-    count = f"{len(value)} contour{'s' * (len(value) != 1)}"
     order = ", (row, column) as scikit-image has them" if are_rows else ""
-    said = f"{type(value).__name__} of {count}, {sum(map(len, value))} points, {value[0].dtype}{order}"
-    return _over(marks, count, said, look)
+    said = f"{type(value).__name__} of {text}, {sum(map(len, value))} points, {value[0].dtype}{order}"
+    return _over(marks, text, said, look)
 
 
 def _extent(points: Any) -> str:
@@ -214,3 +211,18 @@ def _is_contour(item: Any) -> bool:
         return False
     shape = item.shape
     return bool(shape[1:] == (1, 2) or (shape[1:] == (2,) and item.dtype.str[1:] == "f8"))
+
+
+def _are_matches(value: Sequence[Any]) -> bool:
+    return _are_all(value, _is_match) or _are_all(value, _is_match_list)
+
+
+def _are_contours(value: Sequence[Any]) -> bool:
+    return _are_all(value, _is_contour)
+
+
+_LISTS: Final = (
+    (are_keypoints, "keypoint", _keypoints),
+    (_are_matches, "match", _matches),
+    (_are_contours, "contour", _contours),
+)

@@ -68,8 +68,11 @@ def is_mask(image: Array) -> bool:
     """Whether an image of one channel has two values only: bool, or uint8 of 0 and 255, or of 0 and 1."""
     if image.ndim != 2 or image.dtype.kind not in "bu" or image.dtype.itemsize > 1:
         return False
-    if image.dtype.kind == "b":
-        return True
+    # A few pixels of a photograph tell already that it is none.
+    return image.dtype.kind == "b" or (_has_two_values(image[::16, ::16]) and _has_two_values(image))
+
+
+def _has_two_values(image: Array) -> bool:
     import numpy as np
 
     # 0 and 255 are the two values that adding one, within a byte, brings to at most 1.

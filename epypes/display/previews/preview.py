@@ -44,15 +44,20 @@ def sketch(value: Any, look: Look) -> Sketch:
 
 def finished(sketched: Sketch, most_bytes: int = THUMBNAIL_BYTES) -> Preview:
     """Return a preview with its thumbnail; one that can't be made gives the reason instead. Never raises."""
-    if sketched.draw is None:
-        return sketched.shown
     try:
-        drawn = sketched.draw(most_bytes)
+        if sketched.closer is not None:
+            sketched = _limited(sketched.closer())
+        drawn = sketched.draw(most_bytes) if sketched.draw is not None else None
     except Exception as error:
         return _failed(sketched.shown, "no picture", error)
     if isinstance(drawn, Chart):
         return replace(sketched.shown, chart=drawn)
     return replace(sketched.shown, picture=drawn)
+
+
+def _limited(found: Sketch | Preview) -> Sketch:
+    sketched = found if isinstance(found, Sketch) else Sketch(found)
+    return replace(sketched, shown=_trimmed(sketched.shown))
 
 
 def _failed(shown: Preview, what: str, error: Exception) -> Preview:
@@ -68,7 +73,7 @@ def _kind(value: Any) -> str:
 def _checked(found: Any, value: Any, look: Look) -> Sketch:
     """Return what a preview function returned, within the limits."""
     if isinstance(found, Sketch):
-        return replace(found, shown=_trimmed(found.shown))
+        return _limited(found)
     if isinstance(found, Preview):
         draw = _drawing(found)
         detail = _kind(value) if found.detail == "" else found.detail

@@ -77,8 +77,8 @@ def register_preview(kind: type | str, function: Callable[[Any], Any] | None = N
         The class, whose subclasses are then shown so too, or its dotted name, ``"package.module.Pose"``, which
         imports nothing.
     function
-        Takes a value, arrays read-only, and returns a short text, an image (an array as OpenCV has it), or a ``Preview``. It is called
-        whenever a picture is made. If it raises, the reason is shown in place.
+        Takes a value, arrays read-only, and returns a short text, an image (an array as OpenCV has it), or a
+        ``Preview``. It is called whenever a picture is made. If it raises, the reason is shown in place.
 
     Returns
     -------

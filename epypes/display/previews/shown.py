@@ -58,6 +58,9 @@ class Sketch:
 
     Attributes
     ----------
+    closer
+        Looks at the value closely, which takes longer and is done only if there is room for a thumbnail: returns what
+        is then shown instead.
     draw
         Makes the thumbnail, in so many bytes at most if it is encoded; None if there is none.
     is_image
@@ -67,6 +70,12 @@ class Sketch:
     shown: Preview
     draw: Callable[[int], Picture | Chart] | None = None
     is_image: bool = False
+    closer: Callable[[], Sketch | Preview] | None = None
+
+    @property
+    def may_be_drawn(self) -> bool:
+        """Whether it may get a thumbnail."""
+        return self.draw is not None or self.closer is not None
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import math
+from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display.previews.imagekinds import EXACT_PX, SAMPLE_PX
+
+_FEW: Final = 10_000
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -20,6 +23,15 @@ def some_of(array: Array) -> Array:
     # Along the first axis, since an array that is not contiguous would be copied to be flattened.
     along = array[:: min(step, array.shape[0])]
     return along.reshape(-1)[:: -(-along.size // SAMPLE_PX)] if along.size > SAMPLE_PX else along
+
+
+def few_of(array: Array) -> Array:
+    """Return a small array as it is, of a larger one a few thousand values: that takes no time worth counting."""
+    if array.size <= _FEW:
+        return array
+    step = max(1, math.isqrt(array.size // _FEW))
+    few = array[::step] if array.ndim == 1 else array[::step, ::step]
+    return few.reshape(-1)[:: -(-few.size // _FEW)]
 
 
 def statistics_text(sample: Array, array: Array) -> str:

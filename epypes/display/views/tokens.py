@@ -107,7 +107,7 @@ def _with_previews(
 
     Each may take the same part of the room that is left, so that all of them are shown, if need be with less detail.
     """
-    by_rank = sorted((name for name, found in sketches.items() if found.draw is not None), key=rank)
+    by_rank = sorted((name for name, found in sketches.items() if found.may_be_drawn), key=rank)
     most = min(most, THUMBNAIL_CHARACTERS // (_characters(_LEAST_BYTES)))
     chosen, left = by_rank[:most], THUMBNAIL_CHARACTERS
     previews = {name: found.shown for name, found in sketches.items()}
