@@ -272,7 +272,10 @@ def test_values_are_written_short(value, text):
         (Pose(1.5, np.eye(3)), ("x: 1.5", "rotation: float64 3 x 3")),
         (Size(3, 4), ("width: 3", "height: 4")),
         ([], ("(empty)",)),
-        (np.array([[800.5, 0, 320], [0, 800.5, 240], [0, 0, 1]]), ("800.5 0 320", "0 800.5 240", "0 0 1")),
+        (
+            np.array([[800.5, 0, 320], [0, 800.5, 240], [0, 0, 1]]),
+            ("800.5     0 320", "    0 800.5 240", "    0     0   1"),
+        ),
         (np.array([(1, 0.5), (2, 1.5)], dtype=[("id", int), ("area", float)]), ("id  area", "1   0.5", "2   1.5")),
         ([{"id": 1, "name": "nut"}, {"id": 2, "name": "bolt"}], ("id  name", "1   nut", "2   bolt")),
         (pd.DataFrame({"id": [1, 2, 3, 4], "area": [0.5, 1.5, 2, 3]}), ("id  area", "1   0.5", "2   1.5", "3   2")),

@@ -157,13 +157,17 @@ def _rows(array: Array) -> tuple[str, ...]:
     if not array.size or array.ndim > 2 or (array.ndim == 2 and array.shape[1] > _MOST_COLUMNS):
         return ()
     if array.ndim == 1:
-        return row_texts(array, len(array), _MOST_ROWS) if array.dtype.kind not in "biuf" else (_numbers(array),)
+        return (
+            row_texts(array, len(array), _MOST_ROWS) if array.dtype.kind not in "biuf" else (" ".join(_cells(array)),)
+        )
     kept = len(array) if len(array) <= _MOST_ROWS else _MOST_ROWS - 1
-    rows = tuple(_numbers(row) for row in array[:kept])
+    cells = [_cells(row) for row in array[:kept]]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    rows = tuple(" ".join(map(str.rjust, row, widths)) for row in cells)
     return (*rows, f"... {len(array) - kept} more") if kept < len(array) else rows
 
 
-def _numbers(row: Array) -> str:
+def _cells(row: Array) -> list[str]:
     if row.dtype.kind == "f":
-        return " ".join(f"{value:.4g}" for value in row)
-    return " ".join(short_repr(value.item() if hasattr(value, "item") else value) for value in row)
+        return [f"{value:.4g}" for value in row]
+    return [short_repr(value.item() if hasattr(value, "item") else value) for value in row]
