@@ -6,6 +6,8 @@ import colorsys
 import enum
 import io
 import itertools
+import subprocess
+import sys
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
@@ -296,6 +298,17 @@ def test_a_subclass_of_a_container_is_bounded_too():
     assert preview(Many(range(10**6))).text == "Many of 1000000"
 
 
+def test_what_is_long_is_not_asked_for_its_repr():
+    class Huge:
+        def __len__(self):
+            return 10**6
+
+        def __repr__(self):
+            raise AssertionError("asked")
+
+    assert preview(Huge()).text == "Huge of 1000000"
+
+
 def test_a_repr_that_raises_gives_its_reason():
     assert "RuntimeError: no repr" in preview(Hostile()).detail
     assert "RuntimeError: no repr" in preview([Hostile()]).rows[0]
@@ -417,6 +430,16 @@ def test_the_nearest_class_decides_and_for_one_class_the_user():
     assert preview(Special(a=1)).text == "ours"
     ep.register_preview(Special, lambda value: "special")
     assert (preview(Special()).text, preview(Pathlike()).text, preview({}).text) == ("special", "ours", "dict of 0")
+
+
+def test_a_user_may_show_what_is_shown_already_in_another_way():
+    code = (
+        "import epypes as ep, pathlib; from epypes.display.previews.preview import preview\n"
+        "before = preview(pathlib.Path('a')).text; ep.register_preview(pathlib.PurePath, lambda path: 'mine')\n"
+        "print(before, preview(pathlib.Path('a')).text)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["a", "mine"]
 
 
 def test_a_class_is_known_by_its_dotted_name_before_it_exists():

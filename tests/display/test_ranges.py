@@ -93,6 +93,12 @@ def test_an_image_of_one_value_decides_nothing():
     assert shown(ours.run(x=steps(0, 2048, 4095, dtype="uint16")), 3) == pytest.approx([0, 128, 255], abs=4)
 
 
+def test_an_image_of_one_value_is_shown_in_the_range_that_was_kept():
+    ours = runner()
+    view(ours.run(x=steps(-20, 0, 20, dtype="int32")))
+    assert shown(ours.run(x=steps(10, 10, 10, dtype="int32")), 3) == pytest.approx([191, 191, 191], abs=4)
+
+
 def test_another_dtype_has_another_range():
     ours = runner()
     view(ours.run(x=steps(0, 2048, 4095, dtype="uint16")))

@@ -165,6 +165,7 @@ def functions_of_a_number() -> dict[str, Any]:
         "points": lambda n: np.random.default_rng(n).random((6 + n, 2)),
         "image": lambda n: np.full((20 + n, 30), n * 5, np.uint8),
         "rows": lambda n: np.zeros((2, 3)) + n,
+        "descriptors": lambda n: np.zeros((91 + n, 9), np.uint8),
         "odd": lambda n: np.zeros((n + 1, 2, 3, 4)),
         "text": lambda n: "a word"[: 1 + n % 4],
     }

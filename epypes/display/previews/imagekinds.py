@@ -112,12 +112,7 @@ def _has_pieces(image: Array, largest: int) -> bool:
         counted += int(np.count_nonzero(is_inside))
         equal += int(np.count_nonzero(is_inside & (ours == theirs)))
         by_one += int(np.count_nonzero(np.maximum(ours, theirs) - np.minimum(ours, theirs) == 1))
-    if image.dtype.itemsize <= 2 and (
-        equal == counted or (largest > _FEW_LABELS and _is_smooth(by_one, counted - equal))
-    ):
+    may_be_smooth = image.dtype.itemsize <= 2 and largest > _FEW_LABELS
+    if equal == counted or (may_be_smooth and by_one > _SMALL_STEPS * (counted - equal)):
         return False
     return equal >= (_EQUAL_OF_FEW if largest <= _FEW_LABELS else _EQUAL_NEIGHBOURS) * counted
-
-
-def _is_smooth(by_one: int, unequal: int) -> bool:
-    return by_one > _SMALL_STEPS * unequal
