@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from epypes import errors
     from epypes.bundle import load, load_pipeline, promote, to_source, verify
-    from epypes.display import show
+    from epypes.display import Preview, register_preview, reset_display_ranges, show
     from epypes.graph import CompGraph, Placeholder, extend, group, outputs, rename, subgraph, suffix, switch, union
     from epypes.hints import Param
     from epypes.images import Image
@@ -86,6 +86,9 @@ _HOMES = {
     "Node": "epypes.pipeline",
     "NodeBasedCompGraph": "epypes.pipeline",
     "Param": "epypes.hints",
+    "Preview": "epypes.display",
+    "register_preview": "epypes.display",
+    "reset_display_ranges": "epypes.display",
     "Pipeline": "epypes.pipeline",
     "SinkPipeline": "epypes.pipeline",
     "SourcePipeline": "epypes.pipeline",
@@ -118,6 +121,7 @@ __all__ = [
     "Pipeline",
     "Placeholder",
     "Plan",
+    "Preview",
     "Run",
     "RunReport",
     "SinkPipeline",
@@ -135,7 +139,9 @@ __all__ = [
     "load_pipeline",
     "outputs",
     "promote",
+    "register_preview",
     "rename",
+    "reset_display_ranges",
     "show",
     "subgraph",
     "suffix",

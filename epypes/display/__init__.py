@@ -1,19 +1,27 @@
 """How a graph, a run and a value look, as static SVG, HTML and text."""
 
 from epypes.display.mime import mimebundle, to_svg
-from epypes.display.previews.raster import Picture, encode_image, is_image
+from epypes.display.previews.imagekinds import is_image
+from epypes.display.previews.preview import Chart, Preview
+from epypes.display.previews.ranges import reset_display_ranges
+from epypes.display.previews.raster import Picture, encode_image
+from epypes.display.previews.registry import register_preview
 from epypes.display.printed import to_text
 from epypes.display.show import Figure, show
 from epypes.display.views.graphview import GraphView
 from epypes.display.views.view import view
 
 __all__ = [
+    "Chart",
     "Figure",
     "GraphView",
     "Picture",
+    "Preview",
     "encode_image",
     "is_image",
     "mimebundle",
+    "register_preview",
+    "reset_display_ranges",
     "show",
     "to_svg",
     "to_text",

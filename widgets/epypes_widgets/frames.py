@@ -17,7 +17,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from epypes.display.previews.raster import encode_image, is_image
+from epypes.display.previews.imagekinds import is_image
+from epypes.display.previews.ranges import kept_range
+from epypes.display.previews.raster import encode_image
 from epypes.graph import colour_order
 from epypes.run import Run
 
@@ -69,7 +71,8 @@ def make_frame(run: Run, token: str, seq: int, changed_ns: int = 0, *, stale: bo
     if not is_image(value):
         content |= {"media_type": "text/plain", "text": text_of(value)}
         return Frame(seq, content, b"", changed_ns)
-    picture = encode_image(value, MAX_SIDE_PX, colour_order(run.cg, token))
+    ends = kept_range(run.tokens.program, token, value)
+    picture = encode_image(value, MAX_SIDE_PX, colour_order(run.cg, token), ends)
     content |= {
         "media_type": picture.media_type,
         "width": picture.width,

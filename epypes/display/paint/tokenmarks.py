@@ -1,45 +1,69 @@
-"""How large is a token, and how is it painted?"""
+"""How large is a token, and how is it painted?
+
+Layouts are kept by the sizes of vertices, so a size depends on the value as little as possible: thumbnails and rows
+stand in boxes of one size, and texts in fields that are wide enough for the next value, too.
+"""
 
 from __future__ import annotations
 
-import base64
+import re
 from typing import Final
 
 from epypes.display.layout.geometry import Box, Point
-from epypes.display.markup import cut_name, short_name
+from epypes.display.markup import cut, cut_name, escape, short_name
 from epypes.display.paint.marks import LINE_PX, TITLE_CHARACTERS, text_lines, text_width, vertex
+from epypes.display.paint.thumbnails import THUMB_HEIGHT, THUMB_WIDTH, paint_thumbnail
+from epypes.display.previews.short import float_text
 from epypes.display.views.graphview import TokenView
 
-_THUMB_WIDTH: Final = 128
-_THUMB_HEIGHT: Final = 96
+_ROW_PX: Final = 13
+_ROWS: Final = 4
+_ROW_CHARACTERS: Final = 26
+# What a row of 10 px monospace text takes.
+_ROWS_WIDTH: Final = _ROW_CHARACTERS * 6.1
+_SECOND_LINE_CHARACTERS: Final = 24
+_VALUE_CHARACTERS: Final = 18
+_INT_FIELD: Final = 5
+_FLOAT_FIELD: Final = 8
+_FLOAT_DIGITS: Final = 4
+_FIELD: Final = 6
+# A count that is shorter takes as much room, since the next one may be longer.
+_COUNT_DIGITS: Final = 4
+_INT: Final = re.compile(r"-?\d+")
+_FLOAT: Final = re.compile(r"-?(\d+\.\d*|\d*\.\d+)(e[-+]?\d+)?|-?\d+e[-+]?\d+|nan|-?inf")
+_COUNT: Final = re.compile(r"\b\d+\b")
 
 
 def token_box(token: TokenView) -> Box:
     """Return the shape and size of a token."""
-    lines = _token_lines(token)
-    if token.preview and token.preview.picture:
-        return Box("box", max(_THUMB_WIDTH + 12, text_width(*lines)), _THUMB_HEIGHT + 2 * LINE_PX + 16)
-    if token.role == "hyperparameter":
-        return Box("hexagon", text_width(*lines) + 14, LINE_PX + 12)
+    name, kind = short_name(token.name), _kind(token)
+    if kind == "thumbnail":
+        return Box("box", max(THUMB_WIDTH + 12, text_width(name)), THUMB_HEIGHT + 2 * LINE_PX + 16)
+    if kind == "rows":
+        return Box("box", max(_ROWS_WIDTH + 12, text_width(name)), _ROWS * _ROW_PX + 2 * LINE_PX + 16)
+    second = _second(token)
+    if kind == "hyperparameter":
+        return Box("hexagon", text_width(f"{name} = {'0' * _field(second)}") + 14, LINE_PX + 12)
+    lines = (name, "0" * (_field(second) if token.preview else len(second))) if second else (name,)
     return Box("ellipse", text_width(*lines) * 1.18, LINE_PX * len(lines) + 16)
 
 
 def paint_token(token: TokenView, box: Box, centre: Point) -> str:
     """Paint a token as an element with its title."""
-    lines = _token_lines(token)
     x, y = centre[0] - box.width / 2, centre[1] - box.height / 2
     if box.shape == "box":
         body = (
             f'<rect class="shape" x="{x:.1f}" y="{y:.1f}" width="{box.width:.1f}" height="{box.height:.1f}" rx="10"/>'
         )
-        body += text_lines(lines, (centre[0], y + LINE_PX + 4)) + _thumbnail(token, centre[0], y + 2 * LINE_PX + 8)
+        body += text_lines((short_name(token.name), _second(token)), (centre[0], y + LINE_PX + 4))
+        body += _inside(token, box, (centre[0], y + 2 * LINE_PX + 8))
     elif box.shape == "hexagon":
-        body = f'<polygon class="shape" points="{_hexagon(x, y, box)}"/>' + text_lines(lines, centre)
+        body = f'<polygon class="shape" points="{_hexagon(x, y, box)}"/>' + text_lines(_token_lines(token), centre)
     else:
         body = (
             f'<ellipse class="shape" cx="{centre[0]:.1f}" cy="{centre[1]:.1f}" '
             f'rx="{box.width / 2:.1f}" ry="{box.height / 2:.1f}"/>'
-        ) + text_lines(lines, centre)
+        ) + text_lines(_token_lines(token), centre)
     detail = token.preview.detail if token.preview else "no value"
     state = "" if token.state == "static" else f": {detail}, {token.state}"
     if token.first:
@@ -50,13 +74,57 @@ def paint_token(token: TokenView, box: Box, centre: Point) -> str:
     return vertex("token", token.name, states, _title(token, state), body)
 
 
+def _kind(token: TokenView) -> str:
+    """Return what is painted of a token beside its name."""
+    shown = token.preview
+    if shown is not None and (shown.picture is not None or shown.chart is not None):
+        return "thumbnail"
+    if token.role == "hyperparameter" and shown is not None:
+        return "hyperparameter"
+    is_hidden = token.state in ("missing", "left out")
+    return "rows" if shown is not None and shown.rows and not is_hidden else "text"
+
+
+def _inside(token: TokenView, box: Box, top: Point) -> str:
+    """Paint the thumbnail or the rows of a token below its two lines."""
+    if token.preview is None:
+        return ""
+    if _kind(token) == "thumbnail":
+        return paint_thumbnail(token.preview, top)
+    left = top[0] - box.width / 2 + 8
+    return "".join(
+        f'<text class="row" x="{left:.1f}" y="{top[1] + row * _ROW_PX + 8:.1f}">{escape(text[:_ROW_CHARACTERS])}</text>'
+        for row, text in enumerate(token.preview.rows[:_ROWS])
+    )
+
+
 def _token_lines(token: TokenView) -> tuple[str, ...]:
-    name = short_name(token.name)
-    if token.role == "hyperparameter" and token.preview:
-        return (f"{name} = {token.preview.text}",)
-    if token.state in ("missing", "left out"):
-        return name, token.state
-    return (name, token.preview.text) if token.preview else (name,)
+    name, second = short_name(token.name), _second(token)
+    if _kind(token) == "hyperparameter":
+        return (f"{name} = {second}",)
+    return (name, second) if second else (name,)
+
+
+def _second(token: TokenView) -> str:
+    """Return what is written of the value, or of the state."""
+    if token.state in ("missing", "left out") and not (token.role == "hyperparameter" and token.preview):
+        return token.state
+    if token.preview is None:
+        return ""
+    if _kind(token) in ("thumbnail", "rows"):
+        return cut(token.preview.text, _SECOND_LINE_CHARACTERS)
+    text = token.preview.text
+    return float_text(float(text), _FLOAT_DIGITS) if _FLOAT.fullmatch(text) else cut(text, _VALUE_CHARACTERS)
+
+
+def _field(text: str) -> int:
+    """Return how many characters are kept free for a value, so that the next one does not move anything."""
+    if _INT.fullmatch(text) and len(text) <= _INT_FIELD:
+        return _INT_FIELD
+    if _FLOAT.fullmatch(text) and len(text) <= _FLOAT_FIELD:
+        return _FLOAT_FIELD
+    counted = _COUNT.sub(lambda count: count[0].rjust(_COUNT_DIGITS), text)
+    return max(len(text), min(-(-len(counted) // _FIELD) * _FIELD, _VALUE_CHARACTERS))
 
 
 def _title(token: TokenView, state: str) -> str:
@@ -65,27 +133,14 @@ def _title(token: TokenView, state: str) -> str:
 
 
 def _hexagon(x: float, y: float, box: Box) -> str:
-    cut = 10.0
+    corner = 10.0
     right, bottom, middle = x + box.width, y + box.height, y + box.height / 2
     points = (
         (x, middle),
-        (x + cut, y),
-        (right - cut, y),
+        (x + corner, y),
+        (right - corner, y),
         (right, middle),
-        (right - cut, bottom),
-        (x + cut, bottom),
+        (right - corner, bottom),
+        (x + corner, bottom),
     )
     return " ".join(f"{a:.1f},{b:.1f}" for a, b in points)
-
-
-def _thumbnail(token: TokenView, x: float, y: float) -> str:
-    picture = token.preview.picture if token.preview else None
-    if picture is None:
-        return ""
-    scale = min(_THUMB_WIDTH / picture.width, _THUMB_HEIGHT / picture.height)
-    width, height = picture.width * scale, picture.height * scale
-    data = base64.b64encode(picture.data).decode()
-    return (
-        f'<image x="{x - width / 2:.1f}" y="{y + (_THUMB_HEIGHT - height) / 2:.1f}" width="{width:.1f}" '
-        f'height="{height:.1f}" href="data:{picture.media_type};base64,{data}"/>'
-    )

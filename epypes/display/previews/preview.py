@@ -1,125 +1,134 @@
-"""What is shown of one value: a line of text, and a thumbnail if it is an image?"""
+"""What is shown of one value: a line of text, and a thumbnail if it can be drawn?"""
 
 from __future__ import annotations
 
-import enum
+import io
 import math
-import reprlib
-from dataclasses import dataclass
-from typing import Any, Final, Literal
+from dataclasses import replace
+from typing import Any, Final
 
-from epypes.display.previews.raster import Picture, encode_image, is_image, sampled
+from epypes.display.markup import cut
+from epypes.display.previews import arrays, objects, tables
+from epypes.display.previews.charts import MOST_POINTS
+from epypes.display.previews.imagekinds import is_image
+from epypes.display.previews.raster import THUMBNAIL_BYTES, THUMBNAIL_PX, Picture, encode_small
+from epypes.display.previews.registry import looker_of
+from epypes.display.previews.short import reason
+from epypes.display.previews.shown import Chart, Look, Preview, Sketch
 from epypes.images import Order
 
-THUMBNAIL_PX: Final = 128
-_TEXT_WIDTH: Final = 24
-_MOST_ELONGATED: Final = 10
-_LOOKED_AT: Final = 200
-_PLAIN = (int, float, complex, str, bytes, bool, type(None))
-_CONTAINERS = (tuple, list, dict, set, frozenset)
+__all__ = ["THUMBNAIL_PX", "Chart", "Preview", "finished", "preview", "sketch"]
 
+TEXT_CHARACTERS: Final = 30
+_DETAIL_CHARACTERS: Final = 290
+_ROW_CHARACTERS: Final = 60
+_MOST_ROWS: Final = 4
+_CHARTS: Final = ("line", "bars", "points")
 
-@dataclass(frozen=True, slots=True)
-class Chart:
-    """A drawing of lines, bars or points: a thumbnail that is painted, not encoded.
-
-    Attributes
-    ----------
-    kind
-        ``"line"``: each series is a polyline; ``"bars"``: from the bottom up to each point; ``"points"``: dots.
-    series
-        Points by series; x from 0 to 1 to the right, y from 0 to 1 upwards. At most 128 points in all.
-    """
-
-    kind: Literal["line", "bars", "points"]
-    series: tuple[tuple[tuple[float, float], ...], ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Preview:
-    """What is shown of a value.
-
-    Attributes
-    ----------
-    text
-        A short line; for arrays dtype and shape.
-    detail
-        A longer line: dtype, shape, range and other statistics, parted by commas.
-    picture
-        A thumbnail of at most 128 x 128 pixels, or None.
-    chart
-        A thumbnail that is drawn, or None; there is one of the two at most.
-    rows
-        At most 4 short lines of what is inside, such as the first rows of a table.
-    """
-
-    text: str
-    detail: str
-    picture: Picture | None = None
-    chart: Chart | None = None
-    rows: tuple[str, ...] = ()
+# Each of these modules registers the kinds that it knows.
+_KINDS: Final = (arrays, objects, tables)
 
 
 def preview(value: Any, order: Order = "bgr") -> Preview:
-    """Look at a value; never raises, and never calls the ``__repr__`` of an object that is not Python's own.
+    """Look at a value; never raises. ``order`` is that of its colours, if it is an image."""
+    return finished(sketch(value, Look(order)))
 
-    ``order`` is that of its colours, if it is an image.
-    """
+
+def sketch(value: Any, look: Look) -> Sketch:
+    """Look at a value without making its thumbnail; never raises."""
     try:
-        return _array_preview(value, order) if _is_array(value) else _object_preview(value)
+        return _checked(looker_of(type(value))(value, look), value, look)
     except Exception as error:
-        reason = f"no preview: {type(error).__name__}"
-        return Preview(reason, f"{type(value).__name__}, {reason}")
+        return Sketch(_failed(Preview("", _kind(value)), "no preview", error))
 
 
-def _is_array(value: Any) -> bool:
-    return type(value).__module__.startswith("numpy") and hasattr(value, "dtype") and hasattr(value, "shape")
+def finished(sketched: Sketch, most_bytes: int = THUMBNAIL_BYTES) -> Preview:
+    """Return a preview with its thumbnail; one that can't be made gives the reason instead. Never raises."""
+    try:
+        if sketched.closer is not None:
+            sketched = _limited(sketched.closer())
+        drawn = sketched.draw(most_bytes) if sketched.draw is not None else None
+    except Exception as error:
+        return _failed(sketched.shown, "no picture", error)
+    if isinstance(drawn, Chart):
+        return replace(sketched.shown, chart=drawn)
+    return replace(sketched.shown, picture=drawn)
 
 
-def _array_preview(array: Any, order: Order) -> Preview:
-    if not array.shape:
-        return Preview(_cut(str(array.item())), f"{array.dtype} {array.item()!s:.60}")
-    text = f"{array.dtype} {' x '.join(map(str, array.shape))}"
-    if not is_image(array) or _is_strip(array):
-        return Preview(text, text + _range_text(array))
-    colours = f" {order}" if order != "bgr" and array.ndim == 3 and array.shape[2] > 1 else ""
-    return Preview(text, text + colours + _range_text(array), encode_image(array, THUMBNAIL_PX, order))
+def _limited(found: Sketch | Preview) -> Sketch:
+    sketched = found if isinstance(found, Sketch) else Sketch(found)
+    return replace(sketched, shown=_trimmed(sketched.shown))
 
 
-def _is_strip(array: Any) -> bool:
-    """Whether a thumbnail would be a line of pixels, as of 500 descriptors of 32 bytes."""
-    height, width = array.shape[:2]
-    return bool(max(height, width) > _MOST_ELONGATED * min(height, width))
+def _failed(shown: Preview, what: str, error: Exception) -> Preview:
+    said = f"{what}: {reason(error)}"
+    text = cut(said, TEXT_CHARACTERS) if not shown.text else shown.text
+    return replace(shown, text=text, detail=cut(f"{shown.detail}, {said}", _DETAIL_CHARACTERS))
 
 
-def _range_text(array: Any) -> str:
-    """Return the least and the largest value, of a strided sample where the array is large."""
-    import numpy as np
-
-    if not array.size or array.dtype.kind not in "biuf":
-        return ""
-    looked_at = sampled(array) if array.ndim in (2, 3) else array.reshape(-1)[:1_000_000]
-    finite = looked_at[np.isfinite(looked_at)] if array.dtype.kind == "f" else looked_at
-    if not finite.size:
-        return ", no finite value"
-    marked = " of a sample" if looked_at.size < array.size else ""
-    return f", {finite.min()} to {finite.max()}{marked}"
+def _kind(value: Any) -> str:
+    return cut(type(value).__name__, TEXT_CHARACTERS)
 
 
-def _object_preview(value: Any) -> Preview:
-    if isinstance(value, float) and math.isfinite(value):
-        return Preview(f"{value:.6g}", f"float {value!r}")
-    if isinstance(value, enum.Enum):
-        return Preview(_cut(f"{type(value).__name__}.{value.name}"), f"{type(value).__name__}.{value.name}")
-    if isinstance(value, _PLAIN):
-        # reprlib cuts a text only after it has made all of it.
-        short = value[:_LOOKED_AT] if isinstance(value, str | bytes) else value
-        return Preview(_cut(reprlib.repr(short)), f"{type(value).__name__} {reprlib.repr(short)}")
-    kind = type(value).__name__
-    if isinstance(value, _CONTAINERS):
-        return Preview(f"{kind} of {len(value)}", f"{kind} of {len(value)}")
-    return Preview(_cut(kind), kind)
+def _checked(found: Any, value: Any, look: Look) -> Sketch:
+    """Return what a preview function returned, within the limits."""
+    if isinstance(found, Sketch):
+        return _limited(found)
+    if isinstance(found, Preview):
+        draw = _drawing(found)
+        detail = _kind(value) if found.detail == "" else found.detail
+        return Sketch(_trimmed(replace(found, picture=None, chart=None, detail=detail)), draw)
+    if type(found) is str:
+        return Sketch(_trimmed(Preview(found, f"{_kind(value)}, {found}")))
+    if is_image(found):
+        image = arrays.image_sketch(found, look)
+        detail = f"{_kind(value)}, shown as {image.shown.detail}"
+        return replace(image, shown=_trimmed(replace(image.shown, text=_kind(value), detail=detail)))
+    raise TypeError(f"a preview must be a text, an image or an ep.Preview, not {_kind(found)}")
 
 
-def _cut(text: str) -> str:
-    return text if len(text) <= _TEXT_WIDTH else text[: _TEXT_WIDTH - 3] + "..."
+def _trimmed(shown: Preview) -> Preview:
+    """Return a preview whose texts are texts, on one line, and within the limits."""
+    if not all(isinstance(line, str) for line in (shown.text, shown.detail, *shown.rows)):
+        raise TypeError("text, detail and rows of a preview must be texts")
+    rows = tuple(map(_on_one_line, shown.rows[:_MOST_ROWS]))
+    text, detail = cut(shown.text[:500], TEXT_CHARACTERS), cut(shown.detail[:1000], _DETAIL_CHARACTERS)
+    return replace(shown, text=text or "(empty text)", detail=detail, rows=rows)
+
+
+def _on_one_line(row: str) -> str:
+    return "".join(character if character.isprintable() else " " for character in row[:_ROW_CHARACTERS])
+
+
+def _drawing(found: Preview) -> Any:
+    """Return what draws the picture or chart that a user's preview has."""
+    if found.picture is None and found.chart is None:
+        return None
+    if found.picture is not None:
+        if not isinstance(found.picture, Picture):
+            raise TypeError("the picture of a preview comes from epypes.display.encode_image")
+        return lambda most_bytes: _small(found.picture, most_bytes)
+    chart = _checked_chart(found.chart)
+    return lambda most_bytes: chart
+
+
+def _checked_chart(chart: Any) -> Chart:
+    if not isinstance(chart, Chart) or chart.kind not in _CHARTS:
+        raise TypeError(f"chart of a preview must be a Chart of kind {', '.join(_CHARTS)}")
+    room, series = MOST_POINTS, []
+    for points in chart.series:
+        kept = [(float(x), float(y)) for x, y in points[:room]]
+        series.append(tuple((min(max(x, 0.0), 1.0), min(max(y, 0.0), 1.0)) for x, y in kept if math.isfinite(x + y)))
+        room -= len(kept)
+    return Chart(chart.kind, tuple(series))
+
+
+def _small(picture: Any, most_bytes: int) -> Picture:
+    """Return a picture within the limits of a thumbnail."""
+    if max(picture.width, picture.height) <= THUMBNAIL_PX and len(picture.data) <= most_bytes:
+        return Picture(picture.data, picture.media_type, picture.width, picture.height)
+    from PIL import Image
+
+    opened = Image.open(io.BytesIO(picture.data))
+    opened.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX))
+    return encode_small(opened, most_bytes)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 from epypes.display.layout.geometry import Direction as Direction
-from epypes.display.previews.preview import Preview
+from epypes.display.previews.shown import Preview
 from epypes.images import Order
 
 TokenRole = Literal["payload", "hyperparameter"]

@@ -7,7 +7,7 @@ from typing import Final
 
 from epypes.display.views.graphview import FunctionView, GraphView
 from epypes.display.views.structure import structure_of, with_caption
-from epypes.display.views.tokens import MOST_THUMBNAILS, valueless_view, within_budget
+from epypes.display.views.tokens import MOST_THUMBNAILS, valueless_view, with_values
 from epypes.errors import run_call
 from epypes.run import Plan
 
@@ -23,7 +23,7 @@ def plan_view(plan: Plan, most: int = MOST_THUMBNAILS) -> GraphView:
         valueless_view(token, plan.hyperparameters, "missing" if token.name in missing else "static")
         for token in structure.tokens
     ]
-    tokens, _ = within_budget(every, plan.targets, most)
+    tokens, _ = with_values(every, plan.hyperparameters, plan.targets, most)
     return replace(structure, functions=functions, tokens=tokens, caption=with_caption(_plan_caption(plan), structure))
 
 

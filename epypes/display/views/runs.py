@@ -9,7 +9,7 @@ from typing import Any
 from epypes.display.durations import duration_text, overhead_text
 from epypes.display.views.graphview import FunctionView, GraphView
 from epypes.display.views.structure import structure_of, with_caption
-from epypes.display.views.tokens import MOST_THUMBNAILS, token_view, within_budget
+from epypes.display.views.tokens import MOST_THUMBNAILS, token_view, with_run_values
 from epypes.run import FunctionTime, Run
 from epypes.run.need import chosen_branches, wanted_steps
 
@@ -42,7 +42,7 @@ def with_run(
         _function_view(function, run, stale, spent.get(function.name)) for function in structure.functions
     )
     every = [token_view(token, run, hparams, stale) for token in structure.tokens]
-    tokens, dropped = within_budget(every, (*run.cg.sink_tokens, *seen), most)
+    tokens, dropped = with_run_values(every, run, hparams, most, frozenset(seen))
     overhead = f"{overhead_text(report.side_by_side)} {duration_text(report.overhead_ns)}"
     caption = f"{duration_text(report.total_ns)} in all, {overhead}"
     if dropped:

@@ -2,35 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final
 
-from epypes.display.previews.preview import preview
+from epypes.display.previews.preview import Preview, finished, sketch
+from epypes.display.previews.ranges import kept_range
+from epypes.display.previews.raster import THUMBNAIL_BYTES
+from epypes.display.previews.shown import Look, Sketch
+from epypes.display.views.backdrops import RunSurroundings
 from epypes.display.views.graphview import TokenState, TokenView
 from epypes.run import Run
 
+MOST_THUMBNAILS: Final = 24
 # Base64 makes four characters of three bytes; together the thumbnails of one picture take at most this many.
 THUMBNAIL_CHARACTERS: Final = 80_000
-# More are no overview.
-MOST_THUMBNAILS: Final = 24
+# What a picture of so few bytes shows is hardly seen; rather are some left out.
+_LEAST_BYTES: Final = 1_500
+_ELEMENT_CHARACTERS: Final = 150
+_POINT_CHARACTERS: Final = 12
 
 
 def token_view(token: TokenView, run: Run, hparams: Mapping[str, Any], stale: frozenset[str]) -> TokenView:
     """Look at a token of a run; functions in ``stale`` are out of date since."""
     if token.name in hparams or not run.tokens.is_computed(token.name):
         return valueless_view(token, hparams, "not computed")
-    value = run.tokens.values[run.tokens.program.slots[token.name]]
     is_old = run.cg.digraph.producer.get(token.name) in stale
-    return replace(_in_state(token, "stale" if is_old else "fresh"), preview=preview(value, token.order))
+    return _in_state(token, "stale" if is_old else "fresh")
 
 
 def valueless_view(token: TokenView, hparams: Mapping[str, Any], state: TokenState) -> TokenView:
     """Look at a token of which only a hyperparameter's value is known; any other has this state."""
     if token.name not in hparams:
         return _in_state(token, state)
-    token = replace(_in_state(token, "fresh"), role="hyperparameter")
-    return replace(token, preview=preview(hparams[token.name], token.order))
+    return replace(_in_state(token, "fresh"), role="hyperparameter")
 
 
 def _in_state(token: TokenView, state: TokenState) -> TokenView:
@@ -38,27 +44,92 @@ def _in_state(token: TokenView, state: TokenState) -> TokenView:
     return token if token.state == "left out" else replace(token, state=state)
 
 
-def within_budget(
-    tokens: list[TokenView], first: Iterable[str], most: int = MOST_THUMBNAILS
+def with_values(
+    tokens: Iterable[TokenView],
+    hparams: Mapping[str, Any],
+    first: Iterable[str] = (),
+    most: int = MOST_THUMBNAILS,
 ) -> tuple[tuple[TokenView, ...], int]:
-    """Drop thumbnails until the rest fit, and are ``most``; those of ``first`` are kept longest, then others in order.
+    """Add the previews of hyperparameters; those of ``first`` get a thumbnail before others.
 
     Returns
     -------
     tuple
-        The tokens, and how many thumbnails were dropped.
+        The tokens, and how many thumbnails were left out.
     """
-    rank = {name: place for place, name in enumerate(dict.fromkeys(first))}
-    spent = dropped = count = 0
-    kept: dict[str, TokenView] = {}
-    for token in sorted(tokens, key=lambda token: rank.get(token.name, len(rank))):
-        picture = token.preview.picture if token.preview else None
-        size = len(picture.data) * 4 // 3 + 100 if picture else 0
-        if token.preview and picture and (count == most or spent + size > THUMBNAIL_CHARACTERS):
-            dropped += 1
-            token = replace(token, preview=replace(token.preview, picture=None))
-        else:
-            spent += size
-            count += picture is not None
-        kept[token.name] = token
-    return tuple(kept[token.name] for token in tokens), dropped
+    tokens, chosen = tuple(tokens), frozenset(first)
+    sketches = {token.name: sketch(hparams[token.name], Look(token.order)) for token in tokens if token.name in hparams}
+    return _with_previews(tokens, sketches, lambda name: name not in chosen, most)
+
+
+def with_run_values(
+    tokens: Iterable[TokenView],
+    run: Run,
+    hparams: Mapping[str, Any],
+    most: int = MOST_THUMBNAILS,
+    seen: frozenset[str] = frozenset(),
+) -> tuple[tuple[TokenView, ...], int]:
+    """Add the previews of a run's values and of these hyperparameters.
+
+    Sink tokens get a thumbnail first, then source tokens that are images, then what the run made, then the others; and
+    before these the tokens that are ``seen`` at once, if only some are.
+
+    Returns
+    -------
+    tuple
+        The tokens, and how many thumbnails were left out.
+    """
+    tokens = tuple(tokens)
+    program, values = run.tokens.program, run.tokens.values
+    sketches = {}
+    for token in tokens:
+        look = Look(token.order, partial(kept_range, program, token.name), RunSurroundings(run, token.name))
+        if token.name in hparams:
+            sketches[token.name] = sketch(hparams[token.name], look)
+        elif run.tokens.is_computed(token.name):
+            sketches[token.name] = sketch(values[program.slots[token.name]], look)
+    return _with_previews(tokens, sketches, _relevance(run, sketches, seen), most)
+
+
+def _relevance(run: Run, sketches: Mapping[str, Sketch], seen: frozenset[str]) -> Callable[[str], tuple[bool, int]]:
+    sinks, producer = frozenset(run.cg.sink_tokens), run.cg.digraph.producer
+    ran = {entry.function for entry in run.report.functions if entry.ran}
+
+    def rank(token: str) -> int:
+        if token in sinks:
+            return 0
+        if token not in producer and sketches[token].is_image:
+            return 1
+        return 2 if producer.get(token) in ran else 3
+
+    return lambda token: (bool(seen) and token not in seen, rank(token))
+
+
+def _with_previews(
+    tokens: tuple[TokenView, ...], sketches: Mapping[str, Sketch], rank: Callable[[str], Any], most: int
+) -> tuple[tuple[TokenView, ...], int]:
+    """Finish the sketches: with a thumbnail those of the lowest ranks, in graph order, as far as there is room.
+
+    Each may take the same part of the room that is left, so that all of them are shown, if need be with less detail.
+    """
+    by_rank = sorted((name for name, found in sketches.items() if found.may_be_drawn), key=rank)
+    most = min(most, THUMBNAIL_CHARACTERS // (_characters(_LEAST_BYTES)))
+    chosen, left = by_rank[:most], THUMBNAIL_CHARACTERS
+    previews = {name: found.shown for name, found in sketches.items()}
+    for index, name in enumerate(chosen):
+        share = (left // (len(chosen) - index) - _ELEMENT_CHARACTERS) * 3 // 4
+        previews[name] = finished(sketches[name], min(share, THUMBNAIL_BYTES))
+        left -= _cost(previews[name])
+    shown = tuple(replace(token, preview=previews.get(token.name)) for token in tokens)
+    return shown, len(by_rank) - len(chosen)
+
+
+def _cost(shown: Preview) -> int:
+    """Return how many characters a thumbnail takes in a picture."""
+    if shown.chart is not None:
+        return _ELEMENT_CHARACTERS + _POINT_CHARACTERS * sum(map(len, shown.chart.series))
+    return _characters(len(shown.picture.data)) if shown.picture is not None else 0
+
+
+def _characters(size: int) -> int:
+    return size * 4 // 3 + _ELEMENT_CHARACTERS

@@ -16,7 +16,7 @@ from epypes.display.views.plans import plan_view
 from epypes.display.views.runs import run_structure, with_run
 from epypes.display.views.states import with_first, with_running
 from epypes.display.views.structure import structure_of, with_caption
-from epypes.display.views.tokens import MOST_THUMBNAILS, valueless_view, within_budget
+from epypes.display.views.tokens import MOST_THUMBNAILS, valueless_view, with_values
 from epypes.errors import UnknownName
 from epypes.graph import CompGraph
 from epypes.graph.renaming import names_of
@@ -116,7 +116,7 @@ def _graph_view(cg: CompGraph, most: int) -> GraphView:
     """Look at a graph; tokens with a default are shown as the hyperparameters that a runner makes of them."""
     structure = structure_of(cg, {}, ())
     every = [valueless_view(token, cg.defaults, "static") for token in structure.tokens]
-    tokens, _ = within_budget(every, (), most)
+    tokens, _ = with_values(every, cg.defaults, (), most)
     return replace(structure, tokens=tokens)
 
 
@@ -137,5 +137,5 @@ def _between_runs(last: Run | None, plan: Plan, most: int, closed: Mapping[str, 
         for function in structure.functions
     )
     every = [valueless_view(token, plan.hyperparameters, "not computed") for token in structure.tokens]
-    tokens, _ = within_budget(every, (), most)
+    tokens, _ = with_values(every, plan.hyperparameters, (), most)
     return replace(structure, functions=functions, tokens=tokens, caption=with_caption("not run yet", structure))

@@ -1,0 +1,173 @@
+"""What is shown of an array?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final
+
+from epypes.display.markup import cut
+from epypes.display.previews.charts import bar_chart, line_chart
+from epypes.display.previews.features import point_sketch, quad_sketch, segment_sketch
+from epypes.display.previews.imagekinds import image_kind, is_image, one_channel, sampled
+from epypes.display.previews.labels import label_text
+from epypes.display.previews.ranges import is_of_dtype
+from epypes.display.previews.raster import THUMBNAIL_PX, encode_small, pillow_image
+from epypes.display.previews.registry import ours
+from epypes.display.previews.short import array_text, float_text, row_texts, short_repr
+from epypes.display.previews.shown import Look, Preview, Sketch
+from epypes.display.previews.statistics import few_of, some_of, statistics_text
+from epypes.display.previews.tables import record_sketch
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    Array = npt.NDArray[Any]
+
+_MOST_ELONGATED: Final = 10
+_SMALL_SIDE: Final = 4
+_MOST_COLUMNS: Final = 6
+_MOST_ROWS: Final = 4
+_LEAST_BINS: Final = 8
+# Of points, contours, segments, and pairs of points or boxes.
+_PLACES: Final = ((2,), (1, 2), (1, 4), (4,))
+
+
+@ours("numpy.generic")
+def _number_sketch(number: Any, look: Look) -> Preview:
+    """Look at a number of numpy, which has a dtype and no axes."""
+    if number.dtype.kind in "mM":
+        return Preview(str(number), f"{number.dtype} {number}")
+    value = number.item()
+    text = float_text(value) if isinstance(value, float) else short_repr(value)
+    return Preview(text, f"{number.dtype} {short_repr(value)}")
+
+
+@ours("numpy.ndarray")
+def _array_sketch(array: Any, look: Look) -> Sketch | Preview:
+    """Look at an array by its shape and dtype."""
+    import numpy as np
+
+    array = np.asarray(array)
+    if not array.ndim:
+        return _number_sketch(array, look)
+    if array.dtype.names:
+        return record_sketch(array)
+    if array.dtype.kind not in "biuf" or not array.size:
+        return _plain(array)
+    closer = _closer(array)
+    if closer is None:
+        return _plain(array)
+    text = array_text(array)
+    said = f"{text}, {statistics_text(few_of(array), array)}"
+    brief = Preview(text, said, rows=_rows(array) if array.ndim > 1 else ())
+    return Sketch(brief, is_image=closer is image_sketch, closer=lambda: closer(array, look) or _plain(array))
+
+
+def _closer(array: Array) -> Callable[[Array, Look], Sketch | None] | None:
+    """Return what draws an array of its shape; None if nothing can be drawn."""
+    if is_image(array) and not _is_strip(array):
+        return image_sketch
+    if array.shape[1:] in _PLACES:
+        return _places
+    is_line = array.size == max(array.shape) > _SMALL_SIDE
+    return _drawn_numbers if is_line else None
+
+
+def _is_strip(array: Array) -> bool:
+    """Whether a thumbnail would be a line of pixels, as of 500 descriptors of 32 bytes."""
+    height, width = array.shape[:2]
+    return bool(max(height, width) > _MOST_ELONGATED * min(height, width))
+
+
+def image_sketch(array: Array, look: Look) -> Sketch:
+    """Look at an array that is an image."""
+    sample = sampled(array)
+    kind = image_kind(array, sample)
+    ends = look.range_of(array)
+    text = array_text(array)
+    said = [text + _order_text(array, look), statistics_text(sample, array)]
+    if kind == "labels":
+        said.append(label_text(one_channel(sample)) + (" in a sample" if sample is not array else ""))
+    elif kind == "mask":
+        said.append("mask")
+    elif not is_of_dtype(array.dtype, ends):
+        said.append(f"shown from {ends[0]:.6g} to {ends[1]:.6g}")
+    return Sketch(
+        Preview(text, ", ".join(said)),
+        lambda most_bytes: encode_small(pillow_image(array, THUMBNAIL_PX, look.order, ends, kind), most_bytes),
+        is_image=True,
+    )
+
+
+def _order_text(array: Array, look: Look) -> str:
+    return f" {look.order}" if array.ndim == 3 and array.shape[2] > 1 else ""
+
+
+def _places(array: Array, look: Look) -> Sketch | None:
+    """Look at an array of places in an image; None if the image is needed and there is none."""
+    shape = array.shape
+    if shape[1:] in ((2,), (1, 2)):
+        # Four corners are a small matrix, too, where there is no image that they lie on.
+        return point_sketch(array, look, needs_image=array.ndim == 2 and len(array) <= _SMALL_SIDE)
+    if shape[1:] == (1, 4):
+        return segment_sketch(array, look)
+    return quad_sketch(array, look)
+
+
+def _drawn_numbers(array: Array, look: Look) -> Sketch:
+    """Look at an array of one column, or one row, as a histogram or signal."""
+    text = array_text(array)
+    is_histogram = _are_counts(array)
+    name = "histogram" if is_histogram else "signal"
+    said = f"{text} {name}, {statistics_text(some_of(array), array)}"
+    return Sketch(Preview(text, said), lambda most_bytes: bar_chart(array) if is_histogram else line_chart(array))
+
+
+def _are_counts(array: Array) -> bool:
+    """Whether numbers are what cv2.calcHist returns: whole, but float32; of one axis in newer OpenCV."""
+    if array.dtype.str[1:] != "f4" or len(array) < _LEAST_BINS or array.ndim > 2:
+        return False
+    some = some_of(array)
+    return array.ndim == 2 or bool(((some >= 0) & (some % 1 == 0)).all())
+
+
+def histogram_sketch(value: tuple[Any, Any]) -> Sketch:
+    """Look at counts and edges as ``np.histogram`` returns them."""
+    counts, edges = value
+    text = f"{len(counts)} bins"
+    said = f"histogram of {text}, from {edges[0]:.4g} to {edges[-1]:.4g}, {statistics_text(some_of(counts), counts)}"
+    return Sketch(Preview(text, said), lambda most_bytes: bar_chart(counts))
+
+
+def is_histogram(value: Any) -> bool:
+    """Whether a value is what ``np.histogram`` returns."""
+    if len(value) != 2 or not all(getattr(part, "ndim", 0) == 1 for part in value):
+        return False
+    counts, edges = value
+    return len(edges) == len(counts) + 1 and all(part.dtype.kind in "iuf" for part in value)
+
+
+def _plain(array: Array) -> Preview:
+    """Look at an array of which nothing can be drawn."""
+    text = array_text(array)
+    return Preview(text, cut(f"{text}, {statistics_text(some_of(array), array)}", 280), rows=_rows(array))
+
+
+def _rows(array: Array) -> tuple[str, ...]:
+    if not array.size or array.ndim > 2 or (array.ndim == 2 and array.shape[1] > _MOST_COLUMNS):
+        return ()
+    if array.ndim == 1:
+        return (
+            row_texts(array, len(array), _MOST_ROWS) if array.dtype.kind not in "biuf" else (" ".join(_cells(array)),)
+        )
+    kept = len(array) if len(array) <= _MOST_ROWS else _MOST_ROWS - 1
+    cells = [_cells(row) for row in array[:kept]]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    rows = tuple(" ".join(map(str.rjust, row, widths)) for row in cells)
+    return (*rows, f"... {len(array) - kept} more") if kept < len(array) else rows
+
+
+def _cells(row: Array) -> list[str]:
+    if row.dtype.kind == "f":
+        return [f"{value:.4g}" for value in row]
+    return [short_repr(value.item() if hasattr(value, "item") else value) for value in row]

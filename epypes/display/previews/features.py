@@ -1,0 +1,228 @@
+"""What is shown of keypoints, matches, contours and segments?"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+from epypes.display.previews.charts import drawn_in_chart, spread
+from epypes.display.previews.marks import (
+    MOST_MARKS,
+    MOST_PAIRS,
+    Marks,
+    drawer,
+    lie_on,
+    marks_lie_on,
+    pair_drawer,
+    rectangles,
+    some_lines,
+    some_points,
+)
+from epypes.display.previews.short import array_text, is_array
+from epypes.display.previews.shown import Backdrop, Look, Preview, Sketch
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    Floats = npt.NDArray[np.float64]
+
+# So many items of a list are looked at to know what it is a list of, and to choose the strongest keypoints.
+_LOOKED_AT: Final = 100
+_WEIGHED: Final = 10_000
+
+
+def keypoint_name(kind: type) -> bool:
+    """Whether a class is that of OpenCV's keypoints."""
+    return _name(kind) == "cv2.KeyPoint"
+
+
+def are_keypoints(value: Any) -> bool:
+    """Whether a value is a list or tuple of OpenCV's keypoints."""
+    return isinstance(value, list | tuple) and _are_all(value, lambda item: keypoint_name(type(item)))
+
+
+def list_sketch(value: Sequence[Any], look: Look) -> Sketch | None:
+    """Look at a list or tuple of what can be drawn; None if it is any other."""
+    name = type(value).__name__
+    for is_kind, noun, closer in _LISTS:
+        if is_kind(value):
+            text = f"{len(value)} {noun}{('es' if noun.endswith('ch') else 's') * (len(value) != 1)}"
+            return Sketch(Preview(text, f"{name} of {text}"), closer=partial(closer, value, text, look))
+    return None
+
+
+def point_sketch(array: Any, look: Look, *, needs_image: bool = False) -> Sketch | None:
+    """Look at an array (n, 2) or (n, 1, 2) of x and y; None if it needs an image that they lie on, and has none."""
+    marks = some_points(array.reshape(-1, 2))
+    if needs_image and _backdrop(marks, look) is None:
+        return None
+    said = f"{array_text(array)}, points{_extent(array.reshape(-1, 2))}"
+    return _over(marks, array_text(array), said, look)
+
+
+def segment_sketch(array: Any, look: Look) -> Sketch:
+    """Look at an array (n, 1, 4) of the two ends of line segments."""
+    return _over(
+        _segments(array), array_text(array), f"{array_text(array)}, segments{_extent(array.reshape(-1, 2))}", look
+    )
+
+
+def _segments(array: Any) -> Marks:
+    lines = list(array.reshape(-1, 2, 2)[:MOST_MARKS])
+    return replace(some_lines(lines, are_closed=False), total=len(array))
+
+
+def quad_sketch(array: Any, look: Look) -> Sketch | None:
+    """Look at an array (n, 4): places in two images, boxes, or segments as newer OpenCV has them.
+
+    None if they lie on no image. The numbers do not tell which they are: boxes are what lies, with width and height,
+    within the image.
+    """
+    paired = pair_sketch(array, look)
+    backdrop = look.around.nearest_image()
+    if paired is not None or backdrop is None or array.dtype.kind not in "iu" or not len(array):
+        return paired
+    height, width = backdrop.image.shape[:2]
+    ends = array[:, :2].astype("i8") + array[:, 2:]
+    are_boxes = bool((array[:, 2:] > 0).all() and (ends <= (width, height)).all())
+    marks = rectangles(array.astype("i8")) if are_boxes else _segments(array)
+    if not marks_lie_on(marks, backdrop):
+        return None
+    said = "boxes (x, y, width, height)" if are_boxes else "segments"
+    return _over(marks, array_text(array), f"{array_text(array)}, {said}", look)
+
+
+def pair_sketch(array: Any, look: Look) -> Sketch | None:
+    """Look at an array (n, 4) of places in two images; None if there are no such images."""
+    import numpy as np
+
+    backdrops = look.around.image_pair()
+    if backdrops is None or not len(array):
+        return None
+    pairs = array[spread(len(array), MOST_PAIRS)].astype(np.float64)
+    pairs = pairs[np.isfinite(pairs).all(axis=1)]
+    first, second = backdrops
+    if not len(pairs) or not lie_on(pairs[:, :2], first) or not lie_on(pairs[:, 2:], second):
+        return None
+    return _between(backdrops, pairs, len(array), array_text(array), f"{array_text(array)}, places in two images")
+
+
+def _over(marks: Marks, text: str, said: str, look: Look) -> Sketch:
+    backdrop = _backdrop(marks, look)
+    drawn = marks.drawn if backdrop else drawn_in_chart(len(marks.points), len(marks.lines))
+    if backdrop is not None:
+        said += ", drawn over the image"
+    if drawn < marks.total:
+        said += f", {drawn} of {marks.total} drawn"
+    return Sketch(Preview(text, said), drawer(marks, backdrop))
+
+
+def _backdrop(marks: Marks, look: Look) -> Backdrop | None:
+    backdrop = look.around.nearest_image()
+    return backdrop if backdrop is not None and marks_lie_on(marks, backdrop) else None
+
+
+def _between(backdrops: tuple[Backdrop, Backdrop], pairs: Floats, total: int, text: str, said: str) -> Sketch:
+    said += ", drawn between the images"
+    if len(pairs) < total:
+        said += f", {len(pairs)} of {total} drawn"
+    return Sketch(Preview(text, said), pair_drawer(backdrops, pairs))
+
+
+def _keypoints(value: Sequence[Any], text: str, look: Look) -> Sketch:
+    import numpy as np
+
+    weighed = sorted(value[:_WEIGHED], key=lambda keypoint: -keypoint.response)[:MOST_MARKS]
+    marks = some_points(np.array([keypoint.pt for keypoint in weighed], dtype=np.float64), len(value))
+    sizes = [keypoint.size for keypoint in weighed]
+    said = f"{type(value).__name__} of {text}{_extent(marks.points)}, size {min(sizes):.4g} to {max(sizes):.4g}"
+    return _over(marks, text, said, look)
+
+
+def _matches(value: Sequence[Any], text: str, look: Look) -> Sketch:
+    import numpy as np
+
+    flat = [item if _is_match(item) else item[0] for item in value[:_WEIGHED] if _is_match(item) or item]
+    distances = [match.distance for match in flat]
+    said = f"{type(value).__name__} of {text}, distance {min(distances):.4g} to {max(distances):.4g}"
+    backdrops, keypoints = look.around.image_pair(), look.around.keypoint_pair()
+    if backdrops is None or keypoints is None or not _indices_fit(flat, *keypoints):
+        return Sketch(Preview(text, said, rows=_match_rows(flat, len(value))))
+    first, second = keypoints
+    kept = flat[:MOST_PAIRS]
+    pairs = np.array([(*first[m.queryIdx].pt, *second[m.trainIdx].pt) for m in kept], dtype=np.float64)
+    return _between(backdrops, pairs, len(value), text, said)
+
+
+def _match_rows(matches: Sequence[Any], total: int) -> tuple[str, ...]:
+    rows = [f"{m.queryIdx} - {m.trainIdx}: {m.distance:.4g}" for m in matches[:3]]
+    return (*rows, f"... {total - 3} more") if total > 3 else tuple(rows)
+
+
+def _indices_fit(matches: Sequence[Any], first: Sequence[Any], second: Sequence[Any]) -> bool:
+    return all(0 <= m.queryIdx < len(first) and 0 <= m.trainIdx < len(second) for m in matches)
+
+
+def _contours(value: Sequence[Any], text: str, look: Look) -> Sketch:
+    are_rows = value[0].ndim == 2
+    lines = [line[:, ::-1] for line in value] if are_rows else list(value)
+    marks = some_lines(lines, are_closed=not are_rows)
+    order = ", (row, column) as scikit-image has them" if are_rows else ""
+    said = f"{type(value).__name__} of {text}, {sum(map(len, value))} points, {value[0].dtype}{order}"
+    return _over(marks, text, said, look)
+
+
+def _extent(points: Any) -> str:
+    """Return where points lie; of very many, where some of them do."""
+    import numpy as np
+
+    some = points[:: -(-len(points) // _WEIGHED) or 1].astype(np.float64)
+    some = some[np.isfinite(some).all(axis=1)]
+    if not len(some):
+        return ""
+    (left, top), (right, bottom) = some.min(axis=0), some.max(axis=0)
+    return f", x {left:.4g} to {right:.4g}, y {top:.4g} to {bottom:.4g}"
+
+
+def _name(kind: type) -> str:
+    return f"{kind.__module__}.{kind.__qualname__}"
+
+
+def _are_all(value: Sequence[Any], is_kind: Callable[[Any], bool]) -> bool:
+    """Whether all items are of a kind, as far as some of them tell; no item, no kind."""
+    step = -(-len(value) // _LOOKED_AT) or 1
+    return len(value) > 0 and all(is_kind(item) for item in itertools.islice(value, 0, None, step))
+
+
+def _is_match(item: Any) -> bool:
+    return _name(type(item)) == "cv2.DMatch"
+
+
+def _is_match_list(item: Any) -> bool:
+    return isinstance(item, list | tuple) and len(item) <= 16 and all(map(_is_match, item))
+
+
+def _is_contour(item: Any) -> bool:
+    if not is_array(item) or item.dtype.kind not in "iuf":
+        return False
+    shape = item.shape
+    return bool(shape[1:] == (1, 2) or (shape[1:] == (2,) and item.dtype.str[1:] == "f8"))
+
+
+def _are_matches(value: Sequence[Any]) -> bool:
+    return _are_all(value, _is_match) or _are_all(value, _is_match_list)
+
+
+def _are_contours(value: Sequence[Any]) -> bool:
+    return _are_all(value, _is_contour)
+
+
+_LISTS: Final = (
+    (are_keypoints, "keypoint", _keypoints),
+    (_are_matches, "match", _matches),
+    (_are_contours, "contour", _contours),
+)

@@ -1,0 +1,191 @@
+"""How are points and lines drawn over the image that they were found in?
+
+Without an image at hand they become a chart in their own extent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final
+
+from epypes.display.previews.charts import place_chart, spread
+from epypes.display.previews.imagekinds import image_kind, sampled
+from epypes.display.previews.raster import THUMBNAIL_PX, Picture, encode_small, pillow_image
+from epypes.display.previews.shown import Backdrop, Chart
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+    from PIL import Image, ImageDraw
+
+    Floats = npt.NDArray[np.float64]
+
+MOST_MARKS: Final = 200
+# More lines than that, from one image to another, cover both.
+MOST_PAIRS: Final = 40
+# Marks are drawn at twice the size and made smaller with the image, which smooths their edges.
+_OVERSAMPLED: Final = 2
+_FARTHEST_PX: Final = 1e6
+_INSIDE: Final = 0.5
+# Few points are larger than many.
+_FEW: Final = 50
+_RADIUS_PX: Final = 3.0
+_LARGE_RADIUS_PX: Final = 4.0
+_PAIR_RADIUS_PX: Final = 2.0
+_LINE_PX: Final = 2
+_DARKER: Final = 0.75
+_GREEN: Final = (60, 255, 120)
+_COLOURS: Final = ((255, 90, 90), (90, 220, 255), (255, 215, 70), (120, 255, 130), (240, 130, 255), (255, 165, 80))
+
+
+@dataclass(frozen=True, slots=True)
+class Marks:
+    """What is drawn over an image.
+
+    Attributes
+    ----------
+    points
+        (n, 2) of x and y, in pixels of the image.
+    lines
+        Each (k, 2).
+    are_closed
+        Whether lines return to where they began.
+    total
+        How many points or lines there are; fewer may be drawn.
+    """
+
+    points: Floats
+    lines: tuple[Floats, ...] = ()
+    are_closed: bool = False
+    total: int = 0
+
+    @property
+    def drawn(self) -> int:
+        """How many are drawn."""
+        return len(self.lines) or len(self.points)
+
+
+def some_points(points: Any, total: int | None = None) -> Marks:
+    """Return points as marks: of many some, evenly spread in their order, none that is not finite."""
+    import numpy as np
+
+    total = len(points) if total is None else total
+    kept = points[spread(len(points), MOST_MARKS)].reshape(-1, 2).astype(np.float64)
+    return Marks(kept[_is_drawable(kept)], total=total)
+
+
+def some_lines(lines: Any, are_closed: bool) -> Marks:
+    """Return lines, each (k, 2), as marks: of many the longest, each with at most so many points."""
+    import numpy as np
+
+    longest = sorted(lines, key=len, reverse=True)[:MOST_MARKS] if len(lines) > MOST_MARKS else lines
+    kept = [line[:: -(-len(line) // MOST_MARKS) or 1].reshape(-1, 2).astype(np.float64) for line in longest]
+    drawable = tuple(line[_is_drawable(line)] for line in kept if len(line))
+    return Marks(np.empty((0, 2)), tuple(line for line in drawable if len(line)), are_closed, len(lines))
+
+
+def rectangles(boxes: Any) -> Marks:
+    """Return boxes (n, 4) of x, y, width and height as marks."""
+    import numpy as np
+
+    x, y, width, height = boxes[:MOST_MARKS].T
+    corners = np.stack([x, y, x + width, y, x + width, y + height, x, y + height], axis=1)
+    return replace(some_lines(list(corners.reshape(-1, 4, 2)), are_closed=True), total=len(boxes))
+
+
+def lie_on(points: Floats, backdrop: Backdrop) -> bool:
+    """Whether most of these points lie on the image, and not all in its first pixel, where shares would be."""
+    import numpy as np
+
+    if not len(points):
+        return True
+    height, width = backdrop.image.shape[:2]
+    x, y = points[:, 0], points[:, 1]
+    inside = (x >= -1) & (y >= -1) & (x <= width) & (y <= height)
+    return bool(inside.mean() >= _INSIDE) and (len(points) == 1 or float(np.abs(points).max()) > 1.0)
+
+
+def marks_lie_on(marks: Marks, backdrop: Backdrop) -> bool:
+    """Whether marks are likely to have been found in this image."""
+    import numpy as np
+
+    return lie_on(np.concatenate(marks.lines) if marks.lines else marks.points, backdrop)
+
+
+def drawer(marks: Marks, backdrop: Backdrop | None) -> Callable[[int], Picture | Chart]:
+    """Return what draws marks: over an image, or in their own extent."""
+    if backdrop is None:
+        return lambda most_bytes: place_chart(marks.points, marks.lines)
+    return lambda most_bytes: encode_small(_drawn_over(backdrop, marks), most_bytes, has_small_marks=True)
+
+
+def pair_drawer(backdrops: tuple[Backdrop, Backdrop], pairs: Floats) -> Callable[[int], Picture | Chart]:
+    """Return what draws two images side by side, with lines; ``pairs`` are (n, 4): x and y in both."""
+    return lambda most_bytes: encode_small(_drawn_between(backdrops, pairs), most_bytes, has_small_marks=True)
+
+
+def _is_drawable(places: Floats) -> npt.NDArray[np.bool_]:
+    import numpy as np
+
+    return np.asarray((np.abs(np.nan_to_num(places, nan=np.inf)) < _FARTHEST_PX).all(axis=1))
+
+
+def _drawn_over(backdrop: Backdrop, marks: Marks) -> Image.Image:
+    from PIL import ImageDraw
+
+    canvas, scale = _canvas(backdrop, THUMBNAIL_PX * _OVERSAMPLED)
+    pen = ImageDraw.Draw(canvas)
+    for line in marks.lines:
+        _draw_line(pen, (line + 0.5) * scale, marks.are_closed)
+    radius = _LARGE_RADIUS_PX if len(marks.points) <= _FEW else _RADIUS_PX
+    for x, y in (marks.points + 0.5) * scale:
+        _draw_point(pen, x, y, _GREEN, radius)
+    return canvas.reduce(_OVERSAMPLED)
+
+
+def _drawn_between(backdrops: tuple[Backdrop, Backdrop], pairs: Floats) -> Image.Image:
+    from PIL import Image, ImageDraw
+
+    side = THUMBNAIL_PX * _OVERSAMPLED // 2
+    (left, left_scale), (right, right_scale) = (_canvas(backdrop, side) for backdrop in backdrops)
+    canvas = Image.new("RGB", (2 * side, max(left.height, right.height)))
+    canvas.paste(left, (side - left.width, 0))
+    canvas.paste(right, (side, 0))
+    pen = ImageDraw.Draw(canvas)
+    for index, (x0, y0, x1, y1) in enumerate(pairs + 0.5):
+        start = x0 * left_scale + side - left.width, y0 * left_scale
+        end = x1 * right_scale + side, y1 * right_scale
+        colour = _COLOURS[index % len(_COLOURS)]
+        pen.line((*start, *end), fill=colour, width=1)
+        _draw_point(pen, *start, colour, _PAIR_RADIUS_PX)
+        _draw_point(pen, *end, colour, _PAIR_RADIUS_PX)
+    return canvas.reduce(_OVERSAMPLED)
+
+
+def _canvas(backdrop: Backdrop, side: int) -> tuple[Image.Image, float]:
+    """Return an image to be drawn upon, a little darker, and how many of its pixels are one of the image."""
+    from PIL import Image
+
+    array = backdrop.image
+    kind = image_kind(array, sampled(array))
+    picture = pillow_image(array, side, backdrop.order, backdrop.ends, kind).convert("RGB")
+    scale = side / max(array.shape[:2])
+    # Even sides, so that each pixel of the thumbnail is made of four.
+    height, width = (max(1, round(length * scale / _OVERSAMPLED)) * _OVERSAMPLED for length in array.shape[:2])
+    picture = picture.resize((width, height), Image.Resampling.BILINEAR)
+    return picture.point(lambda level: round(level * _DARKER)), scale
+
+
+def _draw_line(pen: ImageDraw.ImageDraw, line: Floats, is_closed: bool) -> None:
+    places = [(float(x), float(y)) for x, y in line]
+    if len(places) == 1:
+        _draw_point(pen, *places[0], _GREEN)
+        return
+    pen.line(places + places[:1] * is_closed, fill=_GREEN, width=_LINE_PX)
+
+
+def _draw_point(
+    pen: ImageDraw.ImageDraw, x: float, y: float, colour: tuple[int, int, int], radius: float = _RADIUS_PX
+) -> None:
+    pen.ellipse((x - radius, y - radius, x + radius, y + radius), fill=colour, outline=(0, 0, 0))

@@ -1,0 +1,109 @@
+"""Which function looks at a value of this type?
+
+Kinds are classes or their dotted names, so that a package is known without being imported. A value is looked at by the
+function of the first class in its method resolution order that has one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final, TypeVar, overload
+from weakref import WeakKeyDictionary
+
+from epypes.display.previews.shown import Look
+from epypes.run.guard import lend
+
+_Function = TypeVar("_Function", bound=Callable[[Any], Any])
+# What a preview function may return is checked where it is called.
+Looker = Callable[[Any, Look], Any]
+_Looker = TypeVar("_Looker", bound=Looker)
+
+
+class Registry:
+    """Functions by class, and by a class's dotted name."""
+
+    def __init__(self) -> None:
+        # Weak, so that a class of a notebook that was defined again can go.
+        self._by_class: WeakKeyDictionary[type, Looker] = WeakKeyDictionary()
+        self._by_name: dict[str, Looker] = {}
+
+    def add(self, kind: type | str, looker: Looker) -> None:
+        """Take a function for a class or a dotted name; it replaces an earlier one."""
+        if isinstance(kind, type):
+            self._by_class[kind] = looker
+        else:
+            self._by_name[kind] = looker
+
+    def get(self, kind: type) -> Looker | None:
+        """Return the function of this very class."""
+        found = self._by_class.get(kind)
+        return found or self._by_name.get(f"{kind.__module__}.{kind.__qualname__}")
+
+
+OURS: Final = Registry()
+_users: Final = Registry()
+
+
+def looker_of(kind: type) -> Looker:
+    """Return the function that looks at values of a class; of two for one class, the user's."""
+    for parent in kind.__mro__:
+        found = _users.get(parent) or OURS.get(parent)
+        if found is not None:
+            return found
+    raise TypeError(f"nothing is registered for {kind.__name__}")
+
+
+def ours(*kinds: type | str) -> Callable[[_Looker], _Looker]:
+    """Register a function of this package, as a decorator."""
+
+    def register(looker: _Looker) -> _Looker:
+        for kind in kinds:
+            OURS.add(kind, looker)
+        return looker
+
+    return register
+
+
+@overload
+def register_preview(kind: type | str, function: None = None) -> Callable[[_Function], _Function]: ...
+@overload
+def register_preview(kind: type | str, function: _Function) -> _Function: ...
+def register_preview(kind: type | str, function: Callable[[Any], Any] | None = None) -> Any:
+    """Say how values of a type are shown in pictures of graphs and runs.
+
+    Parameters
+    ----------
+    kind
+        The class, whose subclasses are then shown so too, or its dotted name, ``"package.module.Pose"``, which
+        imports nothing.
+    function
+        Takes a value, arrays read-only, and returns a short text, an image (an array as OpenCV has it), or a
+        ``Preview``. It is called whenever a picture is made. If it raises, the reason is shown in place.
+
+    Returns
+    -------
+    callable
+        The function; without one, a decorator.
+
+    Raises
+    ------
+    TypeError
+        The kind is neither class nor name, or the function can't be called.
+
+    Examples
+    --------
+    >>> class Pose:
+    ...     x = 3
+    >>> @register_preview(Pose)
+    ... def show_pose(pose):
+    ...     return f"x = {pose.x}"
+    """
+    if not isinstance(kind, type) and not (isinstance(kind, str) and "." in kind):
+        raise TypeError(f"A preview is registered for a class or its dotted name, 'module.Class', not {kind!r}.")
+    if function is None:
+        return lambda given: register_preview(kind, given)
+    if not callable(function):
+        raise TypeError(f"The preview of {kind!r} must be a function that takes the value, not {function!r:.60}.")
+    # As for the functions of a graph: what is shown can't be spoilt.
+    _users.add(kind, lambda value, look: function(lend(value)))
+    return function

@@ -1,0 +1,135 @@
+"""What does a preview consist of, and what may it look at beside the value?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+from epypes.display.previews.ranges import Range, display_range
+from epypes.display.previews.raster import Picture
+from epypes.images import Order
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """A drawing of lines, bars or points: a thumbnail that is painted, not encoded.
+
+    Attributes
+    ----------
+    kind
+        ``"line"``: each series is a polyline; ``"bars"``: from the bottom up to each point; ``"points"``: dots.
+    series
+        Points by series; x from 0 to 1 to the right, y from 0 to 1 upwards. At most 128 points in all.
+    """
+
+    kind: Literal["line", "bars", "points"]
+    series: tuple[tuple[tuple[float, float], ...], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Preview:
+    """What is shown of a value.
+
+    Attributes
+    ----------
+    text
+        A short line; for arrays dtype and shape.
+    detail
+        A longer line: dtype, shape, range and other statistics, parted by commas.
+    picture
+        A thumbnail of at most 128 x 128 pixels, or None.
+    chart
+        A thumbnail that is drawn, or None; there is one of the two at most.
+    rows
+        At most 4 short lines of what is inside, such as the first rows of a table.
+    """
+
+    text: str
+    detail: str = ""
+    picture: Picture | None = None
+    chart: Chart | None = None
+    rows: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Sketch:
+    """A preview whose thumbnail is not made yet, since only some of a graph's are shown.
+
+    Attributes
+    ----------
+    closer
+        Looks at the value closely, which takes longer and is done only if there is room for a thumbnail: returns what
+        is then shown instead.
+    draw
+        Makes the thumbnail, in so many bytes at most if it is encoded; None if there is none.
+    is_image
+        Whether the value itself is an image.
+    """
+
+    shown: Preview
+    draw: Callable[[int], Picture | Chart] | None = None
+    is_image: bool = False
+    closer: Callable[[], Sketch | Preview] | None = None
+
+    @property
+    def may_be_drawn(self) -> bool:
+        """Whether it may get a thumbnail."""
+        return self.draw is not None or self.closer is not None
+
+
+@dataclass(frozen=True, slots=True)
+class Backdrop:
+    """An image over which something is drawn: the array, the order of its colours, its display range."""
+
+    image: Any
+    order: Order
+    ends: Range
+
+
+class Surroundings(Protocol):
+    """The images of a value's graph that it may be drawn over; asked only by what can be drawn."""
+
+    def nearest_image(self) -> Backdrop | None:
+        """Return the nearest image that the value was made from."""
+
+    def image_pair(self) -> tuple[Backdrop, Backdrop] | None:
+        """Return the two images that the value was made from, in the order of its function's inputs."""
+
+    def keypoint_pair(self) -> tuple[Any, Any] | None:
+        """Return the keypoints of these two images."""
+
+
+class Nowhere:
+    """The surroundings of a value that stands alone."""
+
+    def nearest_image(self) -> Backdrop | None:
+        """Return None."""
+        return None
+
+    def image_pair(self) -> tuple[Backdrop, Backdrop] | None:
+        """Return None."""
+        return None
+
+    def keypoint_pair(self) -> tuple[Any, Any] | None:
+        """Return None."""
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """How a value is looked at.
+
+    Attributes
+    ----------
+    order
+        Of its colours, if it is an image.
+    range_of
+        Returns the values that are shown black and white in an image.
+    around
+        What it may be drawn over.
+    """
+
+    order: Order = "bgr"
+    range_of: Callable[[Any], Range] = display_range
+    around: Surroundings = field(default_factory=Nowhere)

@@ -1,0 +1,122 @@
+"""Over which images of a run can what was found in them be drawn?
+
+The graph tells: a token is made from the tokens that its function takes, those from others, and so on.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Any, Final
+
+from epypes.display.previews.features import are_keypoints
+from epypes.display.previews.imagekinds import image_kind, is_image, sampled
+from epypes.display.previews.ranges import kept_range
+from epypes.display.previews.shown import Backdrop
+from epypes.graph import colour_order
+from epypes.run import Run
+
+_MOST_TOKENS: Final = 500
+
+
+class RunSurroundings:
+    """The images and keypoints that a token of a run was made from.
+
+    Parameters
+    ----------
+    run
+        Its values that are out of date are not looked at.
+    token
+        Which one is to be drawn over them.
+    """
+
+    def __init__(self, run: Run, token: str) -> None:
+        self._run, self._token = run, token
+        self._digraph = run.cg.digraph
+
+    def nearest_image(self) -> Backdrop | None:
+        """Return the nearest image among the token's ancestors; of its size rather a photograph than a mask."""
+        return self._image_of(self._token)
+
+    def image_pair(self) -> tuple[Backdrop, Backdrop] | None:
+        """Return the images of the two nearest keypoint tokens; without such, the first image of two inputs."""
+        keypoints = self._pair(self._token, self._is_keypoints, set())
+        if keypoints is not None:
+            first, second = (self._image_of(token) for token in keypoints)
+        else:
+            images = self._pair(self._token, self._is_photograph, set())
+            if images is None:
+                return None
+            first, second = (self._backdrop(token) for token in images)
+        return (first, second) if first is not None and second is not None else None
+
+    def keypoint_pair(self) -> tuple[Any, Any] | None:
+        """Return the values of the two nearest keypoint tokens, one by each input in order."""
+        found = self._pair(self._token, self._is_keypoints, set())
+        return (self._value(found[0]), self._value(found[1])) if found is not None else None
+
+    def _image_of(self, token: str) -> Backdrop | None:
+        if not self._is_fresh(token):
+            return None
+        images = [name for name in self._ancestors(token) if is_image(self._value(name))]
+        if not images:
+            return None
+        size = self._value(images[0]).shape[:2]
+        alike = (name for name in images if self._value(name).shape[:2] == size and self._is_photograph(name))
+        return self._backdrop(next(alike, images[0]))
+
+    def _pair(self, token: str, is_wanted: Callable[[str], bool], seen: set[str]) -> tuple[str, str] | None:
+        """Return two tokens, one by each input of the function that made this one; if there are none, of an input."""
+        if token in seen or not self._is_fresh(token):
+            return None
+        seen.add(token)
+        found: list[str] = []
+        inputs = self._inputs(token)
+        for name in inputs:
+            new = (near for near in self._around(name) if near not in found and is_wanted(near))
+            found += list(next(zip(new, strict=False), ()))
+            if len(found) == 2:
+                return found[0], found[1]
+        return next(filter(None, (self._pair(name, is_wanted, seen) for name in inputs)), None)
+
+    def _around(self, token: str) -> Iterator[str]:
+        """Yield a token, what its function made beside it, and their ancestors."""
+        yield token
+        maker = self._digraph.producer.get(token)
+        if maker is not None:
+            yield from (name for name in self._digraph.outputs[maker] if name != token and self._is_fresh(name))
+        for name in self._ancestors(token):
+            yield name
+            maker = self._digraph.producer.get(name)
+            yield from () if maker is None else (near for near in self._digraph.outputs[maker] if self._is_fresh(near))
+
+    def _ancestors(self, token: str) -> Iterator[str]:
+        """Yield the tokens that a token was made from that have a value, the nearest first."""
+        waiting, seen = deque([token]), {token}
+        while waiting and len(seen) < _MOST_TOKENS:
+            for name in self._inputs(waiting.popleft()):
+                if name not in seen and self._is_fresh(name):
+                    seen.add(name)
+                    waiting.append(name)
+                    yield name
+
+    def _inputs(self, token: str) -> tuple[str, ...]:
+        maker = self._digraph.producer.get(token)
+        return tuple(self._digraph.inputs[maker]) if maker is not None else ()
+
+    def _is_fresh(self, token: str) -> bool:
+        return self._run.tokens.is_computed(token) and not self._run.tokens.is_stale(token)
+
+    def _value(self, token: str) -> Any:
+        return self._run.tokens.values[self._run.tokens.program.slots[token]]
+
+    def _is_keypoints(self, token: str) -> bool:
+        return are_keypoints(self._value(token))
+
+    def _is_photograph(self, token: str) -> bool:
+        value = self._value(token)
+        return is_image(value) and image_kind(value, sampled(value)) == "photograph"
+
+    def _backdrop(self, token: str) -> Backdrop:
+        value = self._value(token)
+        return Backdrop(value, colour_order(self._run.cg, token), kept_range(self._run.tokens.program, token, value))
