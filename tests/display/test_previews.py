@@ -260,7 +260,7 @@ class Size(NamedTuple):
         (Path("/data/left.png"), "left.png"), (ValueError("no image"), "ValueError: no image"), (object(), "object"),
         (len, "len"), (Pose, "Pose"), (np.zeros((2, 3, 4, 5, 6)), "float64 2 x 3 x 4 x 5 x 6"), (Size(3, 4), "Size"),
     ],
-    ids=str,
+    ids=lambda value: value if type(value) is str else type(value).__name__,
 )  # fmt: skip
 def test_values_are_written_short(value, text):
     assert preview(value).text == text

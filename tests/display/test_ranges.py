@@ -58,7 +58,7 @@ def shown(run: ep.Run, count: int) -> list[int]:
         (steps(0, -np.inf, np.inf), (0, 0, 255)),
         (steps(10**9, 10**9 + 5, 10**9 + 10), (0, 127, 255)),
     ],
-    ids=str,
+    ids=lambda value: str(getattr(value, "dtype", value)),
 )
 def test_every_kind_of_number_has_its_range(image, expected):
     assert levels(encode_image(image).data, 3) == pytest.approx(expected, abs=4)
