@@ -14,8 +14,13 @@ _NOT_XML: Final = re.compile("[^\\t\\n\\r\\x20-\\ud7ff\\ue000-\\ufffd\\U00010000
 
 
 def escape(text: str) -> str:
-    """Return text for SVG and HTML, elements and attributes alike; what XML forbids shows as a replacement mark."""
+    """Return text for attributes of SVG and HTML; what XML forbids shows as a replacement mark."""
     return html.escape(_NOT_XML.sub("\ufffd", text))
+
+
+def content(text: str) -> str:
+    """Return text as the content of an element of SVG and HTML, where quotes are nothing special."""
+    return html.escape(_NOT_XML.sub("\ufffd", text), quote=False)
 
 
 def cut(text: str, characters: int) -> str:

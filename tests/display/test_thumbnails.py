@@ -64,7 +64,7 @@ def test_so_many_can_be_asked_for():
     run = ep.CompGraphRunner(chain(60)).run(t0=noise())
     every = view(run).tokens
     for asked, expected in ((0, 0), (3, 3), (1000, 37)):
-        tokens, left_out = with_run_values(every, run, {}, thumbnails=asked)
+        tokens, left_out = with_run_values(every, run, {}, asked)
         assert sum(token.preview.picture is not None for token in tokens) == expected
         assert left_out == 61 - expected
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from epypes.display.markup import escape
+from epypes.display.markup import content, escape
 from epypes.display.paint.style import STYLE
 from epypes.display.views.times import TimeBar, TimesView
 
@@ -55,10 +55,10 @@ def _paint_row(bar: TimeBar, left: float, top: float) -> str:
     base = top + _ROW_PX / 2 + 4
     classes = f"{bar.kind} reused" if bar.is_reused else bar.kind
     return (
-        f'<g class="time {classes}"><title>{escape(bar.title)}</title>'
-        f'<text class="name" x="{_MARGIN_PX}" y="{base:.0f}">{escape(bar.name)}</text>'
+        f'<g class="time {classes}"><title>{content(bar.title)}</title>'
+        f'<text class="name" x="{_MARGIN_PX}" y="{base:.0f}">{content(bar.name)}</text>'
         f"{''.join(_paint_bar(bar, left, top))}"
-        f'<text x="{left + _LONGEST_PX + _GAP_PX:.0f}" y="{base:.0f}">{escape(bar.text)}</text></g>'
+        f'<text x="{left + _LONGEST_PX + _GAP_PX:.0f}" y="{base:.0f}">{content(bar.text)}</text></g>'
     )
 
 

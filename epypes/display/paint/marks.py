@@ -7,7 +7,7 @@ import zlib
 from typing import Final
 
 from epypes.display.layout.geometry import Point
-from epypes.display.markup import escape
+from epypes.display.markup import content
 
 LINE_PX: Final = 16
 _CHARACTER_PX: Final = 6.9
@@ -32,7 +32,7 @@ def vertex_id(kind: str, name: str) -> str:
 def vertex(kind: str, name: str, states: tuple[str, ...], title: str, body: str) -> str:
     """Paint a vertex: an element with an id, its states as classes, and a title."""
     classes = " ".join(state.replace(" ", "-") for state in (kind, *states))
-    return f'<g id="{vertex_id(kind, name)}" class="{classes}"><title>{escape(title)}</title>{body}</g>'
+    return f'<g id="{vertex_id(kind, name)}" class="{classes}"><title>{content(title)}</title>{body}</g>'
 
 
 def text_lines(lines: tuple[str, ...], centre: Point) -> str:
@@ -40,6 +40,6 @@ def text_lines(lines: tuple[str, ...], centre: Point) -> str:
     top = centre[1] - LINE_PX * (len(lines) - 1) / 2 + 4
     kinds = ("name", "small")
     return "".join(
-        f'<text class="{kinds[min(row, 1)]}" x="{centre[0]:.1f}" y="{top + row * LINE_PX:.1f}">{escape(line)}</text>'
+        f'<text class="{kinds[min(row, 1)]}" x="{centre[0]:.1f}" y="{top + row * LINE_PX:.1f}">{content(line)}</text>'
         for row, line in enumerate(lines)
     )

@@ -14,7 +14,7 @@ from functools import cache
 from importlib import resources
 from typing import Any, Final
 
-from epypes.display.markup import cut, escape
+from epypes.display.markup import content, cut, escape
 from epypes.display.paint.style import PAGE_STYLE
 from epypes.display.paint.svg import alt_text, least_width, paint_svg
 from epypes.display.paint.tables import paint_twin
@@ -30,6 +30,7 @@ _NAMED_CHARACTERS: Final = 200
 _SVG_URI: Final = "data:image/svg+xml,"
 # What would end the attribute, the address or a line of it; all else may stand as it is, in any language.
 _IN_URI: Final = {sign: f"%{ord(sign):02X}" for sign in '%#&"\n\r\t'}  # % comes first
+_TAG: Final = re.compile("<[^>]*>")
 _END: Final = "</figure>"
 _WEIGHTS: Final = {"failed": -2.0, "running": -1.5}
 
@@ -46,11 +47,11 @@ def paint_figure(svg: str, alt: str, caption: str = "") -> str:
     """Return a picture as a figure."""
     # An image knows nothing of the page; where the script puts the picture itself, the page's style is there already.
     source = svg.replace(PAGE_STYLE, "", 1)
-    # Between single quotes a picture needs none of its quotes encoded; in its texts there are none of either kind.
-    source = source if "'" in source else source.replace('"', "'")
+    # The quotes of a picture's attributes need not be encoded if they are single ones.
+    source = _TAG.sub(lambda tag: tag[0].replace('"', "'"), source)
     for sign, encoded in _IN_URI.items():
         source = source.replace(sign, encoded)
-    below = f'<figcaption style="font-size:12px">{escape(caption)}</figcaption>' if caption else ""
+    below = f'<figcaption style="font-size:12px">{content(caption)}</figcaption>' if caption else ""
     return (
         f'<figure class="epypes-figure" style="margin:0"><div style="overflow-x:auto">'
         f'<img src="{_SVG_URI}{source}" alt="{escape(alt)}" style="max-width:100%;min-width:{least_width(svg)}px">'
@@ -103,13 +104,13 @@ def _figure_of(graph: GraphView, svg: str, room: int) -> str:
 
 
 def _inside(name: str, graph: GraphView, figure: str) -> str:
-    summary = f"<summary>{escape(cut(name, _NAMED_CHARACTERS))}: {counted(len(graph.functions), 'function')}</summary>"
+    summary = f"<summary>{content(cut(name, _NAMED_CHARACTERS))}: {counted(len(graph.functions), 'function')}</summary>"
     return f'<details class="epypes-inside" data-group="{escape(name)}">{summary}{figure}</details>'
 
 
 def _left_out(names: Sequence[str]) -> Iterator[str]:
     if names:
-        some = escape(cut(", ".join(names), _NAMED_CHARACTERS))
+        some = content(cut(", ".join(names), _NAMED_CHARACTERS))
         yield f"<p>Not shown here: the inside of {some}. Call ep.show(..., open=[...]).</p>"
 
 

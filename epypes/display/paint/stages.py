@@ -11,7 +11,7 @@ from statistics import fmean
 from typing import Final
 
 from epypes.display.layout.geometry import Layout, Point
-from epypes.display.markup import escape, short_name
+from epypes.display.markup import content, short_name
 from epypes.display.paint.marks import LINE_PX, text_width
 from epypes.display.paint.stagemarks import paint_stage, stage_size
 from epypes.display.views.graphview import GraphView, StageView
@@ -90,10 +90,10 @@ def _paint_frame(title: str, frame: Bounds, label: Bounds) -> Iterator[str]:
     if title:
         width, left = label.right - label.left, label.left
         yield (
-            f'<g class="label"><title>{escape(f"pipeline {title}"[:600])}</title><rect class="shape" x="{left:.1f}" '
+            f'<g class="label"><title>{content(f"pipeline {title}"[:600])}</title><rect class="shape" x="{left:.1f}" '
             f'y="{label.top:.1f}" width="{width:.1f}" height="{_TITLE_PX:.0f}" rx="5"/>'
             f'<text class="name" x="{left + width / 2:.1f}" y="{frame.top + LINE_PX / 4:.1f}">'
-            f"{escape(short_name(title))}</text></g>"
+            f"{content(short_name(title))}</text></g>"
         )
 
 

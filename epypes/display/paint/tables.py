@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from epypes.display.durations import duration_text
-from epypes.display.markup import cut, cut_name, escape
+from epypes.display.markup import content, cut, cut_name
 from epypes.display.paint.rows import Table
 from epypes.display.paint.stagemarks import stage_words
 from epypes.display.views.graphview import FunctionView, GraphView, StageView, TokenView
@@ -38,12 +38,12 @@ def paint_twin(graph: GraphView, title: str, room: int) -> str:
 
 
 def _twin(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], room: int) -> str:
-    start = f"<table><caption>{escape(caption)}</caption>{_row('th', head, 0)}"
+    start = f"<table><caption>{content(caption)}</caption>{_row('th', head, 0)}"
     room -= len(start) + _LAST_ROW
     kept: list[str] = []
     left_out = 0
     for cells in rows:
-        row = _row("td", [escape(cut_name(cell, _TWIN_CHARACTERS)) for cell in cells], 0)
+        row = _row("td", [content(cut_name(cell, _TWIN_CHARACTERS)) for cell in cells], 0)
         room -= len(row)
         if room >= 0 and not left_out:
             kept.append(row)
@@ -71,8 +71,8 @@ def _stage_cells(stage: StageView) -> tuple[str, ...]:
 
 def paint_table(table: Table) -> str:
     """Write a table; what holds words stands to the left, where JupyterLab has everything to the right."""
-    above = f"<caption>{escape(table.caption)}</caption>" if table.caption else ""
-    lines = (_row("td", [escape(cut(cell, CELL_CHARACTERS)) for cell in cells], table.texts) for cells in table.rows)
+    above = f"<caption>{content(table.caption)}</caption>" if table.caption else ""
+    lines = (_row("td", [content(cut(cell, CELL_CHARACTERS)) for cell in cells], table.texts) for cells in table.rows)
     return f"<table>{above}{_row('th', table.head, table.texts)}{''.join(lines)}</table>"
 
 

@@ -10,7 +10,7 @@ import re
 from typing import Final
 
 from epypes.display.layout.geometry import Box, Point
-from epypes.display.markup import cut, cut_name, escape, short_name
+from epypes.display.markup import content, cut, cut_name, short_name
 from epypes.display.paint.marks import LINE_PX, TITLE_CHARACTERS, text_lines, text_width, vertex
 from epypes.display.paint.thumbnails import THUMB_HEIGHT, THUMB_WIDTH, paint_thumbnail
 from epypes.display.previews.short import float_text
@@ -93,7 +93,7 @@ def _inside(token: TokenView, box: Box, top: Point) -> str:
         return paint_thumbnail(token.preview, top)
     left = top[0] - box.width / 2 + 8
     return "".join(
-        f'<text class="row" x="{left:.1f}" y="{top[1] + row * _ROW_PX + 8:.1f}">{escape(text[:_ROW_CHARACTERS])}</text>'
+        f'<text class="row" x="{left:.0f}" y="{top[1] + row * _ROW_PX + 8:.0f}">{content(text[:_ROW_CHARACTERS])}</text>'
         for row, text in enumerate(token.preview.rows[:_ROWS])
     )
 
