@@ -93,7 +93,8 @@ def _inside(token: TokenView, box: Box, top: Point) -> str:
         return paint_thumbnail(token.preview, top)
     left = top[0] - box.width / 2 + 8
     return "".join(
-        f'<text class="row" x="{left:.0f}" y="{top[1] + row * _ROW_PX + 8:.0f}">{content(text[:_ROW_CHARACTERS])}</text>'
+        f'<text class="row" x="{left:.0f}" y="{top[1] + row * _ROW_PX + 8:.0f}">'
+        f"{content(text[:_ROW_CHARACTERS])}</text>"
         for row, text in enumerate(token.preview.rows[:_ROWS])
     )
 
