@@ -18,7 +18,7 @@ from PIL import Image
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
 from epypes.display.layout.place import lay_out
-from epypes.display.views.tokens import THUMBNAIL_CHARACTERS
+from epypes.display.limits import THUMBNAIL_CHARACTERS
 from tests.colours import red_image, red_runner
 from tests.pictures import assert_same_picture
 

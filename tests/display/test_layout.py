@@ -144,7 +144,7 @@ def test_what_several_edges_share_is_painted_once():
         "a bend for each source, a way down from row to row, two ends"
     )
     assert {curve[0] for curve in painted} - {curve[-1] for curve in painted} == {
-        f"{x:.1f},{y:.1f}" for (x, y), *_ in lay_out(boxes, edges).splines
+        f"{x:.0f},{y:.0f}" for (x, y), *_ in lay_out(boxes, edges).splines
     }, "each edge begins at its source, and goes on somewhere"
     assert tips.count("M") == 2
 

@@ -74,7 +74,7 @@ def test_a_picture_may_be_shrunk_a_little_and_is_scrolled_otherwise(edge_runner)
     width = float(ET.fromstring(figure.svg).get("width"))
     for text in (figure.svg, figure.html):
         (least,) = re.findall(r"min-width:(\d+)px", re.sub(r"data:[^\"]*", "", text))
-        assert float(least) == pytest.approx(0.6 * width, abs=1)
+        assert float(least) == pytest.approx(0.75 * width, abs=1)
     assert "overflow-x:auto" in figure.html
 
 

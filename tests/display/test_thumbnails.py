@@ -12,7 +12,8 @@ import pytest
 import epypes as ep
 from epypes.display import mimebundle, to_svg, view
 from epypes.display.layout.place import lay_out
-from epypes.display.views.tokens import THUMBNAIL_CHARACTERS, with_run_values
+from epypes.display.limits import THUMBNAIL_CHARACTERS
+from epypes.display.views.tokens import Room, with_run_values
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -64,7 +65,7 @@ def test_so_many_can_be_asked_for():
     run = ep.CompGraphRunner(chain(60)).run(t0=noise())
     every = view(run).tokens
     for asked, expected in ((0, 0), (3, 3), (1000, 37)):
-        tokens, left_out = with_run_values(every, run, {}, asked)
+        tokens, left_out = with_run_values(every, run, {}, Room(asked))
         assert sum(token.preview.picture is not None for token in tokens) == expected
         assert left_out == 61 - expected
 
@@ -194,4 +195,4 @@ def test_thresholds_of_two_to_four_digits_stand_in_the_same_place(fresh_layouts)
 def test_a_box_with_a_thumbnail_has_one_size(photograph):
     for value in (photograph, photograph[:100], photograph > 100, np.arange(100.0), np.zeros((3000, 2000), np.float32)):
         shape = next(iter(vertex(to_svg(made(value)), "y").iter(f"{SVG}rect")))
-        assert (shape.get("width"), shape.get("height")) == ("140.0", "144.0")
+        assert (shape.get("width"), shape.get("height")) == ("140", "144")

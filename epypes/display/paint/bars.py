@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from epypes.display.markup import content, escape
-from epypes.display.paint.style import STYLE
+from epypes.display.paint.style import STYLE, page_style, paper_style
 from epypes.display.views.times import TimeBar, TimesView
 
 _ROW_PX: Final = 22
@@ -20,14 +20,17 @@ _LINE_PX: Final = 2
 
 # All lies on one filled shape, so that it is readable on paper of any colour. Both classes are named, since on a page
 # the styles of a graph that comes later would count for more otherwise.
-_BARS_STYLE: Final = (
-    ".epypes-graph.epypes-times text{text-anchor:start}"
-    ".epypes-graph.epypes-times .track{fill:var(--jp-layout-color2,#e9eef6)}"
-    ".epypes-graph.epypes-times .reused .track{fill:none;stroke:#80868f;stroke-dasharray:4 3}"
-    ".epypes-graph.epypes-times .overhead .bar{fill:#80868f}"
-    ".epypes-graph.epypes-times .range{stroke:var(--jp-ui-font-color1,#1f2328);stroke-width:1.5}"
-    ".epypes-graph.epypes-times .name{font-weight:500}"
-)
+_SCOPE: Final = ".epypes-graph.epypes-times"
+_RULES: Final = {
+    " text": "text-anchor:start",
+    " .track": "fill:@track;stroke:none",
+    " .bar": "fill:@accent",
+    " .reused .track": "fill:none;stroke:@line;stroke-width:1;stroke-dasharray:4 3",
+    " .overhead .bar": "fill:@line",
+    " .range": "stroke:@text;stroke-width:1.5",
+    " .name": "font-weight:500",
+}
+_STYLE: Final = STYLE + paper_style(_SCOPE, _RULES) + page_style(_SCOPE, _RULES)
 
 
 def times_alt_text(times: TimesView) -> str:
@@ -48,7 +51,7 @@ def paint_bars(times: TimesView) -> str:
     )
     paper = f'<rect class="shape" width="{width:.0f}" height="{height:.0f}" rx="8"/>'
     rows = (_paint_row(bar, left, _MARGIN_PX / 2 + place * _ROW_PX) for place, bar in enumerate(times.bars))
-    return "\n".join([head, f"<style>{STYLE}{_BARS_STYLE}</style>", paper, *rows, "</svg>"])
+    return "\n".join([head, f"<style>{_STYLE}</style>", paper, *rows, "</svg>"])
 
 
 def _paint_row(bar: TimeBar, left: float, top: float) -> str:

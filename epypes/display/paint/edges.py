@@ -48,7 +48,7 @@ def _paint_splines(splines: Iterable[tuple[Point, ...]], kind: str) -> str:
 
 def _curves(spline: Sequence[Point]) -> list[tuple[str, str]]:
     """Return the curves of a spline: where each starts, and its controls."""
-    at = [f"{x:.1f},{y:.1f}" for x, y in spline]
+    at = [f"{x:.0f},{y:.0f}" for x, y in spline]
     return [(at[first], " ".join(at[first + 1 : first + 4])) for first in range(0, len(at) - 1, 3)]
 
 

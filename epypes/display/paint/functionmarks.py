@@ -81,7 +81,7 @@ def _state_line(function: FunctionView) -> tuple[str, ...]:
 
 
 def _rectangle(x: float, y: float, width: float, height: float, kind: str = "shape") -> str:
-    return f'<rect class="{kind}" x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}" rx="6"/>'
+    return f'<rect class="{kind}" x="{x:.0f}" y="{y:.0f}" width="{width:.0f}" height="{height:.0f}" rx="6"/>'
 
 
 def _stack(x: float, y: float, box: Box) -> str:
@@ -108,15 +108,15 @@ def _time_bar(function: FunctionView, box: Box, centre: Point, direction: Direct
     left, y = centre[0] - length / 2, centre[1] + (box.height - down) / 2 - 6
     return (
         f'<path class="track" d="M{left:.0f},{y:.0f}h{length:.0f}"/><rect class="bar" x="{left - 1.5:.1f}" '
-        f'y="{y - 1.5:.1f}" width="{(length + 3) * min(function.share, 1):.1f}" height="3" rx="1.5"/>'
+        f'y="{y - 1.5:.0f}" width="{(length + 3) * min(function.share, 1):.1f}" height="3" rx="1.5"/>'
     )
 
 
 def _inner_border(x: float, y: float, box: Box) -> str:
     """Draw a second border inside that of a pipeline, so far away that the bar stands between them."""
     width, height = box.width - 2 * _INSIDE_PX, box.height - 2 * _INSIDE_PX
-    at = f'x="{x + _INSIDE_PX:.1f}" y="{y + _INSIDE_PX:.1f}"'
-    return f'<rect class="shape inner" {at} width="{width:.1f}" height="{height:.1f}" rx="4"/>'
+    at = f'x="{x + _INSIDE_PX:.0f}" y="{y + _INSIDE_PX:.0f}"'
+    return f'<rect class="shape inner" {at} width="{width:.0f}" height="{height:.0f}" rx="4"/>'
 
 
 def _classes(function: FunctionView) -> tuple[str, ...]:
@@ -130,4 +130,4 @@ def _trapezium(x: float, y: float, box: Box, direction: Direction) -> str:
         points = ((x, y), (right, y), (right - _SLOPE_PX, bottom), (x + _SLOPE_PX, bottom))
     else:
         points = ((x, y), (right, y + _SLANT_PX), (right, bottom - _SLANT_PX), (x, bottom))
-    return " ".join(f"{a:.1f},{b:.1f}" for a, b in points)
+    return " ".join(f"{a:.0f},{b:.0f}" for a, b in points)

@@ -40,6 +40,6 @@ def text_lines(lines: tuple[str, ...], centre: Point) -> str:
     top = centre[1] - LINE_PX * (len(lines) - 1) / 2 + 4
     kinds = ("name", "small")
     return "".join(
-        f'<text class="{kinds[min(row, 1)]}" x="{centre[0]:.1f}" y="{top + row * LINE_PX:.1f}">{content(line)}</text>'
+        f'<text class="{kinds[min(row, 1)]}" x="{centre[0]:.0f}" y="{top + row * LINE_PX:.0f}">{content(line)}</text>'
         for row, line in enumerate(lines)
     )

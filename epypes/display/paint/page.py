@@ -14,22 +14,19 @@ from functools import cache
 from importlib import resources
 from typing import Any, Final
 
+from epypes.display.limits import CHARACTERS, CHARACTERS_OF_A_VERTEX, THUMBNAIL_CHARACTERS
 from epypes.display.markup import content, cut, escape
 from epypes.display.paint.style import PAGE_STYLE
 from epypes.display.paint.svg import alt_text, least_width, paint_svg
 from epypes.display.paint.tables import paint_twin
 from epypes.display.views.graphview import FunctionView, GraphView
 from epypes.display.views.groups import counted, function_count
-from epypes.display.views.tokens import THUMBNAIL_CHARACTERS
-
-# A picture, as SVG and as HTML, takes at most so many characters, and as many more as its thumbnails do.
-CHARACTERS: Final = 20_000
-CHARACTERS_OF_A_VERTEX: Final = 600
 
 _NAMED_CHARACTERS: Final = 200
 _SVG_URI: Final = "data:image/svg+xml,"
 # What would end the attribute, the address or a line of it; all else may stand as it is, in any language.
 _IN_URI: Final = {sign: f"%{ord(sign):02X}" for sign in '%#&"\n\r\t'}  # % comes first
+_THUMBNAIL: Final = re.compile('<image [^>]*>|<g class="chart">.*?</g>')
 _TAG: Final = re.compile("<[^>]*>")
 _END: Final = "</figure>"
 _WEIGHTS: Final = {"failed": -2.0, "running": -1.5}
@@ -119,11 +116,16 @@ def _vertices(graph: GraphView) -> int:
 
 
 def _room_of(pictures: Sequence[tuple[GraphView, str]]) -> int:
-    """Return how many characters figures may take on a page of their own; a token that several show counts once."""
-    thumbnails = sum(len(found) for _, svg in pictures for found in re.findall(r'href="data:[^"]*"', svg))
+    """Return how many characters figures may take on a page of their own.
+
+    A token that several of them show counts once; where thumbnails leave room, the others are paid from theirs.
+    """
+    thumbnails = sum(len(found) for _, svg in pictures for found in _THUMBNAIL.findall(svg))
     vertices = function_count(pictures[0][0]) + len({token.name for part, _ in pictures for token in part.tokens})
+    twice = sum(_vertices(part) for part, _ in pictures) - vertices
     fixed = CHARACTERS - len(paint_page())
-    return fixed + CHARACTERS_OF_A_VERTEX * vertices + min(thumbnails, THUMBNAIL_CHARACTERS)
+    spent = min(thumbnails + CHARACTERS_OF_A_VERTEX * twice, THUMBNAIL_CHARACTERS)
+    return fixed + CHARACTERS_OF_A_VERTEX * vertices + spent
 
 
 @cache

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import Final
 
 # What a colour is called in the rules below -> what it is on paper, and what it is in a page: the theme of JupyterLab,
@@ -69,18 +70,20 @@ _RULES: Final = {
 }
 
 
-def _paper() -> str:
-    return "".join(f".epypes-graph{selector}{{{_coloured(declarations)}}}" for selector, declarations in _RULES.items())
+def paper_style(scope: str, rules: Mapping[str, str]) -> str:
+    """Return rules, by selectors within a scope, with the colours of paper; ``@accent`` stands for a colour."""
+    return "".join(f"{scope}{selector}{{{_coloured(declarations)}}}" for selector, declarations in rules.items())
 
 
-def _page() -> str:
-    rules = "".join(
-        f".epypes-graph{selector}{{{';'.join(coloured)}}}"
-        for selector, declarations in _RULES.items()
+def page_style(scope: str, rules: Mapping[str, str]) -> str:
+    """Return of such rules what depends on the theme of a page, for what knows variables and mixes."""
+    themed = "".join(
+        f"{scope}{selector}{{{';'.join(coloured)}}}"
+        for selector, declarations in rules.items()
         if (coloured := [_named(part) for part in declarations.split(";") if "@" in part or "none" in part])
     )
     names = "".join(f"--epypes-{name}:{_named(page)};" for name, (_, page) in _COLOURS.items())
-    return f"@supports(color:color-mix(in srgb,red,red)){{.epypes-graph,.epypes-sheet{{{names}}}{rules}}}"
+    return f"@supports(color:color-mix(in srgb,red,red)){{{scope},.epypes-sheet{{{names}}}{themed}}}"
 
 
 def _coloured(declarations: str) -> str:
@@ -91,8 +94,6 @@ def _named(declarations: str) -> str:
     return re.sub(r"@(\w+)", r"var(--epypes-\1)", declarations)
 
 
-# The rules with the colours of paper; then, for what knows variables and mixes, with those of the page. A viewer that
-# does not know them skips these, and has what stands on paper.
-PAPER_STYLE: Final = _paper()
-PAGE_STYLE: Final = _page()
-STYLE: Final = PAPER_STYLE + PAGE_STYLE
+# A viewer that knows no variables skips the second part, and has what stands on paper.
+PAGE_STYLE: Final = page_style(".epypes-graph", _RULES)
+STYLE: Final = paper_style(".epypes-graph", _RULES) + PAGE_STYLE

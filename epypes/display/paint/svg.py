@@ -27,7 +27,7 @@ _DENSE: Final = 1.6
 _MARGIN: Final = 6
 # A page may shrink a picture that is too wide to this part of its size; smaller, its text could not be read, so it
 # is scrolled.
-_LEAST_SCALE: Final = 0.6
+_LEAST_SCALE: Final = 0.75
 
 
 def paint_svg(graph: GraphView) -> str:

@@ -53,7 +53,7 @@ def paint_token(token: TokenView, box: Box, centre: Point) -> str:
     x, y = centre[0] - box.width / 2, centre[1] - box.height / 2
     if box.shape == "box":
         body = (
-            f'<rect class="shape" x="{x:.1f}" y="{y:.1f}" width="{box.width:.1f}" height="{box.height:.1f}" rx="10"/>'
+            f'<rect class="shape" x="{x:.0f}" y="{y:.0f}" width="{box.width:.0f}" height="{box.height:.0f}" rx="10"/>'
         )
         body += text_lines((short_name(token.name), _second(token)), (centre[0], y + LINE_PX + 4))
         body += _inside(token, box, (centre[0], y + 2 * LINE_PX + 8))
@@ -61,14 +61,14 @@ def paint_token(token: TokenView, box: Box, centre: Point) -> str:
         body = f'<polygon class="shape" points="{_hexagon(x, y, box)}"/>' + text_lines(_token_lines(token), centre)
     else:
         body = (
-            f'<ellipse class="shape" cx="{centre[0]:.1f}" cy="{centre[1]:.1f}" '
-            f'rx="{box.width / 2:.1f}" ry="{box.height / 2:.1f}"/>'
+            f'<ellipse class="shape" cx="{centre[0]:.0f}" cy="{centre[1]:.0f}" '
+            f'rx="{box.width / 2:.0f}" ry="{box.height / 2:.0f}"/>'
         ) + text_lines(_token_lines(token), centre)
     detail = token.preview.detail if token.preview else "no value"
     state = "" if token.state == "static" else f": {detail}, {token.state}"
     if token.first:
         # A dot, since a line of text would change the size of the box with the value.
-        body += f'<circle class="dot" cx="{x + box.width - 11:.1f}" cy="{y + 3:.1f}" r="3.5"/>'
+        body += f'<circle class="dot" cx="{x + box.width - 11:.0f}" cy="{y + 3:.0f}" r="3.5"/>'
         state += f", first {token.first}"
     states = (token.role, token.state, *(("changed",) if token.first else ()))
     return vertex("token", token.name, states, _title(token, state), body)
@@ -144,4 +144,4 @@ def _hexagon(x: float, y: float, box: Box) -> str:
         (right - corner, bottom),
         (x + corner, bottom),
     )
-    return " ".join(f"{a:.1f},{b:.1f}" for a, b in points)
+    return " ".join(f"{a:.0f},{b:.0f}" for a, b in points)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     Array = npt.NDArray[Any]
 
-_MOST_ELONGATED: Final = 10
+_MOST_ELONGATED: Final = 6
 _SMALL_SIDE: Final = 4
 _MOST_COLUMNS: Final = 6
 _MOST_ROWS: Final = 4

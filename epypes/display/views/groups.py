@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Final
 
 from epypes.display.views.graphview import EdgeView, FunctionState, FunctionView, GraphView, GroupView, TokenView
+from epypes.graph import CompGraph
 
 # A graph of so many functions fits on a page; every one that is hidden costs a click.
 _MOST_SHOWN: Final = 24
@@ -55,6 +56,22 @@ def outside_tokens(graph: GraphView, groups: Mapping[str, Sequence[str]]) -> fro
     """Return the tokens that are still seen when these groups are drawn as one box each."""
     inside = _inside(graph, _group_by_place(graph, groups))
     return frozenset(token.name for place, token in enumerate(graph.tokens) if place not in inside)
+
+
+def twice_seen(cg: CompGraph, groups: Mapping[str, Sequence[str]]) -> int:
+    """Return how many vertices are seen inside a group and outside too; the boxes of groups are among them."""
+    count = 0
+    for functions in groups.values():
+        names = frozenset(functions)
+        tokens = {token for name in names for token in (*cg.func_inputs(name), *cg.func_outputs(name))}
+        count += 1 + sum(not _is_within(cg, token, names) for token in tokens)
+    return count
+
+
+def _is_within(cg: CompGraph, token: str, functions: frozenset[str]) -> bool:
+    """Whether only these functions have to do with a token that somebody takes."""
+    takers, maker = cg.digraph.consumers.get(token, ()), cg.digraph.producer.get(token)
+    return bool(takers) and functions.issuperset(takers) and (maker is None or maker in functions)
 
 
 def collapsed(graph: GraphView, groups: Mapping[str, Sequence[str]]) -> GraphView:

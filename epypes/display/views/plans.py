@@ -7,14 +7,14 @@ from typing import Final
 
 from epypes.display.views.graphview import FunctionView, GraphView
 from epypes.display.views.structure import structure_of, with_caption
-from epypes.display.views.tokens import MOST_THUMBNAILS, valueless_view, with_values
+from epypes.display.views.tokens import ROOM, Room, valueless_view, with_values
 from epypes.errors import run_call
 from epypes.run import Plan
 
 _NAMED: Final = 8
 
 
-def plan_view(plan: Plan, most: int = MOST_THUMBNAILS) -> GraphView:
+def plan_view(plan: Plan, room: Room = ROOM) -> GraphView:
     """Look at a plan; hyperparameters may be images, of which so many are shown."""
     structure = structure_of(plan.cg, plan.branches, plan.left_out)
     functions = tuple(_planned_view(function, plan) for function in structure.functions)
@@ -23,7 +23,7 @@ def plan_view(plan: Plan, most: int = MOST_THUMBNAILS) -> GraphView:
         valueless_view(token, plan.hyperparameters, "missing" if token.name in missing else "static")
         for token in structure.tokens
     ]
-    tokens, _ = with_values(every, plan.hyperparameters, plan.targets, most)
+    tokens, _ = with_values(every, plan.hyperparameters, plan.targets, room)
     return replace(structure, functions=functions, tokens=tokens, caption=with_caption(_plan_caption(plan), structure))
 
 

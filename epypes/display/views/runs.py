@@ -9,7 +9,7 @@ from typing import Any
 from epypes.display.durations import duration_text, overhead_text
 from epypes.display.views.graphview import FunctionView, GraphView
 from epypes.display.views.structure import structure_of, with_caption
-from epypes.display.views.tokens import MOST_THUMBNAILS, token_view, with_run_values
+from epypes.display.views.tokens import ROOM, Room, token_view, with_run_values
 from epypes.run import FunctionTime, Run
 from epypes.run.need import chosen_branches, wanted_steps
 
@@ -28,12 +28,12 @@ def with_run(
     run: Run,
     hparams: Mapping[str, Any],
     stale: frozenset[str],
-    most: int = MOST_THUMBNAILS,
+    room: Room = ROOM,
     seen: Sequence[str] = (),
 ) -> GraphView:
     """Add a run to a graph's structure; ``stale`` are functions out of date since the run.
 
-    Of its thumbnails at most so many are kept: those of sinks, of the tokens that are ``seen`` at once, of the others.
+    If only some of its tokens are ``seen`` at once, these get thumbnails before others.
     """
     steps, report = run.tokens.program.steps, run.report
     stale |= {steps[index].name for index in run.tokens.stale}
@@ -42,7 +42,7 @@ def with_run(
         _function_view(function, run, stale, spent.get(function.name)) for function in structure.functions
     )
     every = [token_view(token, run, hparams, stale) for token in structure.tokens]
-    tokens, dropped = with_run_values(every, run, hparams, most, frozenset(seen))
+    tokens, dropped = with_run_values(every, run, hparams, room, frozenset(seen))
     overhead = f"{overhead_text(report.side_by_side)} {duration_text(report.overhead_ns)}"
     caption = f"{duration_text(report.total_ns)} in all, {overhead}"
     if dropped:

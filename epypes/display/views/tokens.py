@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
+from epypes.display.limits import MOST_THUMBNAILS, THUMBNAIL_CHARACTERS
 from epypes.display.previews.preview import Preview, finished, sketch
 from epypes.display.previews.ranges import kept_range
 from epypes.display.previews.raster import THUMBNAIL_BYTES
@@ -15,13 +16,20 @@ from epypes.display.views.backdrops import RunSurroundings
 from epypes.display.views.graphview import TokenState, TokenView
 from epypes.run import Run
 
-MOST_THUMBNAILS: Final = 24
-# Base64 makes four characters of three bytes; together the thumbnails of one picture take at most this many.
-THUMBNAIL_CHARACTERS: Final = 80_000
 # What a picture of so few bytes shows is hardly seen; rather are some left out.
 _LEAST_BYTES: Final = 1_500
 _ELEMENT_CHARACTERS: Final = 150
 _POINT_CHARACTERS: Final = 12
+
+
+class Room(NamedTuple):
+    """How many thumbnails a picture has at most, and how many characters they take together."""
+
+    thumbnails: int = MOST_THUMBNAILS
+    characters: int = THUMBNAIL_CHARACTERS
+
+
+ROOM: Final = Room()
 
 
 def token_view(token: TokenView, run: Run, hparams: Mapping[str, Any], stale: frozenset[str]) -> TokenView:
@@ -48,7 +56,7 @@ def with_values(
     tokens: Iterable[TokenView],
     hparams: Mapping[str, Any],
     first: Iterable[str] = (),
-    most: int = MOST_THUMBNAILS,
+    room: Room = ROOM,
 ) -> tuple[tuple[TokenView, ...], int]:
     """Add the previews of hyperparameters; those of ``first`` get a thumbnail before others.
 
@@ -59,20 +67,26 @@ def with_values(
     """
     tokens, chosen = tuple(tokens), frozenset(first)
     sketches = {token.name: sketch(hparams[token.name], Look(token.order)) for token in tokens if token.name in hparams}
-    return _with_previews(tokens, sketches, lambda name: name not in chosen, most)
+    return _with_previews(tokens, sketches, lambda name: name not in chosen, room)
 
 
 def with_run_values(
     tokens: Iterable[TokenView],
     run: Run,
     hparams: Mapping[str, Any],
-    most: int = MOST_THUMBNAILS,
+    room: Room = ROOM,
     seen: frozenset[str] = frozenset(),
 ) -> tuple[tuple[TokenView, ...], int]:
     """Add the previews of a run's values and of these hyperparameters.
 
-    Sink tokens get a thumbnail first, then source tokens that are images, then what the run made, then the others; and
-    before these the tokens that are ``seen`` at once, if only some are.
+    Sink tokens get a thumbnail first, then source tokens that are images, then what the run made, then the others.
+
+    Parameters
+    ----------
+    room
+        How many thumbnails there are at most, and how many characters they take together.
+    seen
+        The tokens that are seen at once, if only some are: they come before all others.
 
     Returns
     -------
@@ -88,7 +102,7 @@ def with_run_values(
             sketches[token.name] = sketch(hparams[token.name], look)
         elif run.tokens.is_computed(token.name):
             sketches[token.name] = sketch(values[program.slots[token.name]], look)
-    return _with_previews(tokens, sketches, _relevance(run, sketches, seen), most)
+    return _with_previews(tokens, sketches, _relevance(run, sketches, seen), room)
 
 
 def _relevance(run: Run, sketches: Mapping[str, Sketch], seen: frozenset[str]) -> Callable[[str], tuple[bool, int]]:
@@ -106,15 +120,14 @@ def _relevance(run: Run, sketches: Mapping[str, Sketch], seen: frozenset[str]) -
 
 
 def _with_previews(
-    tokens: tuple[TokenView, ...], sketches: Mapping[str, Sketch], rank: Callable[[str], Any], most: int
+    tokens: tuple[TokenView, ...], sketches: Mapping[str, Sketch], rank: Callable[[str], Any], room: Room
 ) -> tuple[tuple[TokenView, ...], int]:
     """Finish the sketches: with a thumbnail those of the lowest ranks, in graph order, as far as there is room.
 
     Each may take the same part of the room that is left, so that all of them are shown, if need be with less detail.
     """
     by_rank = sorted((name for name, found in sketches.items() if found.may_be_drawn), key=rank)
-    most = min(most, THUMBNAIL_CHARACTERS // (_characters(_LEAST_BYTES)))
-    chosen, left = by_rank[:most], THUMBNAIL_CHARACTERS
+    chosen, left = by_rank[: min(room.thumbnails, room.characters // _characters(_LEAST_BYTES))], room.characters
     previews = {name: found.shown for name, found in sketches.items()}
     for index, name in enumerate(chosen):
         share = (left // (len(chosen) - index) - _ELEMENT_CHARACTERS) * 3 // 4

@@ -7,20 +7,24 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, get_args
+from typing import Any, Final, get_args
 
+from epypes.display.limits import CHARACTERS_OF_A_VERTEX, MOST_THUMBNAILS, THUMBNAIL_CHARACTERS
 from epypes.display.views.graphview import Direction, GraphView
-from epypes.display.views.groups import collapsed, groups_of, outside_tokens
+from epypes.display.views.groups import collapsed, groups_of, outside_tokens, twice_seen
 from epypes.display.views.pipelines import PipelineLike, in_pipeline
 from epypes.display.views.plans import plan_view
 from epypes.display.views.runs import run_structure, with_run
 from epypes.display.views.states import with_first, with_running
 from epypes.display.views.structure import structure_of, with_caption
-from epypes.display.views.tokens import MOST_THUMBNAILS, valueless_view, with_values
+from epypes.display.views.tokens import Room, valueless_view, with_values
 from epypes.errors import UnknownName
 from epypes.graph import CompGraph
 from epypes.graph.renaming import names_of
 from epypes.run import CompGraphRunner, Plan, Run
+
+# What is left to thumbnails, however many vertices are seen twice.
+_LEAST_CHARACTERS: Final = THUMBNAIL_CHARACTERS // 3
 
 Shown = CompGraph | CompGraphRunner | Run | Plan | PipelineLike
 
@@ -63,7 +67,9 @@ def view(
         if name not in groups:
             raise UnknownName("group", name, groups, "in this picture")
     closed = {name: inside for name, inside in groups.items() if collapse and name not in opened}
-    return collapsed(replace(_whole(shown, thumbnails, closed), direction=direction), closed)
+    characters = THUMBNAIL_CHARACTERS - CHARACTERS_OF_A_VERTEX * twice_seen(cg, closed)
+    whole = _whole(shown, Room(thumbnails, max(characters, _LEAST_CHARACTERS)), closed)
+    return collapsed(replace(whole, direction=direction), closed)
 
 
 def _require_options(direction: object, thumbnails: object) -> None:
@@ -86,22 +92,22 @@ def _graph_of(shown: Any) -> CompGraph:
     return runner.cg
 
 
-def _whole(shown: Shown, most: int, closed: Mapping[str, Sequence[str]]) -> GraphView:
+def _whole(shown: Shown, room: Room, closed: Mapping[str, Sequence[str]]) -> GraphView:
     """Look at all functions; thumbnails that are in closed groups are dropped first."""
     if isinstance(shown, CompGraph):
-        return _graph_view(shown, most)
+        return _graph_view(shown, room)
     if isinstance(shown, CompGraphRunner):
-        return _runner_view(shown, most, closed)
+        return _runner_view(shown, room, closed)
     if isinstance(shown, Plan):
-        return with_first(plan_view(shown, most), shown.hyperparameters, shown.first_hyperparameters)
+        return with_first(plan_view(shown, room), shown.hyperparameters, shown.first_hyperparameters)
     if isinstance(shown, Run):
-        return _run_view(shown, most, closed)
-    return in_pipeline(_runner_view(shown.runner, most, closed), shown)
+        return _run_view(shown, room, closed)
+    return in_pipeline(_runner_view(shown.runner, room, closed), shown)
 
 
-def _run_view(run: Run, most: int, closed: Mapping[str, Sequence[str]]) -> GraphView:
+def _run_view(run: Run, room: Room, closed: Mapping[str, Sequence[str]]) -> GraphView:
     structure = run_structure(run)
-    graph = with_run(structure, run, run.hyperparameters, frozenset(), most, _seen(structure, closed))
+    graph = with_run(structure, run, run.hyperparameters, frozenset(), room, _seen(structure, closed))
     return with_first(graph, run.hyperparameters, run.first_hyperparameters)
 
 
@@ -112,30 +118,30 @@ def _seen(structure: GraphView, closed: Mapping[str, Sequence[str]]) -> Sequence
     return [token.name for token in structure.tokens if token.name in outside]
 
 
-def _graph_view(cg: CompGraph, most: int) -> GraphView:
+def _graph_view(cg: CompGraph, room: Room) -> GraphView:
     """Look at a graph; tokens with a default are shown as the hyperparameters that a runner makes of them."""
     structure = structure_of(cg, {}, ())
     every = [valueless_view(token, cg.defaults, "static") for token in structure.tokens]
-    tokens, _ = with_values(every, cg.defaults, (), most)
+    tokens, _ = with_values(every, cg.defaults, (), room)
     return replace(structure, tokens=tokens)
 
 
-def _runner_view(runner: CompGraphRunner, most: int, closed: Mapping[str, Sequence[str]]) -> GraphView:
+def _runner_view(runner: CompGraphRunner, room: Room, closed: Mapping[str, Sequence[str]]) -> GraphView:
     # First, so that what ends meanwhile shows as running, not as never run.
     running, last, plan = runner.running, runner.last, runner.plan()
-    graph = _between_runs(last, plan, most, closed)
+    graph = _between_runs(last, plan, room, closed)
     return with_running(with_first(graph, plan.hyperparameters, plan.first_hyperparameters), running)
 
 
-def _between_runs(last: Run | None, plan: Plan, most: int, closed: Mapping[str, Sequence[str]]) -> GraphView:
+def _between_runs(last: Run | None, plan: Plan, room: Room, closed: Mapping[str, Sequence[str]]) -> GraphView:
     structure = structure_of(plan.cg, plan.branches, plan.left_out)
     if last is not None:
         seen = _seen(structure, closed)
-        return with_run(structure, last, plan.hyperparameters, frozenset(plan.order), most, seen)
+        return with_run(structure, last, plan.hyperparameters, frozenset(plan.order), room, seen)
     functions = tuple(
         function if function.state == "left out" else replace(function, state="not run")
         for function in structure.functions
     )
     every = [valueless_view(token, plan.hyperparameters, "not computed") for token in structure.tokens]
-    tokens, _ = with_values(every, plan.hyperparameters, (), most)
+    tokens, _ = with_values(every, plan.hyperparameters, (), room)
     return replace(structure, functions=functions, tokens=tokens, caption=with_caption("not run yet", structure))
