@@ -15,7 +15,7 @@ from importlib import resources
 from typing import Any, Final
 
 from epypes.display.limits import CHARACTERS, CHARACTERS_OF_A_VERTEX, THUMBNAIL_CHARACTERS
-from epypes.display.markup import content, cut, escape
+from epypes.display.markup import QUOTE, content, cut, escape
 from epypes.display.paint.style import PAGE_STYLE
 from epypes.display.paint.svg import alt_text, least_width, paint_svg
 from epypes.display.paint.tables import paint_twin
@@ -23,11 +23,13 @@ from epypes.display.views.graphview import FunctionView, GraphView
 from epypes.display.views.groups import counted, function_count
 
 _NAMED_CHARACTERS: Final = 200
+# A twin without rows.
+_TWIN_CHARACTERS: Final = len(paint_twin(GraphView((), (), ()), "", 0))
+
 _SVG_URI: Final = "data:image/svg+xml,"
 # What would end the attribute, the address or a line of it; all else may stand as it is, in any language.
 _IN_URI: Final = {sign: f"%{ord(sign):02X}" for sign in '%#&"\n\r\t'}  # % comes first
 _THUMBNAIL: Final = re.compile('<image [^>]*>|<g class="chart">.*?</g>')
-_TAG: Final = re.compile("<[^>]*>")
 _END: Final = "</figure>"
 _WEIGHTS: Final = {"failed": -2.0, "running": -1.5}
 
@@ -44,8 +46,8 @@ def paint_figure(svg: str, alt: str, caption: str = "") -> str:
     """Return a picture as a figure."""
     # An image knows nothing of the page; where the script puts the picture itself, the page's style is there already.
     source = svg.replace(PAGE_STYLE, "", 1)
-    # The quotes of a picture's attributes need not be encoded if they are single ones.
-    source = _TAG.sub(lambda tag: tag[0].replace('"', "'"), source)
+    # The quotes that are left are those around attributes: they need not be encoded if they are single ones.
+    source = source.replace('"', "'").replace(QUOTE, '"')
     for sign, encoded in _IN_URI.items():
         source = source.replace(sign, encoded)
     below = f'<figcaption style="font-size:12px">{content(caption)}</figcaption>' if caption else ""
@@ -72,32 +74,30 @@ def paint_graph(graph: GraphView, svg: str, taken: int = 0) -> list[str]:
     names = [group.name for group in graph.groups]
     pictures = [(graph, svg), *((group.graph, paint_svg(group.graph)) for group in graph.groups)]
     room = _room_of(pictures) - taken - len("".join(_left_out(names)))
-    least: list[int] = []
+    bare: list[str] = []
     for name, (part, picture) in zip(("", *names), pictures, strict=True):
-        figure = _figure_of(part, picture, 0)
-        characters = len(_inside(name, part, figure) if least else figure)
-        if least and characters > room:
+        figure = paint_figure(picture, alt_text(part), part.caption)
+        least = len(_inside(name, part, figure) if bare else figure) + len(_data(part, {})) + _TWIN_CHARACTERS
+        if bare and least > room:
             break
-        room -= characters
-        least.append(len(figure))
-    shown = pictures[: len(least)]
+        room -= least
+        bare.append(figure)
+    parts = [part for part, _ in pictures[: len(bare)]]
     # What is left is for twins and sources: as much for each function and token.
-    each = max(room, 0) / max(sum(_vertices(part) for part, _ in shown), 1)
-    figures = [
-        _figure_of(part, picture, characters + int(each * _vertices(part)))
-        for (part, picture), characters in zip(shown, least, strict=True)
-    ]
-    insides = zip(names, shown[1:], figures[1:], strict=False)
-    details = [_inside(name, part, figure) for name, (part, _), figure in insides]
-    return [figures[0], *details, *_left_out(names[len(details) :])]
+    each = max(room, 0) / max(sum(map(_vertices, parts)), 1)
+    first, *insides = (
+        _told(figure, part, int(each * _vertices(part))) for figure, part in zip(bare, parts, strict=True)
+    )
+    details = [_inside(name, part, figure) for name, part, figure in zip(names, parts[1:], insides, strict=False)]
+    return [first, *details, *_left_out(names[len(details) :])]
 
 
-def _figure_of(graph: GraphView, svg: str, room: int) -> str:
-    alt = alt_text(graph)
-    figure = paint_figure(svg, alt, graph.caption).removesuffix(_END)
-    room -= len(figure) + len(_END) + len(_data(graph, {}))
-    twin = paint_twin(graph, alt, room)
-    return f"{figure}{_data(graph, _fitting(graph, room - len(twin)))}{twin}{_END}"
+def _told(figure: str, graph: GraphView, room: int) -> str:
+    """Add the twin of a figure and what the script needs to know, in ``room`` more characters than is their least."""
+    room += _TWIN_CHARACTERS
+    twin = paint_twin(graph, alt_text(graph), room)
+    data = _data(graph, _fitting(graph, room - len(twin)))
+    return f"{figure.removesuffix(_END)}{data}{twin}{_END}"
 
 
 def _inside(name: str, graph: GraphView, figure: str) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display.previews.imagekinds import EXACT_PX, SAMPLE_PX
 
-_FEW: Final = 10_000
+_FEW: Final = 4_000
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -29,9 +29,12 @@ def few_of(array: Array) -> Array:
     """Return a small array as it is, of a larger one a few thousand values: that takes no time worth counting."""
     if array.size <= _FEW:
         return array
-    step = max(1, math.isqrt(array.size // _FEW))
-    few = array[::step] if array.ndim == 1 else array[::step, ::step]
-    return few.reshape(-1)[:: -(-few.size // _FEW)]
+    if array.ndim == 1:
+        return array[:: -(-array.size // _FEW)]
+    step = math.isqrt(array.shape[0] * array.shape[1] // _FEW) + 1
+    few = array[::step, ::step]
+    # To flatten what is not contiguous takes a copy.
+    return few if few.size <= 4 * _FEW else few.reshape(-1)[:: -(-few.size // _FEW)]
 
 
 def statistics_text(sample: Array, array: Array) -> str:
