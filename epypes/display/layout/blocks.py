@@ -122,9 +122,7 @@ def unfold(layout: Layout, graph: Folded, edges: Sequence[Edge], routed: Sequenc
             centres[member] = (x + offset[0], y + offset[1])
             ways[member] = tuple((x + dx, y + dy) for dx, dy in way)
     found = dict(zip(routed, layout.splines, strict=True))
-    splines = tuple(
-        _joined(ways.get(edge[0], ()), found[graph.folded(edge)], ways.get(edge[1], ())) for edge in edges
-    )
+    splines = tuple(_joined(ways.get(edge[0], ()), found[graph.folded(edge)], ways.get(edge[1], ())) for edge in edges)
     return Layout(layout.width, layout.height, tuple(centres), splines)
 
 
@@ -150,10 +148,11 @@ def _alike(boxes: Sequence[Box], edges: Sequence[Edge]) -> list[tuple[int, ...]]
 
 
 def _rows(boxes: Sequence[Box], members: tuple[int, ...]) -> list[tuple[int, ...]]:
-    """Return the rows of a block, as they are read."""
+    """Return the rows of a block, as they are read; no more columns than so many rows need."""
     if sum(boxes[member].width + _COLUMN_GAP_PX for member in members) - _COLUMN_GAP_PX <= _ROW_PX:
         return [members]
-    columns = 2 * _pairs([boxes[member] for member in members])
+    most = 2 * _pairs([boxes[member] for member in members])
+    columns = -(-len(members) // -(-len(members) // most))
     return [members[start : start + columns] for start in range(0, len(members), columns)]
 
 
@@ -204,12 +203,12 @@ def _row(boxes: Sequence[Box], members: tuple[int, ...], tip_px: float) -> Block
 
 
 def _columns(boxes: Sequence[Box], rows: Sequence[tuple[int, ...]], tip_px: float) -> Block:
-    """Arrange vertices in pairs of columns."""
+    """Arrange vertices in pairs of columns; one that is left over stands to the right of its lane."""
     members = tuple(member for row in rows for member in row)
-    pairs = max(len(row) for row in rows) // 2
-    pitch = 2 * max(boxes[member].width for member in members) + _LANE_PX + _COLUMN_GAP_PX
+    column, count = max(boxes[member].width for member in members), max(map(len, rows))
+    lanes = _lanes(count, column)
     height = sum(max(boxes[member].height for member in row) + _ROW_GAP_PX for row in rows)
-    height += _MEETING_PX if pairs > 1 else 0.0
+    height += _MEETING_PX if len(lanes) > 1 else 0.0
     offsets: list[Point] = []
     ways: list[tuple[Point, ...]] = []
     middles: list[float] = []
@@ -220,12 +219,22 @@ def _columns(boxes: Sequence[Box], rows: Sequence[tuple[int, ...]], tip_px: floa
         y += tall + _ROW_GAP_PX
     for number, row in enumerate(rows):
         for place, member in enumerate(row):
-            side = 1 if place % 2 else -1
-            lane = pitch * (place // 2 - (pairs - 1) / 2)
+            side, lane = 1 if place % 2 or place == count - 1 else -1, lanes[place // 2]
             out = lane + side * _LANE_PX / 2
             offsets.append((out + side * boxes[member].width / 2, middles[number]))
             ways.append(_way(out - side * tip_px, lane, middles[number:], height / 2))
-    return Block(Box("box", pitch * pairs - _COLUMN_GAP_PX, height), members, tuple(offsets), tuple(ways))
+    width = lanes[-1] - lanes[0] + 2 * column + _LANE_PX
+    return Block(Box("box", width, height), members, tuple(offsets), tuple(ways))
+
+
+def _lanes(columns: int, column_px: float) -> list[float]:
+    """Return where the lanes between columns are, from the middle of them all."""
+    pairs, pitch = columns // 2, 2 * column_px + _LANE_PX + _COLUMN_GAP_PX
+    lanes = [pitch * (pair - (pairs - 1) / 2) for pair in range(pairs)]
+    if columns % 2:
+        step = column_px + _LANE_PX
+        lanes = [lane - step / 2 for lane in (*lanes, lanes[-1] + step)]
+    return lanes
 
 
 def _way(side: float, lane: float, rows: Sequence[float], bottom: float) -> tuple[Point, ...]:
