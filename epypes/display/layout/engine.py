@@ -23,7 +23,7 @@ _engine_lock = threading.Lock()
 
 
 def routed_layout(boxes: Sequence[Box], edges: Sequence[Edge], blocks: Collection[int]) -> Layout:
-    """Return the layout with a spline for every edge; ``blocks`` are vertices that edges leave, or enter, in the middle.
+    """Return the layout with a spline for every edge; edges leave and enter ``blocks`` in the middle.
 
     An edge into a block has no tip, since it goes on inside: its last control point stands there twice.
 
