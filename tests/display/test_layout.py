@@ -8,7 +8,7 @@ import pytest
 import epypes as ep
 from epypes.display import mimebundle, to_svg
 from epypes.display.layout.blocks import fold
-from epypes.display.layout.geometry import Box
+from epypes.display.layout.geometry import Box, Layout
 from epypes.display.layout.place import lay_out
 from epypes.display.layout.rows import ranks
 from epypes.display.paint.edges import paint_edges
@@ -280,8 +280,42 @@ def test_each_sink_of_a_block_gets_the_tip_of_an_arrow(is_live):
     curves, tips = re.findall(r' d="([^"]*)"', "".join(paint_edges(views, edges, lay_out(boxes, edges))))
     assert tips.count("M") == 9
     assert curves.count("M") == (9 if is_live else 1 + 8), "a way of its own, or one and eight turns off it"
-    if not is_live:
-        assert len(curves) < 9 * 100, "what they share is painted once"
+
+
+def test_edges_that_no_run_uses_are_not_painted_over_each_other():
+    boxes, edges = sinks_of(9, sink=ELLIPSE)
+    layout = lay_out(boxes, edges)
+    views = tuple(EdgeView(tail, head - 1, False, is_live=False) for tail, head in edges)
+    curves, _ = re.findall(r' d="([^"]*)"', "".join(paint_edges(views, edges, layout)))
+    down = 0.0
+    for start, points in re.findall(r"M([^C]*)C([^M]*)", curves):
+        ys = [float(place.split(",")[1]) for place in (start, *points.split())]
+        down += ys[-1] - ys[0]
+    assert down < layout.height + 9 * 12, "one lane, and nine bends off it"
+
+
+def test_an_edge_keeps_its_corners():
+    corner = ((0.0, 0.0), (0.0, 0.0), (0.0, 50.0), (0.0, 50.0), (0.0, 50.0), (30.0, 50.0), (30.0, 50.0))
+    layout = Layout(40.0, 60.0, ((0.0, 0.0), (40.0, 50.0)), ((*corner, (40.0, 50.0)),))
+    painted = "".join(paint_edges((EdgeView(0, 0, True),), ((0, 1),), layout))
+    assert re.search(r"C[^M]* 0(?:\.0)?,50(?:\.0)? ", painted)
+
+
+@pytest.mark.parametrize("direction", ["down", "right"])
+@pytest.mark.parametrize("makes", [True, False], ids=["makes", "takes"])
+def test_a_function_of_250_tokens_is_drawn_within_the_limits(makes, direction):
+    count = 250
+    names = tuple(f"t{index}" for index in range(count))
+    io = {"f": ("x", names) if makes else (names, "x")}
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": lambda *_: tuple(range(count))}, io))
+    run = runner.run(**dict.fromkeys(("x",) if makes else names, 1))
+    bundle = ep.show(run, direction=direction)._repr_mimebundle_()
+    limit = 20_000 + 600 * (count + 2)
+    assert len(bundle["image/svg+xml"]) <= limit
+    assert len(bundle["text/html"]) <= limit
+    pieces = re.search(r'class="edge" d="M([^"]*)"', bundle["image/svg+xml"])[1].split("M")
+    assert len(pieces) == count + 1
+    assert max(len(piece.split()) for piece in pieces) < 40, "whatever the number of rows"
 
 
 def test_few_sinks_stand_in_one_row():
