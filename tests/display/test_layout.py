@@ -8,7 +8,7 @@ import pytest
 import epypes as ep
 from epypes.display import mimebundle, to_svg
 from epypes.display.layout.blocks import fold
-from epypes.display.layout.geometry import Box
+from epypes.display.layout.geometry import Box, Layout
 from epypes.display.layout.place import lay_out
 from epypes.display.layout.rows import ranks
 from epypes.display.paint.edges import paint_edges
@@ -209,6 +209,183 @@ def test_narrow_sources_stand_in_one_row_and_their_edges_meet_below_it(count):
     assert len(doors) == 1
 
 
+# -- blocks of sinks ---------------------------------------------------------------------------------------------------
+
+
+ELLIPSE = Box("ellipse", 90.0, 32.0)
+
+
+def sinks_of(count, functions=1, sink=IMAGE):
+    """Vertices: the functions, then the sinks, each of which comes from all functions."""
+    boxes, edges = sources_of(count, functions, sink)
+    return boxes, tuple((function, sink) for sink, function in edges)
+
+
+@pytest.mark.parametrize("sink", [ELLIPSE, IMAGE], ids=lambda box: box.shape)
+@pytest.mark.parametrize("functions", [1, 2])
+@pytest.mark.parametrize("count", [5, 6, 8, 9, 10, 17, 36, 100])
+def test_many_sinks_of_the_same_functions_stand_in_rows(count, functions, sink):
+    boxes, edges = sinks_of(count, functions, sink)
+    layout = lay_out(boxes, edges)
+    rows = {}
+    for x, y in layout.centres[functions:]:
+        rows.setdefault(round(y), []).append(x)
+    assert layout.width < 700, "no more than 4 columns of images"
+    assert list(rows) == sorted(rows), "from top to bottom"
+    assert all(xs == sorted(xs) for xs in rows.values()), "from left to right"
+    assert len({len(xs) for xs in [*rows.values()][:-1]}) == 1 < len(rows)
+    assert len(rows[max(rows)]) <= len(rows[min(rows)]) <= -(-count // len(rows))
+    assert min(rows) > max(y for _, y in layout.centres[:functions]), "below their functions"
+    for one, other in itertools.combinations(range(len(boxes)), 2):
+        assert not overlap(one, other, boxes, layout)
+    for vertex, (x, y) in enumerate(layout.centres):
+        assert boxes[vertex].width / 2 - 1 <= x <= layout.width - boxes[vertex].width / 2 + 1
+        assert boxes[vertex].height / 2 - 1 <= y <= layout.height - boxes[vertex].height / 2 + 1
+
+
+@pytest.mark.parametrize("sink", [ELLIPSE, IMAGE], ids=lambda box: box.shape)
+@pytest.mark.parametrize("functions", [1, 2])
+@pytest.mark.parametrize("count", [5, 9, 17, 36])
+def test_the_edges_into_a_block_pass_none_of_its_vertices(count, functions, sink):
+    boxes, edges = sinks_of(count, functions, sink)
+    layout = lay_out(boxes, edges)
+    doors = set()
+    (block,) = fold(boxes, edges).blocks.values()
+    for (tail, head), spline in zip(edges, layout.splines, strict=True):
+        (x, y), (x1, y1) = layout.centres[tail], layout.centres[head]
+        assert abs(spline[0][0] - x) <= BOX.width / 2 + 1
+        assert abs(spline[0][1] - y) <= BOX.height / 2 + 1
+        (x2, y2), (end, y3) = spline[-1], spline[-2]
+        assert abs(abs(x2 - x1) - sink.width / 2) < 1, "the tip is at its side"
+        assert abs(y2 - y1) < 1
+        assert y3 == pytest.approx(y2)
+        assert 5 < abs(end - x1) - sink.width / 2 < 12, "and points to it"
+        places = list(points_on(spline))
+        assert not any(
+            is_in(place, vertex, boxes, layout) for place in places for vertex in range(functions, len(boxes))
+        )
+        steps = [abs(a - c) + abs(b - d) for (a, b), (c, d) in itertools.pairwise(places)]
+        assert max(steps) < 144, "without gaps"
+        inside = len(block.ways[block.members.index(head)])
+        doors.add(spline[-inside])
+        before, door, after = (x for x, _ in spline[-inside - 1 :][:3])
+        assert abs(before - door) < 1 > abs(after - door), "downwards, without a bend"
+    assert len(doors) == 1, "together"
+
+
+@pytest.mark.parametrize("is_live", [True, False])
+def test_each_sink_of_a_block_gets_the_tip_of_an_arrow(is_live):
+    boxes, edges = sinks_of(9)
+    views = tuple(EdgeView(tail, head - 1, False, is_live=is_live) for tail, head in edges)
+    curves, tips = re.findall(r' d="([^"]*)"', "".join(paint_edges(views, edges, lay_out(boxes, edges))))
+    assert tips.count("M") == 9
+    assert curves.count("M") == (9 if is_live else 1 + 8), "a way of its own, or one and eight turns off it"
+
+
+def test_edges_that_no_run_uses_are_not_painted_over_each_other():
+    boxes, edges = sinks_of(9, sink=ELLIPSE)
+    layout = lay_out(boxes, edges)
+    views = tuple(EdgeView(tail, head - 1, False, is_live=False) for tail, head in edges)
+    curves, _ = re.findall(r' d="([^"]*)"', "".join(paint_edges(views, edges, layout)))
+    down = 0.0
+    for start, points in re.findall(r"M([^C]*)C([^M]*)", curves):
+        ys = [float(place.split(",")[1]) for place in (start, *points.split())]
+        down += ys[-1] - ys[0]
+    assert down < layout.height + 9 * 12, "one lane, and nine bends off it"
+
+
+def test_an_edge_keeps_its_corners():
+    corner = ((0.0, 0.0), (0.0, 0.0), (0.0, 50.0), (0.0, 50.0), (0.0, 50.0), (30.0, 50.0), (30.0, 50.0))
+    layout = Layout(40.0, 60.0, ((0.0, 0.0), (40.0, 50.0)), ((*corner, (40.0, 50.0)),))
+    painted = "".join(paint_edges((EdgeView(0, 0, True),), ((0, 1),), layout))
+    assert re.search(r"C[^M]* 0(?:\.0)?,50(?:\.0)? ", painted)
+
+
+@pytest.mark.parametrize("direction", ["down", "right"])
+@pytest.mark.parametrize("makes", [True, False], ids=["makes", "takes"])
+def test_a_function_of_250_tokens_is_drawn_within_the_limits(makes, direction):
+    count = 250
+    names = tuple(f"t{index}" for index in range(count))
+    io = {"f": ("x", names) if makes else (names, "x")}
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": lambda *_: tuple(range(count))}, io))
+    run = runner.run(**dict.fromkeys(("x",) if makes else names, 1))
+    bundle = ep.show(run, direction=direction)._repr_mimebundle_()
+    limit = 20_000 + 600 * (count + 2)
+    assert len(bundle["image/svg+xml"]) <= limit
+    assert len(bundle["text/html"]) <= limit
+    pieces = re.search(r'class="edge" d="M([^"]*)"', bundle["image/svg+xml"])[1].split("M")
+    assert len(pieces) == count + 1
+    assert max(len(piece.split()) for piece in pieces) < 40, "whatever the number of rows"
+
+
+def test_few_sinks_stand_in_one_row():
+    boxes, edges = sinks_of(4)
+    assert len({y for _, y in lay_out(boxes, edges).centres[1:]}) == 1
+
+
+def test_images_and_ellipses_of_one_function_stand_in_blocks_of_their_own():
+    boxes = (BOX, *(ELLIPSE, ELLIPSE, IMAGE, IMAGE) * 3)
+    layout = lay_out(boxes, tuple((0, sink) for sink in range(1, 13)))
+    ellipses, images = (
+        [layout.centres[sink][0] for sink in range(1, 13) if boxes[sink] is box] for box in (ELLIPSE, IMAGE)
+    )
+    assert max(ellipses) < min(images) or max(images) < min(ellipses)
+
+
+def test_sinks_of_different_sizes_do_not_overlap():
+    sizes = (IMAGE, Box("box", 171.0, 100.0), Box("box", 60.0, 30.0))
+    boxes = (BOX, *sizes * 5)
+    layout = lay_out(boxes, tuple((0, sink) for sink in range(1, 16)))
+    assert layout.width < 5 * 171
+    for one, other in itertools.combinations(range(len(boxes)), 2):
+        assert not overlap(one, other, boxes, layout)
+    for head, spline in enumerate(layout.splines, start=1):
+        assert abs(abs(spline[-1][0] - layout.centres[head][0]) - boxes[head].width / 2) < 1
+        assert not any(is_in(place, vertex, boxes, layout) for place in points_on(spline) for vertex in range(1, 16))
+
+
+def test_a_token_that_a_function_takes_stands_outside_the_block_of_sinks():
+    boxes, edges = sinks_of(9)
+    (block,) = fold((*boxes, BOX), (*edges, (4, 10))).blocks.values()
+    assert set(block.members) == {1, 2, 3, 5, 6, 7, 8, 9}
+
+
+@pytest.mark.parametrize("direction", ["down", "right"])
+def test_a_block_of_sources_can_lead_to_one_of_sinks(direction):
+    boxes = (HEXAGON,) * 6 + (IMAGE,) * 7
+    edges = tuple((source, sink) for source in range(6) for sink in range(6, 13))
+    layout = lay_out(boxes, edges, direction=direction)
+    assert len(fold(boxes, edges).boxes) == 2
+    for (tail, head), spline in zip(edges, layout.splines, strict=True):
+        for point, vertex in ((spline[0], tail), (spline[-1], head)):
+            x, y = layout.centres[vertex]
+            assert abs(point[0] - x) <= boxes[vertex].width / 2 + 1
+            assert abs(point[1] - y) <= boxes[vertex].height / 2 + 1
+        assert not any(is_in(place, vertex, boxes, layout) for place in points_on(spline) for vertex in range(13))
+
+
+@pytest.mark.parametrize("count", [5, 8, 11])
+def test_narrow_sinks_stand_in_one_row_and_their_edges_part_above_it(count):
+    narrow = Box("ellipse", 28.0, 110.0)
+    boxes, edges = sinks_of(count, 2, narrow)
+    layout = lay_out(boxes, edges)
+    xs = [x for x, _ in layout.centres[2:]]
+    assert xs == sorted(xs)
+    assert len({y for _, y in layout.centres[2:]}) == 1
+    assert layout.width < 500
+    doors = set()
+    for (_, head), spline in zip(edges, layout.splines, strict=True):
+        x, y = layout.centres[head]
+        assert spline[-1] == pytest.approx((x, y - narrow.height / 2)), "the tip is at its top"
+        assert spline[-2][0] == pytest.approx(x), "and comes from above"
+        assert 5 < spline[-1][1] - spline[-2][1] < 12
+        doors.add(spline[-5])
+        assert not any(
+            is_in(place, vertex, boxes, layout) for place in points_on(spline) for vertex in range(2, len(boxes))
+        )
+    assert len(doors) == 1
+
+
 # -- directions -------------------------------------------------------------------------------------------------------
 
 
@@ -218,6 +395,7 @@ def lying(boxes):
 
 CASES = {
     "a block": sources_of(9, 2),
+    "a block of sinks": sinks_of(9, 2),
     "a chain with arcs": chain_with_a_shared_token(45),
     "a row": sources_of(3),
 }

@@ -2,14 +2,14 @@
 
 A function with nine hyperparameters would have them all in one row, so wide that a page shrinks the picture until
 nothing can be read. Sources that lead to exactly the same vertices stand in a block instead: a row whose edges meet
-below it, or, if that is too wide, pairs of columns, each around a lane in which their edges run down together. For
-Graphviz a block is one vertex.
+below it, or, if that is too wide, pairs of columns, each around a lane in which their edges run down together. Sinks
+that come from exactly the same vertices stand in such a block turned upside down. For Graphviz a block is one vertex.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -31,11 +31,12 @@ _COLUMN_GAP_PX: Final = 14.0
 _BEND_PX: Final = 10.0
 # Under the last row, where the lanes of a block meet.
 _MEETING_PX: Final = 18.0
+_TIP_PX: Final = 8.0
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Sources that stand together.
+    """Sources, or sinks, that stand together.
 
     Attributes
     ----------
@@ -46,7 +47,8 @@ class Block:
     offsets
         By member, from the block's centre to its own.
     ways
-        By member, from its side to the middle of the block's bottom: the control points of a spline, from the centre.
+        By member, from the block's centre: the control points of a spline from a source to the middle of the block's
+        bottom; or of one from the middle of its top to a sink, and the tip of the arrow.
     """
 
     box: Box
@@ -80,8 +82,10 @@ class Folded:
 
 
 def fold(boxes: Sequence[Box], edges: Sequence[Edge]) -> Folded:
-    """Put sources of one shape that lead to exactly the same vertices into blocks, if they are many."""
-    blocks = [_block(boxes, members) for members in _alike(boxes, edges)]
+    """Put sources, or sinks, of one shape and with exactly the same neighbours into blocks, if they are many."""
+    turned = [(head, tail) for tail, head in edges]
+    blocks = [_arranged(boxes, _rows(boxes, members)) for members in _alike(boxes, edges)]
+    blocks += [_upside_down(boxes, _rows(boxes, members)) for members in _alike(boxes, turned)]
     hidden = {member for block in blocks for member in block.members}
     left = [vertex for vertex in range(len(boxes)) if vertex not in hidden]
     place = {vertex: index for index, vertex in enumerate(left)}
@@ -118,17 +122,21 @@ def unfold(layout: Layout, graph: Folded, edges: Sequence[Edge], routed: Sequenc
             centres[member] = (x + offset[0], y + offset[1])
             ways[member] = tuple((x + dx, y + dy) for dx, dy in way)
     found = dict(zip(routed, layout.splines, strict=True))
-    splines = tuple(_joined(ways.get(edge[0], ()), found[graph.folded(edge)]) for edge in edges)
+    splines = tuple(_joined(ways.get(edge[0], ()), found[graph.folded(edge)], ways.get(edge[1], ())) for edge in edges)
     return Layout(layout.width, layout.height, tuple(centres), splines)
 
 
-def _joined(way: tuple[Point, ...], spline: tuple[Point, ...]) -> tuple[Point, ...]:
-    """Let a spline begin with the way out of the block; it starts where that ends, but for Graphviz's rounding."""
-    return (*way, *spline[1:]) if way else spline
+def _joined(out: tuple[Point, ...], spline: tuple[Point, ...], into: tuple[Point, ...]) -> tuple[Point, ...]:
+    """Let a spline begin with the way out of a block and end with that into one; they meet, but for rounding."""
+    start = (*out, *spline[1:]) if out else spline
+    return (*start[:-2], *into) if into else start
 
 
 def _alike(boxes: Sequence[Box], edges: Sequence[Edge]) -> list[tuple[int, ...]]:
-    """Return the sources that lead to the same vertices and have the same shape, where they are many."""
+    """Return the sources that lead to the same vertices and have the same shape, where they are many.
+
+    If all edges are turned, they are sinks.
+    """
     heads: dict[int, set[int]] = {}
     for tail, head in edges:
         heads.setdefault(tail, set()).add(head)
@@ -139,24 +147,13 @@ def _alike(boxes: Sequence[Box], edges: Sequence[Edge]) -> list[tuple[int, ...]]
     return [tuple(members) for members in groups.values() if len(members) > _MOST_APART]
 
 
-def _block(boxes: Sequence[Box], members: tuple[int, ...]) -> Block:
-    width = sum(boxes[member].width + _COLUMN_GAP_PX for member in members) - _COLUMN_GAP_PX
-    return _row(boxes, members, width) if width <= _ROW_PX else _columns(boxes, members)
-
-
-def _row(boxes: Sequence[Box], members: tuple[int, ...], width: float) -> Block:
-    """Arrange vertices in one row, on one line at the bottom, whose edges meet below it."""
-    tall = max(boxes[member].height for member in members)
-    bottom = (tall + _FUNNEL_PX) / 2
-    start, x = bottom - _FUNNEL_PX, -width / 2
-    offsets: list[Point] = []
-    ways: list[tuple[Point, ...]] = []
-    for member in members:
-        x += boxes[member].width / 2
-        offsets.append((x, start - boxes[member].height / 2))
-        ways.append(((x, start), (x, bottom - _FUNNEL_PX / 4), (0.0, start + _FUNNEL_PX / 4), (0.0, bottom)))
-        x += boxes[member].width / 2 + _COLUMN_GAP_PX
-    return Block(Box("box", width, 2 * bottom), members, tuple(offsets), tuple(ways))
+def _rows(boxes: Sequence[Box], members: tuple[int, ...]) -> list[tuple[int, ...]]:
+    """Return the rows of a block, as they are read; no more columns than so many rows need."""
+    if sum(boxes[member].width + _COLUMN_GAP_PX for member in members) - _COLUMN_GAP_PX <= _ROW_PX:
+        return [members]
+    most = 2 * _pairs([boxes[member] for member in members])
+    columns = -(-len(members) // -(-len(members) // most))
+    return [members[start : start + columns] for start in range(0, len(members), columns)]
 
 
 def _pairs(members: Sequence[Box]) -> int:
@@ -167,14 +164,51 @@ def _pairs(members: Sequence[Box]) -> int:
     return max(1, min(int(columns / 2), int(_MOST_BLOCK_PX / (2 * width)), -(-len(members) // 2)))
 
 
-def _columns(boxes: Sequence[Box], members: tuple[int, ...]) -> Block:
-    """Arrange vertices, row by row, in pairs of columns."""
-    pairs = _pairs([boxes[member] for member in members])
-    column = max(boxes[member].width for member in members)
-    pitch = 2 * column + _LANE_PX + _COLUMN_GAP_PX
-    rows = [members[start : start + 2 * pairs] for start in range(0, len(members), 2 * pairs)]
+def _arranged(boxes: Sequence[Box], rows: Sequence[tuple[int, ...]], tip_px: float = 0.0) -> Block:
+    """Arrange sources; or, from bottom to top, sinks, whose ways leave room for the tips of arrows."""
+    return _columns(boxes, rows, tip_px) if len(rows) > 1 else _row(boxes, rows[0], tip_px)
+
+
+def _upside_down(boxes: Sequence[Box], rows: Sequence[tuple[int, ...]]) -> Block:
+    """Arrange sinks: their edges come from the middle of the block's top."""
+    block = _arranged(boxes, rows[::-1], _TIP_PX)
+
+    def over(points: Iterable[Point]) -> tuple[Point, ...]:
+        return tuple((x, -y) for x, y in points)
+
+    ways = tuple(over((*reversed(way), _tip(*way[:2]))) for way in block.ways)
+    return Block(block.box, block.members, over(block.offsets), ways)
+
+
+def _tip(end: Point, control: Point) -> Point:
+    """Return the tip of an arrow that goes on where a way ends, from its last control point."""
+    (x, y), (dx, dy) = end, (end[0] - control[0], end[1] - control[1])
+    scale = _TIP_PX / math.hypot(dx, dy)
+    return x + dx * scale, y + dy * scale
+
+
+def _row(boxes: Sequence[Box], members: tuple[int, ...], tip_px: float) -> Block:
+    """Arrange vertices in one row, on one line at the bottom, whose edges meet below it."""
+    width = sum(boxes[member].width + _COLUMN_GAP_PX for member in members) - _COLUMN_GAP_PX
+    bottom = (max(boxes[member].height for member in members) + tip_px + _FUNNEL_PX) / 2
+    start, x = bottom - _FUNNEL_PX, -width / 2
+    offsets: list[Point] = []
+    ways: list[tuple[Point, ...]] = []
+    for member in members:
+        x += boxes[member].width / 2
+        offsets.append((x, start - tip_px - boxes[member].height / 2))
+        ways.append(((x, start), (x, bottom - _FUNNEL_PX / 4), (0.0, start + _FUNNEL_PX / 4), (0.0, bottom)))
+        x += boxes[member].width / 2 + _COLUMN_GAP_PX
+    return Block(Box("box", width, 2 * bottom), members, tuple(offsets), tuple(ways))
+
+
+def _columns(boxes: Sequence[Box], rows: Sequence[tuple[int, ...]], tip_px: float) -> Block:
+    """Arrange vertices in pairs of columns; one that is left over stands to the right of its lane."""
+    members = tuple(member for row in rows for member in row)
+    column, count = max(boxes[member].width for member in members), max(map(len, rows))
+    lanes = _lanes(count, column)
     height = sum(max(boxes[member].height for member in row) + _ROW_GAP_PX for row in rows)
-    height += _MEETING_PX if pairs > 1 else 0.0
+    height += _MEETING_PX if len(lanes) > 1 else 0.0
     offsets: list[Point] = []
     ways: list[tuple[Point, ...]] = []
     middles: list[float] = []
@@ -185,12 +219,22 @@ def _columns(boxes: Sequence[Box], members: tuple[int, ...]) -> Block:
         y += tall + _ROW_GAP_PX
     for number, row in enumerate(rows):
         for place, member in enumerate(row):
-            side = 1 if place % 2 else -1
-            lane = pitch * (place // 2 - (pairs - 1) / 2)
+            side, lane = 1 if place % 2 or place == count - 1 else -1, lanes[place // 2]
             out = lane + side * _LANE_PX / 2
             offsets.append((out + side * boxes[member].width / 2, middles[number]))
-            ways.append(_way(out, lane, middles[number:], height / 2))
-    return Block(Box("box", pitch * pairs - _COLUMN_GAP_PX, height), members, tuple(offsets), tuple(ways))
+            ways.append(_way(out - side * tip_px, lane, middles[number:], height / 2))
+    width = lanes[-1] - lanes[0] + 2 * column + _LANE_PX
+    return Block(Box("box", width, height), members, tuple(offsets), tuple(ways))
+
+
+def _lanes(columns: int, column_px: float) -> list[float]:
+    """Return where the lanes between columns are, from the middle of them all."""
+    pairs, pitch = columns // 2, 2 * column_px + _LANE_PX + _COLUMN_GAP_PX
+    lanes = [pitch * (pair - (pairs - 1) / 2) for pair in range(pairs)]
+    if columns % 2:
+        step = column_px + _LANE_PX
+        lanes = [lane - step / 2 for lane in (*lanes, lanes[-1] + step)]
+    return lanes
 
 
 def _way(side: float, lane: float, rows: Sequence[float], bottom: float) -> tuple[Point, ...]:

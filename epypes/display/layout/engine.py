@@ -23,7 +23,9 @@ _engine_lock = threading.Lock()
 
 
 def routed_layout(boxes: Sequence[Box], edges: Sequence[Edge], blocks: Collection[int]) -> Layout:
-    """Return the layout with a spline for every edge; ``blocks`` are vertices that edges leave in the middle.
+    """Return the layout with a spline for every edge; edges leave and enter ``blocks`` in the middle.
+
+    An edge into a block has no tip, since it goes on inside: its last control point stands there twice.
 
     Raises
     ------
@@ -53,8 +55,9 @@ def _dot_source(boxes: Sequence[Box], edges: Sequence[Edge], blocks: Collection[
             height=f"{box.height / _POINTS_PER_INCH:.4f}",
         )
     for tail, head in edges:
-        # The edges of a block leave it where those of its members meet.
-        dot.edge(f"v{tail}:s" if tail in blocks else f"v{tail}", f"v{head}")
+        # The edges of a block leave or enter it where those of its members meet.
+        ends = f"v{tail}:s" if tail in blocks else f"v{tail}", f"v{head}:n" if head in blocks else f"v{head}"
+        dot.edge(*ends, arrowhead="none" if head in blocks else None)
     return str(dot.source)
 
 

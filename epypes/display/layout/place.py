@@ -1,9 +1,9 @@
 """Where does each vertex and edge go?
 
 Graphviz places vertices and routes edges (``engine``), but for what it would take minutes over or make unreadable:
-many sources of the same functions (``blocks``), edges along a long chain (``arcs``), and graphs that are too dense or
-too large (``rows``). The result is kept: a run with other values, or a graph with other names of the same lengths, is
-not laid out again.
+many sources or sinks of the same functions (``blocks``), edges along a long chain (``arcs``), and graphs that are too
+dense or too large (``rows``). The result is kept: a run with other values, or a graph with other names of the same
+lengths, is not laid out again.
 """
 
 from __future__ import annotations

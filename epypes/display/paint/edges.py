@@ -38,12 +38,33 @@ def _paint_splines(splines: Iterable[tuple[Point, ...]], kind: str) -> str:
     """Paint edges as one path of curves and one of their tips; each edge is a piece of both that begins with M."""
     curves, tips = [], []
     for *spline, tip in splines:
-        curves.append(_curves(spline))
+        # What edges share is not told apart where each is painted whole.
+        curves.append(_curves(spline if kind == _OFF else _without_stops(spline)))
         tips.append(f"M{_arrow(spline[-1], tip)}Z")
     if kind == _OFF:
         # Dashes over dashes would be a line.
         curves, tips = _each_once(curves), list(dict.fromkeys(tips))
     return f'<path class="edge{kind}" d="{"".join(map(_path, curves))}"/><path class="tip{kind}" d="{"".join(tips)}"/>'
+
+
+def _without_stops(spline: Sequence[Point]) -> list[Point]:
+    """Let one curve run where several would run straight on: an edge passes many others on its way out of a block."""
+    way = list(spline[:1])
+    for first in range(0, len(spline) - 1, 3):
+        curve = spline[first : first + 4]
+        if _is_straight(way[-4:]) and _is_straight(curve) and _are_in_line(way[-4], *curve[::3]):
+            way[-2:] = curve[2:]
+        else:
+            way += curve[1:]
+    return way
+
+
+def _is_straight(curve: Sequence[Point]) -> bool:
+    return len(curve) == 4 and curve[0] == curve[1] and curve[2] == curve[3]
+
+
+def _are_in_line(*points: Point) -> bool:
+    return any(len(set(along)) == 1 for along in zip(*points, strict=True))
 
 
 def _curves(spline: Sequence[Point]) -> list[tuple[str, str]]:
