@@ -9,10 +9,15 @@ from typing import Final
 
 # detect_and_describe_features_1, of the paper's figure 13, is to fit.
 _NAME_CHARACTERS: Final = 32
+# What such a name takes at most in a page.
+_NAME_ROOM: Final = 110
 # What XML 1.0 allows; a control character or half a surrogate pair in a name would make the whole picture unreadable.
 _NOT_XML: Final = re.compile("[^\\t\\n\\r\\x20-\\ud7ff\\ue000-\\ufffd\\U00010000-\\U0010ffff]")
 
 
+# What takes more characters in a page, where a picture is part of an address: an ampersand stands there as "%26amp;".
+_LONGER: Final = {"&": 7, "<": 6, ">": 6, '"': 5, "%": 3, "#": 3}
+_LONG: Final = re.compile(r"[&<>\"%#]|[^\x20-\x7e]")
 # A quote in a text. In a page, where a picture is part of an address, it takes less room than its other name.
 QUOTE: Final = "&#34;"
 
@@ -38,6 +43,20 @@ def cut(text: str, characters: int) -> str:
     return text if len(text) <= characters else text[: characters - 1] + "…"
 
 
+def written_length(text: str) -> int:
+    """Return how many bytes a text takes in a page at most."""
+    longer = _LONG.findall(text)
+    return len(text) + sum(_LONGER.get(sign, len(sign.encode(errors="replace"))) - 1 for sign in longer)
+
+
+def fitted(text: str, room: int) -> str:
+    """Return text on one line, cut to what takes at most so many bytes in a page."""
+    text = cut(text, room)
+    while len(text) > 1 and written_length(text) > room:
+        text = cut(text, max(len(text) * room // written_length(text) - 1, 1))
+    return text
+
+
 def wrapped(text: str, characters: int, lines: int) -> tuple[str, ...]:
     """Return text on at most so many lines, each of at most so many characters."""
     beginning = cut(text[: 4 * characters * lines], 2 * characters * lines)
@@ -60,4 +79,8 @@ def cut_name(name: str, characters: int) -> str:
 
 def short_name(name: str) -> str:
     """Return a name as it stands on a vertex."""
-    return cut_name(name, _NAME_CHARACTERS)
+    short, characters = cut_name(name, _NAME_CHARACTERS), _NAME_CHARACTERS
+    while written_length(short) > _NAME_ROOM:
+        characters = characters * 3 // 4
+        short = cut_name(name, characters)
+    return short

@@ -10,7 +10,8 @@ from epypes.display.paint.page import paint_figure, paint_graph, paint_page
 from epypes.display.paint.rows import NO_REPORTS, plan_table, table_of
 from epypes.display.paint.svg import paint_svg
 from epypes.display.paint.tables import paint_table
-from epypes.display.paint.text import paint_text
+from epypes.display.paint.text import paint_text, repr_text
+from epypes.display.previews.short import reason
 from epypes.display.views.graphview import GraphView
 from epypes.display.views.times import report_times, summary_times
 from epypes.display.views.view import Shown, view
@@ -24,27 +25,28 @@ def mimebundle(shown: Any) -> dict[str, str]:
 
     Never raises: what can't be painted is shown as text, with the reason and the way out.
     """
-    return bundle_of(repr(shown), lambda: _painted(shown), lambda: view(shown))
+    return bundle_of(shown, lambda: _painted(shown), lambda: view(shown))
 
 
-def bundle_of(plain: str, paint: Callable[[], dict[str, str]], look: Callable[[], GraphView]) -> dict[str, str]:
+def bundle_of(shown: Any, paint: Callable[[], dict[str, str]], look: Callable[[], GraphView]) -> dict[str, str]:
     """Return a text and what is painted, or, where that can't be, the text with the reason.
 
     Parameters
     ----------
-    plain
-        The text.
+    shown
+        What the text is of.
     paint
         Paints the other forms.
     look
         Looks at the graph, which is shown as text where no Graphviz engine answers.
     """
+    plain = repr_text(shown)
     try:
         return {"text/plain": plain, **paint()}
     except LayoutUnavailable as error:
         return {"text/plain": f"{plain}\n{paint_text(look())}\n{error}"}
     except Exception as error:
-        return {"text/plain": f"{plain}\n(no picture: {type(error).__name__}: {error!s:.200})"}
+        return {"text/plain": f"{plain}\n(no picture: {reason(error)})"}
 
 
 def _painted(shown: Any) -> dict[str, str]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from epypes.display.paint.rows import Tabular, table_of
-from epypes.display.paint.text import text_table
+from epypes.display.paint.text import repr_text, text_table
+from epypes.display.previews.short import reason
 
 
 def to_text(shown: Tabular) -> str:
@@ -11,4 +12,4 @@ def to_text(shown: Tabular) -> str:
     try:
         return text_table(table_of(shown))
     except Exception as error:
-        return f"{shown!r}\n(no table: {type(error).__name__}: {error!s:.200})"
+        return f"{repr_text(shown)}\n(no table: {reason(error)})"

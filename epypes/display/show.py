@@ -70,7 +70,7 @@ class Figure:
         return f"<Figure: {counted(function_count(self.view), 'function')}{groups}; {self.view.direction}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        return bundle_of(repr(self), lambda: html_and_svg(self.view, self.table), lambda: self.view)
+        return bundle_of(self, lambda: html_and_svg(self.view, self.table), lambda: self.view)
 
 
 def show(

@@ -297,7 +297,7 @@ def test_a_value_whose_class_lies_can_be_run_and_shown():
 
 
 def test_graphviz_is_not_asked_for_what_would_take_it_minutes(monkeypatch):
-    monkeypatch.setattr("epypes.display.layout.engine._run_engine", lambda source: pytest.fail("asked"))
+    monkeypatch.setattr("epypes.display.layout.engine._dot_source", lambda *graph: pytest.fail("asked"))
     sources = tuple(f"s{index}" for index in range(100))
     io = {f"f{index}": (sources, f"t{index}") for index in range(100)}
     svg = to_svg(ep.CompGraph(dict.fromkeys(io, lambda *xs: 1), io))

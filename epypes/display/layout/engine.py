@@ -7,6 +7,7 @@ Graphviz inside its wheel; where it is missing, ``dot`` on the PATH serves.
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import threading
@@ -22,6 +23,16 @@ _DOT_TIMEOUT_S: Final = 30.0
 _engine_lock = threading.Lock()
 
 
+def _renew_lock() -> None:
+    """Forget a lock that another thread of the parent process held, and will never release here."""
+    global _engine_lock
+    _engine_lock = threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_renew_lock)
+
+
 def routed_layout(boxes: Sequence[Box], edges: Sequence[Edge], blocks: Collection[int]) -> Layout:
     """Return the layout with a spline for every edge; edges leave and enter ``blocks`` in the middle.
 
@@ -32,7 +43,13 @@ def routed_layout(boxes: Sequence[Box], edges: Sequence[Edge], blocks: Collectio
     LayoutUnavailable
         No engine answered.
     """
-    return _read(json.loads(_run_engine(_dot_source(boxes, edges, blocks))), len(boxes), edges)
+    source, tried = _dot_source(boxes, edges, blocks), []
+    for name, engine in (("pygraphviz", _pygraphviz), ("dot on the PATH", _dot_on_path)):
+        try:
+            return _read(json.loads(engine(source)), len(boxes), edges)
+        except Exception as error:  # an engine that is broken is as good as none
+            tried.append(f"{name} ({type(error).__name__}: {error!s:.200})")
+    raise LayoutUnavailable(tried)
 
 
 def _dot_source(boxes: Sequence[Box], edges: Sequence[Edge], blocks: Collection[int]) -> str:
@@ -59,16 +76,6 @@ def _dot_source(boxes: Sequence[Box], edges: Sequence[Edge], blocks: Collection[
         ends = f"v{tail}:s" if tail in blocks else f"v{tail}", f"v{head}:n" if head in blocks else f"v{head}"
         dot.edge(*ends, arrowhead="none" if head in blocks else None)
     return str(dot.source)
-
-
-def _run_engine(source: str) -> str:
-    tried: list[str] = []
-    for name, engine in (("pygraphviz", _pygraphviz), ("dot on the PATH", _dot_on_path)):
-        try:
-            return engine(source)
-        except (ImportError, OSError, subprocess.SubprocessError) as error:
-            tried.append(f"{name} ({error})")
-    raise LayoutUnavailable(tried)
 
 
 def _pygraphviz(source: str) -> str:

@@ -57,9 +57,10 @@ def paint_function(function: FunctionView, box: Box, centre: Point, direction: D
     if function.state == "ran":
         body += _time_bar(function, box, centre, direction)
     body += text_lines(_function_lines(function), centre)
-    said = "; ".join(filter(None, (*_said_state(function), *function.notes, function.message[:_TOLD_CHARACTERS])))
+    said = "; ".join(filter(None, (*_said_state(function), *function.notes, function.message)))
     title = f"{function.kind} {cut_name(function.name, TITLE_CHARACTERS)}: {said}"
-    return vertex("function", function.name, _classes(function), title, body)
+    more = _TOLD_CHARACTERS if function.state == "failed" else 0
+    return vertex("function", function.name, _classes(function), title, body, more=more)
 
 
 def _function_lines(function: FunctionView) -> tuple[str, ...]:

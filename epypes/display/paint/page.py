@@ -15,7 +15,7 @@ from importlib import resources
 from typing import Any, Final
 
 from epypes.display.limits import CHARACTERS, CHARACTERS_OF_A_VERTEX, THUMBNAIL_CHARACTERS
-from epypes.display.markup import QUOTE, content, cut, escape
+from epypes.display.markup import QUOTE, content, cut, escape, fitted
 from epypes.display.paint.style import PAGE_STYLE
 from epypes.display.paint.svg import alt_text, least_width, paint_svg
 from epypes.display.paint.tables import paint_twin
@@ -23,6 +23,7 @@ from epypes.display.views.graphview import FunctionView, GraphView
 from epypes.display.views.groups import counted, function_count
 
 _NAMED_CHARACTERS: Final = 200
+_CAPTION_ROOM: Final = 1_500
 # A twin without rows.
 _TWIN_CHARACTERS: Final = len(paint_twin(GraphView((), (), ()), "", 0))
 
@@ -50,7 +51,8 @@ def paint_figure(svg: str, alt: str, caption: str = "") -> str:
     source = source.replace('"', "'").replace(QUOTE, '"')
     for sign, encoded in _IN_URI.items():
         source = source.replace(sign, encoded)
-    below = f'<figcaption style="font-size:12px">{content(caption)}</figcaption>' if caption else ""
+    told = content(fitted(caption, _CAPTION_ROOM))
+    below = f'<figcaption style="font-size:12px">{told}</figcaption>' if caption else ""
     return (
         f'<figure class="epypes-figure" style="margin:0"><div style="overflow-x:auto">'
         f'<img src="{_SVG_URI}{source}" alt="{escape(alt)}" style="max-width:100%;min-width:{least_width(svg)}px">'
@@ -101,8 +103,8 @@ def _told(figure: str, graph: GraphView, room: int) -> str:
 
 
 def _inside(name: str, graph: GraphView, figure: str) -> str:
-    summary = f"<summary>{content(cut(name, _NAMED_CHARACTERS))}: {counted(len(graph.functions), 'function')}</summary>"
-    return f'<details class="epypes-inside" data-group="{escape(name)}">{summary}{figure}</details>'
+    told = f"{content(fitted(name, _NAMED_CHARACTERS))}: {counted(len(graph.functions), 'function')}"
+    return f'<details class="epypes-inside" data-group="{escape(name)}"><summary>{told}</summary>{figure}</details>'
 
 
 def _left_out(names: Sequence[str]) -> Iterator[str]:
@@ -172,7 +174,8 @@ def _data(graph: GraphView, kept: Texts) -> str:
         for place, function in enumerate(graph.functions)
     ]
     groups = {place: function.name for place, function in enumerate(graph.functions) if function.kind == "group"}
-    data = {"io": list(_io(graph)), "groups": groups, "about": about, "texts": list(kept)}
+    io = list(_io(graph)) if graph.draws_edges else []
+    data = {"io": io, "groups": groups, "about": about, "texts": list(kept)}
     return f'<script type="application/json" class="epypes-data">{_json(data)}</script>'
 
 

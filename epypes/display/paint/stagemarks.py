@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from typing import Final
 
 from epypes.display.layout.geometry import Point
@@ -15,6 +16,8 @@ _LOOP_PX: Final = 24
 _SLOT_PX: Final = 7
 _NOTE_CHARACTERS: Final = 30
 _NOTE_LINES: Final = 2
+_MOST_LINES: Final = 8
+_TOLD_CHARACTERS: Final = 300
 # Counts grow while somebody looks: a few digits more are not to move anything.
 _WIDTH_STEP: Final = 4
 _WORDS: Final = {
@@ -49,12 +52,12 @@ def paint_stage(stage: StageView, size: tuple[float, float], centre: Point) -> s
     body += text_lines(_lines(stage), (middle, centre[1]))
     kind = "call" if stage.kind == "function" else stage.kind
     title = f"{stage.kind} {stage.name}: {'; '.join(stage_words(stage))}"
-    return vertex("stage", stage.name, (kind, stage.state), title[:600], body)
+    return vertex("stage", stage.name, (kind, stage.state), title, body, more=_TOLD_CHARACTERS)
 
 
 def _lines(stage: StageView) -> tuple[str, ...]:
     words = (line for said in stage_words(stage) for line in wrapped(said, _NOTE_CHARACTERS, _NOTE_LINES))
-    return short_name(stage.name), *words
+    return short_name(stage.name), *islice(words, _MOST_LINES)
 
 
 def _queue(x: float, y: float, width: float, height: float) -> tuple[str, float]:

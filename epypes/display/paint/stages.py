@@ -11,13 +11,14 @@ from statistics import fmean
 from typing import Final
 
 from epypes.display.layout.geometry import Layout, Point
-from epypes.display.markup import content, short_name
+from epypes.display.markup import content, fitted, short_name
 from epypes.display.paint.marks import LINE_PX, text_width
 from epypes.display.paint.stagemarks import paint_stage, stage_size
 from epypes.display.views.graphview import GraphView, StageView
 
 _PADDING_PX: Final = 16.0
 _TITLE_PX: Final = 22.0
+_TITLE_ROOM: Final = 600
 # Between stages, and between them and the frame.
 _GAP_PX: Final = 26.0
 _TIP_PX: Final = 8.0
@@ -89,9 +90,10 @@ def _paint_frame(title: str, frame: Bounds, label: Bounds) -> Iterator[str]:
     )
     if title:
         width, left = label.right - label.left, label.left
+        told = content(fitted(f"pipeline {title}", _TITLE_ROOM))
         yield (
-            f'<g class="label"><title>{content(f"pipeline {title}"[:600])}</title><rect class="shape" x="{left:.1f}" '
-            f'y="{label.top:.1f}" width="{width:.1f}" height="{_TITLE_PX:.0f}" rx="5"/>'
+            f'<g class="label"><title>{told}</title><rect class="shape" x="{left:.1f}" y="{label.top:.1f}" '
+            f'width="{width:.1f}" height="{_TITLE_PX:.0f}" rx="5"/>'
             f'<text class="name" x="{left + width / 2:.1f}" y="{frame.top + LINE_PX / 4:.1f}">'
             f"{content(short_name(title))}</text></g>"
         )

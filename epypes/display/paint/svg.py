@@ -6,12 +6,13 @@ without a new layout, and colours follow the page's theme.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from typing import Final
 
 from epypes.display.layout.geometry import Box, Layout
 from epypes.display.layout.place import lay_out
-from epypes.display.markup import escape, short_name
+from epypes.display.markup import escape, fitted, short_name
 from epypes.display.paint.edges import paint_edges
 from epypes.display.paint.functionmarks import function_box, paint_function
 from epypes.display.paint.stages import paint_around
@@ -24,9 +25,12 @@ from epypes.display.views.groups import counted, function_count
 # Graphviz minutes and would fill the picture.
 _MANY_EDGES: Final = 150
 _DENSE: Final = 1.6
+_CAPTION_ROOM: Final = 400
 _MARGIN: Final = 6
 # A page may shrink a picture that is too wide to this part of its size; smaller, its text could not be read, so it
 # is scrolled.
+# No text in an attribute has a quote of its own.
+_LEAST_WIDTH: Final = re.compile('" style="min-width:([0-9]+)px">')
 _LEAST_SCALE: Final = 0.75
 
 
@@ -59,15 +63,17 @@ def paint_svg(graph: GraphView) -> str:
         f'style="min-width:{_LEAST_SCALE * width:.0f}px">'
     )
     parts = [head, f"<style>{STYLE}</style>", *around]
-    parts += paint_edges(graph.edges, edges, layout)
+    if graph.draws_edges:
+        parts += paint_edges(graph.edges, edges, layout)
     parts += _paint_vertices(graph, boxes, layout)
     parts.append("</svg>")
     return "\n".join(parts)
 
 
 def least_width(svg: str) -> str:
-    """Return the width in pixels that a painted graph asks for at least."""
-    return svg.partition("min-width:")[2].partition("px")[0]
+    """Return the width in pixels that a painted graph asks for at least; 0 if it does not ask."""
+    found = _LEAST_WIDTH.search(svg)
+    return found[1] if found else "0"
 
 
 def alt_text(graph: GraphView) -> str:
@@ -75,7 +81,7 @@ def alt_text(graph: GraphView) -> str:
     order = ", ".join(short_name(function.name) for function in graph.functions[:12])
     more = ", ..." if len(graph.functions) > 12 else ""
     functions = counted(function_count(graph), "function")
-    said = f"Computational graph of {functions}: {order}{more}. {graph.caption}".strip()
+    said = f"Computational graph of {functions}: {order}{more}. {fitted(graph.caption, _CAPTION_ROOM)}".strip()
     if not graph.title:
         return said
     stages = [short_name(stage.name) for stage in graph.before] + ["the graph"] * bool(graph.before or graph.after)

@@ -6,13 +6,14 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from epypes.display.durations import duration_text
-from epypes.display.markup import content, cut, cut_name
+from epypes.display.markup import content, cut, cut_name, fitted
 from epypes.display.paint.rows import Table
 from epypes.display.paint.stagemarks import stage_words
 from epypes.display.views.graphview import FunctionView, GraphView, StageView, TokenView
 
 _LEFT: Final = ' style="text-align:left"'
 CELL_CHARACTERS: Final = 60
+_CELL_ROOM: Final = 100
 _TWIN_CHARACTERS: Final = 200
 # What is kept for saying how many rows do not fit.
 _LAST_ROW: Final = 60
@@ -72,8 +73,12 @@ def _stage_cells(stage: StageView) -> tuple[str, ...]:
 def paint_table(table: Table) -> str:
     """Write a table; what holds words stands to the left, where JupyterLab has everything to the right."""
     above = f"<caption>{content(table.caption)}</caption>" if table.caption else ""
-    lines = (_row("td", [content(cut(cell, CELL_CHARACTERS)) for cell in cells], table.texts) for cells in table.rows)
+    lines = (_row("td", list(map(_cell, cells)), table.texts) for cells in table.rows)
     return f"<table>{above}{_row('th', table.head, table.texts)}{''.join(lines)}</table>"
+
+
+def _cell(text: str) -> str:
+    return content(fitted(cut(text, CELL_CHARACTERS), _CELL_ROOM))
 
 
 def _row(tag: str, cells: Sequence[str], texts: int) -> str:

@@ -7,9 +7,11 @@ from epypes.display.markup import cut
 from epypes.display.paint.rows import Table
 from epypes.display.paint.stagemarks import stage_words
 from epypes.display.paint.tables import CELL_CHARACTERS
+from epypes.display.previews.short import reason
 from epypes.display.views.graphview import FunctionView, GraphView, StageView
 
 _MOST_LINES = 40
+_REPR_CHARACTERS = 99
 _STATES = {
     "planned": "[to run]",
     "reused": "[reused]",
@@ -72,3 +74,11 @@ def _state(function: FunctionView) -> str:
     if function.duration_ns is not None:
         return f"[{duration_text(function.duration_ns)}]"
     return _STATES.get(function.state, "")
+
+
+def repr_text(shown: object) -> str:
+    """Return the repr of what is shown, which in a subclass may be of any length, or raise."""
+    try:
+        return cut(repr(shown), _REPR_CHARACTERS)
+    except Exception as error:
+        return f"<{type(shown).__name__}: no repr: {reason(error)}>"

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from epypes.display.layout.geometry import Point
+from epypes.display.markup import escape
 from epypes.display.previews.raster import Picture
 from epypes.display.previews.shown import Chart, Preview
 
@@ -30,7 +31,7 @@ def _picture(picture: Picture, top: Point) -> str:
     data = base64.b64encode(picture.data).decode()
     return (
         f'<image x="{top[0] - width / 2:.1f}" y="{top[1] + (THUMB_HEIGHT - height) / 2:.1f}" width="{width:.1f}" '
-        f'height="{height:.1f}" href="data:{picture.media_type};base64,{data}"/>'
+        f'height="{height:.1f}" href="data:{escape(picture.media_type)};base64,{data}"/>'
     )
 
 

@@ -10,7 +10,7 @@ import re
 from typing import Final
 
 from epypes.display.layout.geometry import Box, Point
-from epypes.display.markup import content, cut, cut_name, short_name
+from epypes.display.markup import content, cut, cut_name, fitted, short_name, written_length
 from epypes.display.paint.marks import LINE_PX, TITLE_CHARACTERS, text_lines, text_width, vertex
 from epypes.display.paint.thumbnails import THUMB_HEIGHT, THUMB_WIDTH, paint_thumbnail
 from epypes.display.previews.short import float_text
@@ -19,6 +19,7 @@ from epypes.display.views.graphview import TokenView
 _ROW_PX: Final = 13
 _ROWS: Final = 4
 _ROW_CHARACTERS: Final = 26
+_ROW_ROOM: Final = 50
 # What a row of 10 px monospace text takes.
 _ROWS_WIDTH: Final = _ROW_CHARACTERS * 6.1
 _SECOND_LINE_CHARACTERS: Final = 24
@@ -51,12 +52,15 @@ def token_box(token: TokenView) -> Box:
 def paint_token(token: TokenView, box: Box, centre: Point) -> str:
     """Paint a token as an element with its title."""
     x, y = centre[0] - box.width / 2, centre[1] - box.height / 2
+    thumbnail = ""
     if box.shape == "box":
         body = (
             f'<rect class="shape" x="{x:.0f}" y="{y:.0f}" width="{box.width:.0f}" height="{box.height:.0f}" rx="10"/>'
         )
         body += text_lines((short_name(token.name), _second(token)), (centre[0], y + LINE_PX + 4))
-        body += _inside(token, box, (centre[0], y + 2 * LINE_PX + 8))
+        top = centre[0], y + 2 * LINE_PX + 8
+        thumbnail, rows = _inside(token, box, top)
+        body += rows
     elif box.shape == "hexagon":
         body = f'<polygon class="shape" points="{_hexagon(x, y, box)}"/>' + text_lines(_token_lines(token), centre)
     else:
@@ -71,7 +75,7 @@ def paint_token(token: TokenView, box: Box, centre: Point) -> str:
         body += f'<circle class="dot" cx="{x + box.width - 11:.0f}" cy="{y + 3:.0f}" r="3.5"/>'
         state += f", first {token.first}"
     states = (token.role, token.state, *(("changed",) if token.first else ()))
-    return vertex("token", token.name, states, _title(token, state), body)
+    return vertex("token", token.name, states, _title(token, state), body, thumbnail)
 
 
 def _kind(token: TokenView) -> str:
@@ -85,18 +89,23 @@ def _kind(token: TokenView) -> str:
     return "rows" if shown is not None and shown.rows and not is_hidden else "text"
 
 
-def _inside(token: TokenView, box: Box, top: Point) -> str:
+def _inside(token: TokenView, box: Box, top: Point) -> tuple[str, str]:
     """Paint the thumbnail or the rows of a token below its two lines."""
     if token.preview is None:
-        return ""
+        return "", ""
     if _kind(token) == "thumbnail":
-        return paint_thumbnail(token.preview, top)
+        return paint_thumbnail(token.preview, top), ""
     left = top[0] - box.width / 2 + 8
-    return "".join(
-        f'<text class="row" x="{left:.0f}" y="{top[1] + row * _ROW_PX + 8:.0f}">'
-        f"{content(text[:_ROW_CHARACTERS])}</text>"
+    return "", "".join(
+        f'<text class="row" x="{left:.0f}" y="{top[1] + row * _ROW_PX + 8:.0f}">{content(_fitted_row(text))}</text>'
         for row, text in enumerate(token.preview.rows[:_ROWS])
     )
+
+
+def _fitted_row(text: str) -> str:
+    """Return a row with its blanks, which keep columns apart, in what it may take."""
+    text = text[:_ROW_CHARACTERS]
+    return text if written_length(text) <= _ROW_ROOM else fitted(text, _ROW_ROOM)
 
 
 def _token_lines(token: TokenView) -> tuple[str, ...]:

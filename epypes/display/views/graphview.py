@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 from epypes.display.layout.geometry import Direction as Direction
 from epypes.display.previews.shown import Preview
 from epypes.images import Order
+
+# For each vertex.
+_MOST_EDGES: Final = 10
 
 TokenRole = Literal["payload", "hyperparameter"]
 TokenState = Literal["static", "not computed", "fresh", "stale", "missing", "left out"]
@@ -138,6 +141,11 @@ class GraphView:
     after: tuple[StageView, ...] = ()
     groups: tuple[GroupView, ...] = ()
     direction: Direction = "down"
+
+    @property
+    def draws_edges(self) -> bool:
+        """Whether its edges can be seen; of too many, nobody sees one."""
+        return len(self.edges) <= _MOST_EDGES * (len(self.functions) + len(self.tokens))
 
     def io(self) -> list[tuple[list[str], list[str]]]:
         """Return by function, in order, the names of its input and of its output tokens."""

@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any, Final
 
+from epypes.display.markup import short_name
 from epypes.display.previews.preview import preview
 from epypes.display.views.graphview import GraphView, TokenView
 from epypes.display.views.structure import with_caption
@@ -24,7 +25,8 @@ def with_running(graph: GraphView, running: Collection[str]) -> GraphView:
         else function
         for function in graph.functions
     )
-    named = ", ".join(list(running)[:_NAMED]) + f" and {len(running) - _NAMED} more" * (len(running) > _NAMED)
+    more = f" and {len(running) - _NAMED} more" * (len(running) > _NAMED)
+    named = ", ".join(map(short_name, list(running)[:_NAMED])) + more
     return replace(graph, functions=functions, caption=with_caption(f"running: {named}", graph))
 
 

@@ -59,7 +59,7 @@ def view(
     UnknownName
         There is no such group.
     """
-    _require_options(direction, thumbnails)
+    _require_options(direction, thumbnails, collapse)
     cg = _graph_of(shown)
     groups = groups_of(cg.functions, cg.groups)
     opened = names_of("open", open)
@@ -69,23 +69,31 @@ def view(
     closed = {name: inside for name, inside in groups.items() if collapse and name not in opened}
     characters = THUMBNAIL_CHARACTERS - CHARACTERS_OF_A_VERTEX * twice_seen(cg, closed)
     whole = _whole(shown, Room(thumbnails, max(characters, _LEAST_CHARACTERS)), closed)
-    return collapsed(replace(whole, direction=direction), closed)
+    graph = collapsed(replace(whole, direction=direction), closed)
+    if graph.draws_edges:
+        return graph
+    return replace(graph, caption=with_caption(f"{len(graph.edges):,} edges, too many to be drawn", graph))
 
 
-def _require_options(direction: object, thumbnails: object) -> None:
-    if direction not in get_args(Direction):
-        raise ValueError(f'direction must be "down" or "right", not {direction!r}.')
+def _require_options(direction: object, thumbnails: object, collapse: object) -> None:
+    if not isinstance(direction, str) or direction not in get_args(Direction):
+        raise ValueError(f'direction must be "down" or "right", not {direction!r:.60}.')
     if isinstance(thumbnails, bool) or not isinstance(thumbnails, int):
-        raise TypeError(f"thumbnails must be a number, of how many there are at most, not {thumbnails!r}.")
+        raise TypeError(f"thumbnails must be a number, of how many there are at most, not {thumbnails!r:.60}.")
     if thumbnails < 0:
         raise ValueError(f"thumbnails must be 0 or more, not {thumbnails}.")
+    if not isinstance(collapse, bool):
+        raise TypeError(f"collapse must be True or False, not {collapse!r:.60}; open=[...] names groups.")
 
 
 def _graph_of(shown: Any) -> CompGraph:
     """Return the graph of what is shown; raise TypeError if it can't be shown."""
     if isinstance(shown, CompGraph):
         return shown
-    runner = shown if isinstance(shown, CompGraphRunner | Run | Plan) else getattr(shown, "runner", None)
+    try:
+        runner = shown if isinstance(shown, CompGraphRunner | Run | Plan) else getattr(shown, "runner", None)
+    except Exception:  # the attribute may be anything of anybody's
+        runner = None
     if not isinstance(runner, CompGraphRunner | Run | Plan) or isinstance(shown, type):
         text = "What can be shown is a CompGraph, a CompGraphRunner, a Run, a Plan or a Pipeline"
         raise TypeError(f"{text}, not {type(shown).__name__!r}.")
