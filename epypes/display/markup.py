@@ -43,10 +43,15 @@ def cut(text: str, characters: int) -> str:
     return text if len(text) <= characters else text[: characters - 1] + "…"
 
 
+def size(text: str) -> int:
+    """Return how many bytes a text takes in a file."""
+    return len(text) if text.isascii() else len(text.encode())
+
+
 def written_length(text: str) -> int:
     """Return how many bytes a text takes in a page at most."""
     longer = _LONG.findall(text)
-    return len(text) + sum(_LONGER.get(sign, len(sign.encode(errors="replace"))) - 1 for sign in longer)
+    return len(text) + sum(_LONGER.get(sign, size(_allowed(sign))) - 1 for sign in longer)
 
 
 def fitted(text: str, room: int) -> str:

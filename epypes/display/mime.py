@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from epypes.display.markup import size
 from epypes.display.paint.bars import paint_bars, times_alt_text
 from epypes.display.paint.page import paint_figure, paint_graph, paint_page
 from epypes.display.paint.rows import NO_REPORTS, plan_table, table_of
@@ -82,7 +83,7 @@ def html_and_svg(graph: GraphView, below: str = "") -> dict[str, str]:
         No Graphviz engine answered.
     """
     svg = paint_svg(graph)
-    return {"text/html": paint_page(*paint_graph(graph, svg, len(below)), below), "image/svg+xml": svg}
+    return {"text/html": paint_page(*paint_graph(graph, svg, size(below)), below), "image/svg+xml": svg}
 
 
 def to_svg(shown: Shown) -> str:

@@ -60,8 +60,8 @@ class Figure:
         elif path.suffix == ".json":
             text = json.dumps(to_json(self.view))
         else:
-            way_out = " A browser prints the .html as PDF." if path.suffix == ".pdf" else ""
-            raise ValueError(f"save() writes .svg, .html and .json, not {path.name!r}.{way_out}")
+            way_out = "A browser opens .svg and .html, and prints them as PDF or saves them as pictures."
+            raise ValueError(f"save() writes .svg, .html and .json, not {path.name!r}. {way_out}")
         path.write_text(text, encoding="utf-8")
         return path
 

@@ -152,7 +152,7 @@ def test_the_card_goes_with_the_pointer_and_with_escape(sheet: Sheet, edges: str
     sheet.page.mouse.move(1190, 10)
     assert not sheet.has_card
     sheet.page.keyboard.press("Tab")
-    assert sheet.card[0] == "function grayscale"
+    assert sheet.card[0] == "token image"
     sheet.page.keyboard.press("Escape")
     assert not sheet.has_card
 
@@ -243,6 +243,34 @@ def test_a_function_whose_source_did_not_fit_says_so(sheet: Sheet) -> None:
     assert "source left out to keep the picture small" in sheet.about
 
 
+def test_a_panel_that_would_stand_out_of_sight_stands_at_the_edge_of_the_window(sheet: Sheet, edges: str) -> None:
+    sheet.put(edges + "<div style='height:5000px'></div>")
+    window = {"width": 900, "height": 300}
+    sheet.page.set_viewport_size(window)
+    sheet.page.click("#function-grayscale")
+    panel = sheet.page.locator(".epypes-about")
+    panel.wait_for(state="visible")
+    box = panel.bounding_box()
+    assert box["y"] + box["height"] <= window["height"]
+    assert "cvtColor" in sheet.about
+    sheet.page.evaluate("scrollTo(0, 4000)")
+    panel.wait_for(state="hidden")
+    sheet.page.evaluate("scrollTo(0, 0)")
+    panel.wait_for(state="visible")
+    sheet.page.keyboard.press("Escape")
+    panel.wait_for(state="hidden")
+    sheet.page.set_viewport_size({"width": 900, "height": 3000})
+    sheet.page.click("#function-grayscale")
+    assert panel.bounding_box()["y"] > sheet.page.locator("figure svg").first.bounding_box()["height"], "below it"
+
+
+def test_a_still_picture_says_how_it_comes_alive(sheet: Sheet, edges: str) -> None:
+    sheet.put(edges)
+    assert "Trust the notebook" not in sheet.page.inner_text("body")
+    sheet.put(re.sub(r"(?s)<script\b.*?</script>", "", edges))
+    assert "Trust the notebook" in sheet.page.inner_text("body")
+
+
 def test_choosing_a_group_opens_what_is_inside_it(sheet: Sheet) -> None:
     cg = ep.group(ep.group(edge_runner().cg, "before <it>", ["grayscale", "blur"]), "after", ["canny"])
     sheet.put(mimebundle(cg)["text/html"])
@@ -260,13 +288,17 @@ def test_choosing_a_group_opens_what_is_inside_it(sheet: Sheet) -> None:
 # -- keyboard and screen reader ---------------------------------------------------------------------------------------
 
 
-def test_the_keyboard_reaches_functions_in_run_order_and_does_what_the_mouse_does(sheet: Sheet, edges: str) -> None:
+def test_the_keyboard_goes_as_the_data_flows_and_does_what_the_mouse_does(sheet: Sheet, edges: str) -> None:
     sheet.put(edges)
     reached = []
-    for _ in range(4):
+    for _ in range(9):
         sheet.page.keyboard.press("Tab")
         reached.append(sheet.focused())
-    assert reached == ["function-grayscale", "function-blur", "function-canny", "token-image"]
+    assert reached == [
+        "token-image", "function-grayscale", "token-image_gray", "token-blur_kernel", "function-blur",
+        "token-image_blurred", "token-canny_lo", "token-canny_hi", "function-canny",
+    ]  # fmt: skip
+    sheet.page.keyboard.press("Tab")
     assert "fresh" in sheet.card
     ring = "document.activeElement.matches(':focus-visible') && getComputedStyle(document.activeElement).outlineStyle"
     assert sheet.page.evaluate(ring) == "solid"
@@ -342,6 +374,7 @@ def test_a_picture_that_is_taken_away_and_put_back_shows_its_card_again(sheet: S
 
 def test_the_card_follows_its_vertex_when_the_page_scrolls(sheet: Sheet, edges: str) -> None:
     sheet.put(edges)
+    sheet.page.keyboard.press("Tab")
     sheet.page.keyboard.press("Tab")
     beside = """() => {
         const [card, vertex] = ['.epypes-card', '#function-grayscale']

@@ -37,6 +37,7 @@
 
   function enliven(figure) {
     figure.dataset.alive = "";
+    figure.querySelector(".epypes-still")?.remove();
     const image = figure.querySelector("img");
     const svg = image && inlined(image);
     const data = figure.querySelector("script.epypes-data");
@@ -49,12 +50,14 @@
     const labels = vertices.map(labelled);
     const edges = edgesOf(svg, data.io, functions.length);
     const way = draw("path", "way"), head = draw("path", "head");
-    vertices[0]?.before(way, head);
+    // In this order the Tab key goes through them: as the data flows.
+    svg.append(way, head, ...flow(data.io, functions.length, vertices.length).map((place) => vertices[place]));
     const card = make("div", "epypes-card"), about = make("div", "epypes-about");
     card.setAttribute("popover", "manual");
     card.setAttribute("aria-hidden", "true");
     about.setAttribute("aria-live", "polite");
     (figure.querySelector("figcaption") ?? figure.lastChild).after(about, card);
+    const dock = docked(about, figure);
     const placeOf = (target) => vertices.indexOf(target?.closest?.(VERTEX));
     let near = -1, chosen = -1, frame = 0;
 
@@ -87,6 +90,7 @@
       way.setAttribute("d", (kin?.edges ?? []).map((edge) => edge.line).join(""));
       head.setAttribute("d", (kin?.edges ?? []).map((edge) => edge.tip).join(""));
       about.replaceChildren(...(chosen < 0 ? [] : story(labels[chosen], data, chosen, functions.length)));
+      dock();
       if (chosen >= 0) openInside(figure, data.groups?.[chosen]);
     }
 
@@ -108,6 +112,35 @@
         choose(place);
       }
     });
+  }
+
+  function flow(io, functions, count) {
+    const order = new Set();
+    io.forEach(([inputs, outputs], place) => {
+      const at = (token) => functions + (token < 0 ? ~token : token);
+      for (const each of [...inputs.map(at), place, ...outputs.map(at)]) order.add(each);
+    });
+    for (let place = 0; place < count; place++) order.add(place);
+    return [...order];
+  }
+
+  // Below a large picture nobody would see the panel: then it stands at the lower edge of the window, while the figure
+  // is to be seen. Gives a function that is called when what is in the panel has changed.
+  function docked(panel, figure) {
+    if (!panel.togglePopover) return () => {};
+    const watch = new IntersectionObserver(([entry]) => {
+      if (panel.isConnected && panel.hasAttribute("popover")) panel.togglePopover(entry.isIntersecting);
+    });
+    return () => {
+      watch.disconnect();
+      panel.removeAttribute("popover");
+      if (!panel.firstChild || panel.getBoundingClientRect().bottom <= innerHeight) return;
+      const at = figure.getBoundingClientRect();
+      panel.style.left = `${Math.max(GAP, at.left)}px`;
+      panel.style.width = `${Math.min(at.width, innerWidth - 2 * GAP)}px`;
+      panel.setAttribute("popover", "manual");
+      watch.observe(figure);
+    };
   }
 
   // A title would show a second, slower card; what it says becomes the vertex's name. JupyterLab takes keys for its
@@ -184,7 +217,7 @@
   function story(label, data, place, functions) {
     const [name, rest] = parts(label);
     const [signature, source] = (place < functions && data.texts[data.about[place]]) || ["", ""];
-    const made = [make("b", "", name), make("code", "", signature), make("div", "", rest)];
+    const made = [make("b", "", name), ...(signature ? [make("code", "", signature)] : []), make("div", "", rest)];
     if (source) {
       made.push(make("pre", "", source));
       made.at(-1).tabIndex = 0;

@@ -13,6 +13,7 @@ from epypes.display.views.graphview import FunctionView
 _MESSAGE_CHARACTERS: Final = 36
 _MESSAGE_LINES: Final = 3
 _REASON_CHARACTERS: Final = 30
+_REASON_LINES: Final = 2
 # A switch is drawn like a multiplexer, narrower at its output, by this much on each side.
 _SLOPE_PX: Final = 14
 # In a picture from left to right, where its height matters, by less.
@@ -77,7 +78,7 @@ def _state_line(function: FunctionView) -> tuple[str, ...]:
     if function.state == "failed":
         return ("failed", *wrapped(function.message, _MESSAGE_CHARACTERS, _MESSAGE_LINES))
     if function.state == "planned":
-        return "to run", cut_name(function.message, _REASON_CHARACTERS)
+        return "to run", *wrapped(function.message, _REASON_CHARACTERS, _REASON_LINES)
     return (function.state,)
 
 

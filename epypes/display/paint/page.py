@@ -15,7 +15,7 @@ from importlib import resources
 from typing import Any, Final
 
 from epypes.display.limits import CHARACTERS, CHARACTERS_OF_A_VERTEX, THUMBNAIL_CHARACTERS
-from epypes.display.markup import QUOTE, content, cut, escape, fitted
+from epypes.display.markup import QUOTE, content, cut, escape, fitted, size
 from epypes.display.paint.style import PAGE_STYLE
 from epypes.display.paint.svg import alt_text, least_width, paint_svg
 from epypes.display.paint.tables import paint_twin
@@ -24,8 +24,10 @@ from epypes.display.views.groups import counted, function_count
 
 _NAMED_CHARACTERS: Final = 200
 _CAPTION_ROOM: Final = 1_500
-# A twin without rows.
-_TWIN_CHARACTERS: Final = len(paint_twin(GraphView((), (), ()), "", 0))
+# Taken away by the script.
+_STILL: Final = '<p class="epypes-still" style="font-size:12px"><i>Trust the notebook to explore this picture.</i></p>'
+# A twin without rows, and what stands beside it.
+_TWIN_CHARACTERS: Final = len(paint_twin(GraphView((), (), ()), "", 0)) + len(_STILL)
 
 _SVG_URI: Final = "data:image/svg+xml,"
 # What would end the attribute, the address or a line of it; all else may stand as it is, in any language.
@@ -54,7 +56,7 @@ def paint_figure(svg: str, alt: str, caption: str = "") -> str:
     told = content(fitted(caption, _CAPTION_ROOM))
     below = f'<figcaption style="font-size:12px">{told}</figcaption>' if caption else ""
     return (
-        f'<figure class="epypes-figure" style="margin:0"><div style="overflow-x:auto">'
+        f'<figure class="epypes-figure" style="margin:0"><div style="overflow-x:auto;scrollbar-width:thin">'
         f'<img src="{_SVG_URI}{source}" alt="{escape(alt)}" style="max-width:100%;min-width:{least_width(svg)}px">'
         f"</div>{below}{_END}"
     )
@@ -75,11 +77,11 @@ def paint_graph(graph: GraphView, svg: str, taken: int = 0) -> list[str]:
     """
     names = [group.name for group in graph.groups]
     pictures = [(graph, svg), *((group.graph, paint_svg(group.graph)) for group in graph.groups)]
-    room = _room_of(pictures) - taken - len("".join(_left_out(names)))
+    room = _room_of(pictures) - taken - size("".join(_left_out(names)))
     bare: list[str] = []
     for name, (part, picture) in zip(("", *names), pictures, strict=True):
         figure = paint_figure(picture, alt_text(part), part.caption)
-        least = len(_inside(name, part, figure) if bare else figure) + len(_data(part, {})) + _TWIN_CHARACTERS
+        least = size(_inside(name, part, figure) if bare else figure) + size(_data(part, {})) + _TWIN_CHARACTERS
         if bare and least > room:
             break
         room -= least
@@ -96,10 +98,15 @@ def paint_graph(graph: GraphView, svg: str, taken: int = 0) -> list[str]:
 
 def _told(figure: str, graph: GraphView, room: int) -> str:
     """Add the twin of a figure and what the script needs to know, in ``room`` more characters than is their least."""
-    room += _TWIN_CHARACTERS
+    # A fifth at least is kept for the rows of the twin.
+    sources = _fitting(graph, room * 4 // 5)
+    data = _data(graph, sources)
+    spent = size(data) - size(_data(graph, {}))
+    room += _TWIN_CHARACTERS - len(_STILL) - spent
     twin = paint_twin(graph, alt_text(graph), room)
-    data = _data(graph, _fitting(graph, room - len(twin)))
-    return f"{figure.removesuffix(_END)}{data}{twin}{_END}"
+    left = room - size(twin)
+    data = _data(graph, _fitting(graph, spent + left)) if left > 0 else data
+    return f"{figure.removesuffix(_END)}{_STILL}{data}{twin}{_END}"
 
 
 def _inside(name: str, graph: GraphView, figure: str) -> str:
@@ -150,11 +157,11 @@ def _fitting(graph: GraphView, room: int) -> Texts:
         texts = function.signature, function.source
         if not any(texts):
             continue
-        room -= 5 + (0 if texts in kept else len(_json(texts)))
+        room -= 5 + (0 if texts in kept else size(_json(texts)))
         if room >= 0:
             kept.setdefault(texts, []).append(place)
         elif texts not in kept:
-            room += 5 + len(_json(texts))
+            room += 5 + size(_json(texts))
     return kept
 
 

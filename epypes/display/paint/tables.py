@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from epypes.display.durations import duration_text
-from epypes.display.markup import content, cut, cut_name, fitted
+from epypes.display.markup import content, cut, cut_name, fitted, size
 from epypes.display.paint.rows import Table
 from epypes.display.paint.stagemarks import stage_words
 from epypes.display.views.graphview import FunctionView, GraphView, StageView, TokenView
@@ -33,25 +33,25 @@ def paint_twin(graph: GraphView, title: str, room: int) -> str:
     rows = (*map(_stage_cells, graph.before), *functions, *map(_stage_cells, graph.after))
     tokens = ((token.name, *_value(token)) for token in graph.tokens)
     start, end = f'<div style="{_HIDDEN}">', "</div>"
-    room -= len(start) + len(end)
+    room -= size(start) + size(end)
     first = _twin(title, ("function", "inputs", "outputs", "state"), rows, room)
-    return start + first + _twin("Its tokens", ("token", "value", "state"), tokens, room - len(first)) + end
+    return start + first + _twin("Its tokens", ("token", "value", "state"), tokens, room - size(first)) + end
 
 
 def _twin(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], room: int) -> str:
     start = f"<table><caption>{content(caption)}</caption>{_row('th', head, 0)}"
-    room -= len(start) + _LAST_ROW
+    room -= size(start) + _LAST_ROW
     kept: list[str] = []
     left_out = 0
     for cells in rows:
         row = _row("td", [content(cut_name(cell, _TWIN_CHARACTERS)) for cell in cells], 0)
-        room -= len(row)
+        room -= size(row)
         if room >= 0 and not left_out:
             kept.append(row)
         else:
             left_out += 1
     more = _row("td", [f"and {left_out} more"], 0) if left_out else ""
-    return f"{start}{''.join(kept)}{more}</table>" if kept or not left_out else ""
+    return f"{start}{''.join(kept)}{more}</table>" if kept else ""
 
 
 def _state(function: FunctionView) -> Iterable[str]:

@@ -104,7 +104,7 @@ def _inside(token: TokenView, box: Box, top: Point) -> tuple[str, str]:
 
 def _fitted_row(text: str) -> str:
     """Return a row with its blanks, which keep columns apart, in what it may take."""
-    text = text[:_ROW_CHARACTERS]
+    text = text if len(text) <= _ROW_CHARACTERS else text[: _ROW_CHARACTERS - 1] + "…"
     return text if written_length(text) <= _ROW_ROOM else fitted(text, _ROW_ROOM)
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any, Final, Protocol
 
 from epypes.display.markup import cut
+from epypes.display.previews.short import reason
 from epypes.display.views.graphview import GraphView, StageView
 from epypes.run import CompGraphRunner
 
@@ -43,7 +44,7 @@ def in_pipeline(graph: GraphView, pipeline: PipelineLike) -> GraphView:
         stages = pipeline.stages
         before, after = _stage_views(stages.before), _stage_views(stages.after)
     except Exception as error:
-        caption = f"its stages can't be told: {cut(f'{type(error).__name__}: {error!s:.200}', _NOTE_CHARACTERS)}"
+        caption = f"its stages can't be told: {reason(error, _NOTE_CHARACTERS)}"
         return replace(graph, title=title, caption=". ".join(filter(None, (graph.caption, caption))))
     return replace(graph, title=title, before=before, after=after)
 
