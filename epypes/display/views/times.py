@@ -16,7 +16,7 @@ BarKind = Literal["function", "rest", "overhead", "total"]
 MOST_BARS: Final = 60
 _TITLE_CHARACTERS: Final = 100
 _REPORT_LEGEND: Final = "Bars: time of each function; the longest is drawn in full."
-_SUMMARY_LEGEND: Final = "Bars: the median time of each function; lines: 5 % to 95 % of 5 times or more."
+_SUMMARY_LEGEND: Final = "Bars: the median time of each function; lines: 5 % to 95 % of its times, if 5 or more."
 # A range that is so many times as long as the longest median would leave nothing to be seen of the rest; it is cut.
 _LONGEST_RANGE: Final = 4.0
 
