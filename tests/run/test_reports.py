@@ -58,15 +58,15 @@ def test_failed_runs_and_reruns_are_kept_too(way):
 
 
 def failing_chain(count=3):
-    """``f0`` to ``f2`` one after another, of which ``f1`` can't do 0, and functions beside them."""
+    """``f0`` to ``f2`` one after another, of which ``f1`` can't do 0, after functions of their own."""
 
     def invert(x, n):
         return n / x
 
     chain = {"f0": ("x", "a"), "f1": (("a", "n"), "b"), "f2": ("b", "c"), "beside": ("x", "d")}
     more = {f"g{place}": ("x", f"d{place}") for place in range(count - 3)}
-    functions = dict.fromkeys(chain | more, lambda value: value) | {"f1": invert}
-    return ep.CompGraph(functions, chain | more)
+    functions = dict.fromkeys(more | chain, lambda value: value) | {"f1": invert}
+    return ep.CompGraph(functions, more | chain)
 
 
 @pytest.mark.parametrize("count", [3, 450])
@@ -79,6 +79,7 @@ def test_a_report_knows_which_function_failed(way, count):
         runner.run(x=0)
     assert [report.failed for report in runner.reports] == [None] * way.runs + ["f1"]
     assert told(runner.reports[-1]) == told(runner.last.report)
+    assert isinstance(runner.reports.kept[-1][2], dict) == (count < 400)
     assert [entry.failed for entry in runner.reports[0].functions] == [False] * (count + 1)
     found = {entry.function: entry for entry in runner.reports[-1].functions}
     assert [name for name, entry in found.items() if entry.failed] == ["f1"]

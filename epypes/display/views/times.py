@@ -177,7 +177,7 @@ def range_text(fitted: LogNormal) -> str:
 def _scale_ns(fitted: Iterable[LogNormal]) -> float:
     every = list(fitted)
     median = max((one.median_ns for one in every), default=1.0)
-    longest = max((one.quantile_ns(0.95) for one in every if one.has_range), default=median)
+    longest = max((one.quantile_ns(0.95) for one in every if one.has_range), default=0.0)
     return min(max(longest, median), _LONGEST_RANGE * median)
 
 
