@@ -8,7 +8,7 @@ from typing import Any
 from epypes.display.markup import size
 from epypes.display.paint.bars import paint_bars, times_alt_text
 from epypes.display.paint.page import paint_figure, paint_graph, paint_page
-from epypes.display.paint.rows import NO_REPORTS, plan_table, table_of
+from epypes.display.paint.rows import plan_table, summary_of, table_of
 from epypes.display.paint.svg import paint_svg
 from epypes.display.paint.tables import paint_table
 from epypes.display.paint.text import paint_text, repr_text
@@ -17,7 +17,7 @@ from epypes.display.views.graphview import GraphView
 from epypes.display.views.times import report_times, summary_times
 from epypes.display.views.view import Shown, view
 from epypes.errors import LayoutUnavailable
-from epypes.run import Plan, RunReport, TimingSummary, summarize
+from epypes.run import Plan, RunReport, TimingSummary
 from epypes.run.report import Reports
 
 
@@ -51,10 +51,12 @@ def bundle_of(shown: Any, paint: Callable[[], dict[str, str]], look: Callable[[]
 
 
 def _painted(shown: Any) -> dict[str, str]:
-    if isinstance(shown, Reports) and not len(shown):
-        return {"text/html": f"<p>{NO_REPORTS}</p>"}
-    if isinstance(shown, RunReport | TimingSummary | Reports):
-        return _painted_times(summarize(shown) if isinstance(shown, Reports) else shown)
+    if isinstance(shown, Reports):
+        shown = summary_of(shown)
+    if isinstance(shown, str):
+        return {"text/html": f"<p>{shown}</p>"}
+    if isinstance(shown, RunReport | TimingSummary):
+        return _painted_times(shown)
     return html_and_svg(view(shown), table_below(shown))
 
 

@@ -77,7 +77,7 @@ class Attempts:
         if wanted is not None or not has_payload or self._program.revised:
             dirty = bytes(len(self._program.steps)) if wanted is None else wanted.translate(_INVERTED)
             freshness = Freshness(self._program, dirty, has_payload, revisions)
-        return values, freshness, (self._program, wanted, durations_ns, total_ns, False), None
+        return values, freshness, (self._program, wanted, durations_ns, total_ns, False, -1), None
 
     def stale(self, draft: Draft, targets: Sequence[str], start_ns: int) -> Outcome:
         """Run the dirty steps that the targets need, all without.
@@ -165,10 +165,21 @@ def _ended(
     start_ns: int,
     side_by_side: bool,
 ) -> Outcome:
-    failure = None
+    failure, failed_at = None, -1
     if failed is not None:
-        durations_ns[failed.place] = failed.duration_ns
-        failure = failure_of(draft, failed.place, failed.exception)
-        draft.forget(draft.program.downstream([failed.place], draft.values))
-    times = (draft.program, wanted, durations_ns, perf_counter_ns() - start_ns, side_by_side)
+        failed_at = failed.place
+        durations_ns[failed_at] = failed.duration_ns
+        failure = failure_of(draft, failed_at, failed.exception)
+        draft.forget(draft.program.downstream([failed_at], draft.values))
+        wanted = _reached(draft, wanted)
+    times = (draft.program, wanted, durations_ns, perf_counter_ns() - start_ns, side_by_side, failed_at)
     return draft.values, draft.freshness(), times, failure
+
+
+def _reached(draft: Draft, wanted: bytes | None) -> bytes:
+    """Return which of the wanted steps are up to date after a failure: of the others none was reused."""
+    dirty = [place for place, is_dirty in enumerate(draft.dirty) if is_dirty]
+    reached = bytearray(wanted or b"\1" * len(draft.dirty))
+    for place in draft.program.downstream(dirty, draft.values):
+        reached[place] = 0
+    return bytes(reached)

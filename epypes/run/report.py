@@ -13,10 +13,11 @@ from epypes.run.program import Program, longest_path_ns
 if TYPE_CHECKING:
     import pandas as pd
 
-# The program, the steps that were wanted, nanoseconds by step that ran, nanoseconds in all, whether side by side.
-Times = tuple[Program, bytes | None, Mapping[int, int] | Sequence[int], int, bool]
+# The program, the steps that were wanted, nanoseconds by step that ran, nanoseconds in all, whether side by side, the
+# step that failed: -1 if none did.
+Times = tuple[Program, bytes | None, Mapping[int, int] | Sequence[int], int, bool, int]
 
-_COLUMNS: Final = ("function", "ran", "time_ms", "share")
+_COLUMNS: Final = ("function", "ran", "time_ms", "share", "failed")
 _KEPT: Final = 1_000
 # Above so many functions kept times are packed: a thousand reports of a large graph would hold a gigabyte of integers.
 _PACKED_ABOVE: Final = 400
@@ -24,11 +25,22 @@ _PACKED_ABOVE: Final = 400
 
 @dataclass(frozen=True, slots=True)
 class FunctionTime:
-    """How long one function took: ``duration_ns`` in nanoseconds; 0, with ``ran`` false, if it was reused."""
+    """How long one function took.
+
+    Attributes
+    ----------
+    duration_ns
+        In nanoseconds; of a function that failed until it raised, of one that was reused 0.
+    ran
+        Whether it was called, to whatever end; if not, it was reused.
+    failed
+        Whether it raised.
+    """
 
     function: str
     duration_ns: int
     ran: bool
+    failed: bool = False
 
 
 class RunReport:
@@ -42,7 +54,7 @@ class RunReport:
         Whether functions may have run side by side.
     """
 
-    __slots__ = ("_durations_ns", "_program", "_wanted", "side_by_side", "total_ns")
+    __slots__ = ("_durations_ns", "_failed_at", "_program", "_wanted", "side_by_side", "total_ns")
 
     def __init__(
         self,
@@ -51,10 +63,11 @@ class RunReport:
         durations_ns: Mapping[int, int] | Sequence[int],
         total_ns: int,
         side_by_side: bool,
+        failed_at: int = -1,
     ) -> None:
         # A sequence has an entry for every step; -1 stands for a step that did not run.
         self._program, self._wanted, self.total_ns, self.side_by_side = program, wanted, total_ns, side_by_side
-        self._durations_ns = durations_ns
+        self._durations_ns, self._failed_at = durations_ns, failed_at
 
     @property
     def program(self) -> Program:
@@ -69,24 +82,29 @@ class RunReport:
 
     @property
     def functions(self) -> tuple[FunctionTime, ...]:
-        """One entry per function that the run needed, in run order."""
-        ran_ns, wanted = self._ran_ns(), self._wanted
+        """One entry per function that the run needed, in run order; of a failed run those it came to."""
+        ran_ns, wanted, failed_at = self._ran_ns(), self._wanted, self._failed_at
         return tuple(
-            FunctionTime(step.name, ran_ns.get(step.place, 0), step.place in ran_ns)
+            FunctionTime(step.name, ran_ns.get(step.place, 0), step.place in ran_ns, step.place == failed_at)
             for step in self._program.steps
             if wanted is None or wanted[step.place] or step.place in ran_ns
         )
 
     @property
     def durations_ns(self) -> dict[str, int]:
-        """Nanoseconds by function that ran, in run order."""
+        """Nanoseconds by function that ran, in run order; of one that failed until it raised."""
         ran_ns = self._ran_ns()
         return {self._program.steps[index].name: ran_ns[index] for index in sorted(ran_ns)}
 
     @property
     def ran(self) -> tuple[str, ...]:
-        """The functions that ran."""
+        """The functions that ran, with the one that failed."""
         return tuple(self.durations_ns)
+
+    @property
+    def failed(self) -> str | None:
+        """The function that failed, or None."""
+        return None if self._failed_at < 0 else self._program.steps[self._failed_at].name
 
     @property
     def reused(self) -> tuple[str, ...]:
@@ -109,21 +127,26 @@ class RunReport:
         return self.total_ns - spent_ns
 
     def to_frame(self) -> pd.DataFrame:
-        """Return a table: function, ran, time_ms, share (of the total)."""
+        """Return a table: function, ran, time_ms, share (of the total), failed.
+
+        A function that failed has ``ran`` true as well, and the time until it raised.
+        """
         import pandas as pd
 
         return pd.DataFrame(self._rows(), columns=list(_COLUMNS))
 
-    def _rows(self) -> list[tuple[str, bool, float, float]]:
+    def _rows(self) -> list[tuple[str, bool, float, float, bool]]:
         """Return what ``to_frame`` has as rows."""
         total_ns = max(self.total_ns, 1)
         return [
-            (entry.function, entry.ran, entry.duration_ns / 1e6, entry.duration_ns / total_ns)
+            (entry.function, entry.ran, entry.duration_ns / 1e6, entry.duration_ns / total_ns, entry.failed)
             for entry in self.functions
         ]
 
     def __repr__(self) -> str:
-        return f"<RunReport: {len(self.ran)} functions ran, {len(self.reused)} reused>"
+        failed = self._failed_at >= 0
+        ran = len(self.ran) - failed
+        return f"<RunReport: {ran} functions ran, {len(self.reused)} reused{', 1 failed' * failed}>"
 
     def __str__(self) -> str:
         from epypes.display import to_text
@@ -161,7 +184,7 @@ class Reports(Sequence[RunReport]):
         return len(self.kept)
 
     def to_frame(self) -> pd.DataFrame:
-        """Return a table: run (0 is the oldest), function, ran, time_ms, share (of that run's total)."""
+        """Return a table: run (0 is the oldest), function, ran, time_ms, share (of that run's total), failed."""
         import pandas as pd
 
         rows = [(place, *row) for place, report in enumerate(self) for row in report._rows()]
@@ -185,8 +208,8 @@ class Reports(Sequence[RunReport]):
 
 
 def _packed(times: Times) -> Times:
-    program, wanted, durations_ns, total_ns, side_by_side = times
+    program, wanted, durations_ns, total_ns, side_by_side, failed_at = times
     if not isinstance(durations_ns, Mapping):
         return times
     packed: Sequence[int] = array("q", [durations_ns.get(step.place, -1) for step in program.steps])
-    return program, wanted, packed, total_ns, side_by_side
+    return program, wanted, packed, total_ns, side_by_side, failed_at

@@ -131,7 +131,7 @@ class CompGraphRunner:
         except StepFailed as failed:
             outcome = attempts.run_broken_off(values, failed, None, True, start_ns)
         else:
-            times = (program, None, durations_ns, perf_counter_ns() - start_ns, False)
+            times = (program, None, durations_ns, perf_counter_ns() - start_ns, False, -1)
             run = self._last = Run((values, attempts.clean, hparams, times, None))
             self.reports.kept.append(times)
             return run
@@ -175,7 +175,7 @@ class CompGraphRunner:
             except StepFailed as failed:
                 outcome = attempts.rerun_broken_off(values, failed, changed, start_ns)
             else:
-                times = (self._program, None, durations_ns, perf_counter_ns() - start_ns, False)
+                times = (self._program, None, durations_ns, perf_counter_ns() - start_ns, False, -1)
                 run = self._last = Run((values, freshness, hparams, times, None))
                 self.reports.kept.append(times)
                 return run

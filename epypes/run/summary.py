@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 _STANDARD: Final = NormalDist()
 _COLUMNS: Final = ("function", "runs", "not_positive", "mode_ms", "median_ms", "p05_ms", "p95_ms")
+# Fewer durations say nothing of the tails: two that differ by a factor of 3 would get a range of a factor of 6.
+_FEWEST_WITH_RANGE: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +66,11 @@ class LogNormal:
         return self.not_positive < self.count
 
     @property
+    def has_range(self) -> bool:
+        """Whether at least 5 durations were fitted; fewer say nothing of the tails, so no range of them is shown."""
+        return self.count - self.not_positive >= _FEWEST_WITH_RANGE
+
+    @property
     def median_ns(self) -> float:
         """Half of the durations are shorter, in nanoseconds."""
         return math.exp(self.mu)
@@ -80,6 +87,8 @@ class LogNormal:
 
     def quantile_ns(self, share: float) -> float:
         """Return the duration that this share of the distribution stays below, in nanoseconds.
+
+        Always that of the curve; whether the tails can be relied on says ``has_range``.
 
         Parameters
         ----------
@@ -111,7 +120,9 @@ class LogNormal:
 
 @dataclass(frozen=True, slots=True)
 class TimingSummary:
-    """The times of many runs; shows itself as bars and as a table.
+    """The times of many runs, without those that failed; shows itself as bars and as a table.
+
+    Of fewer than 5 durations no range from 5 % to 95 % is shown: few runs say nothing of the tails.
 
     Attributes
     ----------
@@ -122,10 +133,12 @@ class TimingSummary:
     overhead
         The graph overhead (the paper's o_cg).
     runs
-        How many runs there were.
+        How many runs were summarized.
     side_by_side
         Whether in one of them functions may have run side by side; graph overhead is then wall time less the critical
         path.
+    failed_runs
+        How many runs more there were that failed; their times are in no distribution.
 
     Notes
     -----
@@ -137,11 +150,13 @@ class TimingSummary:
     overhead: LogNormal
     runs: int
     side_by_side: bool = False
+    failed_runs: int = 0
 
     def to_frame(self) -> pd.DataFrame:
         """Return a table: function, runs, not_positive, mode_ms, median_ms, p05_ms, p95_ms.
 
-        The last two rows are ``total`` and ``graph overhead``; p05 and p95 are quantiles of the fitted distribution.
+        The last two rows are ``total`` and ``graph overhead``; p05 and p95 are quantiles of the fitted distribution,
+        nan where fewer than 5 durations were fitted.
         """
         import pandas as pd
 
@@ -169,13 +184,13 @@ def summarize(reports: Iterable[RunReport]) -> TimingSummary:
     Parameters
     ----------
     reports
-        Such as ``runner.reports``. Reports of failed runs are among them, with the times up to the failure. Functions
-        of one name in several graphs are taken together.
+        Such as ``runner.reports``. Those of failed runs are counted and left out, since a function that raised did
+        not take the time that it takes. Functions of one name in several graphs are taken together.
 
     Raises
     ------
     ValueError
-        There is no report.
+        There is no report, or all are of failed runs.
 
     Notes
     -----
@@ -199,14 +214,23 @@ def summarize(reports: Iterable[RunReport]) -> TimingSummary:
         if not isinstance(report, RunReport):
             kind = type(report).__name__
             raise TypeError(f"summarize takes RunReports, such as runner.reports, not {kind!r}.")
-    durations = _by_function(given)
+    ended = [report for report in given if report.failed is None]
+    if not ended:
+        raise ValueError(_all_failed(len(given)))
+    durations = _by_function(ended)
     return TimingSummary(
         functions=MappingProxyType({name: _fit(values) for name, values in durations.items() if values}),
-        total=_fit([report.total_ns for report in given]),
-        overhead=_fit([report.overhead_ns for report in given]),
-        runs=len(given),
-        side_by_side=any(report.side_by_side for report in given),
+        total=_fit([report.total_ns for report in ended]),
+        overhead=_fit([report.overhead_ns for report in ended]),
+        runs=len(ended),
+        side_by_side=any(report.side_by_side for report in ended),
+        failed_runs=len(given) - len(ended),
     )
+
+
+def _all_failed(count: int) -> str:
+    failed = "The only run has failed" if count == 1 else f"All {count} runs have failed"
+    return f"{failed}, so there are no times to summarize. runner.last.failure says why."
 
 
 def _by_function(reports: Sequence[RunReport]) -> dict[str, list[int]]:
@@ -231,5 +255,6 @@ def _fit(durations_ns: Sequence[int]) -> LogNormal:
 
 
 def _row(name: str, fitted: LogNormal) -> tuple[str | int | float, ...]:
-    times_ns = (fitted.mode_ns, fitted.median_ns, fitted.quantile_ns(0.05), fitted.quantile_ns(0.95))
+    low_ns, high_ns = (fitted.quantile_ns(share) if fitted.has_range else math.nan for share in (0.05, 0.95))
+    times_ns = (fitted.mode_ns, fitted.median_ns, low_ns, high_ns)
     return name, fitted.count, fitted.not_positive, *(time / 1e6 for time in times_ns)

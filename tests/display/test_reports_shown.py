@@ -22,13 +22,16 @@ from tests.pictures import assert_same_picture
 MS = 1_000_000
 
 
-def report(times_ms: dict[str, float | None], total_ms: float, side_by_side: bool = False) -> ep.RunReport:
-    """A report of independent functions; None for one that was reused."""
+def report(
+    times_ms: dict[str, float | None], total_ms: float, side_by_side: bool = False, failed: str = ""
+) -> ep.RunReport:
+    """A report of independent functions, None for one that was reused, of which one may have failed."""
     io = {name: ((), f"t{place}") for place, name in enumerate(times_ms)}
     program = Program(ep.CompGraph(dict.fromkeys(io, lambda: 1), io), True)
     names = [step.name for step in program.steps]
     spent = {names.index(name): round(time * MS) for name, time in times_ms.items() if time is not None}
-    return ep.RunReport(program, None, spent, round(total_ms * MS), side_by_side)
+    failed_at = names.index(failed) if failed else -1
+    return ep.RunReport(program, None, spent, round(total_ms * MS), side_by_side, failed_at)
 
 
 def bars(shown) -> dict[str, ET.Element]:
@@ -125,6 +128,30 @@ def test_pictures_of_times_stay_small(count):
             assert 0 < len(bundle[form].encode()) <= 20_000 + 600 * count
 
 
+def test_a_function_that_failed_says_after_how_long():
+    shown = report({"a": 10, "b": None, "c": 0.007}, 20, failed="c")
+    bundle, found = mimebundle(shown), bars(shown)
+    assert "1 function ran, 1 reused, 1 failed" in bundle["text/html"]
+    assert [texts(group)[1] for group in found.values()][:3] == ["10 ms, 50%", "reused", "failed after 7 µs"]
+    assert [found[name].get("class") for name in "abc"] == [
+        "time function",
+        "time function reused",
+        "time function failed",
+    ]
+    assert found["c"].find(f"{SVG}title").text == "function c: failed after 7 µs"
+    assert 0 < length(found["c"]) < length(found["a"])
+    assert table_of(bundle["text/html"])[3] == ["c", "failed after 7 µs", "0%"]
+    assert "failed" not in mimebundle(report({"a": 10, "b": None}, 20))["text/plain"]
+    assert "1 failed" not in mimebundle(report({"a": 10, "b": None}, 20))["text/html"]
+
+
+def test_a_function_that_failed_at_once_is_shown_among_many():
+    times = {f"f{place}": 5.0 for place in range(300)} | {"f7": 0.0}
+    shown = report(times, 2_000, failed="f7")
+    assert texts(bars(shown)["f7"]) == ["f7", "failed after 0 ns"]
+    assert ["f7", "failed after 0 ns", "0%"] in table_of(mimebundle(shown)["text/html"])
+
+
 # -- many runs --------------------------------------------------------------------------------------------------------
 
 
@@ -148,6 +175,18 @@ def test_a_summary_is_a_picture_with_the_median_as_a_bar_and_the_range_as_a_line
     title = found["a"].find(f"{SVG}title").text
     assert title.startswith("function a: median 9.")
     assert title.endswith("in 5 runs")
+
+
+def test_of_fewer_than_five_runs_no_range_is_told():
+    for runs, has_range in ((4, False), (5, True)):
+        summary = summarized(*range(8, 8 + runs))
+        found, html = bars(summary), mimebundle(summary)["text/html"]
+        for name in ("a", "b", "graph overhead"):
+            assert (found[name].find(f"{SVG}path") is not None) == has_range
+            assert (" to " in found[name].find(f"{SVG}title").text) == has_range
+            assert (" to " in texts(found[name])[1]) == has_range
+        assert length(found["a"]) > 5 * length(found["b"]) > 0
+        assert all(bool(row[-1]) == has_range for row in table_of(html)[1:])
 
 
 def test_one_run_in_a_thousand_does_not_shrink_all_other_bars():
@@ -182,12 +221,25 @@ def test_reports_without_a_run_show_a_sentence():
     assert repr(Reports()) == "<Reports of 0 runs>"
 
 
+def test_reports_of_failed_runs_alone_show_a_sentence():
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": lambda x: 1 / x}, {"f": ("x", "y")}))
+    for said in ("The only run has failed", "All 2 runs have failed"):
+        with pytest.raises(ZeroDivisionError):
+            runner.run(x=0)
+        sentence = f"{said}, so there are no times to summarize. runner.last.failure says why."
+        assert mimebundle(runner.reports) == {"text/plain": repr(runner.reports), "text/html": f"<p>{sentence}</p>"}
+        assert str(runner.reports) == sentence
+    runner.run(x=1)
+    assert str(runner.reports).startswith("1 run, 2 failed runs left out; log-normal distributions\n")
+    assert "1 run, 2 failed runs left out" in mimebundle(runner.reports)["text/html"]
+
+
 def test_reports_become_a_table_of_one_row_per_run_and_function():
     pandas = pytest.importorskip("pandas")
     runner = ep.CompGraphRunner(
         ep.CompGraph({"f": abs, "g": lambda y, k: y}, {"f": ("x", "y"), "g": (("y", "k"), "z")}), {"k": 1}
     )
-    columns = ["run", "function", "ran", "time_ms", "share"]
+    columns = ["run", "function", "ran", "time_ms", "share", "failed"]
     assert list(runner.reports.to_frame().columns) == columns
     assert len(runner.reports.to_frame()) == 0
     runner.run(x=1)
@@ -226,11 +278,13 @@ def plan_with_all() -> ep.Plan:
     [
         report({"a": 10, "a longer name": None, "c": 5}, 20),
         report_of(300),
+        report({"a": 10, "b": None, "c": 0.007}, 20, failed="c"),
+        ep.summarize([report({"a": 1, "b": 2}, 4)] * 5 + [report({"a": 1}, 4, failed="a")]),
         ep.summarize([report({"a": 1, "b": 0}, 4), report({"a": 2, "b": 0}, 4)]),
         plan_with_all(),
         branching_runner().plan(),
     ],
-    ids=["report", "long report", "summary", "plan", "plan with missing"],
+    ids=["report", "long report", "failed", "summary with failed", "summary", "plan", "plan with missing"],
 )
 def test_what_is_printed_says_what_the_page_says(shown):
     text, html = str(shown), mimebundle(shown)["text/html"]

@@ -23,6 +23,7 @@ def told(report):
         report.durations_ns,
         report.ran,
         report.reused,
+        report.failed,
         report.total_ns,
         report.side_by_side,
         report.overhead_ns,
@@ -54,6 +55,118 @@ def test_failed_runs_and_reruns_are_kept_too(way):
     assert len(runner.reports) == 2 * way.runs + 1
     assert told(runner.reports[-1]) == told(runner.last.report)
     assert runner.reports[-1].ran == ("invert",)
+
+
+def failing_chain(count=3):
+    """``f0`` to ``f2`` one after another, of which ``f1`` can't do 0, after functions of their own."""
+
+    def invert(x, n):
+        return n / x
+
+    chain = {"f0": ("x", "a"), "f1": (("a", "n"), "b"), "f2": ("b", "c"), "beside": ("x", "d")}
+    more = {f"g{place}": ("x", f"d{place}") for place in range(count - 3)}
+    functions = dict.fromkeys(more | chain, lambda value: value) | {"f1": invert}
+    return ep.CompGraph(functions, more | chain)
+
+
+@pytest.mark.parametrize("count", [3, 450])
+def test_a_report_knows_which_function_failed(way, count):
+    """Those of graphs above 400 functions are packed, and their runs never compiled."""
+    runner = way.runner(failing_chain(count), {"n": 1})
+    for _ in range(way.runs):
+        assert runner.run(x=1).report.failed is None
+    with pytest.raises(ZeroDivisionError):
+        runner.run(x=0)
+    assert [report.failed for report in runner.reports] == [None] * way.runs + ["f1"]
+    assert told(runner.reports[-1]) == told(runner.last.report)
+    assert isinstance(runner.reports.kept[-1][2], dict) == (count < 400)
+    assert [entry.failed for entry in runner.reports[0].functions] == [False] * (count + 1)
+    found = {entry.function: entry for entry in runner.reports[-1].functions}
+    assert [name for name, entry in found.items() if entry.failed] == ["f1"]
+    assert found["f1"].ran
+    assert found["f1"].duration_ns == runner.last.report.durations_ns["f1"] > 0
+    assert ", 0 reused, 1 failed>" in repr(runner.reports[-1])
+    assert "failed" not in repr(runner.reports[0])
+
+
+def test_a_rerun_that_failed_says_so_and_the_next_one_does_not(way):
+    runner = way.runner(failing_chain(), {"n": 1})
+    runner.run(x=1)
+    for n in range(2, 2 + way.runs):
+        runner.rerun(n=n)
+    with way.is_taken(), pytest.raises(TypeError):
+        runner.rerun(n="one")
+    report = runner.last.report
+    assert (report.failed, report.ran, report.reused) == ("f1", ("f1",), ("f0", "beside"))
+    assert repr(report) == "<RunReport: 0 functions ran, 2 reused, 1 failed>"
+    assert runner.rerun(n=1).report.failed is None
+    assert runner.reports[-2].failed == "f1"
+
+
+def test_what_a_failed_run_never_reached_is_not_said_to_be_reused(way):
+    runner = way.runner(failing_chain(), {"n": 1})
+    for _ in range(way.runs):
+        runner.run(x=1)
+    with way.is_taken(), pytest.raises(ZeroDivisionError):
+        runner.run(x=0)
+    report = runner.last.report
+    assert report.reused == ()
+    assert set(report.ran) <= {"f0", "f1", "beside"}
+    assert "f2" not in [entry.function for entry in report.functions]
+    with pytest.raises(ZeroDivisionError):
+        runner.run("b", x=0)
+    assert [(entry.function, entry.failed) for entry in runner.last.report.functions] == [("f0", False), ("f1", True)]
+
+
+def test_of_functions_side_by_side_the_first_in_run_order_is_the_one_that_failed(way):
+    io = {"slow": ("x", "a"), "quick": ("x", "b")}
+    both = threading.Barrier(2)
+
+    def slow(x):
+        if x == 0 and way.name == "side by side":
+            both.wait(10)
+        return 1 / x
+
+    def quick(x):
+        if x == 0:
+            both.wait(10)
+        return 1 / x
+
+    runner = way.runner(ep.CompGraph({"slow": slow, "quick": quick}, io))
+    for _ in range(way.runs):
+        runner.run(x=1)
+    with way.is_taken(), pytest.raises(ZeroDivisionError):
+        runner.run(x=0)
+    assert (runner.last.report.failed, runner.last.report.ran) == ("slow", ("slow",))
+
+
+def test_a_pipeline_that_fails_inside_a_graph_has_failed_in_both(way):
+    inner = ep.Pipeline("inner", failing_chain(), {"n": 1})
+    outer = way.runner(
+        ep.CompGraph({"before": abs, "nested": inner}, {"before": ("a", "x"), "nested": ("x", ("c", "d"))})
+    )
+    for _ in range(way.runs):
+        outer.run(a=1)
+    with pytest.raises(ZeroDivisionError):
+        outer.run(a=0)
+    assert (outer.reports[-1].failed, outer.reports[-1].ran) == ("nested", ("before", "nested"))
+    assert (inner.runner.reports[-1].failed, inner.runner.reports[-2].failed) == ("f1", None)
+
+
+def test_tables_of_reports_say_what_failed():
+    pytest.importorskip("pandas")
+    runner = ep.CompGraphRunner(failing_chain(), {"n": 1})
+    runner.run(x=1)
+    with pytest.raises(TypeError):
+        runner.rerun(n="one")
+    table = runner.reports[-1].to_frame()
+    assert list(table.columns) == ["function", "ran", "time_ms", "share", "failed"]
+    assert table[["function", "ran", "failed"]].values.tolist() == [
+        ["f0", False, False], ["f1", True, True], ["beside", False, False],
+    ]  # fmt: skip
+    table = runner.reports.to_frame()
+    assert list(table.columns) == ["run", "function", "ran", "time_ms", "share", "failed"]
+    assert table[table["failed"]][["run", "function"]].values.tolist() == [[1, "f1"]]
 
 
 @pytest.mark.parametrize("count", [3, 450])

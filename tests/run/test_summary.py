@@ -16,11 +16,11 @@ CHAIN = ep.CompGraph(
 )
 
 
-def report_of(durations_ns, total_ns=10_000, cg=CHAIN, side_by_side=False):
-    """A report with these times by function."""
+def report_of(durations_ns, total_ns=10_000, cg=CHAIN, side_by_side=False, failed=None):
+    """A report with these times by function, of a run in which a function may have failed."""
     places = {name: place for place, name in enumerate(cg.functions)}
     by_place = {places[name]: duration for name, duration in durations_ns.items()}
-    return ep.RunReport(Program(cg, True), None, by_place, total_ns, side_by_side)
+    return ep.RunReport(Program(cg, True), None, by_place, total_ns, side_by_side, places.get(failed, -1))
 
 
 def test_the_fit_is_the_one_of_maximum_likelihood():
@@ -101,7 +101,7 @@ def test_reports_of_several_graphs_are_taken_together_by_name():
 
 
 def test_the_table_has_a_row_per_function_and_two_for_the_whole():
-    durations = (1_000_000, 2_000_000, 4_000_000)
+    durations = (1_000_000, 1_000_000, 2_000_000, 4_000_000, 4_000_000)
     frame = ep.summarize(
         report_of({"first": value, "second": 500_000}, total_ns=5_000_000) for value in durations
     ).to_frame()
@@ -134,6 +134,49 @@ def test_a_summary_of_a_large_graph_keeps_a_hundred_rows():
     assert ">f299</td>" in html
     assert ">f0</td>" not in html
     assert "203 functions more" in unescape(html)
+
+
+def test_failed_runs_are_counted_and_left_out_of_every_distribution():
+    ended = [report_of({"first": 50_000_000, "second": 3_000}, 51_000_000)] * 4
+    failed = report_of({"first": 7_000}, 9_000, failed="first")
+    summary = ep.summarize(
+        [failed, *ended[:2], report_of({"first": 60_000_000, "second": 2}, failed="second"), *ended[2:]]
+    )
+    assert (summary.runs, summary.failed_runs) == (4, 2)
+    without = ep.summarize(ended)
+    assert (without.runs, without.failed_runs) == (4, 0)
+    assert (summary.functions, summary.total, summary.overhead) == (without.functions, without.total, without.overhead)
+    assert summary.functions["first"].median_ns == pytest.approx(50_000_000)
+    html = summary._repr_mimebundle_()["text/html"]
+    assert "4 runs, 2 failed runs left out; log-normal distributions" in html
+    assert (
+        "4 runs, 1 failed run left out; log-normal" in ep.summarize([failed, *ended])._repr_mimebundle_()["text/html"]
+    )
+
+
+def test_what_only_failed_runs_did_is_not_in_a_summary():
+    other = ep.CompGraph({"third": lambda x: x}, {"third": ("x", "y")})
+    failed = report_of({"third": 5}, cg=other, side_by_side=True, failed="third")
+    summary = ep.summarize([report_of({"first": 5}), failed])
+    assert list(summary.functions) == ["first"]
+    assert not summary.side_by_side
+
+
+@pytest.mark.parametrize(("count", "said"), [(1, "The only run has failed"), (3, "All 3 runs have failed")])
+def test_where_all_runs_have_failed_nothing_can_be_summarized(count, said):
+    with pytest.raises(ValueError, match=rf"{said}, so there are no times.*runner\.last\.failure says why\."):
+        ep.summarize([report_of({"first": 5}, failed="first")] * count)
+
+
+def test_fewer_than_five_durations_have_no_range():
+    reports = [report_of({"first": duration, "second": duration}) for duration in (1_000, 2_000, 3_000, 4_000)]
+    few = ep.summarize([*reports, report_of({"first": 5_000, "second": 0})])
+    assert {name: fitted.has_range for name, fitted in few.functions.items()} == {"first": True, "second": False}
+    assert few.total.has_range, "equal durations are durations too"
+    frame = few.to_frame().set_index("function")
+    assert frame["p05_ms"].isna().to_dict() == frame["p95_ms"].isna().to_dict()
+    assert frame["p05_ms"].isna().to_dict() == {"first": False, "second": True, "total": False, "graph overhead": False}
+    assert frame["median_ms"].notna().all()
 
 
 def test_nothing_to_summarize_is_refused_with_the_way_out():

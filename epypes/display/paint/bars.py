@@ -26,6 +26,8 @@ _RULES: Final = {
     " .track": "fill:@track;stroke:none",
     " .bar": "fill:@accent",
     " .reused .track": "fill:none;stroke:@line;stroke-width:1;stroke-dasharray:4 3",
+    " .failed .track": "fill:@alarm;stroke:@error;stroke-width:1",
+    " .failed .bar": "fill:@error",
     " .overhead .bar": "fill:@line",
     " .range": "stroke:@text;stroke-width:1.5",
     " .name": "font-weight:500",
@@ -56,7 +58,7 @@ def paint_bars(times: TimesView) -> str:
 
 def _paint_row(bar: TimeBar, left: float, top: float) -> str:
     base = top + _ROW_PX / 2 + 4
-    classes = f"{bar.kind} reused" if bar.is_reused else bar.kind
+    classes = f"{bar.kind}{' reused' * bar.is_reused}{' failed' * bar.is_failed}"
     return (
         f'<g class="time {classes}"><title>{content(bar.title)}</title>'
         f'<text class="name" x="{_MARGIN_PX}" y="{base:.0f}">{content(bar.name)}</text>'

@@ -10,7 +10,9 @@ from epypes.display.durations import duration_text, overhead_text
 from epypes.display.views.graphview import FunctionView, GraphView
 from epypes.display.views.plans import plan_view
 from epypes.display.views.times import (
+    failed_text,
     functions_text,
+    longest_first,
     median_ns,
     range_text,
     report_caption,
@@ -23,7 +25,7 @@ from epypes.run.report import Reports
 # Below them stand the rest, the total and the graph overhead: a hundred rows in all.
 _MOST_FUNCTIONS: Final = 97
 _DONE: Final = {"missing": "placeholder", "planned": "runs"}
-NO_REPORTS: Final = "No run has ended yet, so there are no times. Call run(...) first."
+_NO_REPORTS: Final = "No run has ended yet, so there are no times. Call run(...) first."
 
 Tabular = Plan | RunReport | TimingSummary | Reports
 
@@ -45,7 +47,19 @@ def table_of(shown: Tabular) -> Table:
         return report_table(shown)
     if isinstance(shown, TimingSummary):
         return summary_table(shown)
-    return summary_table(summarize(shown)) if len(shown) else Table(NO_REPORTS, (), ())
+    summary = summary_of(shown)
+    return Table(summary, (), ()) if isinstance(summary, str) else summary_table(summary)
+
+
+def summary_of(reports: Reports) -> TimingSummary | str:
+    """Return the summary of reports, or, where there is none, a sentence that says why."""
+    given = list(reports)
+    if not given:
+        return _NO_REPORTS
+    try:
+        return summarize(given)
+    except ValueError as error:  # all runs have failed
+        return str(error)
 
 
 def plan_table(graph: GraphView) -> Table:
@@ -75,11 +89,11 @@ def _other_plans(rest: Sequence[FunctionView]) -> Iterable[tuple[str, ...]]:
 def report_table(report: RunReport) -> Table:
     """Return a report as a table: per function its time and its share of the whole.
 
-    The functions stand in run order; of many those that took longest, the rest in one row.
+    The functions stand in run order; of many those that took longest and the one that failed, the rest in one row.
     """
     total_ns = max(report.total_ns, 1)
     entries = report.functions
-    longest = sorted(entries, key=lambda entry: -entry.duration_ns)
+    longest = longest_first(entries)
     kept = {entry.function for entry in longest[:_MOST_FUNCTIONS]}
     rows = [_time_row(entry, total_ns) for entry in entries if entry.function in kept]
     rows += _rest_row(longest[_MOST_FUNCTIONS:], total_ns)
@@ -104,7 +118,8 @@ def summary_table(summary: TimingSummary) -> Table:
 def _time_row(entry: FunctionTime, total_ns: int) -> tuple[str, ...]:
     if not entry.ran:
         return entry.function, "reused", ""
-    return entry.function, duration_text(entry.duration_ns), f"{entry.duration_ns / total_ns:.0%}"
+    time = failed_text(entry) if entry.failed else duration_text(entry.duration_ns)
+    return entry.function, time, f"{entry.duration_ns / total_ns:.0%}"
 
 
 def _rest_row(rest: Sequence[FunctionTime], total_ns: int) -> Iterable[tuple[str, ...]]:
@@ -119,4 +134,5 @@ def _summary_row(name: str, fitted: LogNormal) -> tuple[str, ...]:
         return name, str(fitted.count), "no positive value", "", ""
     mode, median = (duration_text(round(time_ns)) for time_ns in (fitted.mode_ns, fitted.median_ns))
     left_out = f", {fitted.not_positive} not positive" * bool(fitted.not_positive)
-    return name, f"{fitted.count}{left_out}", mode, median, range_text(fitted)
+    shown_range = range_text(fitted) if fitted.has_range else ""
+    return name, f"{fitted.count}{left_out}", mode, median, shown_range

@@ -16,7 +16,7 @@ BarKind = Literal["function", "rest", "overhead", "total"]
 MOST_BARS: Final = 60
 _TITLE_CHARACTERS: Final = 100
 _REPORT_LEGEND: Final = "Bars: time of each function; the longest is drawn in full."
-_SUMMARY_LEGEND: Final = "Bars: the median time of each function; lines: 5 % to 95 % of its times."
+_SUMMARY_LEGEND: Final = "Bars: the median time of each function; lines: 5 % to 95 % of its times, if 5 or more."
 # A range that is so many times as long as the longest median would leave nothing to be seen of the rest; it is cut.
 _LONGEST_RANGE: Final = 4.0
 
@@ -34,9 +34,11 @@ class TimeBar:
     length
         From 0 to 1, the longest one.
     low, high
-        The range of many times, on the same scale; both 0 for a single one.
+        The range of many times, on the same scale; both 0 for a single one, and where fewer than 5 say nothing of it.
     is_reused
         Whether the function did not run.
+    is_failed
+        Whether it raised.
     """
 
     kind: BarKind
@@ -47,6 +49,7 @@ class TimeBar:
     low: float = 0.0
     high: float = 0.0
     is_reused: bool = False
+    is_failed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,21 +67,41 @@ def functions_text(count: int) -> str:
 
 
 def report_caption(report: RunReport) -> str:
-    """Return how many functions of a run ran, and how many were reused."""
+    """Return how many functions of a run ran to their end, how many were reused, and whether one failed."""
     entries = report.functions
-    ran = sum(entry.ran for entry in entries)
-    return f"{functions_text(ran)} ran, {len(entries) - ran} reused"
+    failed = sum(entry.failed for entry in entries)
+    reused = sum(not entry.ran for entry in entries)
+    ran = functions_text(len(entries) - reused - failed)
+    return f"{ran} ran, {reused} reused{f', {failed} failed' * failed}"
 
 
 def summary_caption(summary: TimingSummary) -> str:
     """Return how many runs were summarized, and how."""
-    return f"{summary.runs} run{'s' * (summary.runs != 1)}; log-normal distributions"
+    left_out = f", {_runs_text(summary.failed_runs, 'failed ')} left out" * bool(summary.failed_runs)
+    return f"{_runs_text(summary.runs)}{left_out}; log-normal distributions"
+
+
+def _runs_text(count: int, kind: str = "") -> str:
+    return f"{count} {kind}run{'s' * (count != 1)}"
+
+
+def failed_text(entry: FunctionTime) -> str:
+    """Return what is said of a function that failed."""
+    return f"failed after {duration_text(entry.duration_ns)}"
+
+
+def longest_first(entries: Sequence[FunctionTime]) -> list[FunctionTime]:
+    """Return a run's functions, those first that are to be seen: one that failed, then those that took longest."""
+    return sorted(entries, key=lambda entry: (not entry.failed, -entry.duration_ns))
 
 
 def report_times(report: RunReport) -> TimesView:
-    """Look at the times of a run; of many functions at those that took longest, and at the rest as one."""
+    """Look at the times of a run; of many functions at those that took longest, and at the rest as one.
+
+    A function that failed is always among them.
+    """
     entries, total_ns = report.functions, max(report.total_ns, 1)
-    longest = sorted(entries, key=lambda entry: -entry.duration_ns)
+    longest = longest_first(entries)
     kept = {entry.function for entry in longest[:MOST_BARS]}
     bars = [_function_bar(entry, total_ns) for entry in entries if entry.function in kept]
     bars += _rest_bar(longest[MOST_BARS:], total_ns)
@@ -92,10 +115,16 @@ def report_times(report: RunReport) -> TimesView:
 
 def _function_bar(entry: FunctionTime, total_ns: int) -> TimeBar:
     if entry.ran:
-        return _bar("function", entry.function, entry.duration_ns, total_ns)
+        bar = _bar("function", entry.function, entry.duration_ns, total_ns)
+        return _as_failed(bar, entry) if entry.failed else bar
     return TimeBar(
         "function", short_name(entry.function), "reused", f"{_named(entry.function)}: reused", is_reused=True
     )
+
+
+def _as_failed(bar: TimeBar, entry: FunctionTime) -> TimeBar:
+    text = failed_text(entry)
+    return replace(bar, text=text, title=f"{_named(entry.function)}: {text}", is_failed=True)
 
 
 def _bar(kind: BarKind, name: str, spent_ns: int, total_ns: int) -> TimeBar:
@@ -147,8 +176,9 @@ def range_text(fitted: LogNormal) -> str:
 
 def _scale_ns(fitted: Iterable[LogNormal]) -> float:
     every = list(fitted)
-    longest = max((one.quantile_ns(0.95) for one in every), default=1.0)
-    return min(longest, _LONGEST_RANGE * max((one.median_ns for one in every), default=1.0))
+    median = max((one.median_ns for one in every), default=1.0)
+    longest = max((one.quantile_ns(0.95) for one in every if one.has_range), default=0.0)
+    return min(max(longest, median), _LONGEST_RANGE * median)
 
 
 def _fitted_bar(kind: BarKind, name: str, fitted: LogNormal, scale_ns: float) -> TimeBar:
@@ -156,8 +186,9 @@ def _fitted_bar(kind: BarKind, name: str, fitted: LogNormal, scale_ns: float) ->
     if not fitted.is_fitted:
         return TimeBar(kind, shown, "no positive value", f"{named}: no positive value")
     median = duration_text(round(fitted.median_ns))
-    runs = f"in {fitted.count} run{'s' * (fitted.count != 1)}"
+    runs, length = f"in {_runs_text(fitted.count)}", min(fitted.median_ns / scale_ns, 1.0)
+    if not fitted.has_range:
+        return TimeBar(kind, shown, median, f"{named}: median {median}, {runs}", length)
     title = f"{named}: median {median}, 5 % to 95 % {range_text(fitted)}, {runs}"
     low, high = (min(fitted.quantile_ns(share) / scale_ns, 1.0) for share in (0.05, 0.95))
-    length = min(fitted.median_ns / scale_ns, 1.0)
     return TimeBar(kind, shown, f"{median} ({range_text(fitted)})", title, length, low, high)
