@@ -140,8 +140,8 @@ def _as_bytes(image: Array, ends: Range) -> npt.NDArray[np.uint8]:
         return np.ascontiguousarray(np.right_shift(np.minimum(image, np.uint16(high)), bits - 8), dtype=np.uint8)
     is_wide = image.dtype.itemsize > 4 or (image.dtype.kind in "iu" and image.dtype.itemsize == 4)
     values: npt.NDArray[np.floating[Any]] = image.astype(np.float64 if is_wide else np.float32)
-    with np.errstate(invalid="ignore", over="ignore"):
-        # Halves, since the two ends may be further apart than the largest float.
+    # Halves, since the two ends may be further apart than the largest float.
+    with np.errstate(invalid="ignore", over="ignore", under="ignore"):
         scaled = (values / 2 - low / 2) * (255.0 / max(high / 2 - low / 2, 5e-324))
     return np.ascontiguousarray(np.nan_to_num(scaled, nan=0.0).clip(0, 255), dtype=np.uint8)
 
