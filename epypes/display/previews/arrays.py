@@ -43,12 +43,17 @@ def _number_sketch(number: Any, look: Look) -> Preview:
     return Preview(text, f"{number.dtype} {short_repr(value)}")
 
 
+def plain_array(array: Any) -> Array:
+    """Return an array without what a subclass of numpy's makes of it."""
+    import numpy as np
+
+    return np.asarray(array)
+
+
 @ours("numpy.ndarray")
 def _array_sketch(array: Any, look: Look) -> Sketch | Preview:
     """Look at an array by its shape and dtype."""
-    import numpy as np
-
-    array = np.asarray(array)
+    array = plain_array(array)
     if not array.ndim:
         return _number_sketch(array, look)
     if array.dtype.names:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.display.previews.charts import drawn_in_chart, spread
+from epypes.display.previews.charts import drawn_in_chart
 from epypes.display.previews.kinds import dotted_name, is_of
 from epypes.display.previews.marks import (
     MOST_MARKS,
@@ -62,7 +62,9 @@ def list_sketch(value: Sequence[Any], name: str, look: Look, plain: Callable[[],
         if is_kind(value):
             text = f"{len(value)} {noun}{('es' if noun.endswith('ch') else 's') * (len(value) != 1)}"
             said = f"{name} of {text}"
-            return Sketch(Preview(text, said), closer=partial(_closer_look, closer, value, Preview(text, said), look, plain))
+            return Sketch(
+                Preview(text, said), closer=partial(_closer_look, closer, value, Preview(text, said), look, plain)
+            )
     return None
 
 
@@ -83,9 +85,7 @@ def point_sketch(array: Any, look: Look, *, needs_image: bool = False) -> Sketch
 
 def segment_sketch(array: Any, look: Look) -> Sketch:
     """Look at an array (n, 1, 4) of the two ends of line segments."""
-    return _over(
-        _segments(array), array_text(array), f"{array_text(array)}, segments{_extent(array)}", look
-    )
+    return _over(_segments(array), array_text(array), f"{array_text(array)}, segments{_extent(array)}", look)
 
 
 def _segments(array: Any) -> Marks:

@@ -96,7 +96,12 @@ def some_lines(lines: Any, are_closed: bool, total: int | None = None) -> Marks:
     longest = sorted(lines, key=len, reverse=True)[:MOST_MARKS] if len(lines) > MOST_MARKS else lines
     kept = [line[:: -(-len(line) // MOST_MARKS) or 1].reshape(-1, 2).astype(np.float64) for line in longest]
     drawable = tuple(line[_is_drawable(line)] for line in kept if len(line))
-    return Marks(np.empty((0, 2)), tuple(line for line in drawable if len(line)), are_closed, len(lines) if total is None else total)
+    return Marks(
+        np.empty((0, 2)),
+        tuple(line for line in drawable if len(line)),
+        are_closed,
+        len(lines) if total is None else total,
+    )
 
 
 def rectangles(boxes: Any) -> Marks:
@@ -238,5 +243,10 @@ class _Pen:
             first, last = max(first, enters), min(last, leaves)
         if first > last:
             return None
-        (x0, y0), (x1, y1) = start, end
-        return (x0 + first * (x1 - x0), y0 + first * (y1 - y0)), (x0 + last * (x1 - x0), y0 + last * (y1 - y0))
+        return self._between(start, end, first), self._between(start, end, last)
+
+    def _between(self, start: _Place, end: _Place, share: float) -> _Place:
+        # Within limits once more: of very large numbers the difference is not exact.
+        ends = zip(start, end, self._low, self._high, strict=True)
+        x, y = (min(max(a + share * (b - a), low), high) for a, b, low, high in ends)
+        return x, y

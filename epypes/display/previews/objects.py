@@ -64,7 +64,7 @@ def _path(value: Any, look: Look) -> Preview:
 @ours(list)
 def _list(value: Sequence[Any], look: Look) -> Sketch | Preview:
     # A subclass may have ways of its own to reach its items, which are nobody else's.
-    plain = value if type(value) is list else list.copy(value)
+    plain = value if type(value) is list else list(items_in(value))
     if is_dict_list(plain):
         return dict_list_sketch(plain)
     return list_sketch(plain, _name(value), look, lambda: _items(value)) or _items(value)
