@@ -160,8 +160,9 @@ def _keypoints(value: Sequence[Any], shown: Preview, look: Look) -> Sketch:
 def _matches(value: Sequence[Any], shown: Preview, look: Look) -> Sketch | None:
     import numpy as np
 
-    flat = [item if _is_match(item) else item[0] for item in value[:_WEIGHED] if _is_match(item) or item]
-    if not all(map(_is_match, flat)):
+    known = value[:_WEIGHED]
+    flat = known if _is_match(value[0]) else [item[0] for item in known if len(item)]
+    if not _is_match(flat[0]) or not _are_of_one_class(flat):
         return None
     distances = [match.distance for match in flat]
     said = f"{shown.detail}, distance {min(distances):.4g} to {max(distances):.4g}"
@@ -190,7 +191,7 @@ def _is_keypoint_of(keypoints: Sequence[Any], index: int) -> bool:
 
 def _contours(value: Sequence[Any], shown: Preview, look: Look) -> Sketch | None:
     known, axes = value[:_WEIGHED], value[0].ndim
-    if not all(_is_contour(line) and line.ndim == axes for line in known):
+    if not all(line.ndim == axes and _has_contour_shape(line) for line in known):
         return None
     are_rows = axes == 2
     marks = some_lines([line[:, ::-1] for line in known] if are_rows else known, not are_rows, len(value))
@@ -217,6 +218,11 @@ def _are_all(value: Sequence[Any], is_kind: Callable[[Any], bool]) -> bool:
     step = -(-len(value) // _LOOKED_AT) or 1
     if not value or not all(is_kind(item) for item in itertools.islice(value, 0, None, step)):
         return False
+    return _are_of_one_class(value)
+
+
+def _are_of_one_class(value: Sequence[Any]) -> bool:
+    """Whether the first of many items are of one class."""
     first = type(value[0])
     return all(type(item) is first for item in itertools.islice(value, _WEIGHED))
 
@@ -230,10 +236,12 @@ def _is_match_list(item: Any) -> bool:
 
 
 def _is_contour(item: Any) -> bool:
-    if not is_of(item, "numpy", "ndarray") or item.dtype.kind not in "iuf":
-        return False
-    shape = item.shape
-    return bool(shape[1:] == (1, 2) or (shape[1:] == (2,) and item.dtype.str[1:] == "f8"))
+    return is_of(item, "numpy", "ndarray") and _has_contour_shape(item)
+
+
+def _has_contour_shape(array: Any) -> bool:
+    axes = array.shape[1:]
+    return bool(array.dtype.kind in "iuf" and (axes == (1, 2) or (axes == (2,) and array.dtype.str[1:] == "f8")))
 
 
 def _are_matches(value: Sequence[Any]) -> bool:

@@ -55,7 +55,11 @@ def parents(kind: type) -> tuple[type, ...]:
 
 def declared(kind: type, name: str) -> Any:
     """Return an attribute as it stands in a class or the nearest of its parents; None if there is none."""
-    return next((_attributes_of(parent)[name] for parent in parents(kind) if name in _attributes_of(parent)), None)
+    for parent in _parents_of(kind):
+        attributes = _attributes_of(parent)
+        if name in attributes:
+            return attributes[name]
+    return None
 
 
 def stored(value: Any, name: str) -> tuple[Any, ...]:
@@ -72,9 +76,15 @@ def stored(value: Any, name: str) -> tuple[Any, ...]:
 def is_of(value: Any, package: str, *names: str) -> bool:
     """Whether a value is of one of these classes of a package, that somebody else has imported by now."""
     module = sys.modules.get(package)
-    kinds = (getattr(module, name, None) for name in names) if module is not None else ()
-    ancestors = parents(type(value))
-    return any(kind is parent for kind in kinds for parent in ancestors)
+    if module is None:
+        return False
+    ancestors = _parents_of(type(value))
+    for name in names:
+        known = getattr(module, name, None)
+        # By identity, since a class may say of itself that it equals another.
+        if any(known is parent for parent in ancestors):
+            return True
+    return False
 
 
 def is_array(value: Any) -> bool:
@@ -113,7 +123,11 @@ def plain_text(text: str) -> str:
 
 
 def _first_of(kinds: Iterable[Any], value: Any) -> Any:
-    return next((known for known in kinds if issubclass(type(value), known)), None)
+    kind = type(value)
+    for known in kinds:
+        if issubclass(kind, known):
+            return known
+    return None
 
 
 def sorted_items(value: Any, written: Callable[[Any], str], most: int = 2_000) -> list[Any]:
