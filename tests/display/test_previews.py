@@ -590,7 +590,7 @@ def test_sets_and_objects_look_the_same_in_every_process():
         "names = set('abcdefgh')\n"
         "mixed = {1, 'a', None, 2.5, ('t',), frozenset(names), frozenset('xyz'), Thing}\n"
         "values = [names, frozenset(names), [names], {'k': names}, (names, 1), mixed, types.SimpleNamespace(s=names, o=Thing()),\n"
-        "          Thing().method, functools.partial(function), (i for i in names), ValueError(Thing()), {str(i) for i in range(5000)}]\n"
+        "          Thing().method, functools.partial(function), (i for i in names), ValueError(Thing()), ValueError(names), [ValueError(names)], {str(i) for i in range(5000)}]\n"
         "print([(p.text, p.detail, p.rows) for p in map(preview, values)])"
     )
     environment = {**os.environ, "PYTHONHASHSEED": "random"}

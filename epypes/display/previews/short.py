@@ -35,6 +35,7 @@ _BRACKETS: Final = (
 )
 _NAMED: Final = (FunctionType, BuiltinFunctionType)
 _TEXTS: Final = (str, bytes, bytearray)
+_arguments_of: Final = BaseException.__dict__["args"].__get__
 # Where an object is in memory is another place in each process.
 _ADDRESS: Final = re.compile(" at 0x[0-9A-Fa-f]{6,}")
 
@@ -76,6 +77,9 @@ class ShortRepr(reprlib.Repr):
             return f"{kind_name(kind)}({self._pairs(fields, level, '{}={}', str)})"
         if issubclass(kind, dict | MappingProxyType):
             return f"{{{self._pairs(x, level, '{}: {}', lambda key: self.repr1(key, level - 1))}}}"
+        if declared(kind, "__repr__") is BaseException.__repr__:
+            arguments = [self.repr1(item, level - 1) for item in _arguments_of(x)[: self.maxlist]]
+            return f"{kind_name(kind)}({', '.join(arguments)})"
         brackets = next(((left, right) for known, left, right in _BRACKETS if issubclass(kind, known)), None)
         return self._items(x, *brackets, level) if brackets else ""
 
@@ -126,11 +130,20 @@ def said_by(write: Any, value: Any) -> str:
     return _ADDRESS.sub("", plain_text(write(value))[: 2 * _LONGEST])
 
 
+def _message(error: BaseException) -> str:
+    """Return what an exception says; one that says no text but a value, as that value is written."""
+    arguments = _arguments_of(error)
+    is_value = len(arguments) == 1 and not issubclass(type(arguments[0]), str)
+    if is_value and declared(type(error), "__str__") is BaseException.__str__:
+        return short_repr(arguments[0])
+    return said_by(str, error)
+
+
 def reason(error: BaseException, characters: int = 60) -> str:
     """Return what was raised, ``"ValueError: no image"``, cut."""
     kind = kind_name(type(error))
     try:
-        said = said_by(str, error)
+        said = _message(error)
     except Exception:  # an exception's __str__ is its author's
         said = ""
     return cut(f"{kind}: {said}" if said else kind, characters)
