@@ -24,7 +24,8 @@ class Run(Mapping[str, Any]):
     """A run that has ended: a mapping from tokens to values, which does not change any more.
 
     Reading a token that was not computed raises NotComputed; iterating gives those that were. Arrays are read-only:
-    draw on a copy, ``run["edges"].copy()``.
+    draw on a copy, ``run["edges"].copy()``. A payload array is not copied: if its owner fills it again, the run and its
+    picture show what is in it then.
     """
 
     # One tuple to be set, and nothing else: to record a run takes a good part of what EPypes adds to its functions.

@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageDraw
 from skimage import data, measure
 
 import epypes as ep
@@ -224,3 +224,49 @@ def test_coordinates_that_are_not_finite_are_not_drawn():
     shown = previews(run_of(points=lambda image: points))["points"]
     assert shown.picture is not None
     assert 0 < green(shown).sum() < 60
+
+
+@pytest.mark.parametrize("far", [np.nan, np.inf, 1e300, 1e9, 1e6, 99_999.0])
+def test_places_that_are_far_off_are_left_out_or_cut_off(far, monkeypatch):
+    """Pillow takes seconds for each line that leaves the picture far behind."""
+    near, away = cv2.KeyPoint(100.0, 100.0, 5.0), cv2.KeyPoint(far, 1.0, 5.0)
+    marks = {
+        "points": np.array([[20, 20], [40, 40], [60, far]]),
+        "segments": np.array([[[20, 20, 220, 20]], [[30, 30, 200, 30]], [[5, 5, far, 5]]]),
+        "pairs": np.array([[20, 20, 30, 30], [40, 40, 50, 50], [9, 9, far, far]]),
+        "contours": [np.array([[20, 20], [200, 20], [200, 200], [20, far]], np.float64)],
+        "matches": [cv2.DMatch(0, 0, 1.0), cv2.DMatch(1, 1, 1.0)],
+    }
+    functions = {
+        "k1": lambda image: [near, away],
+        "k2": lambda other: [near] * 2,
+        "draw": lambda k1, k2: tuple(marks.values()),
+    }
+    io = {"k1": ("image", "k1"), "k2": ("other", "k2"), "draw": (("k1", "k2"), tuple(marks))}
+    image = np.full((256, 256), 90, np.uint8) + np.eye(256, dtype=np.uint8)
+    drawn = []
+    for name in ("line", "ellipse"):
+        original = getattr(ImageDraw.ImageDraw, name)
+
+        def told(pen, places, *arguments, original=original, **options):
+            drawn.append(np.abs(np.array(places, float)).max())
+            if np.isfinite(drawn[-1]) and drawn[-1] < 10_000:
+                original(pen, places, *arguments, **options)
+
+        monkeypatch.setattr(ImageDraw.ImageDraw, name, told)
+    shown = previews(ep.CompGraphRunner(ep.CompGraph(functions, io)).run(image=image, other=image))
+    assert drawn
+    assert all(largest <= 3 * 256 for largest in drawn)
+    for name in marks:
+        assert shown[name].picture is not None, name
+    assert green(shown["segments"])[9:12, 20:100].any(axis=0).all()
+
+
+def test_a_line_that_ends_far_off_keeps_its_direction():
+    far = np.array([[[-20_000, 128, 40_000, 128]], [[20, 20, 220, 20]], [[20, 30, 220, 30]]], np.float32)
+    marked = green(previews(run_of(segments=lambda image: far))["segments"])
+    assert marked[62:67].any(axis=0).all()
+    slanted = far.copy()
+    slanted[0] = (0, 0, 51_200, 25_600)
+    marked = green(previews(run_of(segments=lambda image: slanted))["segments"])
+    assert all(marked[place // 2 - 2 : place // 2 + 3, place - 2 : place + 3].any() for place in range(50, 120, 10))

@@ -6,10 +6,13 @@ import colorsys
 import enum
 import io
 import itertools
+import os
 import subprocess
 import sys
+import tracemalloc
+import warnings
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -299,14 +302,12 @@ def test_a_subclass_of_a_container_is_bounded_too():
 
 
 def test_what_is_long_is_not_asked_for_its_repr():
-    class Huge:
-        def __len__(self):
-            return 10**6
-
+    class Huge(dict):
         def __repr__(self):
             raise AssertionError("asked")
 
-    assert preview(Huge()).text == "Huge of 1000000"
+    assert preview(Huge.fromkeys(range(10**4)).keys()).text == "dict_keys of 10000"
+    assert preview(Huge.fromkeys(range(10**4))).text == "Huge of 10000"
 
 
 def test_a_repr_that_raises_gives_its_reason():
@@ -454,3 +455,290 @@ def test_what_is_no_class_is_refused(kind):
         ep.register_preview(kind, str)
     with pytest.raises(TypeError, match="must be a function"):
         ep.register_preview(Pose, "text")
+
+
+# What is looked at is not asked
+
+
+def meta(**attributes: Any) -> Any:
+    """Return an object whose class has a class of its own, with these attributes."""
+    return type("Meta", (type,), attributes)("Thing", (), {})()
+
+
+def boom(*arguments: Any, **options: Any) -> Any:
+    raise RuntimeError("boom")
+
+
+@pytest.mark.parametrize("name", ["__name__", "__module__", "__mro__", "__getattribute__", "__getattr__", "dtype"])
+def test_a_class_that_does_not_tell_its_name_has_one(name):
+    hostile = meta(**{name: boom if name.startswith("__get") else property(boom)})
+    assert preview(hostile).text == "Thing"
+    assert preview([hostile, {"k": hostile}]).rows == ("Thing", "{'k': Thing}")
+    assert "image/svg+xml" in mimebundle(
+        ep.CompGraphRunner(ep.CompGraph({"f": lambda: hostile}, {"f": ((), "y")})).run()
+    )
+
+
+def test_a_name_that_is_no_text_does_not_hide_the_picture():
+    assert preview(meta(__name__=5, __repr__=boom)).text == "Thing"
+
+
+def test_what_would_have_to_be_computed_is_not_asked_for():
+    asked = []
+
+    class Lazy:
+        shape, ndim, dtype, size = (100, 100), 2, np.dtype("uint8"), 10_000
+
+        def __len__(self):
+            asked.append("len")
+            return 100
+
+        def __array__(self, *arguments, **options):
+            asked.append("array")
+            return np.zeros((100, 100), np.uint8)
+
+        __getitem__ = astype = copy = __iter__ = __array__
+
+    groups = pd.DataFrame({"a": [1, 2], "b": [3, 4]}).groupby("a")
+    for value in (Lazy(), [Lazy()], (Lazy(), Lazy()), groups):
+        assert preview(value).picture is None
+    cg = ep.CompGraph(
+        {"f": lambda x: x, "g": lambda y: np.arange(60.0).reshape(30, 2)}, {"f": ("x", "y"), "g": ("y", "z")}
+    )
+    mimebundle(ep.CompGraphRunner(cg).run(x=Lazy()))
+    assert asked == []
+    assert not is_image(Lazy())
+
+
+def test_a_subclass_is_shown_by_what_it_holds_whatever_its_methods_say():
+    class Text(str):
+        __getitem__ = __len__ = __iter__ = split = strip = isprintable = __str__ = __repr__ = boom
+
+    class Numbers(list):
+        __getitem__ = __len__ = __iter__ = boom
+
+    class Names(dict):
+        __getitem__ = __len__ = __iter__ = items = keys = boom
+
+    class Both(set):
+        __len__ = __iter__ = boom
+
+    assert preview(Text("abc")).text == "'abc'"
+    assert preview(Numbers([1, 2])).rows == ("1", "2")
+    assert preview(Names(a=1)).rows == ("a: 1",)
+    assert preview(Both({1, 2})).rows == ("1", "2")
+    assert preview({"all": [Text("abc"), Numbers([1]), Both({3})]}).rows == ("all: ['abc', [1], {3}]",)
+    shown = preview(registered(ep.Preview(Text("a" * 99), Text("b"), rows=(Text("c" * 99),))))
+    assert (type(shown.text), len(shown.text), shown.detail, len(shown.rows[0])) == (str, 30, "b", 60)
+    assert preview(registered(Text("a text"))).text == "a text"
+
+
+def test_fields_that_are_kept_from_the_repr_are_not_shown():
+    @dataclass
+    class Login:
+        host: str = "cam1"
+        password: str = field(default="hunter2", repr=False)
+
+    @dataclass
+    class Written:
+        password: str = "hunter2"
+
+        def __repr__(self):
+            return "Written(***)"
+
+    @dataclass(repr=False)
+    class Unwritten:
+        password: str = "hunter2"
+
+    class Inheriting(Login):
+        def __repr__(self):
+            return "Inheriting(***)"
+
+    assert preview(Login()).rows == ("host: 'cam1'",)
+    assert preview([Login()]).rows == ("Login(host='cam1')",)
+    assert [preview(kind()).text for kind in (Written, Unwritten, Inheriting)] == [
+        "Written(***)",
+        "Unwritten",
+        "Inheriting(***)",
+    ]
+    assert "hunter2" not in repr([preview(kind()) for kind in (Login, Written, Unwritten, Inheriting)])
+
+
+def test_a_field_that_is_computed_is_left_out():
+    @dataclass(slots=True)
+    class Kept:
+        x: int = 1
+
+    @dataclass
+    class Computed:
+        x: int = 1
+        y: int = 2
+
+    Computed.x = property(boom, lambda self, value: None)
+    assert preview(Kept()).rows == ("x: 1",)
+    assert preview(Computed()).rows == ("y: 2",)
+
+
+# Same object, same bytes
+
+
+def test_sets_and_objects_look_the_same_in_every_process():
+    code = (
+        "import functools, types, pathlib; from epypes.display.previews.preview import preview\n"
+        "class Thing:\n    def method(self): pass\n"
+        "def function(): pass\n"
+        "names = set('abcdefgh')\n"
+        "mixed = {1, 'a', None, 2.5, ('t',), frozenset(names), frozenset('xyz'), Thing}\n"
+        "values = [names, frozenset(names), [names], {'k': names}, (names, 1), mixed, types.SimpleNamespace(s=names, o=Thing()),\n"
+        "          Thing().method, functools.partial(function), (i for i in names), ValueError(Thing()), ValueError(names), [ValueError(names)], {str(i) for i in range(5000)}]\n"
+        "print([(p.text, p.detail, p.rows) for p in map(preview, values)])"
+    )
+    environment = {**os.environ, "PYTHONHASHSEED": "random"}
+    ran = [
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+        for _ in range(3)
+    ]
+    assert len({done.stdout for done in ran}) == 1
+    assert " at 0x" not in ran[0].stdout
+
+
+def test_the_items_of_a_set_stand_in_order():
+    assert preview({10, 9, 2, 1}).rows == ("1", "2", "9", "10")
+    assert preview(frozenset("hgfedcba")).rows == ("'a'", "'b'", "'c'", "... 5 more")
+    assert preview([{3, 1, 2}]).rows == ("{1, 2, 3}",)
+
+
+# Numbers of every size
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        np.array([[-1.7e308, 1.7e308] * 10] * 20), np.full((20, 20), 3e38, np.float32), np.full((20, 20), 60_000, np.float16),
+        np.full((300, 1), 3e38, np.float32), np.array([np.inf, np.nan] * 20, np.float32), np.full(500, 1.7e308),
+        np.full(50, np.longdouble("1e4000")), np.full((20, 2), np.longdouble("1e4000")), np.full((20, 20), 5e-324),
+        np.full((20, 20), np.longdouble("1e4000")), np.full((5, 2), np.inf), np.full((9, 1, 4), 2**31 - 1, np.int32),
+        np.full((20, 20), 1e308 + 1e308j), np.array([[0, 2**64 - 1] * 10] * 20, np.uint64),
+    ],
+    ids=range(14),
+)  # fmt: skip
+def test_numpy_does_not_warn_of_numbers_that_are_only_looked_at(value):
+    with np.errstate(all="raise"), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert "no p" not in preview(value).detail
+        if is_image(value):
+            encode_image(value)
+
+
+@pytest.mark.parametrize(
+    ("shape", "order", "dtype"),
+    [
+        ((1, 3, 1500, 2000), (0, 2, 3, 1), np.float32),
+        ((200, 300, 400), (2, 1, 0), np.float32),
+        ((4, 3_000_000), (1, 0), np.float32),
+        ((3, 1000, 2000), (2, 1, 0), "M8[s]"),
+        ((3, 1000, 2000), (2, 1, 0), [("a", "i4"), ("b", "f8")]),
+    ],
+)
+def test_no_large_array_is_copied_to_be_looked_at(shape, order, dtype):
+    array = np.zeros(shape, dtype).transpose(order)
+    preview(array)
+    tracemalloc.start()
+    try:
+        preview(array)
+        assert tracemalloc.get_traced_memory()[1] < array.nbytes / 3
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_very_large_mask_is_shown_by_a_sample_and_says_so():
+    whole = np.broadcast_to(np.uint8(255), (30_000, 30_000))
+    shown = preview(whole)
+    assert "of a sample: thin lines may be missing" in shown.detail
+    assert pixels(shown.picture, "L").min() == 255
+    assert "thin lines" not in preview(np.zeros((3000, 4000), bool)).detail
+
+
+# Lists that only begin as something else
+
+
+def test_a_list_that_is_no_list_of_features_after_all_is_shown_as_a_list():
+    keypoint, found = cv2.KeyPoint(1, 1, 1), cv2.DMatch(0, 0, 1.0)
+    contour = np.zeros((3, 1, 2), np.int32)
+    for value in (
+        [keypoint] * 150 + ["x"] + [keypoint] * 60,
+        [found] * 150 + ["x"] + [found] * 60,
+        [[found]] * 150 + [["x"]] + [[found]] * 60,
+        [contour] * 150 + [np.zeros((3, 3))] + [contour] * 60,
+        [contour] * 150 + [np.zeros((3, 2))] + [contour] * 60,
+        [[], []],
+    ):
+        shown = preview(value)
+        assert shown.text == f"list of {len(value)}"
+        assert "no p" not in shown.detail
+        assert shown.picture is shown.chart is None
+
+
+def test_two_series_are_no_histogram():
+    two = (pd.Series([1, 2, 3], index=list("abc")), pd.Series([1, 2, 3, 4], index=list("abcd")))
+    assert preview(two).text == "tuple of 2"
+    assert preview((np.arange(3), np.arange(4.0))).text == "3 bins"
+
+
+# Pictures and charts of a user's own
+
+
+def picture(**changes: Any) -> Any:
+    return replace(encode_image(red_image(40)), **changes)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"media_type": 'image/png"/><script>alert(1)</script>'}, {"media_type": "text/html"}, {"media_type": b"image/png"},
+        {"media_type": type("Media", (str,), {})("image/jpeg")}, {"data": b"<script>alert(1)</script>"}, {"data": "text"},
+        {"data": [1, 2]}, {"width": 0}, {"height": -5}, {"width": float("nan")}, {"width": "40"}, {"media_type": "image/png"},
+        {"data": encode_image(red_image(40)).data[:-200]}, {"width": True}, {"data": bytearray(encode_image(red_image(40)).data)},
+    ],
+    ids=range(15),
+)  # fmt: skip
+def test_a_picture_that_is_not_what_it_says_is_not_painted(changes):
+    value = registered(ep.Preview("mine", picture=picture(**changes)))
+    shown = preview(value)
+    assert shown.picture is None
+    assert (shown.text, "no picture: " in shown.detail) == ("mine", True)
+    painted = mimebundle(ep.CompGraphRunner(ep.CompGraph({"f": lambda: value}, {"f": ((), "y")})).run())["text/html"]
+    assert "<script>alert" not in painted
+
+
+def test_a_picture_has_the_size_that_its_file_has():
+    shown = preview(registered(ep.Preview("mine", picture=picture(width=3, height=7)))).picture
+    assert (shown.width, shown.height) == (40, 40)
+
+
+def test_a_chart_has_few_series_and_none_without_points():
+    shown = preview(
+        registered(ep.Preview("mine", chart=Chart("line", (((np.nan, 1), (0, 1)), (), *[((0, 0), (1, 1))] * 10_000))))
+    )
+    assert len(shown.chart.series) <= 32
+    assert all(shown.chart.series)
+    assert sum(map(len, shown.chart.series)) <= 128
+    assert preview(registered(ep.Preview("mine", chart=Chart("line", ((),) * 10_000)))).chart is None
+
+
+def test_a_preview_that_shows_the_run_that_it_is_in_ends():
+    class Part:
+        pass
+
+    called = []
+
+    @ep.register_preview(Part)
+    def show(part):
+        called.append(part)
+        assert ">Part<" in mimebundle(run)["image/svg+xml"]
+        return "shown"
+
+    cg = ep.CompGraph({"f": lambda x, z: 0}, {"f": (("x", "z"), "y")})
+    run = ep.CompGraphRunner(cg).run(x=Part(), z=Part())
+    assert mimebundle(run)["image/svg+xml"].count(">shown<") == 2
+    assert len(called) == 2

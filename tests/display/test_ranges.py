@@ -122,6 +122,20 @@ def test_a_runner_keeps_its_ranges_for_itself():
 
 
 def test_what_has_no_ranges_is_refused_and_a_runner_without_a_run_has_none():
-    ep.reset_display_ranges(runner())
-    with pytest.raises(TypeError, match="A runner, a run or a pipeline"):
-        ep.reset_display_ranges(3)
+    ours = runner()
+    ep.reset_display_ranges(ours)
+    for wrong in (3, None, ours.cg, ours.plan(), ours.run(x=steps(1)).report, ours.last.hyperparameters):
+        with pytest.raises(TypeError, match="A runner, a run or a pipeline"):
+            ep.reset_display_ranges(wrong)
+
+
+def test_ranges_of_hyperparameters_are_kept_and_reset_too():
+    ours = ep.CompGraphRunner(ep.CompGraph({"f": lambda k: 0}, {"f": ("k", "y")}), {"k": steps(0.0, 50.0, 100.0)})
+    seen = lambda: next(token.preview.detail for token in view(ours).tokens if token.name == "k")  # noqa: E731
+    ours.run()
+    assert "shown from 0 to 100" in seen()
+    ours["k"] = steps(0.0, 10.0, 20.0)
+    ours.run()
+    assert "shown from 0 to 100" in seen()
+    ep.reset_display_ranges(ours)
+    assert "shown from 0 to 20" in seen()

@@ -9,9 +9,10 @@ from epypes.display.markup import cut
 from epypes.display.previews.charts import bar_chart, line_chart
 from epypes.display.previews.features import point_sketch, quad_sketch, segment_sketch
 from epypes.display.previews.imagekinds import image_kind, is_image, one_channel, sampled
+from epypes.display.previews.kinds import is_of
 from epypes.display.previews.labels import label_text
 from epypes.display.previews.ranges import is_of_dtype
-from epypes.display.previews.raster import THUMBNAIL_PX, encode_small, pillow_image
+from epypes.display.previews.raster import THUMBNAIL_PX, encode_small, is_pooled, pillow_image
 from epypes.display.previews.registry import ours
 from epypes.display.previews.short import array_text, float_text, row_texts, short_repr
 from epypes.display.previews.shown import Look, Preview, Sketch
@@ -42,12 +43,17 @@ def _number_sketch(number: Any, look: Look) -> Preview:
     return Preview(text, f"{number.dtype} {short_repr(value)}")
 
 
+def plain_array(array: Any) -> Array:
+    """Return an array without what a subclass of numpy's makes of it."""
+    import numpy as np
+
+    return np.asarray(array)
+
+
 @ours("numpy.ndarray")
 def _array_sketch(array: Any, look: Look) -> Sketch | Preview:
     """Look at an array by its shape and dtype."""
-    import numpy as np
-
-    array = np.asarray(array)
+    array = plain_array(array)
     if not array.ndim:
         return _number_sketch(array, look)
     if array.dtype.names:
@@ -89,7 +95,7 @@ def image_sketch(array: Array, look: Look) -> Sketch:
     if kind == "labels":
         said.append(label_text(one_channel(sample)) + (" in a sample" if sample is not array else ""))
     elif kind == "mask":
-        said.append("mask")
+        said.append("mask" if is_pooled(array) else "mask, of a sample: thin lines may be missing")
     elif not is_of_dtype(array.dtype, ends):
         said.append(f"shown from {ends[0]:.6g} to {ends[1]:.6g}")
     return Sketch(
@@ -141,7 +147,7 @@ def histogram_sketch(value: tuple[Any, Any]) -> Sketch:
 
 def is_histogram(value: Any) -> bool:
     """Whether a value is what ``np.histogram`` returns."""
-    if len(value) != 2 or not all(getattr(part, "ndim", 0) == 1 for part in value):
+    if len(value) != 2 or not all(is_of(part, "numpy", "ndarray") and part.ndim == 1 for part in value):
         return False
     counts, edges = value
     return len(edges) == len(counts) + 1 and all(part.dtype.kind in "iuf" for part in value)
@@ -170,4 +176,4 @@ def _rows(array: Array) -> tuple[str, ...]:
 def _cells(row: Array) -> list[str]:
     if row.dtype.kind == "f":
         return [f"{value:.4g}" for value in row]
-    return [short_repr(value.item() if hasattr(value, "item") else value) for value in row]
+    return [short_repr(value.item() if is_of(value, "numpy", "generic") else value) for value in row]

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     Floats = npt.NDArray[np.float64]
 
 MOST_POINTS: Final = 128
+MOST_LINES: Final = MOST_POINTS // 4
 _BINS: Final = MOST_POINTS // 2
-_LEAST_OF_A_LINE: Final = 4
 # Of the frame that a chart is painted into.
 _ASPECT: Final = 4 / 3
 
@@ -73,12 +73,12 @@ def spread(count: int, most: int) -> npt.NDArray[np.intp]:
 
 def drawn_in_chart(points: int, lines: int) -> int:
     """Return how many of so many lines, or without lines of so many points, a chart has."""
-    return min(lines, MOST_POINTS // _LEAST_OF_A_LINE) or min(points, MOST_POINTS)
+    return min(lines, MOST_LINES) or min(points, MOST_POINTS)
 
 
 def _shortened(lines: tuple[Floats, ...]) -> tuple[Floats, ...]:
     """Return the longest of many lines, each with every n-th of its points."""
-    longest = sorted(lines, key=len, reverse=True)[: MOST_POINTS // _LEAST_OF_A_LINE]
+    longest = sorted(lines, key=len, reverse=True)[:MOST_LINES]
     most = MOST_POINTS // len(longest)
     return tuple(line[:: -(-len(line) // most)] for line in longest)
 

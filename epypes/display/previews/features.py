@@ -8,7 +8,8 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.display.previews.charts import drawn_in_chart, spread
+from epypes.display.previews.charts import drawn_in_chart
+from epypes.display.previews.kinds import dotted_name, is_of
 from epypes.display.previews.marks import (
     MOST_MARKS,
     MOST_PAIRS,
@@ -19,9 +20,10 @@ from epypes.display.previews.marks import (
     pair_drawer,
     rectangles,
     some_lines,
+    some_pairs,
     some_points,
 )
-from epypes.display.previews.short import array_text, is_array
+from epypes.display.previews.short import array_text
 from epypes.display.previews.shown import Backdrop, Look, Preview, Sketch
 
 if TYPE_CHECKING:
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
 
     Floats = npt.NDArray[np.float64]
 
+_Closer = Callable[[Sequence[Any], Preview, Look], Sketch | None]
 # So many items of a list are looked at to know what it is a list of, and to choose the strongest keypoints.
 _LOOKED_AT: Final = 100
 _WEIGHED: Final = 10_000
@@ -37,22 +40,38 @@ _WEIGHED: Final = 10_000
 
 def keypoint_name(kind: type) -> bool:
     """Whether a class is that of OpenCV's keypoints."""
-    return _name(kind) == "cv2.KeyPoint"
+    return dotted_name(kind) == "cv2.KeyPoint"
 
 
 def are_keypoints(value: Any) -> bool:
     """Whether a value is a list or tuple of OpenCV's keypoints."""
-    return isinstance(value, list | tuple) and _are_all(value, lambda item: keypoint_name(type(item)))
+    return type(value) in (list, tuple) and _are_all(value, lambda item: keypoint_name(type(item)))
 
 
-def list_sketch(value: Sequence[Any], look: Look) -> Sketch | None:
-    """Look at a list or tuple of what can be drawn; None if it is any other."""
-    name = type(value).__name__
+def list_sketch(value: Sequence[Any], name: str, look: Look, plain: Callable[[], Preview]) -> Sketch | None:
+    """Look at a list or tuple of what can be drawn; None if it is any other.
+
+    Parameters
+    ----------
+    name
+        What such a list is called.
+    plain
+        Looks at it if on a closer look it is any other.
+    """
     for is_kind, noun, closer in _LISTS:
         if is_kind(value):
             text = f"{len(value)} {noun}{('es' if noun.endswith('ch') else 's') * (len(value) != 1)}"
-            return Sketch(Preview(text, f"{name} of {text}"), closer=partial(closer, value, text, look))
+            said = f"{name} of {text}"
+            return Sketch(
+                Preview(text, said), closer=partial(_closer_look, closer, value, Preview(text, said), look, plain)
+            )
     return None
+
+
+def _closer_look(
+    closer: _Closer, value: Sequence[Any], shown: Preview, look: Look, plain: Callable[[], Preview]
+) -> Sketch | Preview:
+    return closer(value, shown, look) or plain()
 
 
 def point_sketch(array: Any, look: Look, *, needs_image: bool = False) -> Sketch | None:
@@ -60,15 +79,13 @@ def point_sketch(array: Any, look: Look, *, needs_image: bool = False) -> Sketch
     marks = some_points(array.reshape(-1, 2))
     if needs_image and _backdrop(marks, look) is None:
         return None
-    said = f"{array_text(array)}, points{_extent(array.reshape(-1, 2))}"
+    said = f"{array_text(array)}, points{_extent(array)}"
     return _over(marks, array_text(array), said, look)
 
 
 def segment_sketch(array: Any, look: Look) -> Sketch:
     """Look at an array (n, 1, 4) of the two ends of line segments."""
-    return _over(
-        _segments(array), array_text(array), f"{array_text(array)}, segments{_extent(array.reshape(-1, 2))}", look
-    )
+    return _over(_segments(array), array_text(array), f"{array_text(array)}, segments{_extent(array)}", look)
 
 
 def _segments(array: Any) -> Marks:
@@ -87,9 +104,9 @@ def quad_sketch(array: Any, look: Look) -> Sketch | None:
     if paired is not None or backdrop is None or array.dtype.kind not in "iu" or not len(array):
         return paired
     height, width = backdrop.image.shape[:2]
-    ends = array[:, :2].astype("i8") + array[:, 2:]
+    ends = array[:, :2].astype("f8") + array[:, 2:]
     are_boxes = bool((array[:, 2:] > 0).all() and (ends <= (width, height)).all())
-    marks = rectangles(array.astype("i8")) if are_boxes else _segments(array)
+    marks = rectangles(array) if are_boxes else _segments(array)
     if not marks_lie_on(marks, backdrop):
         return None
     said = "boxes (x, y, width, height)" if are_boxes else "segments"
@@ -98,13 +115,10 @@ def quad_sketch(array: Any, look: Look) -> Sketch | None:
 
 def pair_sketch(array: Any, look: Look) -> Sketch | None:
     """Look at an array (n, 4) of places in two images; None if there are no such images."""
-    import numpy as np
-
     backdrops = look.around.image_pair()
     if backdrops is None or not len(array):
         return None
-    pairs = array[spread(len(array), MOST_PAIRS)].astype(np.float64)
-    pairs = pairs[np.isfinite(pairs).all(axis=1)]
+    pairs = some_pairs(array)
     first, second = backdrops
     if not len(pairs) or not lie_on(pairs[:, :2], first) or not lie_on(pairs[:, 2:], second):
         return None
@@ -133,29 +147,33 @@ def _between(backdrops: tuple[Backdrop, Backdrop], pairs: Floats, total: int, te
     return Sketch(Preview(text, said), pair_drawer(backdrops, pairs))
 
 
-def _keypoints(value: Sequence[Any], text: str, look: Look) -> Sketch:
+def _keypoints(value: Sequence[Any], shown: Preview, look: Look) -> Sketch:
     import numpy as np
 
     weighed = sorted(value[:_WEIGHED], key=lambda keypoint: -keypoint.response)[:MOST_MARKS]
     marks = some_points(np.array([keypoint.pt for keypoint in weighed], dtype=np.float64), len(value))
     sizes = [keypoint.size for keypoint in weighed]
-    said = f"{type(value).__name__} of {text}{_extent(marks.points)}, size {min(sizes):.4g} to {max(sizes):.4g}"
-    return _over(marks, text, said, look)
+    said = f"{shown.detail}{_extent(marks.points)}, size {min(sizes):.4g} to {max(sizes):.4g}"
+    return _over(marks, shown.text, said, look)
 
 
-def _matches(value: Sequence[Any], text: str, look: Look) -> Sketch:
+def _matches(value: Sequence[Any], shown: Preview, look: Look) -> Sketch | None:
     import numpy as np
 
-    flat = [item if _is_match(item) else item[0] for item in value[:_WEIGHED] if _is_match(item) or item]
+    known = value[:_WEIGHED]
+    flat = known if _is_match(value[0]) else [item[0] for item in known if len(item)]
+    if not _is_match(flat[0]) or not _are_of_one_class(flat):
+        return None
     distances = [match.distance for match in flat]
-    said = f"{type(value).__name__} of {text}, distance {min(distances):.4g} to {max(distances):.4g}"
+    said = f"{shown.detail}, distance {min(distances):.4g} to {max(distances):.4g}"
     backdrops, keypoints = look.around.image_pair(), look.around.keypoint_pair()
-    if backdrops is None or keypoints is None or not _indices_fit(flat, *keypoints):
-        return Sketch(Preview(text, said, rows=_match_rows(flat, len(value))))
-    first, second = keypoints
     kept = flat[:MOST_PAIRS]
-    pairs = np.array([(*first[m.queryIdx].pt, *second[m.trainIdx].pt) for m in kept], dtype=np.float64)
-    return _between(backdrops, pairs, len(value), text, said)
+    if backdrops is not None and keypoints is not None and _indices_fit(kept, *keypoints):
+        first, second = keypoints
+        pairs = some_pairs(np.array([(*first[m.queryIdx].pt, *second[m.trainIdx].pt) for m in kept]))
+        if len(pairs):
+            return _between(backdrops, pairs, len(value), shown.text, said)
+    return Sketch(Preview(shown.text, said, rows=_match_rows(flat, len(value))))
 
 
 def _match_rows(matches: Sequence[Any], total: int) -> tuple[str, ...]:
@@ -164,23 +182,30 @@ def _match_rows(matches: Sequence[Any], total: int) -> tuple[str, ...]:
 
 
 def _indices_fit(matches: Sequence[Any], first: Sequence[Any], second: Sequence[Any]) -> bool:
-    return all(0 <= m.queryIdx < len(first) and 0 <= m.trainIdx < len(second) for m in matches)
+    return all(_is_keypoint_of(first, m.queryIdx) and _is_keypoint_of(second, m.trainIdx) for m in matches)
 
 
-def _contours(value: Sequence[Any], text: str, look: Look) -> Sketch:
-    are_rows = value[0].ndim == 2
-    lines = [line[:, ::-1] for line in value] if are_rows else list(value)
-    marks = some_lines(lines, are_closed=not are_rows)
+def _is_keypoint_of(keypoints: Sequence[Any], index: int) -> bool:
+    return 0 <= index < len(keypoints) and keypoint_name(type(keypoints[index]))
+
+
+def _contours(value: Sequence[Any], shown: Preview, look: Look) -> Sketch | None:
+    known, axes = value[:_WEIGHED], value[0].ndim
+    if not all(line.ndim == axes and _has_contour_shape(line) for line in known):
+        return None
+    are_rows = axes == 2
+    marks = some_lines([line[:, ::-1] for line in known] if are_rows else known, not are_rows, len(value))
     order = ", (row, column) as scikit-image has them" if are_rows else ""
-    said = f"{type(value).__name__} of {text}, {sum(map(len, value))} points, {value[0].dtype}{order}"
-    return _over(marks, text, said, look)
+    first = f" in the first {_WEIGHED}" * (len(known) < len(value))
+    said = f"{shown.detail}, {sum(map(len, known))} points{first}, {value[0].dtype}{order}"
+    return _over(marks, shown.text, said, look)
 
 
 def _extent(points: Any) -> str:
     """Return where points lie; of very many, where some of them do."""
     import numpy as np
 
-    some = points[:: -(-len(points) // _WEIGHED) or 1].astype(np.float64)
+    some = points[:: -(-len(points) // _WEIGHED) or 1].reshape(-1, 2).astype(np.float64)
     some = some[np.isfinite(some).all(axis=1)]
     if not len(some):
         return ""
@@ -188,33 +213,39 @@ def _extent(points: Any) -> str:
     return f", x {left:.4g} to {right:.4g}, y {top:.4g} to {bottom:.4g}"
 
 
-def _name(kind: type) -> str:
-    return f"{kind.__module__}.{kind.__qualname__}"
-
-
 def _are_all(value: Sequence[Any], is_kind: Callable[[Any], bool]) -> bool:
-    """Whether all items are of a kind, as far as some of them tell; no item, no kind."""
+    """Whether all items are of a kind, as far as some of them, and the classes of many, tell; no item, no kind."""
     step = -(-len(value) // _LOOKED_AT) or 1
-    return len(value) > 0 and all(is_kind(item) for item in itertools.islice(value, 0, None, step))
+    if not value or not all(is_kind(item) for item in itertools.islice(value, 0, None, step)):
+        return False
+    return _are_of_one_class(value)
+
+
+def _are_of_one_class(value: Sequence[Any]) -> bool:
+    """Whether the first of many items are of one class."""
+    first = type(value[0])
+    return all(type(item) is first for item in itertools.islice(value, _WEIGHED))
 
 
 def _is_match(item: Any) -> bool:
-    return _name(type(item)) == "cv2.DMatch"
+    return dotted_name(type(item)) == "cv2.DMatch"
 
 
 def _is_match_list(item: Any) -> bool:
-    return isinstance(item, list | tuple) and len(item) <= 16 and all(map(_is_match, item))
+    return type(item) in (list, tuple) and len(item) <= 16 and all(map(_is_match, item))
 
 
 def _is_contour(item: Any) -> bool:
-    if not is_array(item) or item.dtype.kind not in "iuf":
-        return False
-    shape = item.shape
-    return bool(shape[1:] == (1, 2) or (shape[1:] == (2,) and item.dtype.str[1:] == "f8"))
+    return is_of(item, "numpy", "ndarray") and _has_contour_shape(item)
+
+
+def _has_contour_shape(array: Any) -> bool:
+    axes = array.shape[1:]
+    return bool(array.dtype.kind in "iuf" and (axes == (1, 2) or (axes == (2,) and array.dtype.str[1:] == "f8")))
 
 
 def _are_matches(value: Sequence[Any]) -> bool:
-    return _are_all(value, _is_match) or _are_all(value, _is_match_list)
+    return _are_all(value, _is_match) or (_are_all(value, _is_match_list) and any(value[:_WEIGHED]))
 
 
 def _are_contours(value: Sequence[Any]) -> bool:

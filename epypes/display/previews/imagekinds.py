@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+from epypes.display.previews.kinds import is_of
+
 if TYPE_CHECKING:
     import numpy.typing as npt
 
@@ -31,10 +33,10 @@ _SMALL_STEPS: Final = 0.8
 
 
 def is_image(value: Any) -> bool:
-    """Whether a value can be seen as an image: (y, x), (y, x, 3) or (y, x, 4), at least 8 x 8 pixels."""
-    shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
-    if not isinstance(shape, tuple) or getattr(dtype, "kind", "") not in ("b", "u", "i", "f"):
+    """Whether a value can be seen as an image: an array (y, x), (y, x, 3) or (y, x, 4), at least 8 x 8 pixels."""
+    if not is_of(value, "numpy", "ndarray") or value.dtype.kind not in "buif":
         return False
+    shape = value.shape
     channels = shape[2] if len(shape) == 3 else 1
     return len(shape) in (2, 3) and channels in (1, 3, 4) and min(shape[:2]) >= SMALLEST_SIDE_PX
 

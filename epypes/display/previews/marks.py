@@ -5,7 +5,9 @@ Without an image at hand they become a chart in their own extent.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -17,7 +19,7 @@ from epypes.display.previews.shown import Backdrop, Chart
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
-    from PIL import Image, ImageDraw
+    from PIL import Image
 
     Floats = npt.NDArray[np.float64]
 
@@ -27,6 +29,8 @@ MOST_PAIRS: Final = 40
 # Marks are drawn at twice the size and made smaller with the image, which smooths their edges.
 _OVERSAMPLED: Final = 2
 _FARTHEST_PX: Final = 1e6
+# What lies further off a canvas than its own size is not seen, and drawing it takes seconds.
+_MARGIN: Final = 1.0
 _INSIDE: Final = 0.5
 # Few points are larger than many.
 _FEW: Final = 50
@@ -35,6 +39,8 @@ _LARGE_RADIUS_PX: Final = 4.0
 _PAIR_RADIUS_PX: Final = 2.0
 _LINE_PX: Final = 2
 _DARKER: Final = 0.75
+_Colour = tuple[int, int, int]
+_Place = tuple[float, float]
 _GREEN: Final = (60, 255, 120)
 _COLOURS: Final = ((255, 90, 90), (90, 220, 255), (255, 215, 70), (120, 255, 130), (240, 130, 255), (255, 165, 80))
 
@@ -75,21 +81,34 @@ def some_points(points: Any, total: int | None = None) -> Marks:
     return Marks(kept[_is_drawable(kept)], total=total)
 
 
-def some_lines(lines: Any, are_closed: bool) -> Marks:
+def some_pairs(places: Any) -> Floats:
+    """Return pairs (n, 4) of places as they are drawn: of many some, none that is not finite or far away."""
+    import numpy as np
+
+    kept: Floats = places[spread(len(places), MOST_PAIRS)].astype(np.float64)
+    return kept[_is_drawable(kept)]
+
+
+def some_lines(lines: Any, are_closed: bool, total: int | None = None) -> Marks:
     """Return lines, each (k, 2), as marks: of many the longest, each with at most so many points."""
     import numpy as np
 
     longest = sorted(lines, key=len, reverse=True)[:MOST_MARKS] if len(lines) > MOST_MARKS else lines
     kept = [line[:: -(-len(line) // MOST_MARKS) or 1].reshape(-1, 2).astype(np.float64) for line in longest]
     drawable = tuple(line[_is_drawable(line)] for line in kept if len(line))
-    return Marks(np.empty((0, 2)), tuple(line for line in drawable if len(line)), are_closed, len(lines))
+    return Marks(
+        np.empty((0, 2)),
+        tuple(line for line in drawable if len(line)),
+        are_closed,
+        len(lines) if total is None else total,
+    )
 
 
 def rectangles(boxes: Any) -> Marks:
     """Return boxes (n, 4) of x, y, width and height as marks."""
     import numpy as np
 
-    x, y, width, height = boxes[:MOST_MARKS].T
+    x, y, width, height = boxes[:MOST_MARKS].astype(np.float64).T
     corners = np.stack([x, y, x + width, y, x + width, y + height, x, y + height], axis=1)
     return replace(some_lines(list(corners.reshape(-1, 4, 2)), are_closed=True), total=len(boxes))
 
@@ -132,34 +151,33 @@ def _is_drawable(places: Floats) -> npt.NDArray[np.bool_]:
 
 
 def _drawn_over(backdrop: Backdrop, marks: Marks) -> Image.Image:
-    from PIL import ImageDraw
-
     canvas, scale = _canvas(backdrop, THUMBNAIL_PX * _OVERSAMPLED)
-    pen = ImageDraw.Draw(canvas)
+    pen = _Pen(canvas)
     for line in marks.lines:
-        _draw_line(pen, (line + 0.5) * scale, marks.are_closed)
+        pen.line((line + 0.5) * scale, _GREEN, _LINE_PX, is_closed=marks.are_closed)
     radius = _LARGE_RADIUS_PX if len(marks.points) <= _FEW else _RADIUS_PX
     for x, y in (marks.points + 0.5) * scale:
-        _draw_point(pen, x, y, _GREEN, radius)
+        pen.point(x, y, _GREEN, radius)
     return canvas.reduce(_OVERSAMPLED)
 
 
 def _drawn_between(backdrops: tuple[Backdrop, Backdrop], pairs: Floats) -> Image.Image:
-    from PIL import Image, ImageDraw
+    import numpy as np
+    from PIL import Image
 
     side = THUMBNAIL_PX * _OVERSAMPLED // 2
     (left, left_scale), (right, right_scale) = (_canvas(backdrop, side) for backdrop in backdrops)
     canvas = Image.new("RGB", (2 * side, max(left.height, right.height)))
     canvas.paste(left, (side - left.width, 0))
     canvas.paste(right, (side, 0))
-    pen = ImageDraw.Draw(canvas)
+    pen = _Pen(canvas)
     for index, (x0, y0, x1, y1) in enumerate(pairs + 0.5):
         start = x0 * left_scale + side - left.width, y0 * left_scale
         end = x1 * right_scale + side, y1 * right_scale
         colour = _COLOURS[index % len(_COLOURS)]
-        pen.line((*start, *end), fill=colour, width=1)
-        _draw_point(pen, *start, colour, _PAIR_RADIUS_PX)
-        _draw_point(pen, *end, colour, _PAIR_RADIUS_PX)
+        pen.line(np.array([start, end]), colour)
+        pen.point(*start, colour, _PAIR_RADIUS_PX)
+        pen.point(*end, colour, _PAIR_RADIUS_PX)
     return canvas.reduce(_OVERSAMPLED)
 
 
@@ -177,15 +195,58 @@ def _canvas(backdrop: Backdrop, side: int) -> tuple[Image.Image, float]:
     return picture.point(lambda level: round(level * _DARKER)), scale
 
 
-def _draw_line(pen: ImageDraw.ImageDraw, line: Floats, is_closed: bool) -> None:
-    places = [(float(x), float(y)) for x, y in line]
-    if len(places) == 1:
-        _draw_point(pen, *places[0], _GREEN)
-        return
-    pen.line(places + places[:1] * is_closed, fill=_GREEN, width=_LINE_PX)
+class _Pen:
+    """Draws upon a canvas, and nothing that is far off: Pillow would visit each pixel of a line, wherever it is."""
 
+    def __init__(self, canvas: Image.Image) -> None:
+        from PIL import ImageDraw
 
-def _draw_point(
-    pen: ImageDraw.ImageDraw, x: float, y: float, colour: tuple[int, int, int], radius: float = _RADIUS_PX
-) -> None:
-    pen.ellipse((x - radius, y - radius, x + radius, y + radius), fill=colour, outline=(0, 0, 0))
+        self._draw = ImageDraw.Draw(canvas)
+        self._low = -_MARGIN * canvas.width, -_MARGIN * canvas.height
+        self._high = (1 + _MARGIN) * canvas.width, (1 + _MARGIN) * canvas.height
+
+    def point(self, x: float, y: float, colour: _Colour, radius: float = _RADIUS_PX) -> None:
+        """Draw a dot."""
+        if self._is_near(((x, y),)):
+            self._draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=colour, outline=(0, 0, 0))
+
+    def line(self, line: Floats, colour: _Colour, width: int = 1, *, is_closed: bool = False) -> None:
+        """Draw a line through places (k, 2); of one place, a dot."""
+        places: list[_Place] = [(float(x), float(y)) for x, y in line]
+        if len(places) == 1:
+            self.point(*places[0], colour)
+            return
+        places += places[:1] * is_closed
+        if self._is_near(places):
+            self._draw.line(places, fill=colour, width=width)
+            return
+        for start, end in itertools.pairwise(places):
+            near = self._near_part(start, end)
+            if near is not None:
+                self._draw.line(near, fill=colour, width=width)
+
+    def _is_near(self, places: Iterable[_Place]) -> bool:
+        (left, top), (right, bottom) = self._low, self._high
+        return all(left <= x <= right and top <= y <= bottom for x, y in places)
+
+    def _near_part(self, start: _Place, end: _Place) -> tuple[_Place, _Place] | None:
+        """Return the part of a line that is near; None if there is none, or if an end is nowhere."""
+        first, last = 0.0, 1.0
+        for a, b, low, high in zip(start, end, self._low, self._high, strict=True):
+            if not math.isfinite(b - a):
+                return None
+            if a == b:
+                if not low <= a <= high:
+                    return None
+                continue
+            enters, leaves = sorted(((low - a) / (b - a), (high - a) / (b - a)))
+            first, last = max(first, enters), min(last, leaves)
+        if first > last:
+            return None
+        return self._between(start, end, first), self._between(start, end, last)
+
+    def _between(self, start: _Place, end: _Place, share: float) -> _Place:
+        # Within limits once more: of very large numbers the difference is not exact.
+        ends = zip(start, end, self._low, self._high, strict=True)
+        x, y = (min(max(a + share * (b - a), low), high) for a, b, low, high in ends)
+        return x, y

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 from weakref import WeakKeyDictionary
 
 from epypes.display.previews.imagekinds import sampled
+from epypes.display.previews.kinds import kind_name
+from epypes.run import CompGraphRunner, Run
 from epypes.run.program import Program
 
 if TYPE_CHECKING:
@@ -63,11 +65,11 @@ def reset_display_ranges(shown: Any) -> None:
         A runner, a run or a pipeline; of all its tokens.
     """
     runner = getattr(shown, "runner", shown)
-    run = getattr(runner, "last", runner)
-    if run is None:
-        return
-    if not hasattr(run, "tokens"):
-        raise TypeError(f"A runner, a run or a pipeline has display ranges, not {type(shown).__name__!r}.")
+    run = runner.last if isinstance(runner, CompGraphRunner) else runner
+    if not isinstance(run, Run):
+        if isinstance(runner, CompGraphRunner):
+            return
+        raise TypeError(f"A runner, a run or a pipeline has display ranges, not {kind_name(type(shown))!r}.")
     with _lock:
         _kept.pop(run.tokens.program, None)
 

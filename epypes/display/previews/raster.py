@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display.previews.imagekinds import image_kind, is_image, is_mask, one_channel, sampled
 from epypes.display.previews.labels import label_picture
+from epypes.display.previews.looking import silent_numpy
 from epypes.display.previews.ranges import Range, display_range
 
 if TYPE_CHECKING:
@@ -33,6 +34,9 @@ JPEG_QUALITY: Final = 80
 _QUALITIES: Final = (68, 55, 42)
 _COLOURS: Final = 48
 _LEAST_SIDE_PX: Final = 16
+_MOST_POOLED_PX: Final = 16_000_000
+# So many pixels of a very large mask, along each side, make one of the thumbnail.
+_SAMPLED: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,11 +77,12 @@ def encode_image(
     ends
         The values that are shown black and white; None takes those of ``display_range``.
     """
-    sample = sampled(array)
-    kind = image_kind(array, sample)
-    if kind == "mask" and sample is not array and not is_mask(one_channel(array)):
-        kind = "photograph"
-    return _save(pillow_image(array, max_side_px, order, ends, kind))
+    with silent_numpy():
+        sample = sampled(array)
+        kind = image_kind(array, sample)
+        if kind == "mask" and sample is not array and not is_mask(one_channel(array)):
+            kind = "photograph"
+        return _save(pillow_image(array, max_side_px, order, ends, kind))
 
 
 def pillow_image(array: Array, max_side_px: int | None, order: Order, ends: Range | None, kind: str) -> Image.Image:
@@ -140,9 +145,8 @@ def _as_bytes(image: Array, ends: Range) -> npt.NDArray[np.uint8]:
         return np.ascontiguousarray(np.right_shift(np.minimum(image, np.uint16(high)), bits - 8), dtype=np.uint8)
     is_wide = image.dtype.itemsize > 4 or (image.dtype.kind in "iu" and image.dtype.itemsize == 4)
     values: npt.NDArray[np.floating[Any]] = image.astype(np.float64 if is_wide else np.float32)
-    with np.errstate(invalid="ignore", over="ignore"):
-        # Halves, since the two ends may be further apart than the largest float.
-        scaled = (values / 2 - low / 2) * (255.0 / max(high / 2 - low / 2, 5e-324))
+    # Halves, since the two ends may be further apart than the largest float.
+    scaled = (values / 2 - low / 2) * (255.0 / max(high / 2 - low / 2, 5e-324))
     return np.ascontiguousarray(np.nan_to_num(scaled, nan=0.0).clip(0, 255), dtype=np.uint8)
 
 
@@ -172,12 +176,20 @@ def _mask_picture(mask: Array, max_side_px: int | None) -> Image.Image:
     import numpy as np
     from PIL import Image
 
-    pool = 1 if max_side_px is None else -(-max(mask.shape) // max_side_px)
     bits = mask.view(np.uint8) if mask.dtype.kind == "b" else mask
+    if max_side_px is not None and not is_pooled(mask):
+        stride = max(1, max(mask.shape) // (_SAMPLED * max_side_px))
+        bits = bits[::stride, ::stride]
+    pool = 1 if max_side_px is None else -(-max(bits.shape) // max_side_px)
     if pool > 1:
         # Every pixel counts, or lines between those of a sample would vanish; by whole rows, 12 MP take 0.4 ms.
         bits = _pooled(np.ascontiguousarray(_pooled(bits, pool).T), pool).T
     return Image.fromarray(np.ascontiguousarray(bits != 0)).convert("1")
+
+
+def is_pooled(mask: Array) -> bool:
+    """Whether all pixels of a mask are looked at when it is made smaller: of a very large one that takes too long."""
+    return mask.size <= _MOST_POOLED_PX
 
 
 def _pooled(bits: Array, pool: int) -> Array:

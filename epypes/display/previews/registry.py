@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any, Final, TypeVar, overload
 from weakref import WeakKeyDictionary
 
+from epypes.display.previews.kinds import dotted_name, kind_name, parents
 from epypes.display.previews.shown import Look
 from epypes.run.guard import lend
 
@@ -37,7 +38,7 @@ class Registry:
     def get(self, kind: type) -> Looker | None:
         """Return the function of this very class."""
         found = self._by_class.get(kind)
-        return found or self._by_name.get(f"{kind.__module__}.{kind.__qualname__}")
+        return found or self._by_name.get(dotted_name(kind))
 
 
 OURS: Final = Registry()
@@ -46,11 +47,11 @@ _users: Final = Registry()
 
 def looker_of(kind: type) -> Looker:
     """Return the function that looks at values of a class; of two for one class, the user's."""
-    for parent in kind.__mro__:
+    for parent in parents(kind):
         found = _users.get(parent) or OURS.get(parent)
         if found is not None:
             return found
-    raise TypeError(f"nothing is registered for {kind.__name__}")
+    raise TypeError(f"nothing is registered for {kind_name(kind)}")
 
 
 def ours(*kinds: type | str) -> Callable[[_Looker], _Looker]:
@@ -78,7 +79,8 @@ def register_preview(kind: type | str, function: Callable[[Any], Any] | None = N
         imports nothing.
     function
         Takes a value, arrays read-only, and returns a short text, an image (an array as OpenCV has it), or a
-        ``Preview``. It is called whenever a picture is made. If it raises, the reason is shown in place.
+        ``Preview``. It runs whenever a picture of a graph or run with such a value is made, so it should be quick and
+        change nothing. If it raises, the reason is shown in place; what it shows itself meanwhile has no previews.
 
     Returns
     -------

@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
+import re
 import reprlib
 from collections import deque
-from collections.abc import Iterable, Mapping
-from types import BuiltinFunctionType, FunctionType
+from collections.abc import Iterable, Iterator
+from types import BuiltinFunctionType, FunctionType, MappingProxyType
 from typing import Any, Final
 
 from epypes.display.markup import cut
+from epypes.display.previews.fields import fields_of
+from epypes.display.previews.kinds import (
+    declared,
+    is_array,
+    items_in,
+    kind_name,
+    length_of,
+    pairs_in,
+    plain_text,
+    qualified_name,
+    sorted_items,
+)
 
 _MOST_BITS: Final = 400
 _LONGEST: Final = 200
@@ -21,8 +33,11 @@ _BRACKETS: Final = (
     (frozenset, "{", "}"),
     (deque, "deque([", "])"),
 )
-_NAMED: Final = (FunctionType, BuiltinFunctionType, type)
-_CALL: Final = "{}={}"
+_NAMED: Final = (FunctionType, BuiltinFunctionType)
+_TEXTS: Final = (str, bytes, bytearray)
+_arguments_of: Final = BaseException.__dict__["args"].__get__
+# Where an object is in memory is another place in each process.
+_ADDRESS: Final = re.compile(" at 0x[0-9A-Fa-f]{6,}")
 
 
 class ShortRepr(reprlib.Repr):
@@ -40,66 +55,61 @@ class ShortRepr(reprlib.Repr):
         try:
             return self._written(x, level)
         except Exception as error:
-            return f"<{type(x).__name__}: no repr: {reason(error, 40)}>"
+            return f"<{kind_name(type(x))}: no repr: {reason(error, 40)}>"
 
     def _written(self, x: Any, level: int) -> str:
         kind = type(x)
-        if issubclass(kind, str | bytes | bytearray):
+        known = next((known for known in _TEXTS if issubclass(kind, known)), None)
+        if known is not None:
             # reprlib cuts a text only after it has made all of it.
-            return self._cut(repr(x[:_LONGEST]) if len(x) <= _LONGEST else repr(x[:_LONGEST])[:-1], self.maxstring)
+            beginning = repr(known.__getitem__(x, slice(_LONGEST)))
+            return cut(beginning if length_of(x) <= _LONGEST else beginning[:-1], self.maxstring)
         if kind is int and x.bit_length() > _MOST_BITS:
             return f"int of {x.bit_length()} bits"
         if is_array(x):
             return array_text(x)
-        return self._container(x, level) or self._cut(self._object(x), self.maxother)
+        return self._container(x, level) or cut(self._object(x), self.maxother)
 
     def _container(self, x: Any, level: int) -> str:
         kind = type(x)
         fields = fields_of(x)
         if fields is not None:
-            return f"{kind.__name__}({self._dict(fields, level, _CALL)})"
-        if issubclass(kind, dict):
-            return f"{{{self._dict(x, level, '{}: {}')}}}"
+            return f"{kind_name(kind)}({self._pairs(fields, level, '{}={}', str)})"
+        if issubclass(kind, dict | MappingProxyType):
+            return f"{{{self._pairs(x, level, '{}: {}', lambda key: self.repr1(key, level - 1))}}}"
+        if declared(kind, "__repr__") is BaseException.__repr__:
+            arguments = [self.repr1(item, level - 1) for item in _arguments_of(x)[: self.maxlist]]
+            return f"{kind_name(kind)}({', '.join(arguments)})"
         brackets = next(((left, right) for known, left, right in _BRACKETS if issubclass(kind, known)), None)
         return self._items(x, *brackets, level) if brackets else ""
 
     def _object(self, x: Any) -> str:
         kind = type(x)
-        if getattr(kind, "__repr__", None) is object.__repr__ or issubclass(kind, _NAMED):
-            # Their repr says where they are in memory, which is another place in each process.
-            return str(getattr(x, "__qualname__", kind.__name__))
-        length = _length(x)
+        if issubclass(kind, type):
+            return qualified_name(x)
+        if issubclass(kind, _NAMED):
+            return plain_text(x.__qualname__)
+        if declared(kind, "__repr__") is object.__repr__:
+            return kind_name(kind)
+        length = length_of(x)
         # What is so long would take its own repr as long.
-        return f"{kind.__name__} of {length}" if length > _LONGEST else repr(x)
+        return f"{kind_name(kind)} of {length}" if length > _LONGEST else said_by(repr, x)
 
     def _items(self, x: Any, left: str, right: str, level: int) -> str:
-        if level <= 0 and len(x):
+        count = length_of(x)
+        if level <= 0 and count:
             return f"{left}...{right}"
-        parts = [self.repr1(item, level - 1) for item in itertools.islice(iter(x), self.maxlist)]
-        more = ["..."] if len(x) > self.maxlist else []
-        closing = ",)" if right == ")" and len(x) == 1 else right
+        parts = [self.repr1(item, level - 1) for item in itertools.islice(shown_items(x), self.maxlist)]
+        more = ["..."] if count > len(parts) else []
+        closing = ",)" if right == ")" and count == 1 else right
         return f"{left}{', '.join(parts + more)}{closing}"
 
-    def _dict(self, x: Mapping[Any, Any], level: int, form: str) -> str:
-        if level <= 0 and x:
+    def _pairs(self, x: Any, level: int, form: str, key_text: Any) -> str:
+        pairs = list(itertools.islice(pairs_in(x), self.maxdict + 1))
+        if level <= 0 and pairs:
             return "..."
-        items = itertools.islice(iter(x.items()), self.maxdict)
-        is_call = form == _CALL
-        parts = [
-            form.format(key if is_call else self.repr1(key, level - 1), self.repr1(value, level - 1))
-            for key, value in items
-        ]
-        return ", ".join(parts + ["..."] * (len(x) > self.maxdict))
-
-    def _cut(self, text: str, characters: int) -> str:
-        return cut(text, characters)
-
-
-def _length(x: Any) -> int:
-    try:
-        return len(x)
-    except Exception:  # whatever an object's __len__ raises
-        return 0
+        parts = [form.format(key_text(key), self.repr1(value, level - 1)) for key, value in pairs[: self.maxdict]]
+        return ", ".join(parts + ["..."] * (len(pairs) > self.maxdict))
 
 
 _SHORT: Final = ShortRepr()
@@ -110,30 +120,33 @@ def short_repr(value: Any) -> str:
     return cut(_SHORT.repr(value), 120)
 
 
+def shown_items(value: Any) -> Iterator[Any]:
+    """Return the items of a list, tuple, set or deque, those of a set in order."""
+    return iter(sorted_items(value, short_repr)) if issubclass(type(value), set | frozenset) else items_in(value)
+
+
+def said_by(write: Any, value: Any) -> str:
+    """Return what an author's ``repr`` or ``str`` says of a value, without addresses in memory."""
+    return _ADDRESS.sub("", plain_text(write(value))[: 2 * _LONGEST])
+
+
+def _message(error: BaseException) -> str:
+    """Return what an exception says; one that says no text but a value, as that value is written."""
+    arguments = _arguments_of(error)
+    is_value = len(arguments) == 1 and not issubclass(type(arguments[0]), str)
+    if is_value and declared(type(error), "__str__") is BaseException.__str__:
+        return short_repr(arguments[0])
+    return said_by(str, error)
+
+
 def reason(error: BaseException, characters: int = 60) -> str:
     """Return what was raised, ``"ValueError: no image"``, cut."""
-    kind = type(error).__name__
+    kind = kind_name(type(error))
     try:
-        said = str(error)[:_LONGEST]
+        said = _message(error)
     except Exception:  # an exception's __str__ is its author's
         said = ""
     return cut(f"{kind}: {said}" if said else kind, characters)
-
-
-def is_array(value: Any) -> bool:
-    """Whether a value is an array or a number of numpy."""
-    kind = type(value)
-    return hasattr(kind, "dtype") and any(str(parent.__module__) == "numpy" for parent in kind.__mro__)
-
-
-def fields_of(value: Any) -> dict[str, Any] | None:
-    """Return the fields of a named tuple, or of a dataclass that is written by its fields; None of any other."""
-    kind = type(value)
-    if issubclass(kind, tuple) and hasattr(kind, "_fields"):
-        return dict(zip(kind._fields, value, strict=False))
-    if not dataclasses.is_dataclass(kind):
-        return None
-    return {field.name: getattr(value, field.name, "missing") for field in dataclasses.fields(kind)}
 
 
 def float_text(value: float, digits: int = 6) -> str:
@@ -145,7 +158,7 @@ def float_text(value: float, digits: int = 6) -> str:
 def array_text(array: Any) -> str:
     """Return dtype and shape of an array, ``"uint8 480 x 640"``; of one without axes its value."""
     if not array.shape:
-        return cut(str(array.item())[:_LONGEST], 60)
+        return cut(item if type(item := array.item()) is str else short_repr(item), 60)
     return f"{dtype_text(array.dtype)} {' x '.join(map(str, array.shape))}"
 
 
@@ -158,12 +171,12 @@ def row_texts(values: Iterable[Any], count: int, most: int) -> tuple[str, ...]:
     """Return the first of so many values as lines, the last of which says how many more there are."""
     kept = count if count <= most else most - 1
     rows = [short_repr(value) for value in itertools.islice(iter(values), kept)]
-    return (*rows, f"... {count - kept} more") if count > kept else tuple(rows)
+    return (*rows, f"... {count - len(rows)} more") if count > len(rows) else tuple(rows)
 
 
-def item_texts(mapping: Mapping[Any, Any], count: int, most: int) -> tuple[str, ...]:
+def item_texts(mapping: Any, count: int, most: int) -> tuple[str, ...]:
     """Return the first of so many items as lines ``key: value``."""
     kept = count if count <= most else most - 1
-    items = itertools.islice(iter(mapping.items()), kept)
-    rows = [f"{key if type(key) is str else short_repr(key)}: {short_repr(value)}" for key, value in items]
+    pairs = itertools.islice(pairs_in(mapping), kept)
+    rows = [f"{key if type(key) is str else short_repr(key)}: {short_repr(value)}" for key, value in pairs]
     return (*rows, f"... {count - kept} more") if count > kept else tuple(rows)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display.previews.imagekinds import EXACT_PX, SAMPLE_PX
@@ -17,24 +16,30 @@ if TYPE_CHECKING:
 
 def some_of(array: Array) -> Array:
     """Return an array of at most a million values as it is, of a larger one every n-th."""
-    if array.size <= EXACT_PX:
-        return array
-    step = -(-array.size // SAMPLE_PX)
-    # Along the first axis, since an array that is not contiguous would be copied to be flattened.
-    along = array[:: min(step, array.shape[0])]
-    return along.reshape(-1)[:: -(-along.size // SAMPLE_PX)] if along.size > SAMPLE_PX else along
+    return array if array.size <= EXACT_PX else _sample(array, SAMPLE_PX)
 
 
 def few_of(array: Array) -> Array:
     """Return a small array as it is, of a larger one a few thousand values: that takes no time worth counting."""
-    if array.size <= _FEW:
-        return array
-    if array.ndim == 1:
-        return array[:: -(-array.size // _FEW)]
-    step = math.isqrt(array.shape[0] * array.shape[1] // _FEW) + 1
-    few = array[::step, ::step]
-    # To flatten what is not contiguous takes a copy.
-    return few if few.size <= 4 * _FEW else few.reshape(-1)[:: -(-few.size // _FEW)]
+    return array if array.size <= _FEW else _sample(array, _FEW)
+
+
+def _sample(array: Array, most: int) -> Array:
+    """Return about so many values, every n-th of each long axis: to flatten an array may take a copy of all of it."""
+    longest = _longest_axis(array.shape, most)
+    # A copy, since what lies far apart in memory is to be fetched once.
+    return array[tuple(slice(None, None, -(-length // longest)) for length in array.shape)].copy()
+
+
+def _longest_axis(shape: tuple[int, ...], most: int) -> int:
+    """Return the length that axes may have, so that no more than so many values are left and short axes stay whole."""
+    room = float(most)
+    for axes, length in zip(range(len(shape), 0, -1), sorted(shape), strict=True):
+        side = room ** (1 / axes)
+        if length > side:
+            return max(1, int(side + 1e-9))
+        room /= length
+    return max(shape)
 
 
 def statistics_text(sample: Array, array: Array) -> str:
@@ -53,15 +58,14 @@ def _numbers(sample: Array, array: Array) -> list[str]:
         return [f"{np.mean(sample):.3g} of it true" + " in a sample" * (sample.size < array.size)]
     if array.dtype.kind not in "iufc":
         return []
-    with np.errstate(all="ignore"):
-        values = np.abs(sample) if array.dtype.kind == "c" else sample
-        finite, odd = _finite(values)
-        if not finite.size:
-            return ["no finite value", *odd]
-        marked = " of a sample" if sample.size < array.size else ""
-        name = "magnitude " if array.dtype.kind == "c" else ""
-        mean = np.mean(finite, dtype=np.float64 if array.dtype.kind == "f" else None)
-        return [f"{name}{_text(finite.min())} to {_text(finite.max())}{marked}", f"mean {mean:.4g}", *odd]
+    values = np.abs(sample) if array.dtype.kind == "c" else sample
+    finite, odd = _finite(values)
+    if not finite.size:
+        return ["no finite value", *odd]
+    marked = " of a sample" if sample.size < array.size else ""
+    name = "magnitude " if array.dtype.kind == "c" else ""
+    mean = np.mean(finite, dtype=np.float64 if array.dtype.kind == "f" else None)
+    return [f"{name}{_text(finite.min())} to {_text(finite.max())}{marked}", f"mean {mean:.4g}", *odd]
 
 
 def _finite(values: Any) -> tuple[Any, list[str]]:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from epypes.display.markup import cut
+from epypes.display.previews.kinds import is_of
 from epypes.display.previews.registry import ours
 from epypes.display.previews.short import short_repr
 from epypes.display.previews.shown import Look, Preview
@@ -21,7 +22,7 @@ _ROW_CHARACTERS: Final = 60
 # pandas 3 says where a class is imported from, earlier ones where it is defined.
 @ours("pandas.DataFrame", "pandas.core.frame.DataFrame")
 def _frame(frame: Any, look: Look) -> Preview:
-    names = [str(name) for name in itertools.islice(frame.columns, _NAMED)]
+    names = [_label(name) for name in itertools.islice(frame.columns, _NAMED)]
     kinds = [str(kind) for kind in itertools.islice(frame.dtypes, _NAMED)]
     columns = ", ".join(f"{cut(name, 20)} {kind}" for name, kind in zip(names, kinds, strict=True))
     rows = frame.iloc[:_ROWS, :_MOST_COLUMNS].itertuples(index=False, name=None)
@@ -31,7 +32,7 @@ def _frame(frame: Any, look: Look) -> Preview:
 @ours("pandas.Series", "pandas.core.series.Series")
 def _series(series: Any, look: Look) -> Preview:
     rows = [f"{short_repr(key)}: {_cell(value)}" for key, value in series.iloc[:_ROWS].items()]
-    name = "" if series.name is None else f" {cut(str(series.name), 20)}"
+    name = "" if series.name is None else f" {cut(_label(series.name), 20)}"
     more = [f"... {len(series) - _ROWS} more"] * (len(series) > _ROWS)
     said = f"Series{name}: {series.dtype}, {_rows_text(len(series))}, {memory_text(series.nbytes)}"
     return Preview(f"Series, {_rows_text(len(series))}", said, rows=(*rows, *more))
@@ -40,10 +41,9 @@ def _series(series: Any, look: Look) -> Preview:
 def record_sketch(array: Any) -> Preview:
     """Look at an array with named fields."""
     names = list(array.dtype.names)
-    flat = array.reshape(-1)
-    rows = [tuple(row[name] for name in names[:_MOST_COLUMNS]) for row in flat[:_ROWS]]
+    rows = [tuple(row[name] for name in names[:_MOST_COLUMNS]) for row in array.flat[:_ROWS]]
     fields = ", ".join(f"{cut(name, 20)} {array.dtype[name]}" for name in names[:_NAMED])
-    return _table(flat.size, len(names), names, rows, f"array of {memory_text(array.nbytes)}: {fields}")
+    return _table(array.size, len(names), names, rows, f"array of {memory_text(array.nbytes)}: {fields}")
 
 
 def is_dict_list(value: Sequence[Any]) -> bool:
@@ -79,9 +79,13 @@ def _line(cells: list[str]) -> str:
 
 
 def _cell(value: Any) -> str:
-    if hasattr(value, "item") and not getattr(value, "shape", ()):
+    if is_of(value, "numpy", "generic"):
         value = value.item()
-    return cut(f"{value:.4g}" if isinstance(value, float) else value if type(value) is str else short_repr(value), 12)
+    return cut(f"{value:.4g}" if type(value) is float else _label(value), 12)
+
+
+def _label(value: Any) -> str:
+    return value if type(value) is str else short_repr(value)
 
 
 def _rows_text(count: int) -> str:

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, Final
 
+from epypes.display.previews.arrays import plain_array
 from epypes.display.previews.features import are_keypoints
 from epypes.display.previews.imagekinds import image_kind, is_image, sampled
 from epypes.display.previews.ranges import kept_range
@@ -108,7 +109,8 @@ class RunSurroundings:
         return self._run.tokens.is_computed(token) and not self._run.tokens.is_stale(token)
 
     def _value(self, token: str) -> Any:
-        return self._run.tokens.values[self._run.tokens.program.slots[token]]
+        value = self._run.tokens.values[self._run.tokens.program.slots[token]]
+        return plain_array(value) if is_image(value) else value
 
     def _is_keypoints(self, token: str) -> bool:
         return are_keypoints(self._value(token))

@@ -1,0 +1,146 @@
+"""Of which kind is a value, found without running a line of its class?
+
+A class may say of itself what it likes, and compute or raise when it is asked. So Python's own slots are read, and
+what is known of a value is only what its classes are, by identity.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterable, Iterator
+from types import GetSetDescriptorType, MappingProxyType, MemberDescriptorType
+from typing import Any, Final
+
+_name_of: Final = type.__dict__["__name__"].__get__
+_qualified_name_of: Final = type.__dict__["__qualname__"].__get__
+_module_of: Final = type.__dict__["__module__"].__get__
+_parents_of: Final = type.__dict__["__mro__"].__get__
+_attributes_of: Final = type.__dict__["__dict__"].__get__
+# Their length is known to Python itself. Subclasses may compute theirs, and are asked for that of their parent.
+_SIZED: Final[tuple[Any, ...]] = (
+    list, tuple, set, frozenset, OrderedDict, dict, deque, str, bytes, bytearray, range,
+    type({}.keys()), type({}.values()), type({}.items()),
+)  # fmt: skip
+_ITERABLE: Final[tuple[Any, ...]] = (list, tuple, set, frozenset, deque)
+_MAPPINGS: Final[tuple[Any, ...]] = (OrderedDict, dict, MappingProxyType)
+_PANDAS: Final = ("DataFrame", "Series", "Index")
+
+
+def kind_name(kind: type) -> str:
+    """Return the name of a class; never raises."""
+    name: str = _name_of(kind)
+    return name
+
+
+def qualified_name(kind: type) -> str:
+    """Return the name of a class within its module; never raises."""
+    name: str = _qualified_name_of(kind)
+    return name
+
+
+def dotted_name(kind: type) -> str:
+    """Return where a class is from, ``"package.module.Pose"``; never raises."""
+    try:
+        return f"{plain_text(_module_of(kind))}.{qualified_name(kind)}"
+    except (AttributeError, TypeError):  # a class may have lost its module, or have a number as one
+        return qualified_name(kind)
+
+
+def parents(kind: type) -> tuple[type, ...]:
+    """Return a class and those that it is made from, in the order in which Python asks them."""
+    found: tuple[type, ...] = _parents_of(kind)
+    return found
+
+
+def declared(kind: type, name: str) -> Any:
+    """Return an attribute as it stands in a class or the nearest of its parents; None if there is none."""
+    for parent in _parents_of(kind):
+        attributes = _attributes_of(parent)
+        if name in attributes:
+            return attributes[name]
+    return None
+
+
+def stored(value: Any, name: str) -> tuple[Any, ...]:
+    """Return a tuple of the attribute that an object holds itself, or of its class's constant; else an empty one."""
+    kind = type(value)
+    descriptor, own = declared(kind, name), declared(kind, "__dict__")
+    if type(own) is GetSetDescriptorType and name in (attributes := own.__get__(value)):
+        return (attributes[name],)
+    if type(descriptor) is MemberDescriptorType:
+        return (descriptor.__get__(value),)
+    return () if descriptor is None or declared(type(descriptor), "__get__") is not None else (descriptor,)
+
+
+def is_of(value: Any, package: str, *names: str) -> bool:
+    """Whether a value is of one of these classes of a package, that somebody else has imported by now."""
+    module = sys.modules.get(package)
+    if module is None:
+        return False
+    ancestors = _parents_of(type(value))
+    for name in names:
+        known = getattr(module, name, None)
+        # By identity, since a class may say of itself that it equals another.
+        if any(known is parent for parent in ancestors):
+            return True
+    return False
+
+
+def is_array(value: Any) -> bool:
+    """Whether a value is an array or a number of numpy."""
+    return is_of(value, "numpy", "ndarray", "generic")
+
+
+def length_of(value: Any) -> int:
+    """Return the length of a value of which it is known without computing; 0 of any other."""
+    known = _first_of(_SIZED, value)
+    if known is not None:
+        return int(known.__len__(value))
+    return len(value) if is_of(value, "pandas", *_PANDAS) else 0
+
+
+def items_in(value: Any) -> Iterator[Any]:
+    """Return the items of a list, tuple, set or deque, or of what is of a subclass."""
+    known = _first_of(_ITERABLE, value)
+    if known is None:
+        raise TypeError(f"the items of {kind_name(type(value))} are not known")
+    found: Iterator[Any] = known.__iter__(value)
+    return found
+
+
+def pairs_in(value: Any) -> Iterator[tuple[Any, Any]]:
+    """Return the keys and values of a dict, or of what is of a subclass."""
+    known = _first_of(_MAPPINGS, value)
+    if known is None:
+        raise TypeError(f"the items of {kind_name(type(value))} are not known")
+    return iter(known.items(value))
+
+
+def plain_text(text: str) -> str:
+    """Return a text whose class is str, whatever a subclass makes of its methods."""
+    return str.__str__(text)
+
+
+def _first_of(kinds: Iterable[Any], value: Any) -> Any:
+    kind = type(value)
+    for known in kinds:
+        if issubclass(kind, known):
+            return known
+    return None
+
+
+def sorted_items(value: Any, written: Callable[[Any], str], most: int = 2_000) -> list[Any]:
+    """Return the items of a set in an order that is the same in every process; none of a very large one.
+
+    Items are compared with their like: numbers and texts by what they are, all others by how they are written, since
+    to compare them is their authors' affair.
+    """
+    if length_of(value) > most:
+        return []
+
+    def rank(item: Any) -> tuple[str, bool, Any]:
+        is_plain = type(item) in (int, float, str, bytes)
+        return kind_name(type(item)), is_plain, item if is_plain else written(item)
+
+    return sorted(items_in(value), key=rank)
