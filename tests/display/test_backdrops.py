@@ -99,7 +99,7 @@ def test_keypoints_are_drawn_over_the_image_that_they_were_found_in(pair_run):
         # Dark areas, where no feature is, show the photograph.
         assert np.abs(plain[-20:] * 0.75 - drawn[-20:]).mean() < 12
     assert shown["keypoints_1"].text == "500 keypoints"
-    assert "drawn over the image, 200 of 500 drawn" in shown["keypoints_1"].detail
+    assert "drawn over image_1, 200 of 500 drawn" in shown["keypoints_1"].detail
 
 
 @pytest.mark.parametrize("token", ["matches", "knn_matches", "best_matches", "paired", "paired_late"])
@@ -125,12 +125,33 @@ def test_matches_whose_indices_do_not_fit_are_rows(pair_run):
 
 def test_points_are_drawn_where_they_are():
     points = np.array([[64, 32], [192, 224]], np.float32)
-    for form in (points, points[:, None], points.astype(int)):
+    for form in (points, points[:, None], points.astype(np.int32), points[:, None].astype(float)):
         marked = green(previews(run_of(points=lambda image, form=form: form))["points"])
         assert marked.shape == (128, 128)
         for x, y in points // 2:
             assert marked[int(y) - 1 : int(y) + 2, int(x) - 1 : int(x) + 2].any()
         assert marked.sum() < 60
+
+
+def test_points_of_numpy_are_row_and_column_and_say_so():
+    rows = np.array([[32, 64], [224, 192]])
+    for form, order in ((rows, "(row, column)"), (rows.astype(float), "(row, column)"), (rows.astype("f4"), "(x, y)")):
+        shown = previews(run_of(points=lambda image, form=form: form))["points"]
+        assert f"points {order}, x " in shown.detail
+        x, y = (32, 16) if "row" in order else (16, 32)
+        assert green(shown)[y - 1 : y + 2, x - 1 : x + 2].any()
+
+
+def test_points_that_lie_on_the_image_only_the_other_way_round_are_taken_so():
+    wide = {"image": np.full((100, 400), 90, np.uint8)}
+    for form, order in (
+        (np.array([[300, 20], [20, 20]]), "(x, y)"),
+        (np.array([[20, 300], [20, 20]], "f4"), "(row, column)"),
+    ):
+        cg = ep.CompGraph({"find": lambda image, form=form: form}, {"find": ("image", "points")})
+        shown = previews(ep.CompGraphRunner(cg).run(**wide))["points"]
+        assert f"points {order}" in shown.detail
+        assert "drawn over image" in shown.detail
 
 
 def test_contours_of_opencv_are_x_y_and_of_scikit_image_row_column():

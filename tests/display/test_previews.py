@@ -336,13 +336,39 @@ def test_a_peak_of_a_long_signal_is_not_lost():
 
 
 def test_points_without_an_image_keep_their_shape_and_point_downwards():
-    (points,) = preview(np.array([[0, 0], [100, 0], [0, 50], [100, 50], [0, 0]], float)).chart.series
+    (points,) = preview(np.array([[0, 0], [100, 0], [0, 50], [100, 50], [0, 0]], np.float32)).chart.series
     (left, top), (right, _), (_, bottom) = points[:3]
     assert top > bottom
     assert (right - left) * 4 / 3 == pytest.approx(2 * (top - bottom), abs=0.01)
 
 
 # Registration by type
+
+
+def test_a_mask_tells_thin_lines_from_areas():
+    mask = np.zeros((1000, 1000), bool)
+    mask[500, :] = True
+    mask[700:900, 100:900] = True
+    shown = np.asarray(Image.open(io.BytesIO(preview(mask).picture.data)).convert("L"))
+    line, area = shown[60:68].max(axis=0), shown[95:110, 20:100]
+    assert line.min() > 60, "it can be seen"
+    assert area.min() == 255
+    assert (shown[60:68] > 0).sum(axis=0).max() <= 2
+    assert line.max() < 255
+
+
+def test_a_preview_function_may_give_words_and_an_image():
+    class Pose:
+        pass
+
+    image = np.full((60, 80, 3), (0, 0, 200), np.uint8)
+    ep.register_preview(Pose, lambda pose: ep.Preview("3 mm", "pose, 3 mm", picture=image))
+    shown = preview(Pose())
+    assert (shown.text, shown.detail) == ("3 mm", "pose, 3 mm")
+    red = np.asarray(Image.open(io.BytesIO(shown.picture.data)))
+    assert red[..., 0].mean() > 190
+    ep.register_preview(Pose, lambda pose: ep.Preview("3 mm", picture="pose.png"))
+    assert "picture must be an image" in preview(Pose()).text + preview(Pose()).detail
 
 
 def registered(returned: Any) -> Any:

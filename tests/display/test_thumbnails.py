@@ -51,14 +51,14 @@ def test_twenty_four_thumbnails_are_shown_and_the_others_keep_their_words():
     run = ep.CompGraphRunner(chain(60)).run(t0=noise())
     assert with_thumbnail(run) == {"t60", *(f"t{index}" for index in range(23))}
     assert "37 thumbnails left out" in view(run).caption
-    assert all(token.preview.text == "uint8 200 x 200 x 3" for token in view(run).tokens)
+    assert all(token.preview.text == "uint8 200 x 200 x 3 bgr" for token in view(run).tokens)
 
 
 def test_what_has_no_thumbnail_still_tells_its_range():
     run = ep.CompGraphRunner(chain(60)).run(t0=noise())
     left_out = next(token.preview for token in view(run).tokens if token.name == "t50")
     assert left_out.picture is None
-    assert re.match(r"uint8 200 x 200 x 3, \d+ to \d+ of a sample, mean ", left_out.detail)
+    assert re.match(r"uint8 200 x 200 x 3 bgr, \d+ to \d+ of a sample, mean ", left_out.detail)
 
 
 def test_so_many_can_be_asked_for():

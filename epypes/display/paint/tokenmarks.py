@@ -22,7 +22,7 @@ _ROW_CHARACTERS: Final = 26
 _ROW_ROOM: Final = 50
 # What a row of 10 px monospace text takes.
 _ROWS_WIDTH: Final = _ROW_CHARACTERS * 6.1
-_SECOND_LINE_CHARACTERS: Final = 24
+_SECOND_LINE_CHARACTERS: Final = 26
 _VALUE_CHARACTERS: Final = 18
 _INT_FIELD: Final = 5
 _FLOAT_FIELD: Final = 8

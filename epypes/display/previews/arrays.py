@@ -63,7 +63,7 @@ def _array_sketch(array: Any, look: Look) -> Sketch | Preview:
     closer = _closer(array)
     if closer is None:
         return _plain(array)
-    text = array_text(array)
+    text = array_text(array) + _order_text(array, look) * (closer is image_sketch)
     said = f"{text}, {statistics_text(few_of(array), array)}"
     brief = Preview(text, said, rows=_rows(array) if array.ndim > 1 else ())
     return Sketch(brief, is_image=closer is image_sketch, closer=lambda: closer(array, look) or _plain(array))
@@ -90,8 +90,8 @@ def image_sketch(array: Array, look: Look) -> Sketch:
     sample = sampled(array)
     kind = image_kind(array, sample)
     ends = look.range_of(array)
-    text = array_text(array)
-    said = [text + _order_text(array, look), statistics_text(sample, array)]
+    text = array_text(array) + _order_text(array, look)
+    said = [text, statistics_text(sample, array)]
     if kind == "labels":
         said.append(label_text(one_channel(sample)) + (" in a sample" if sample is not array else ""))
     elif kind == "mask":

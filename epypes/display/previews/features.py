@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
+from epypes.display.markup import cut
 from epypes.display.previews.charts import drawn_in_chart
 from epypes.display.previews.kinds import dotted_name, is_of
 from epypes.display.previews.marks import (
@@ -19,6 +20,7 @@ from epypes.display.previews.marks import (
     marks_lie_on,
     pair_drawer,
     rectangles,
+    share_on,
     some_lines,
     some_pairs,
     some_points,
@@ -36,6 +38,7 @@ _Closer = Callable[[Sequence[Any], Preview, Look], Sketch | None]
 # So many items of a list are looked at to know what it is a list of, and to choose the strongest keypoints.
 _LOOKED_AT: Final = 100
 _WEIGHED: Final = 10_000
+_NAME_CHARACTERS: Final = 40
 
 
 def keypoint_name(kind: type) -> bool:
@@ -75,12 +78,26 @@ def _closer_look(
 
 
 def point_sketch(array: Any, look: Look, *, needs_image: bool = False) -> Sketch | None:
-    """Look at an array (n, 2) or (n, 1, 2) of x and y; None if it needs an image that they lie on, and has none."""
-    marks = some_points(array.reshape(-1, 2))
+    """Look at an array (n, 2) or (n, 1, 2) of places; None if it needs an image that they lie on, and has none.
+
+    OpenCV gives x and y, as int32 or float32 or with an axis of their own; scikit-image and NumPy give row and column,
+    as int64 or float64. If more of them lie on the image the other way round, they are taken so.
+    """
+    places = array.reshape(-1, 2)
+    are_rows = array.ndim == 2 and array.dtype.itemsize == 8
+    marks, turned = (some_points(_x_and_y(places, order)) for order in (are_rows, not are_rows))
+    image = look.around.nearest_image() if array.ndim == 2 else None
+    if image is not None and share_on(turned.points, image) > share_on(marks.points, image):
+        marks, are_rows = turned, not are_rows
     if needs_image and _backdrop(marks, look) is None:
         return None
-    said = f"{array_text(array)}, points{_extent(array)}"
+    order = "(row, column)" if are_rows else "(x, y)"
+    said = f"{array_text(array)}, points {order}{_extent(_x_and_y(places, are_rows))}"
     return _over(marks, array_text(array), said, look)
+
+
+def _x_and_y(places: Any, are_rows: bool) -> Any:
+    return places[:, ::-1] if are_rows else places
 
 
 def segment_sketch(array: Any, look: Look) -> Sketch:
@@ -129,7 +146,7 @@ def _over(marks: Marks, text: str, said: str, look: Look) -> Sketch:
     backdrop = _backdrop(marks, look)
     drawn = marks.drawn if backdrop else drawn_in_chart(len(marks.points), len(marks.lines))
     if backdrop is not None:
-        said += ", drawn over the image"
+        said += f", drawn over {cut(backdrop.name, _NAME_CHARACTERS)}"
     if drawn < marks.total:
         said += f", {drawn} of {marks.total} drawn"
     return Sketch(Preview(text, said), drawer(marks, backdrop))

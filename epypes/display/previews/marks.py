@@ -119,10 +119,14 @@ def lie_on(points: Floats, backdrop: Backdrop) -> bool:
 
     if not len(points):
         return True
+    return share_on(points, backdrop) >= _INSIDE and (len(points) == 1 or float(np.abs(points).max()) > 1.0)
+
+
+def share_on(points: Floats, backdrop: Backdrop) -> float:
+    """Return which part of these points lie on the image, from 0 to 1."""
     height, width = backdrop.image.shape[:2]
     x, y = points[:, 0], points[:, 1]
-    inside = (x >= -1) & (y >= -1) & (x <= width) & (y <= height)
-    return bool(inside.mean() >= _INSIDE) and (len(points) == 1 or float(np.abs(points).max()) > 1.0)
+    return float(((x >= -1) & (y >= -1) & (x <= width) & (y <= height)).mean()) if len(points) else 1.0
 
 
 def marks_lie_on(marks: Marks, backdrop: Backdrop) -> bool:

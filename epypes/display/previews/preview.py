@@ -82,7 +82,8 @@ def _checked(found: Any, value: Any, look: Look) -> Sketch:
         return _limited(found)
     if issubclass(kind, Preview):
         detail = found.detail if found.detail != "" else _kind(value)
-        return Sketch(_trimmed(Preview(found.text, detail, rows=found.rows)), _drawing(found.picture, found.chart))
+        drawing = _drawing(found.picture, found.chart, look)
+        return Sketch(_trimmed(Preview(found.text, detail, rows=found.rows)), drawing)
     if issubclass(kind, str):
         return Sketch(_trimmed(Preview(found, f"{_kind(value)}, {plain_text(found)[:_DETAIL_CHARACTERS]}")))
     if is_image(found):
@@ -106,11 +107,13 @@ def _on_one_line(row: str) -> str:
     return "".join(mark if mark.isprintable() else " " for mark in plain_text(row)[:_ROW_CHARACTERS])
 
 
-def _drawing(picture: Any, chart: Any) -> Callable[[int], Picture | Chart] | None:
+def _drawing(picture: Any, chart: Any, look: Look) -> Callable[[int], Picture | Chart] | None:
     """Return what draws the picture or chart that a user's preview has."""
+    if is_image(picture):
+        return arrays.image_sketch(arrays.plain_array(picture), look).draw
     if picture is not None:
         if not issubclass(type(picture), Picture):
-            raise TypeError("the picture of a preview comes from epypes.display.encode_image")
+            raise TypeError("picture must be an image: an array of at least 8 x 8 pixels")
         return lambda most_bytes: checked_picture(picture, most_bytes)
     if chart is None:
         return None

@@ -95,6 +95,10 @@ class ShortRepr(reprlib.Repr):
         # What is so long would take its own repr as long.
         return f"{kind_name(kind)} of {length}" if length > _LONGEST else said_by(repr, x)
 
+    def repr_float(self, x: float, level: int) -> str:
+        """Write a float that is inside of something: to six digits."""
+        return float_text(x) if level < self.maxlevel else repr(x)
+
     def _items(self, x: Any, left: str, right: str, level: int) -> str:
         count = length_of(x)
         if level <= 0 and count:
@@ -127,7 +131,12 @@ def shown_items(value: Any) -> Iterator[Any]:
 
 def said_by(write: Any, value: Any) -> str:
     """Return what an author's ``repr`` or ``str`` says of a value, without addresses in memory."""
-    return _ADDRESS.sub("", plain_text(write(value))[: 2 * _LONGEST])
+    return without_addresses(plain_text(write(value))[: 2 * _LONGEST])
+
+
+def without_addresses(text: str) -> str:
+    """Return text without addresses in memory, which differ from process to process."""
+    return _ADDRESS.sub("", text)
 
 
 def _message(error: BaseException) -> str:

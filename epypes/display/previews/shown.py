@@ -38,7 +38,7 @@ class Preview:
     detail
         A longer line: dtype, shape, range and other statistics, parted by commas.
     picture
-        A thumbnail of at most 128 x 128 pixels, or None.
+        A thumbnail of at most 128 x 128 pixels, or None. A preview function may give an image instead.
     chart
         A thumbnail that is drawn, or None; there is one of the two at most.
     rows
@@ -80,11 +80,12 @@ class Sketch:
 
 @dataclass(frozen=True, slots=True)
 class Backdrop:
-    """An image over which something is drawn: the array, the order of its colours, its display range."""
+    """An image over which something is drawn: the array, the order of its colours, its display range, its token."""
 
     image: Any
     order: Order
     ends: Range
+    name: str
 
 
 class Surroundings(Protocol):

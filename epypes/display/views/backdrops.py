@@ -121,4 +121,5 @@ class RunSurroundings:
 
     def _backdrop(self, token: str) -> Backdrop:
         value = self._value(token)
-        return Backdrop(value, colour_order(self._run.cg, token), kept_range(self._run.tokens.program, token, value))
+        ends = kept_range(self._run.tokens.program, token, value)
+        return Backdrop(value, colour_order(self._run.cg, token), ends, token)

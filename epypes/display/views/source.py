@@ -13,6 +13,7 @@ from typing import Any, Final
 from weakref import WeakKeyDictionary
 
 from epypes.display.previews.preview import preview
+from epypes.display.previews.short import without_addresses
 from epypes.graph import CompGraph
 from epypes.graph.redefined import unwrapped
 
@@ -67,10 +68,10 @@ def _signature_text(signature: inspect.Signature) -> str:
         each if each.default is each.empty else each.replace(default=_Told(preview(each.default).text))
         for each in signature.parameters.values()
     ]
-    text = str(signature.replace(parameters=short))
+    text = without_addresses(str(signature.replace(parameters=short)))
     if len(text) > SIGNATURE_CHARACTERS:
         plain = [each.replace(annotation=each.empty) for each in short]
-        text = str(signature.replace(parameters=plain, return_annotation=signature.empty))
+        text = without_addresses(str(signature.replace(parameters=plain, return_annotation=signature.empty)))
     return _cut(text, SIGNATURE_CHARACTERS)
 
 
