@@ -8,6 +8,7 @@ import pytest
 import epypes as ep
 from epypes.display import mimebundle, to_svg
 from epypes.display.layout.blocks import fold
+from epypes.display.layout.engine import routed_layout
 from epypes.display.layout.geometry import Box, Layout
 from epypes.display.layout.place import lay_out
 from epypes.display.layout.rows import ranks
@@ -47,6 +48,27 @@ def test_a_token_that_every_function_of_a_long_chain_takes_leaves_the_chain_stra
 def test_edges_that_skip_few_rows_are_routed_by_graphviz():
     boxes, edges = chain_with_a_shared_token(10)
     assert max(len(spline) for spline in lay_out(boxes, edges).splines) > 5, "around the vertices in their way"
+
+
+@pytest.mark.parametrize("direction", ["down", "right"])
+def test_vertices_that_may_change_places_stand_in_their_order(direction):
+    boxes, edges = (BOX,) * 9, ((4, 0), (3, 0), (2, 0), (0, 6), (0, 5), (5, 1), (6, 1), (1, 8), (1, 7))
+    layout = lay_out(boxes, edges, False, direction)
+    across = 0 if direction == "down" else 1
+    for alike in ((2, 3, 4), (5, 6), (7, 8)):
+        at = [layout.centres[vertex][across] for vertex in alike]
+        assert at == sorted(at)
+    for (tail, head), spline in zip(edges, layout.splines, strict=True):
+        for point, vertex in ((spline[0], tail), (spline[-1], head)):
+            assert all(abs(a - b) <= 31 for a, b in zip(point, layout.centres[vertex], strict=True)), "its own edge"
+
+
+def test_vertices_of_other_sizes_or_neighbours_keep_their_places():
+    boxes, edges = (BOX, BOX, HEXAGON, BOX, BOX), ((2, 0), (3, 0), (4, 0), (4, 1))
+    graphviz = routed_layout(boxes, edges, ())
+    assert {round(x) for x, _ in lay_out(boxes, edges).centres} in (
+        {round(x) for x, _ in graphviz.centres}, {round(graphviz.width - x) for x, _ in graphviz.centres}
+    )  # fmt: skip
 
 
 # -- blocks -----------------------------------------------------------------------------------------------------------

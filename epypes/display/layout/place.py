@@ -16,7 +16,7 @@ from epypes.display.layout.blocks import fold, unfold
 from epypes.display.layout.engine import routed_layout
 from epypes.display.layout.geometry import Box, Direction, Edge, Layout
 from epypes.display.layout.rows import in_rows
-from epypes.display.layout.turn import in_order, lying, transposed
+from epypes.display.layout.turn import alike_in_order, in_order, lying, transposed
 
 # Graphviz takes 0.25 s for so many vertices and 0.9 s for twice as many, and beyond them pygraphviz prints a warning.
 _MOST_VERTICES: Final = 1000
@@ -55,6 +55,7 @@ def _downwards(boxes: tuple[Box, ...], edges: tuple[Edge, ...], is_dense: bool) 
     unrouted = long_edges(len(graph.boxes), graph.edges)
     routed = [edge for edge in graph.edges if edge not in unrouted]
     layout = in_order(routed_layout(graph.boxes, routed, graph.blocks), graph.edges)
+    layout = alike_in_order(layout, graph.boxes, graph.edges, routed)
     arcs = {edge for edge in edges if graph.folded(edge) in unrouted}
     layout = unfold(layout, graph, [edge for edge in edges if edge not in arcs], routed)
     return with_arcs(layout, boxes, edges, arcs)

@@ -2,7 +2,7 @@
 
 Everything is laid out from top to bottom; a picture from left to right is one of boxes that lie on their sides, seen
 from the other side of the diagonal. Graphviz cares for few crossings, not for what stands left and what right, so a
-layout whose inputs mostly stand in the wrong order is turned over.
+layout whose inputs mostly stand in the wrong order is turned over, and vertices that may change places do so.
 """
 
 from __future__ import annotations
@@ -47,3 +47,41 @@ def _mirrored(layout: Layout) -> Layout:
         return tuple((layout.width - x, y) for x, y in points)
 
     return Layout(layout.width, layout.height, over(layout.centres), tuple(map(over, layout.splines)))
+
+
+def alike_in_order(layout: Layout, boxes: Sequence[Box], edges: Sequence[Edge], routed: Sequence[Edge]) -> Layout:
+    """Let vertices of one size that have the same neighbours stand from left to right in their order.
+
+    Parameters
+    ----------
+    routed
+        The edges in the order of the layout's splines.
+    """
+    takes_place_of = _exchanges(layout, boxes, edges)
+    if not takes_place_of:
+        return layout
+    spline = dict(zip(routed, layout.splines, strict=True))
+    place = [takes_place_of.get(vertex, vertex) for vertex in range(len(boxes))]
+    return Layout(
+        layout.width,
+        layout.height,
+        tuple(layout.centres[vertex] for vertex in place),
+        tuple(spline[place[tail], place[head]] for tail, head in routed),
+    )
+
+
+def _exchanges(layout: Layout, boxes: Sequence[Box], edges: Sequence[Edge]) -> dict[int, int]:
+    """Return by vertex whose place it takes."""
+    neighbours: dict[int, set[tuple[bool, int]]] = {vertex: set() for vertex in range(len(boxes))}
+    for tail, head in edges:
+        neighbours[tail].add((True, head))
+        neighbours[head].add((False, tail))
+    alike: dict[tuple[Box, frozenset[tuple[bool, int]]], list[int]] = {}
+    for vertex, box in enumerate(boxes):
+        alike.setdefault((box, frozenset(neighbours[vertex])), []).append(vertex)
+    return {
+        vertex: place
+        for vertices in alike.values()
+        if len(vertices) > 1
+        for vertex, place in zip(vertices, sorted(vertices, key=lambda each: layout.centres[each]), strict=True)
+    }
