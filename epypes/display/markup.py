@@ -57,6 +57,8 @@ def written_length(text: str) -> int:
 def fitted(text: str, room: int) -> str:
     """Return text on one line, cut to what takes at most so many bytes in a page."""
     text = cut(text, room)
+    if _LONG.search(text) is None:
+        return text
     while len(text) > 1 and written_length(text) > room:
         text = cut(text, max(len(text) * room // written_length(text) - 1, 1))
     return text

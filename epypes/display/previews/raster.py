@@ -32,7 +32,9 @@ THUMBNAIL_PX: Final = 128
 THUMBNAIL_BYTES: Final = 5_000
 JPEG_QUALITY: Final = 80
 _QUALITIES: Final = (68, 55, 42)
-_GREYS: Final = 8
+# Of a line, half or a quarter is left by mean: it is made brighter again. Few greys, which compress well.
+_GREYS: Final = 4
+_BRIGHTER: Final = [round((_GREYS - 1) * (level / 255) ** 0.5) for level in range(256)]
 _COLOURS: Final = 48
 _LEAST_SIDE_PX: Final = 16
 _MOST_POOLED_PX: Final = 16_000_000
@@ -175,10 +177,13 @@ def _resized(picture: Image.Image, max_side_px: int | None) -> Image.Image:
 
 def _mask_thumbnail(mask: Array, max_side_px: int) -> Image.Image:
     """Shrink to twice the size by maximum, and from there by mean: thin lines stay, and stay thinner than areas."""
+    from PIL import Image
+
     doubled = _mask_picture(mask, 2 * max_side_px).convert("L")
-    # Of a line, half or a quarter is left: it is made brighter again.
-    brighter = _resized(doubled, max_side_px).point([round(255 * (level / 255) ** 0.5) for level in range(256)])
-    return brighter.quantize(_GREYS)
+    indices = _resized(doubled, max_side_px).point(_BRIGHTER)
+    picture = Image.frombytes("P", indices.size, indices.tobytes())
+    picture.putpalette([level * 255 // (_GREYS - 1) for level in range(_GREYS) for _ in "rgb"])
+    return picture
 
 
 def _mask_picture(mask: Array, max_side_px: int | None) -> Image.Image:
@@ -218,5 +223,5 @@ def _save(picture: Image.Image, quality: int = JPEG_QUALITY, *, full_colours: bo
     if kind == "JPEG":
         picture.save(stream, kind, quality=quality, subsampling=0 if full_colours else -1)
     else:
-        picture.save(stream, kind, compress_level=1 if max(picture.size) > THUMBNAIL_PX else 9)
+        picture.save(stream, kind, compress_level=1 if max(picture.size) > THUMBNAIL_PX else 6)
     return Picture(stream.getvalue(), f"image/{kind.lower()}", picture.width, picture.height)

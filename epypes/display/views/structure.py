@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any, Final
+from weakref import WeakKeyDictionary
 
 from epypes.display.markup import cut
 from epypes.display.previews.preview import preview
@@ -18,6 +19,8 @@ _REDEFINED_INSIDE: Final = "a function inside was redefined: build again"
 _SELECTOR_CHARACTERS: Final = 20
 _KEY_CHARACTERS: Final = 16
 _NAMED: Final = 3
+# By graph the last structure, with what it depends on: a run changes values, and rarely more.
+_kept: WeakKeyDictionary[CompGraph, tuple[tuple[Any, ...], GraphView]] = WeakKeyDictionary()
 
 
 def structure_of(cg: CompGraph, branches: Mapping[str, Any], left_out: Collection[str]) -> GraphView:
@@ -30,8 +33,16 @@ def structure_of(cg: CompGraph, branches: Mapping[str, Any], left_out: Collectio
     left_out
         The functions that are not needed; they, and the tokens that only they make or take, get this state.
     """
+    old = tuple((name, is_redefined_inside(cg.functions[name])) for name in redefined(cg))
+    key = old, tuple(branches.items()), tuple(left_out)
+    kept = _kept.get(cg)
+    if kept is None or kept[0] != key:
+        kept = _kept[cg] = key, _structure(cg, branches, left_out, frozenset(name for name, _ in old))
+    return kept[1]
+
+
+def _structure(cg: CompGraph, branches: Mapping[str, Any], left_out: Collection[str], old: frozenset[str]) -> GraphView:
     unread = {name: _unread(cg, name, branches) for name in cg.switches}
-    old = frozenset(redefined(cg))
     return GraphView(
         tuple(_function_view(cg, name, branches, name in left_out, name in old) for name in cg.functions),
         tuple(_token_view(cg, token, branches, left_out, unread) for token in cg.tokens),
