@@ -154,6 +154,7 @@ def test_a_replay_that_dies_is_reported(bundle, end):
         verify(bundle.path)
 
 
+@pytest.mark.slow
 def test_a_replay_that_takes_too_long_is_ended(bundle):
     module = bundle.path / "pipeline.py"
     module.write_text(f"{module.read_text()}\nimport threading\nthreading.Event().wait(120)\n")
@@ -458,6 +459,7 @@ def test_the_old_bundle_is_there_until_the_new_one_is(runner, tmp_path, monkeypa
     assert ep.load(target).hyperparameters["lo"] == 10
 
 
+@pytest.mark.slow
 def test_a_bundle_that_is_replaced_while_it_is_read_is_never_mixed_with_the_next(tmp_path):
     digests = {}
     for function, k in ((np.add, 1), (np.multiply, 2)):

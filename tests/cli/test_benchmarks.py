@@ -35,6 +35,7 @@ WORKS = [
 ]
 
 
+@pytest.mark.slow
 def test_a_quick_run_of_the_engines_benchmarks_keeps_every_row(tmp_path):
     rows = engine.rows(QUICK)
     write_json(rows, {"loman"}, tmp_path / "out" / "benchmarks.json")

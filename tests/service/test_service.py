@@ -126,6 +126,7 @@ def test_a_bundle_is_served_once(edge_bundle):
         assert f"is being served already, by process {process.pid} at tcp://127.0.0.1:" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_killed_service_is_not_taken_for_a_running_one(edge_bundle, photograph):
     with running(edge_bundle.path) as process:
         process.kill()
@@ -137,6 +138,7 @@ def test_a_killed_service_is_not_taken_for_a_running_one(edge_bundle, photograph
         assert call(edge_bundle.path, {"image": photograph}, timeout_s=TIMEOUT_S).tokens["edges"].any()
 
 
+@pytest.mark.slow
 def test_a_service_that_is_killed_while_it_works_is_told_to_the_caller(edge_bundle, photograph):
     with running(edge_bundle.path) as process, Client(edge_bundle.path, timeout_s=TIMEOUT_S) as client:
         client.call({"image": photograph})
@@ -146,6 +148,7 @@ def test_a_service_that_is_killed_while_it_works_is_told_to_the_caller(edge_bund
             client.call({"image": photograph})
 
 
+@pytest.mark.slow
 def test_a_stopped_service_makes_the_call_time_out(edge_bundle, photograph):
     with running(edge_bundle.path) as process, Client(edge_bundle.path, timeout_s=1.0) as client:
         client.call({"image": photograph})

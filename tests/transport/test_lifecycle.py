@@ -289,6 +289,7 @@ def test_a_script_that_stops_nothing_ends_promptly_with_a_warning():
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_an_idle_publisher_and_subscriber_take_less_than_1_percent_of_a_cpu():
     script = START_BOTH + (
         "import threading\n"

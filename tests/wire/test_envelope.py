@@ -267,6 +267,7 @@ def mutate_description(frames: list[bytes], rng: random.Random) -> list[bytes]:
     return [frames[0], message.SerializeToString(), *frames[2:]]
 
 
+@pytest.mark.slow
 def test_of_10000_broken_messages_none_raises_anything_but_a_message_error():
     rng = random.Random(2019)
     frames = [bytes(frame) for frame in encode(full_envelope(), "cam1", inline_below=64)]
