@@ -22,6 +22,8 @@ _SLANT_PX: Final = 7
 _INSIDE_PX: Final = 3
 # How far each box behind that of a group sticks out.
 _STACK_PX: Final = 4
+# By so much text makes room for the bar below it.
+_ABOVE_BAR_PX: Final = 2
 # From the border of a function to the bar of its time.
 _BAR_INSET_PX: Final = 10
 _TOLD_CHARACTERS: Final = 600
@@ -57,6 +59,7 @@ def paint_function(function: FunctionView, box: Box, centre: Point, direction: D
         body += _inner_border(x, y, box)
     if function.state == "ran":
         body += _time_bar(function, box, centre, direction)
+        centre = centre[0], centre[1] - _ABOVE_BAR_PX
     body += text_lines(_function_lines(function), centre)
     said = "; ".join(filter(None, (*_said_state(function), *function.notes, function.message)))
     title = f"{function.kind} {cut_name(function.name, TITLE_CHARACTERS)}: {said}"
