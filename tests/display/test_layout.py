@@ -29,6 +29,15 @@ def chain_with_a_shared_token(count):
     return (BOX,) * (2 * count + 2), tuple(edges)
 
 
+def assert_ends_at_their_vertices(boxes, edges, layout):
+    """Each edge begins at the side of one of its vertices and ends at that of the other."""
+    for (tail, head), spline in zip(edges, layout.splines, strict=True):
+        for point, vertex in ((spline[0], tail), (spline[-1], head)):
+            x, y = layout.centres[vertex]
+            assert abs(point[0] - x) <= boxes[vertex].width / 2 + 1
+            assert abs(point[1] - y) <= boxes[vertex].height / 2 + 1
+
+
 @pytest.mark.parametrize("count", [45, 90])
 def test_a_token_that_every_function_of_a_long_chain_takes_leaves_the_chain_straight(count):
     boxes, edges = chain_with_a_shared_token(count)
@@ -37,11 +46,8 @@ def test_a_token_that_every_function_of_a_long_chain_takes_leaves_the_chain_stra
     assert max(middles[1:]) - min(middles[1:]) < BOX.width, "it is not bent by the ways of the long edges"
     assert [y for _, y in layout.centres[:count]] == sorted(y for _, y in layout.centres[:count])
     assert len(layout.splines) == len(edges)
-    for (tail, head), spline in zip(edges, layout.splines, strict=True):
-        for point, vertex in ((spline[0], tail), (spline[-1], head)):
-            x, y = layout.centres[vertex]
-            assert abs(point[0] - x) <= BOX.width / 2 + 1
-            assert abs(point[1] - y) <= BOX.height / 2 + 1
+    assert_ends_at_their_vertices(boxes, edges, layout)
+    for spline in layout.splines:
         assert all(0 <= x <= layout.width for x, _ in spline)
 
 
@@ -201,11 +207,7 @@ def test_a_block_that_every_function_of_a_long_chain_takes_is_joined_by_arcs():
     boxes = (*boxes[:-1], *(HEXAGON,) * shared)
     layout = lay_out(boxes, tuple(edges))
     assert len(layout.splines) == len(edges)
-    for (tail, head), spline in zip(edges, layout.splines, strict=True):
-        for point, vertex in ((spline[0], tail), (spline[-1], head)):
-            x, y = layout.centres[vertex]
-            assert abs(point[0] - x) <= boxes[vertex].width / 2 + 1
-            assert abs(point[1] - y) <= boxes[vertex].height / 2 + 1
+    assert_ends_at_their_vertices(boxes, edges, layout)
     middles = [x for x, _ in layout.centres[: 2 * count]]
     assert max(middles[1:]) - min(middles[1:]) < HEXAGON.width
 
@@ -378,11 +380,8 @@ def test_a_block_of_sources_can_lead_to_one_of_sinks(direction):
     edges = tuple((source, sink) for source in range(6) for sink in range(6, 13))
     layout = lay_out(boxes, edges, direction=direction)
     assert len(fold(boxes, edges).boxes) == 2
-    for (tail, head), spline in zip(edges, layout.splines, strict=True):
-        for point, vertex in ((spline[0], tail), (spline[-1], head)):
-            x, y = layout.centres[vertex]
-            assert abs(point[0] - x) <= boxes[vertex].width / 2 + 1
-            assert abs(point[1] - y) <= boxes[vertex].height / 2 + 1
+    assert_ends_at_their_vertices(boxes, edges, layout)
+    for spline in layout.splines:
         assert not any(is_in(place, vertex, boxes, layout) for place in points_on(spline) for vertex in range(13))
 
 
@@ -440,11 +439,7 @@ def test_to_the_right_every_edge_leads_to_the_right_and_no_vertices_overlap(case
     assert all(layout.centres[tail][0] < layout.centres[head][0] for tail, head in edges)
     for one, other in itertools.combinations(range(len(boxes)), 2):
         assert not overlap(one, other, boxes, layout)
-    for (tail, head), spline in zip(edges, layout.splines, strict=True):
-        for point, vertex in ((spline[0], tail), (spline[-1], head)):
-            x, y = layout.centres[vertex]
-            assert abs(point[0] - x) <= boxes[vertex].width / 2 + 1
-            assert abs(point[1] - y) <= boxes[vertex].height / 2 + 1
+    assert_ends_at_their_vertices(boxes, edges, layout)
 
 
 @pytest.mark.parametrize("direction", ["down", "right"])

@@ -43,14 +43,8 @@ def view(
     ----------
     shown
         What is looked at.
-    direction
-        Where the data flows to on the page: ``"down"`` or ``"right"``.
-    thumbnails
-        How many there are at most.
-    open
-        The groups whose functions are drawn one by one.
-    collapse
-        Whether groups are drawn as one box each, but for those that are open.
+    direction, thumbnails, open, collapse
+        As for ``ep.show``.
 
     Raises
     ------
