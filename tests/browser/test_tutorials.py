@@ -19,7 +19,7 @@ def test_every_cell_runs_and_every_graph_is_drawn(browser: Any, lab: JupyterLab,
     try:
         notebook.run_all()
         notebook.screenshot(SCREENSHOTS / f"{tutorial.stem}-{theme}.png")
-        figures = notebook.page.locator("figure:has(figcaption)")
+        figures = notebook.page.locator("figure.epypes-figure")
         assert figures.count() > 0
         assert notebook.page.locator("figure svg.epypes-graph").count() == figures.count(), "none is left an image"
         assert not notebook.page_errors
