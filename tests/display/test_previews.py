@@ -70,7 +70,7 @@ class HostileArray:
         np.zeros((0, 5)), np.zeros((3, 0, 3), np.uint8), np.full((20, 20), np.nan), np.array([np.inf, 1.0]),
         np.array([object()], dtype=object), np.zeros((2, 3, 4, 5, 6)), np.array("text"), np.float32(2), np.array(3),
         HostileList([1, 2]), HostileDict(a=1), 10**100_000, range(10**9), deque([1] * 10**6), [[[[[[1]]]]]], "\0\ud800",
-        np.array([np.datetime64("NaT")]), np.array(["a", None], dtype=object), np.array([b"x", b"yy"]), np.ma.zeros(9),
+        np.array([np.datetime64("NaT", "s")]), np.array(["a", None], dtype=object), np.array([b"x", b"yy"]), np.ma.zeros(9),
         np.zeros((0,), dtype=[("a", int)]), np.full((9, 2), np.nan), np.full((9, 1, 4), np.inf), np.array([[1e300, -1e308]]),
         np.full((30, 30), 1e308) * np.where(np.eye(30) > 0, -1, 1), np.zeros((9, 0)), np.array([], dtype="M8[s]"),
         [np.zeros((0, 1, 2), np.int32)], (np.zeros(3), np.zeros(4)), pd.DataFrame(), pd.DataFrame({"a": [Hostile()]}),

@@ -55,7 +55,7 @@ def _exception(value: BaseException, look: Look) -> Preview:
     return Preview(reason(value), reason(value, 200))
 
 
-@ours("pathlib.PurePath")
+@ours("pathlib.PurePath", "pathlib._local.PurePath")
 def _path(value: Any, look: Look) -> Preview:
     text = os.fspath(value)
     return Preview(value.name or text, f"{_name(value)} {cut(text, 200)}")
