@@ -8,7 +8,7 @@ from typing import Any
 from epypes.display.markup import size
 from epypes.display.paint.bars import paint_bars, times_alt_text
 from epypes.display.paint.page import paint_figure, paint_graph, paint_page
-from epypes.display.paint.rows import plan_table, summary_of, table_of
+from epypes.display.paint.rows import summary_of, table_of
 from epypes.display.paint.svg import paint_svg
 from epypes.display.paint.tables import paint_table
 from epypes.display.paint.text import paint_text, repr_text
@@ -73,7 +73,7 @@ def table_below(shown: Any) -> str:
     """Return the table below the picture of a plan, with all functions of its groups; nothing for anything else."""
     if not isinstance(shown, Plan):
         return ""
-    return paint_table(plan_table(view(shown, collapse=False))._replace(caption=""))
+    return paint_table(table_of(shown)._replace(caption=""))
 
 
 def html_and_svg(graph: GraphView, below: str = "") -> dict[str, str]:
