@@ -7,11 +7,11 @@ from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 
 from epypes.display.durations import duration_text, overhead_text
+from epypes.display.markup import counted
 from epypes.display.views.graphview import FunctionView, GraphView
 from epypes.display.views.plans import plan_view
 from epypes.display.views.times import (
     failed_text,
-    functions_text,
     longest_first,
     median_ns,
     range_text,
@@ -83,7 +83,11 @@ def _other_plans(rest: Sequence[FunctionView]) -> Iterable[tuple[str, ...]]:
     """Sum up what has no row of its own."""
     if rest:
         counts = Counter(_DONE.get(function.state, function.state) for function in rest)
-        yield f"{functions_text(len(rest))} more", ", ".join(f"{count} {done}" for done, count in counts.items()), ""
+        yield (
+            f"{counted(len(rest), 'function')} more",
+            ", ".join(f"{count} {done}" for done, count in counts.items()),
+            "",
+        )
 
 
 def report_table(report: RunReport) -> Table:
@@ -109,7 +113,7 @@ def summary_table(summary: TimingSummary) -> Table:
     kept = set(sorted(functions, key=lambda name: -median_ns(functions[name]))[:_MOST_FUNCTIONS])
     rows = [_summary_row(name, functions[name]) for name in functions if name in kept]
     if len(functions) > len(kept):
-        rows.append((f"{functions_text(len(functions) - len(kept))} more, which take less", "", "", "", ""))
+        rows.append((f"{counted(len(functions) - len(kept), 'function')} more, which take less", "", "", "", ""))
     rows.append(_summary_row("in all", summary.total))
     rows.append(_summary_row(overhead_text(summary.side_by_side), summary.overhead))
     return Table(summary_caption(summary), ("function", "runs", "mode", "median", "5 % to 95 %"), rows)

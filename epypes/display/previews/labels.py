@@ -9,6 +9,8 @@ import colorsys
 import functools
 from typing import TYPE_CHECKING, Any, Final
 
+from epypes.display.markup import counted
+
 if TYPE_CHECKING:
     import numpy.typing as npt
     from PIL import Image
@@ -54,4 +56,4 @@ def label_text(sample: Array) -> str:
     positive = sample[sample > 0]
     is_narrow = positive.size > 0 and int(positive.max()) <= 10 * sample.size
     count = int(np.count_nonzero(np.bincount(positive))) if is_narrow else len(np.unique(positive))
-    return f"{count} label{'s' * (count != 1)}"
+    return counted(count, "label")

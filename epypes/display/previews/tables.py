@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Sequence
 from typing import Any, Final
 
-from epypes.display.markup import cut
+from epypes.display.markup import counted, cut
 from epypes.display.previews.kinds import is_of
 from epypes.display.previews.registry import ours
 from epypes.display.previews.short import short_repr
@@ -34,8 +34,8 @@ def _series(series: Any, look: Look) -> Preview:
     rows = [f"{short_repr(key)}: {_cell(value)}" for key, value in series.iloc[:_ROWS].items()]
     name = "" if series.name is None else f" {cut(_label(series.name), 20)}"
     more = [f"... {len(series) - _ROWS} more"] * (len(series) > _ROWS)
-    said = f"Series{name}: {series.dtype}, {_rows_text(len(series))}, {memory_text(series.nbytes)}"
-    return Preview(f"Series, {_rows_text(len(series))}", said, rows=(*rows, *more))
+    said = f"Series{name}: {series.dtype}, {counted(len(series), 'row')}, {memory_text(series.nbytes)}"
+    return Preview(f"Series, {counted(len(series), 'row')}", said, rows=(*rows, *more))
 
 
 def record_sketch(array: Any) -> Preview:
@@ -62,7 +62,7 @@ def dict_list_sketch(value: Sequence[dict[str, Any]]) -> Preview:
 
 
 def _table(count: int, columns: int, names: list[str], rows: list[tuple[Any, ...]], said: str) -> Preview:
-    text = f"{_rows_text(count)} x {columns} columns"
+    text = f"{counted(count, 'row')} x {columns} columns"
     more = ", ..." if columns > _NAMED else ""
     kept = [[cut(name, 10) for name in names[:_MOST_COLUMNS]], *([_cell(value) for value in row] for row in rows)]
     return Preview(text, cut(f"{said}{more}; {text}", 280), rows=tuple(map(_line, _padded(kept))))
@@ -86,7 +86,3 @@ def _cell(value: Any) -> str:
 
 def _label(value: Any) -> str:
     return value if type(value) is str else short_repr(value)
-
-
-def _rows_text(count: int) -> str:
-    return f"{count} row{'s' * (count != 1)}"

@@ -10,6 +10,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
+from epypes.display.markup import counted
 from epypes.display.views.graphview import EdgeView, FunctionState, FunctionView, GraphView, GroupView, TokenView
 from epypes.graph import CompGraph
 
@@ -209,8 +210,3 @@ def _without_thumbnail(token: TokenView) -> TokenView:
 def function_count(graph: GraphView) -> int:
     """Return how many functions there are, those inside groups included."""
     return len(graph.functions) + sum(len(group.graph.functions) - 1 for group in graph.groups)
-
-
-def counted(count: int, noun: str) -> str:
-    """Return how many of something there are, such as ``3 functions``."""
-    return f"{count} {noun}{'s' * (count != 1)}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
+from epypes.display.markup import counted
 from epypes.display.views.graphview import FunctionView, GraphView
 from epypes.display.views.structure import structure_of, with_caption
 from epypes.display.views.tokens import ROOM, Room, valueless_view, with_values
@@ -42,7 +43,7 @@ def _planned_view(function: FunctionView, plan: Plan) -> FunctionView:
 def _plan_caption(plan: Plan) -> str:
     placeholders = len(plan.placeholders)
     to_run = len(plan.order) - placeholders
-    parts = [f"{to_run} function{'s' * (to_run != 1)} to run, {len(plan.reused)} reused"]
+    parts = [f"{counted(to_run, 'function')} to run, {len(plan.reused)} reused"]
     if plan.left_out:
         parts.append(f"{len(plan.left_out)} left out")
     if placeholders:

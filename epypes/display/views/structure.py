@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Mapping
 from typing import Any, Final
 from weakref import WeakKeyDictionary
 
-from epypes.display.markup import cut
+from epypes.display.markup import counted, cut
 from epypes.display.previews.preview import preview
 from epypes.display.views.graphview import EdgeView, FunctionState, FunctionView, GraphView, TokenView
 from epypes.display.views.source import graph_lines, signature_and_source
@@ -75,7 +75,7 @@ def _function_view(
     if inner is None:
         signature, source = signature_and_source(cg.functions[name])
         return FunctionView(name, state, notes=old, is_redefined=is_redefined, signature=signature, source=source)
-    note = f"pipeline of {len(inner.functions)} function{'s' * (len(inner.functions) != 1)}"
+    note = f"pipeline of {counted(len(inner.functions), 'function')}"
     return FunctionView(
         name, state, kind="pipeline", notes=(note, *old), is_redefined=is_redefined, source=graph_lines(inner)
     )

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from epypes.display.durations import duration_text, overhead_text
-from epypes.display.markup import cut_name, short_name
+from epypes.display.markup import counted, cut_name, short_name
 from epypes.run import FunctionTime, LogNormal, RunReport, TimingSummary
 
 BarKind = Literal["function", "rest", "overhead", "total"]
@@ -61,28 +61,19 @@ class TimesView:
     bars: tuple[TimeBar, ...]
 
 
-def functions_text(count: int) -> str:
-    """Return a number of functions in words."""
-    return f"{count} function{'s' * (count != 1)}"
-
-
 def report_caption(report: RunReport) -> str:
     """Return how many functions of a run ran to their end, how many were reused, and whether one failed."""
     entries = report.functions
     failed = sum(entry.failed for entry in entries)
     reused = sum(not entry.ran for entry in entries)
-    ran = functions_text(len(entries) - reused - failed)
+    ran = counted(len(entries) - reused - failed, "function")
     return f"{ran} ran, {reused} reused{f', {failed} failed' * failed}"
 
 
 def summary_caption(summary: TimingSummary) -> str:
     """Return how many runs were summarized, and how."""
-    left_out = f", {_runs_text(summary.failed_runs, 'failed ')} left out" * bool(summary.failed_runs)
-    return f"{_runs_text(summary.runs)}{left_out}; log-normal distributions"
-
-
-def _runs_text(count: int, kind: str = "") -> str:
-    return f"{count} {kind}run{'s' * (count != 1)}"
+    left_out = f", {counted(summary.failed_runs, 'failed run')} left out" * bool(summary.failed_runs)
+    return f"{counted(summary.runs, 'run')}{left_out}; log-normal distributions"
 
 
 def failed_text(entry: FunctionTime) -> str:
@@ -145,7 +136,7 @@ def _rest_bar(rest: Sequence[FunctionTime], total_ns: int) -> Iterable[TimeBar]:
 
 def rest_text(rest: Sequence[FunctionTime]) -> str:
     """Return what is said of functions that are not shown one by one."""
-    return f"{functions_text(len(rest))} more, {sum(not entry.ran for entry in rest)} of them reused"
+    return f"{counted(len(rest), 'function')} more, {sum(not entry.ran for entry in rest)} of them reused"
 
 
 def summary_times(summary: TimingSummary) -> TimesView:
@@ -155,7 +146,7 @@ def summary_times(summary: TimingSummary) -> TimesView:
     scale = _scale_ns(fitted for fitted in (*functions.values(), summary.overhead) if fitted.is_fitted)
     bars = [_fitted_bar("function", name, functions[name], scale) for name in functions if name in kept]
     if len(functions) > len(kept):
-        said = f"{functions_text(len(functions) - len(kept))} more, which take less"
+        said = f"{counted(len(functions) - len(kept), 'function')} more, which take less"
         bars.append(TimeBar("rest", said, "", said))
     bars.append(_fitted_bar("overhead", overhead_text(summary.side_by_side), summary.overhead, scale))
     total = _fitted_bar("total", "in all", summary.total, scale)
@@ -186,7 +177,7 @@ def _fitted_bar(kind: BarKind, name: str, fitted: LogNormal, scale_ns: float) ->
     if not fitted.is_fitted:
         return TimeBar(kind, shown, "no positive value", f"{named}: no positive value")
     median = duration_text(round(fitted.median_ns))
-    runs, length = f"in {_runs_text(fitted.count)}", min(fitted.median_ns / scale_ns, 1.0)
+    runs, length = f"in {counted(fitted.count, 'run')}", min(fitted.median_ns / scale_ns, 1.0)
     if not fitted.has_range:
         return TimeBar(kind, shown, median, f"{named}: median {median}, {runs}", length)
     title = f"{named}: median {median}, 5 % to 95 % {range_text(fitted)}, {runs}"
