@@ -29,6 +29,14 @@ def chain_with_a_shared_token(count):
     return (BOX,) * (2 * count + 2), tuple(edges)
 
 
+def assert_in_one_row(layout):
+    """All but the first two vertices stand in one row, in their order."""
+    xs = [x for x, _ in layout.centres[2:]]
+    assert xs == sorted(xs)
+    assert len({y for _, y in layout.centres[2:]}) == 1
+    assert layout.width < 500
+
+
 def assert_ends_at_their_vertices(boxes, edges, layout):
     """Each edge begins at the side of one of its vertices and ends at that of the other."""
     for (tail, head), spline in zip(edges, layout.splines, strict=True):
@@ -217,10 +225,7 @@ def test_narrow_sources_stand_in_one_row_and_their_edges_meet_below_it(count):
     lying = Box("hexagon", 28.0, 110.0)
     boxes, edges = sources_of(count, 2, lying)
     layout = lay_out(boxes, edges)
-    xs = [x for x, _ in layout.centres[2:]]
-    assert xs == sorted(xs)
-    assert len({y for _, y in layout.centres[2:]}) == 1
-    assert layout.width < 500
+    assert_in_one_row(layout)
     doors = set()
     for (tail, _), spline in zip(edges, layout.splines, strict=True):
         x, y = layout.centres[tail]
@@ -390,10 +395,7 @@ def test_narrow_sinks_stand_in_one_row_and_their_edges_part_above_it(count):
     narrow = Box("ellipse", 28.0, 110.0)
     boxes, edges = sinks_of(count, 2, narrow)
     layout = lay_out(boxes, edges)
-    xs = [x for x, _ in layout.centres[2:]]
-    assert xs == sorted(xs)
-    assert len({y for _, y in layout.centres[2:]}) == 1
-    assert layout.width < 500
+    assert_in_one_row(layout)
     doors = set()
     for (_, head), spline in zip(edges, layout.splines, strict=True):
         x, y = layout.centres[head]

@@ -8,6 +8,7 @@ import xml.etree.ElementTree as ET
 from html import unescape
 from urllib.parse import unquote
 
+import pandas
 import pytest
 
 import epypes as ep
@@ -235,7 +236,6 @@ def test_reports_of_failed_runs_alone_show_a_sentence():
 
 
 def test_reports_become_a_table_of_one_row_per_run_and_function():
-    pandas = pytest.importorskip("pandas")
     runner = ep.CompGraphRunner(
         ep.CompGraph({"f": abs, "g": lambda y, k: y}, {"f": ("x", "y"), "g": (("y", "k"), "z")}), {"k": 1}
     )

@@ -154,7 +154,6 @@ def test_a_pipeline_that_fails_inside_a_graph_has_failed_in_both(way):
 
 
 def test_tables_of_reports_say_what_failed():
-    pytest.importorskip("pandas")
     runner = ep.CompGraphRunner(failing_chain(), {"n": 1})
     runner.run(x=1)
     with pytest.raises(TypeError):
