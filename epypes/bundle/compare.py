@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from epypes.wording import counted
+
 
 @dataclass(frozen=True, slots=True)
 class Difference:
@@ -47,12 +49,8 @@ class ReplayReport:
 
     def __str__(self) -> str:
         if self.identical:
-            return f"identical: {_count(self.tokens, 'token')} of {_count(self.samples, 'sample')}"
+            return f"identical: {counted(self.tokens, 'token')} of {counted(self.samples, 'sample')}"
         return "\n".join(map(str, self.differences)) or "nothing was compared: the bundle has no samples"
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'s' * (number != 1)}"
 
 
 def first_difference(expected: Any, got: Any, where: str = "") -> str | None:

@@ -91,8 +91,3 @@ def short_name(name: str) -> str:
         characters = characters * 3 // 4
         short = cut_name(name, characters)
     return short
-
-
-def counted(count: int, noun: str) -> str:
-    """Return how many of something there are, such as ``3 functions``."""
-    return f"{count} {noun}{'s' * (count != 1)}"

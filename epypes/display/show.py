@@ -10,13 +10,14 @@ from typing import Any
 
 from epypes.display.layout.geometry import Direction
 from epypes.display.limits import MOST_THUMBNAILS
-from epypes.display.markup import counted, escape
+from epypes.display.markup import escape
 from epypes.display.mime import bundle_of, html_and_svg, table_below
 from epypes.display.paint.svg import alt_text, paint_svg
 from epypes.display.views.graphview import GraphView
 from epypes.display.views.groups import function_count
 from epypes.display.views.jsonview import to_json
 from epypes.display.views.view import view
+from epypes.wording import counted
 
 
 @dataclass(frozen=True, slots=True)

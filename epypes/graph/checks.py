@@ -14,6 +14,7 @@ from epypes.errors import Finding
 from epypes.graph.bipartite import BipartiteDigraph
 from epypes.graph.signature import Parameters, is_plain, parameters_of, signature_of
 from epypes.graph.switch import as_switch
+from epypes.wording import counted
 
 _STRING: Final = frozenset({str})
 _SHAPES = "(x, y), ((x1, ..., xm), y), (x, (y1, ..., yn)) or ((x1, ..., xm), (y1, ..., yn))"
@@ -162,7 +163,7 @@ def _arity_findings(
 ) -> Iterable[Finding]:
     least, most, required = parameters.least, parameters.most, parameters.required_by_keyword
     if not least <= len(tokens) <= most:
-        takes = f"{least} input{'s' * (least != 1)}" if least == most else f"{least} to {most:g} inputs"
+        takes = f"{counted(least, 'input')}" if least == most else f"{least} to {most:g} inputs"
         text = (
             f"Function {name!r} takes {takes} {signature_of(function)}, "
             f"but its io names {len(tokens)}: ({', '.join(tokens)})."

@@ -27,6 +27,7 @@ from epypes.graph.redefined import is_redefined_inside, redefined
 from epypes.graph.switch import as_switch
 from epypes.graph.typecheck import check_types
 from epypes.images import Contracts
+from epypes.wording import counted
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -295,7 +296,7 @@ class CompGraph:
 
     def __repr__(self) -> str:
         count = len(self._functions)
-        start = f"<CompGraph: {count} function{'s' * (count != 1)}, {len(self._tokens)} tokens; "
+        start = f"<CompGraph: {counted(count, 'function')}, {len(self._tokens)} tokens; "
         end = _redefined_text(self) + ">"
         width = min(18, (95 - len(start) - len(end)) // 2)
         return f"{start}{_some(self._sources, width)} -> {_some(self._sinks, width)}{end}"

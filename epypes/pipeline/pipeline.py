@@ -13,6 +13,7 @@ from epypes.pipeline.network import NodeBasedCompGraph
 from epypes.pipeline.node import Node
 from epypes.pipeline.stages import Stages
 from epypes.run import CompGraphRunner, Run
+from epypes.wording import counted
 
 
 class Pipeline(Node):
@@ -99,7 +100,7 @@ class Pipeline(Node):
     def _by_name(self, args: tuple[Any, ...]) -> dict[str, Any]:
         free = self.runner.free_source_tokens
         if len(args) != len(free):
-            inputs = f"{len(free)} input{'s' * (len(free) != 1)}"
+            inputs = counted(len(free), "input")
             text = f"Pipeline {self.name!r} takes {inputs} ({', '.join(free)}), not {len(args)}."
             raise PayloadError(free, text)
         return dict(zip(free, args, strict=True))

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from epypes.pipeline.loop import EventLoop
 from epypes.pipeline.mailbox import Mailbox
+from epypes.wording import counted
 
 StageKind = Literal["queue", "loop", "function"]
 StageState = Literal["static", "running", "stopped", "failed"]
@@ -64,7 +65,7 @@ def queue_stage(name: str, queue: Any, *, is_waited_for: bool = False) -> Stage:
 
 def loop_stage(loop: EventLoop, failed: int) -> Stage:
     """Look at an event loop, ``failed`` of whose events failed."""
-    events = f"{loop.handled} event{'s' * (loop.handled != 1)}"
+    events = counted(loop.handled, "event")
     return Stage("loop", "EventLoop", "running" if loop.is_running else "stopped", (f"{events}, {failed} failed",))
 
 

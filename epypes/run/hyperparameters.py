@@ -9,6 +9,7 @@ from typing import Any, Final
 from epypes.errors import HyperparameterError
 from epypes.run.guard import ARRAYLESS, lend
 from epypes.run.program import Program
+from epypes.run.refused import wrong_payload
 from epypes.run.tokens import NOT_COMPUTED, is_same_value
 
 _NOTHING: Final[Mapping[str, Any]] = {}
@@ -123,6 +124,24 @@ class Hyperparameters:
         self.require(token)
         entries = {name: entry for name, entry in self.entries.items() if name != token}
         return Hyperparameters(self.program, entries, self.revision + 1, plain=self.plain - {token})
+
+    def with_payload(self, payload: Mapping[str, Any]) -> list[Any]:
+        """Return the values by slot with which a run on a payload begins.
+
+        Raises
+        ------
+        PayloadError, UnknownName
+            A token is not a free source token, or a switch has no such branch.
+        """
+        values, free = self.base.copy(), self.free_slots
+        for token, value in payload.items():
+            slot = free.get(token)
+            if slot is None:
+                raise wrong_payload(self.program.cg, token, free)
+            values[slot] = value
+        if self.program.selectors:
+            self.require_branches(payload)
+        return values
 
     def changes_since(self, earlier: Hyperparameters) -> Mapping[str, Any]:
         """Return the tokens that have another version than in an earlier or later revision, with their values."""

@@ -11,6 +11,7 @@ from epypes.graph import CompGraph
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.need import chosen_branches, missing_sources, needed_placeholders, wanted_steps
 from epypes.run.tokens import NOT_COMPUTED, TokenManager
+from epypes.wording import counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +60,7 @@ class Plan:
     def __repr__(self) -> str:
         missing = f", {len(self.missing) + len(self.placeholders)} missing" * bool(self.missing or self.placeholders)
         count = len(self.order)
-        return f"<Plan: {count} function{'s' * (count != 1)} to run, {len(self.reused)} reused{missing}>"
+        return f"<Plan: {counted(count, 'function')} to run, {len(self.reused)} reused{missing}>"
 
     def __str__(self) -> str:
         from epypes.display import to_text

@@ -12,6 +12,7 @@ from epypes.run.guard import ARRAYLESS, lend
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.report import RunReport, Times
 from epypes.run.tokens import Freshness, TokenManager
+from epypes.wording import counted
 
 if TYPE_CHECKING:
     from epypes.graph import CompGraph
@@ -108,7 +109,7 @@ class Run(Mapping[str, Any]):
     def __repr__(self) -> str:
         state = f"failed in {self.failure.function!r:.30}" if self.failure else "completed"
         redefinitions = len(redefined(self.cg))
-        old = f"; {redefinitions} function{'s' * (redefinitions != 1)} redefined" * bool(redefinitions)
+        old = f"; {counted(redefinitions, 'function')} redefined" * bool(redefinitions)
         return f"<Run: {state}; {len(self)} of {len(self.cg.tokens)} tokens{old}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, overload
 
 from epypes.run.program import Program, longest_path_ns
+from epypes.wording import counted
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -194,7 +195,7 @@ class Reports(Sequence[RunReport]):
         return (RunReport(*times) for times in tuple(self.kept))
 
     def __repr__(self) -> str:
-        return f"<Reports of {len(self)} run{'s' * (len(self) != 1)}>"
+        return f"<Reports of {counted(len(self), 'run')}>"
 
     def __str__(self) -> str:
         from epypes.display import to_text

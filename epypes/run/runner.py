@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from time import perf_counter_ns
 from typing import Any
 
-from epypes.errors import NotComputed, PayloadError, StaleToken, UnknownName, require_mapping, run_call
+from epypes.errors import StaleToken, require_mapping
 from epypes.graph import CompGraph
 from epypes.graph.redefined import redefined
 from epypes.run.attempt import AttemptsByKind, Outcome
@@ -18,9 +18,13 @@ from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.plan import Plan, plan
 from epypes.run.program import Program
 from epypes.run.record import Run
+from epypes.run.refused import nothing_computed, nothing_run, require_targets
 from epypes.run.report import Reports
 from epypes.run.tokens import TokenManager
+from epypes.run.trials import Trials
 from epypes.run.underway import running_functions
+from epypes.run.watchers import Watchers
+from epypes.wording import counted
 
 
 class CompGraphRunner:
@@ -77,6 +81,8 @@ class CompGraphRunner:
         self._program = Program(cg, guard)
         self._attempts = AttemptsByKind(self._program, workers)
         self._lock = threading.Lock()
+        self._trials = Trials()
+        self._watchers = Watchers()
         self._last: Run | None = None
         given = {**cg.defaults, **hparams}
         self._hparams = Hyperparameters(self._program, {}).frozen(given)
@@ -111,17 +117,10 @@ class CompGraphRunner:
         """
         start_ns = perf_counter_ns()
         if targets:
-            self._check_targets(targets)
+            require_targets(self.cg, targets, self.free_source_tokens)
         hparams, program = self._hparams, self._program
-        values, free = hparams.base.copy(), hparams.free_slots
-        for token, value in payload.items():
-            slot = free.get(token)
-            if slot is None:
-                raise self._wrong_payload(hparams, token)
-            values[slot] = value
-        if program.selectors:
-            hparams.require_branches(payload)
-        attempts, has_payload = self._attempts[hparams.plain], len(payload) == len(free)
+        values = hparams.with_payload(payload)
+        attempts, has_payload = self._attempts[hparams.plain], len(payload) == len(hparams.free_slots)
         compiled = attempts.short_way.whole
         if compiled is None or targets or not has_payload:
             return self._ended(attempts.whole(values, payload, has_payload, targets, start_ns), hparams)
@@ -134,6 +133,8 @@ class CompGraphRunner:
             times = (program, None, durations_ns, perf_counter_ns() - start_ns, False, -1)
             run = self._last = Run((values, attempts.clean, hparams, times, None))
             self.reports.kept.append(times)
+            if self._watchers:
+                self._watchers.tell()
             return run
         return self._ended(outcome, hparams)
 
@@ -153,14 +154,13 @@ class CompGraphRunner:
         """
         start_ns = perf_counter_ns()
         if targets:
-            self._check_targets(targets)
+            require_targets(self.cg, targets, self.free_source_tokens)
         with self._lock:
-            hparams = self._hparams = self._hparams.frozen(changes, also_new=False)
-        last, changed, compiled = self._last, hparams.changed, None
+            hparams, last = self._hparams.frozen(changes, also_new=False), self._last
+            self._hparams = hparams
+        changed, compiled = hparams.changed, None
         if last is None:
-            free = self.free_source_tokens
-            text = f"Nothing has been run yet, so there is no payload. Call {run_call(free)} first."
-            raise PayloadError(free, text)
+            raise nothing_run(self.free_source_tokens)
         attempts = self._attempts[hparams.plain]
         stored, freshness, before = last.record[:3]
         if freshness.is_clean and not targets and hparams.follows == before.revision:
@@ -178,6 +178,8 @@ class CompGraphRunner:
                 times = (self._program, None, durations_ns, perf_counter_ns() - start_ns, False, -1)
                 run = self._last = Run((values, freshness, hparams, times, None))
                 self.reports.kept.append(times)
+                if self._watchers:
+                    self._watchers.tell()
                 return run
         # A failure keeps this frame, with all that is named in it: the Run before, which may have failed too ...
         del last, stored, freshness
@@ -188,39 +190,84 @@ class CompGraphRunner:
 
         To be called where no exception is being handled, which would become the context of the user's.
         """
-        values, freshness, times, failure = outcome
-        run = self._last = Run((values, freshness, hparams, times, failure))
-        self.reports.add(times)
-        if failure is not None:
-            raise failure.exception
+        run = self._last = Run((*outcome[:2], hparams, *outcome[2:]))
+        self.reports.add(run.record[3])
+        self._watchers.tell()
+        if run.failure is not None:
+            raise run.failure.exception
         return run
+
+    def trial(self, values: Mapping[str, Any], /, *targets: str, payload: Mapping[str, Any] | None = None) -> Run:
+        """Run with other hyperparameters, or on another payload, and leave the runner as it is.
+
+        Parameters
+        ----------
+        values
+            Hyperparameters by token; the others are the runner's.
+        targets
+            Tokens; only what they need is run, everything without.
+        payload
+            The free source tokens by name, which count as new; without, all that is not stale in the last run is used.
+
+        Returns
+        -------
+        Run
+            If a function failed, its ``failure`` says so: nothing is raised for it.
+
+        Raises
+        ------
+        HyperparameterError, PayloadError, PlaceholderNeeded, UnknownName
+            As ``rerun`` and ``run`` do.
+        """
+        start_ns = perf_counter_ns()
+        require_targets(self.cg, targets, self.free_source_tokens)
+        before, last = self._state
+        hparams = before.frozen(values, also_new=False)
+        attempts = self._attempts[hparams.plain]
+        if payload is not None:
+            has_payload = len(payload) == len(hparams.free_slots)
+            outcome = attempts.whole(hparams.with_payload(payload), payload, has_payload, targets, start_ns)
+        elif last is None:
+            raise nothing_run(self.free_source_tokens)
+        else:
+            outcome = attempts.stale(self._draft(last, hparams), targets, start_ns)
+        run = Run((*outcome[:2], hparams, *outcome[2:]))
+        self._trials.add(run, before, last)
+        return run
+
+    def adopt(self, run: Run, /) -> bool:
+        """Make a run of ``trial`` the last one and its hyperparameters the runner's, in one step.
+
+        Return False, and do nothing, if the runner has changed since the trial began.
+
+        Raises
+        ------
+        ValueError
+            The run was not tried by this runner.
+        """
+        if run not in self._trials:
+            raise ValueError("Only a run that this runner's trial() returned can be adopted.")
+        with self._lock:
+            if not self._trials.began_from(run, self._hparams, self._last):
+                return False
+            self._hparams, self._last = run.record[2], run
+        self.reports.add(run.record[3])
+        self._watchers.tell()
+        return True
+
+    def watch(self, callback: Callable[[], object], /) -> Callable[[], None]:
+        """Call something without arguments when a run has ended or hyperparameters have changed; return what ends that.
+
+        It is called on the thread that did it, so it must return at once. What it raises is logged.
+        """
+        return self._watchers.add(callback)
 
     def plan(self, /, *targets: str) -> Plan:
         """Return what ``rerun(*targets)`` would do, and why."""
-        self._check_targets(targets)
-        last, hparams = self._last, self._hparams
+        require_targets(self.cg, targets, self.free_source_tokens)
+        hparams, last = self._state
         changed = () if last is None else tuple(hparams.changes_since(last.record[2]))
         return plan(self._now(last, hparams), targets, changed, hparams)
-
-    def _check_targets(self, targets: Sequence[object]) -> None:
-        for token in targets:
-            if not isinstance(token, str):
-                free = self.free_source_tokens
-                kind = type(token).__name__
-                text = f"A target is the name of a token, not {kind!r}. Payload goes by name: {run_call(free)}."
-                raise PayloadError(free, text)
-            self.cg.require_token(token)
-
-    def _wrong_payload(self, hparams: Hyperparameters, token: str) -> Exception:
-        """Return the error that says why this token can't be given to ``run``."""
-        if token not in self._program.slots:
-            return UnknownName("token", token, hparams.free_slots)
-        maker = self.cg.digraph.producer.get(token)
-        if maker is not None:
-            text = f"Token {token!r} is made by function {maker!r}; run() takes free source tokens only."
-        else:
-            text = f"Token {token!r} is a hyperparameter. Set runner[{token!r}], or call unfreeze({token!r})."
-        return PayloadError((token,), text)
 
     # -- hyperparameters ----------------------------------------------------------------------------------------
 
@@ -248,15 +295,18 @@ class CompGraphRunner:
         """Make source tokens hyperparameters, all or none of them."""
         with self._lock:
             self._hparams = self._hparams.frozen(values)
+        self._watchers.tell()
 
     def unfreeze(self, token: str) -> None:
         """Make a hyperparameter a free source token again."""
         with self._lock:
             self._hparams = self._hparams.unfrozen(token)
+        self._watchers.tell()
 
     def __setitem__(self, token: str, value: Any) -> None:
         with self._lock:
             self._hparams = self._hparams.frozen({token: value}, also_new=False)
+        self._watchers.tell()
 
     # -- reading ------------------------------------------------------------------------------------------------
 
@@ -268,13 +318,18 @@ class CompGraphRunner:
     @property
     def stale(self) -> tuple[str, ...]:
         """The functions that ``rerun()`` would run, in run order."""
-        hparams = self._hparams
-        return plan(self._now(self._last, hparams), (), (), hparams).order
+        return self.plan().order
 
     @property
     def running(self) -> tuple[str, ...]:
         """The functions that are being run at this moment, in whatever thread, in run order."""
         return running_functions(self._program)
+
+    @property
+    def _state(self) -> tuple[Hyperparameters, Run | None]:
+        """The hyperparameters and the last run, of one moment."""
+        with self._lock:
+            return self._hparams, self._last
 
     def _draft(self, last: Run | None, hparams: Hyperparameters) -> Draft:
         """Return a run's tokens with these hyperparameters, to go on from.
@@ -295,15 +350,13 @@ class CompGraphRunner:
         return self._draft(last, hparams).tokens()
 
     def __getitem__(self, token: str) -> Any:
-        hparams, last = self._hparams, self._last
+        hparams, last = self._state
         if token in hparams.entries:
             value = hparams.entries[token][0]
             return lend(value) if self.guard else value
         if last is None:
             self.cg.require_token(token)
-            call = run_call(hparams.free_slots)
-            text = f"Token {token!r} has not been computed: nothing has been run. Call {call}."
-            raise NotComputed(token, text)
+            raise nothing_computed(token, hparams.free_slots)
         value = last[token]
         if self._now(last, hparams).is_stale(token):
             raise StaleToken(token)
@@ -320,7 +373,7 @@ class CompGraphRunner:
 
     def keys(self) -> tuple[str, ...]:
         """Return the tokens that can be read now, in graph order."""
-        hparams, last = self._hparams, self._last
+        hparams, last = self._state
         now = self._now(last, hparams)
         return tuple(
             token
@@ -329,18 +382,16 @@ class CompGraphRunner:
         )
 
     def __repr__(self) -> str:
-        redefinitions = len(redefined(self.cg))
+        last, redefinitions = self._last, len(redefined(self.cg))
         old = f" ({redefinitions} redefined)" * bool(redefinitions)
-        if self._last is None:
+        if last is None:
             state = "not run yet"
-        elif self._last.failure:
-            state = f"failed in {self._last.failure.function!r:.{24 - len(old)}}"
+        elif last.failure:
+            state = f"failed in {last.failure.function!r:.{24 - len(old)}}"
         else:
-            stale = len(self.stale)
-            state = f"{stale} function{'s' * (stale != 1)} stale" if stale else "up to date"
-        functions, frozen = len(self.cg.functions), len(self.hyperparameters)
-        counts = f"{functions} function{'s' * (functions != 1)}{old}, {frozen} hyperparameter{'s' * (frozen != 1)}"
-        return f"<CompGraphRunner: {counts}; {state}>"
+            state = f"{counted(len(self.stale), 'function')} stale" if self.stale else "up to date"
+        functions, frozen = counted(len(self.cg.functions), "function"), len(self.hyperparameters)
+        return f"<CompGraphRunner: {functions}{old}, {counted(frozen, 'hyperparameter')}; {state}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         from epypes.display import mimebundle

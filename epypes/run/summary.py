@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from epypes.run.report import RunReport
+from epypes.wording import counted
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -165,7 +166,7 @@ class TimingSummary:
 
     def __repr__(self) -> str:
         functions = len(self.functions)
-        return f"<TimingSummary: {self.runs} run{'s' * (self.runs != 1)}, {functions} function{'s' * (functions != 1)}>"
+        return f"<TimingSummary: {counted(self.runs, 'run')}, {counted(functions, 'function')}>"
 
     def __str__(self) -> str:
         from epypes.display import to_text

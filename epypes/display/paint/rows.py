@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 
 from epypes.display.durations import duration_text, overhead_text
-from epypes.display.markup import counted
 from epypes.display.views.graphview import FunctionView, GraphView
 from epypes.display.views.plans import plan_view
 from epypes.display.views.times import (
@@ -21,6 +20,7 @@ from epypes.display.views.times import (
 )
 from epypes.run import FunctionTime, LogNormal, Plan, RunReport, TimingSummary, summarize
 from epypes.run.report import Reports
+from epypes.wording import counted
 
 # Below them stand the rest, the total and the graph overhead: a hundred rows in all.
 _MOST_FUNCTIONS: Final = 97

@@ -12,7 +12,7 @@ from typing import Final
 
 from epypes.display.layout.geometry import Box, Layout
 from epypes.display.layout.place import lay_out
-from epypes.display.markup import counted, escape, fitted, short_name
+from epypes.display.markup import escape, fitted, short_name
 from epypes.display.paint.edges import paint_edges
 from epypes.display.paint.functionmarks import function_box, paint_function
 from epypes.display.paint.stages import paint_around
@@ -20,6 +20,7 @@ from epypes.display.paint.style import STYLE
 from epypes.display.paint.tokenmarks import paint_token, token_box
 from epypes.display.views.graphview import GraphView
 from epypes.display.views.groups import function_count
+from epypes.wording import counted
 
 # Beyond this many edges, and this many for each vertex, curves and arrows can't be followed by the eye, would take
 # Graphviz minutes and would fill the picture.

@@ -9,7 +9,7 @@ import colorsys
 import functools
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.display.markup import counted
+from epypes.wording import counted
 
 if TYPE_CHECKING:
     import numpy.typing as npt

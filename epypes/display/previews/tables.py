@@ -6,12 +6,13 @@ import itertools
 from collections.abc import Sequence
 from typing import Any, Final
 
-from epypes.display.markup import counted, cut
+from epypes.display.markup import cut
 from epypes.display.previews.kinds import is_of
 from epypes.display.previews.registry import ours
 from epypes.display.previews.short import short_repr
 from epypes.display.previews.shown import Look, Preview
 from epypes.display.previews.statistics import memory_text
+from epypes.wording import counted
 
 _MOST_COLUMNS: Final = 4
 _NAMED: Final = 8

@@ -10,9 +10,9 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
-from epypes.display.markup import counted
 from epypes.display.views.graphview import EdgeView, FunctionState, FunctionView, GraphView, GroupView, TokenView
 from epypes.graph import CompGraph
+from epypes.wording import counted
 
 # A graph of so many functions fits on a page; every one that is hidden costs a click.
 _MOST_SHOWN: Final = 24

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-from epypes.display.markup import counted
 from epypes.display.views.graphview import FunctionView, GraphView
 from epypes.display.views.structure import structure_of, with_caption
 from epypes.display.views.tokens import ROOM, Room, valueless_view, with_values
 from epypes.errors import run_call
 from epypes.run import Plan
+from epypes.wording import counted
 
 _NAMED: Final = 8
 

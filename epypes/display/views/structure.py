@@ -6,12 +6,13 @@ from collections.abc import Collection, Iterator, Mapping
 from typing import Any, Final
 from weakref import WeakKeyDictionary
 
-from epypes.display.markup import counted, cut
+from epypes.display.markup import cut
 from epypes.display.previews.preview import preview
 from epypes.display.views.graphview import EdgeView, FunctionState, FunctionView, GraphView, TokenView
 from epypes.display.views.source import graph_lines, signature_and_source
 from epypes.graph import CompGraph, Switch, as_switch, colour_order
 from epypes.graph.redefined import inner_graph, is_redefined_inside, redefined
+from epypes.wording import counted
 
 TO_BE_WRITTEN: Final = "to be written"
 _REDEFINED: Final = "redefined since: build the graph again"

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from epypes.display.durations import duration_text, overhead_text
-from epypes.display.markup import counted, cut_name, short_name
+from epypes.display.markup import cut_name, short_name
 from epypes.run import FunctionTime, LogNormal, RunReport, TimingSummary
+from epypes.wording import counted
 
 BarKind = Literal["function", "rest", "overhead", "total"]
 
