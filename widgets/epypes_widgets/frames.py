@@ -1,9 +1,4 @@
-"""Which picture goes to the screen, and when?
-
-One frame is in flight at a time. Newer ones replace the one that waits, and the acknowledgement of a painted frame
-lets the newest go; so the screen is never behind by more than one frame, and the last one always arrives.
-No widgets here: whoever uses a FrameSender says how a frame is sent.
-"""
+"""How do tokens of a run become a frame for the screen?"""
 
 from __future__ import annotations
 
@@ -12,75 +7,79 @@ import json
 import math
 import numbers
 import reprlib
-import threading
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from typing import Any, Final
 
-from epypes.display.previews.imagekinds import is_image
-from epypes.display.previews.ranges import kept_range
-from epypes.display.previews.raster import encode_image
-from epypes.graph import colour_order
+from epypes.display import encode_image
 from epypes.run import Run
+from epypes_widgets.looking.histogram import histogram_of
+from epypes_widgets.looking.overlay import overlay, scene
+from epypes_widgets.sender import Frame
+from epypes_widgets.shown import Shown
 
 # Wider than the box on a usual screen; a JPEG of this size is about 150 kB and takes 5 ms to encode.
 MAX_SIDE_PX: Final = 1400
+PINNED_SIDE_PX: Final = 320
 _TEXT_LENGTH: Final = 400
 
+# What the front end is told of a picture, and its bytes.
+Picture = tuple[dict[str, Any], bytes]
 
-@dataclass(frozen=True, slots=True)
-class Frame:
-    """A token's value as it goes to the screen.
 
-    Attributes
+def make_frame(run: Run, seq: int, shown: Shown, changed_ns: int = 0, **content: Any) -> Frame:
+    """Return what is shown of a run that has the tokens for it.
+
+    Parameters
     ----------
+    run
+        Has not failed in what is shown.
     seq
-        Rises with every frame of a panel.
-    content
-        What the front end is told beside the bytes; can be written as JSON.
-    data
-        The bytes of the picture; empty for a token that is shown as text.
+        Of the frame.
+    shown
+        Has a token.
     changed_ns
-        When the newest value in it was set, by this process's ``perf_counter_ns``.
+        When the newest of its values was set.
+    content
+        Is told to the front end as it is.
     """
-
-    seq: int
-    content: Mapping[str, Any]
-    data: bytes = field(default=b"", repr=False)
-    changed_ns: int = 0
-
-
-def make_frame(run: Run, token: str, seq: int, changed_ns: int = 0, *, stale: bool = False) -> Frame:
-    """Return a token of a completed run as a frame: an image as a picture, anything else as text.
-
-    ``stale`` says that newer values failed, so that this is not what the controls ask for.
-    """
-    report = run.report
-    content: dict[str, Any] = {
+    assert shown.token is not None
+    pictures = [picture(run, shown.token, "main")]
+    if shown.other:
+        pictures.append(picture(run, shown.other, "other"))
+    pictures += [picture(run, token, "pinned", PINNED_SIDE_PX) for token in shown.pinned]
+    content = {
         "kind": "frame",
         "seq": seq,
-        "token": token,
-        "values": {name: plain(value) for name, value in run.hyperparameters.items()},
-        "compute_ms": report.total_ns / 1e6,
-        "times_ms": {name: ns / 1e6 for name, ns in report.durations_ns.items()},
-        "ran": len(report.ran),
-        "reused": len(report.reused),
-        "stale": stale,
+        "token": shown.token,
+        "values": plain_values(run.hyperparameters),
+        **_times(run),
+        "pictures": [described for described, _ in pictures],
+        "histogram": histogram_of(run, shown.token) if shown.has_histogram else None,
+        "histograms": {token: histogram_of(run, token) for token in shown.cut} if shown.has_histogram else {},
+        **content,
     }
-    value = run[token]
-    if not is_image(value):
-        content |= {"media_type": "text/plain", "text": text_of(value)}
-        return Frame(seq, content, b"", changed_ns)
-    ends = kept_range(run.tokens.program, token, value)
-    picture = encode_image(value, MAX_SIDE_PX, colour_order(run.cg, token), ends)
-    content |= {
-        "media_type": picture.media_type,
-        "width": picture.width,
-        "height": picture.height,
-        "shape": " x ".join(str(side) for side in value.shape),
-        "dtype": str(value.dtype),
+    return Frame(seq, content, tuple(data for _, data in pictures if data), changed_ns)
+
+
+def picture(run: Run, token: str, role: str, max_side_px: int = MAX_SIDE_PX) -> Picture:
+    """Return a token as a picture: an image, marks over their image, or anything else as text."""
+    found = scene(run, token)
+    described: dict[str, Any] = {"token": token, "role": role, "overlay": None}
+    if found is None:
+        return {**described, "media_type": "text/plain", "text": text_of(run[token])}, b""
+    image = found.backdrop.image
+    encoded = encode_image(image, max_side_px, found.backdrop.order, found.backdrop.ends)
+    described |= {
+        "overlay": overlay(found),
+        "media_type": encoded.media_type,
+        "width": encoded.width,
+        "height": encoded.height,
+        "full_width": image.shape[1],
+        "full_height": image.shape[0],
+        "shape": " x ".join(map(str, image.shape)),
+        "dtype": str(image.dtype),
     }
-    return Frame(seq, content, picture.data, changed_ns)
+    return described, encoded.data
 
 
 def text_of(value: Any) -> str:
@@ -88,6 +87,11 @@ def text_of(value: Any) -> str:
     short = reprlib.Repr()
     short.maxother = short.maxstring = _TEXT_LENGTH
     return short.repr(value)
+
+
+def plain_values(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return hyperparameters as JSON has them."""
+    return {name: plain(value) for name, value in values.items()}
 
 
 def plain(value: Any) -> Any:
@@ -107,78 +111,11 @@ def plain(value: Any) -> Any:
         return reprlib.repr(value)
 
 
-def showable(run: Run, asked: str | None) -> tuple[str, ...]:
-    """Return the tokens that are images, and the sink tokens whatever they are, in graph order."""
-    found = tuple(token for token in run if is_image(run[token]) or token in run.cg.sink_tokens) or tuple(run)
-    return found if asked is None or asked in found else (*found, asked)
-
-
-def best_token(run: Run, tokens: tuple[str, ...]) -> str | None:
-    """Return the last of these that is an image, of sink tokens if there is one; else the last; None of none."""
-    sinks = run.cg.sink_tokens
-    return max(tokens, key=lambda token: (is_image(run[token]), token in sinks, tokens.index(token)), default=None)
-
-
-class FrameSender:
-    """Sends frames one at a time, the newest next.
-
-    Parameters
-    ----------
-    send
-        Is called with a frame, on any thread, one call at a time; must not wait for the front end.
-
-    Notes
-    -----
-    Nothing is sent before ``ready``: there is no view yet that could acknowledge it. All methods may be called from
-    any thread.
-    """
-
-    def __init__(self, send: Callable[[Frame], None]) -> None:
-        self._send = send
-        # Held while sending, so that frames leave in order. An answer within send() on this thread is allowed.
-        self._lock = threading.RLock()
-        self._newest: Frame | None = None
-        self._in_flight: Frame | None = None
-        self._waiting = False
-        self._mounted = False
-
-    @property
-    def in_flight(self) -> Frame | None:
-        """The frame that was sent and is not painted yet."""
-        return self._in_flight
-
-    @property
-    def newest(self) -> Frame | None:
-        """The frame that was offered last."""
-        return self._newest
-
-    def offer(self, frame: Frame) -> None:
-        """Send a frame now, or when the one in flight has been painted, unless a newer one comes until then."""
-        with self._lock:
-            self._newest = frame
-            self._waiting = True
-            self._go_on()
-
-    def painted(self, seq: int) -> Frame | None:
-        """Take an acknowledgement; return the frame that it was for, None if it was late or came twice."""
-        with self._lock:
-            frame = self._in_flight
-            if frame is None or frame.seq != seq:
-                return None
-            self._in_flight = None
-            self._go_on()
-            return frame
-
-    def ready(self) -> None:
-        """Start over with the newest frame: a view has been mounted, and what was in flight may be lost."""
-        with self._lock:
-            self._mounted = True
-            self._in_flight = None
-            self._waiting = self._newest is not None
-            self._go_on()
-
-    def _go_on(self) -> None:
-        if self._mounted and self._waiting and self._in_flight is None and self._newest is not None:
-            self._waiting = False
-            self._in_flight = self._newest
-            self._send(self._newest)
+def _times(run: Run) -> dict[str, Any]:
+    report = run.report
+    return {
+        "compute_ms": report.total_ns / 1e6,
+        "times_ms": {name: ns / 1e6 for name, ns in report.durations_ns.items()},
+        "ran": len(report.ran),
+        "reused": len(report.reused),
+    }

@@ -2,47 +2,65 @@
 
 from __future__ import annotations
 
-import enum
-import threading
-from collections.abc import Mapping
-from itertools import count
-from typing import Any, Final
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import ipywidgets
 
-from epypes.errors import NotComputed, PayloadError, UnknownName, run_call
+from epypes.errors import NotComputed, PayloadError, run_call
+from epypes.hints import Param, Roi
 from epypes.run import CompGraphRunner, Run
-from epypes_widgets.controls import Control, control, grouped
-from epypes_widgets.frames import best_token, make_frame, showable
+from epypes_widgets import code, settings
+from epypes_widgets.controls import column, controls
+from epypes_widgets.frames import plain_values
+from epypes_widgets.hand import Hand
+from epypes_widgets.history import history_of
+from epypes_widgets.latency import Latency, latency_of
+from epypes_widgets.looking.films import payloads
+from epypes_widgets.messages import Messages
 from epypes_widgets.picture import PictureView
-from epypes_widgets.ranges import ranges
-from epypes_widgets.worker import Worker
+from epypes_widgets.promotion import proposal
+from epypes_widgets.screen import Screen
+from epypes_widgets.session import Session
+from epypes_widgets.static import static_html
+from epypes_widgets.still import Still
+from epypes_widgets.tuning import Tuning
+
+if TYPE_CHECKING:
+    from epypes_widgets.historyframe import HistoryFrame
 
 
-def tune(runner: CompGraphRunner, /, *, token: str | None = None, **hints: Any) -> Panel:
-    """Show sliders for a runner's hyperparameters, and the picture that they make.
+def tune(
+    runner: CompGraphRunner, /, *, images: Iterable[Any] | None = None, token: str | None = None, **hints: Any
+) -> Panel:
+    """Show controls for a runner's hyperparameters, and the picture that they make.
 
     Parameters
     ----------
     runner
-        Has been run, so that there is a payload.
+        Has been run, so that there is a payload, unless ``images`` are given.
+    images
+        Test images to switch between: values of the one free source token, or dicts by token.
     token
         The token whose picture is shown at first; without, the last sink token that is an image, else the last
-        image. A hyperparameter of this very name gets no hint.
+        image.
     hints
-        By hyperparameter: an ``ep.Param``, a tuple as a range (low, high[, step]), a list of choices. Without, the
-        annotation of the function that takes it says it, then its value; what can't be moved is shown.
+        By hyperparameter: an ``ep.Param``, an ``ep.Roi``, a tuple as a range (low, high[, step]), a list of choices.
+        Without, the annotation of the function that takes it says it, then the table of OpenCV's and scikit-image's
+        parameters, then its value; what can't be moved is shown. A hyperparameter called ``images`` or ``token`` gets
+        its hint from its annotation.
 
     Returns
     -------
     Panel
-        As the last expression of a cell it shows itself. Running the cell again makes a new panel; the old one goes
-        on working, on the same runner, wherever it is still shown.
+        As the last expression of a cell it shows itself. Running the cell again makes a new panel, which goes on from
+        the runner's values and its history.
 
     Raises
     ------
     PayloadError
-        The runner has not been run.
+        The runner has not been run and there are no images, or they don't fit its free source tokens.
     UnknownName
         A hint is for no hyperparameter of the runner, or ``token`` is not in its graph.
     TypeError, ValueError
@@ -64,104 +82,177 @@ def tune(runner: CompGraphRunner, /, *, token: str | None = None, **hints: Any) 
     if not isinstance(runner, CompGraphRunner):
         kind = type(runner).__name__
         raise TypeError(f"tune() takes a CompGraphRunner, not {kind!r}: tune(CompGraphRunner(cg, hparams)).")
-    if runner.last is None:
+    if token is not None:
+        runner.cg.require_token(token)
+    given = () if images is None else payloads(runner, images)
+    if runner.last is None and not given:
         free = runner.free_source_tokens
         text = f"Nothing has been run yet, so there is nothing to tune on. Call {run_call(free)} first."
         raise PayloadError(free, text)
-    if token is not None:
-        runner.cg.require_token(token)
-    params = ranges(runner, hints)
-    values = runner.hyperparameters
-    return Panel(runner, {name: control(name, values[name], param) for name, param in params.items()}, token)
+    hand = Hand(controls(runner, hints))
+    session = Session(runner, given)
+    if runner.last is None:
+        session.want_image(0)
+    return Panel(hand, session, token)
 
 
 class Panel:
     """Controls and a picture, bound to a runner; made by ``tune``.
 
     Values may be set from any thread. They are computed on a thread of the panel's own, the latest first; a cell that
-    needs the result calls ``wait``. What cells set on the runner itself is used by the panel's next run, but does not
-    move its controls.
+    needs the result calls ``wait``. The runner changes when a run has completed, hyperparameters and tokens together.
+    What cells set on the runner moves the controls.
 
     Parameters
     ----------
-    runner
-        Is run by the panel.
-    controls
-        By hyperparameter, in the order in which they are listed.
+    hand
+        The controls.
+    session
+        Its runner is run by the panel.
     token
         The token to show first; None for the best one.
     """
 
-    def __init__(self, runner: CompGraphRunner, controls: Mapping[str, Control], token: str | None) -> None:
-        self._runner = runner
-        self._controls = dict(controls)
-        self._initial = {name: entry.read() for name, entry in controls.items()}
-        self._asked = token
-        self._seq = count(1).__next__
-        self._moving = threading.RLock()
-        self._is_writing = False
-        self._result: Run | None = None
-        self._failed: set[str] = set()
-        self._worker = Worker(self._compute)
-        self._view = PictureView(lambda: self._worker.idle)
-        self._tokens = ipywidgets.ToggleButtons(options=[], style={"button_width": "auto"})
-        column, self._headings = grouped(runner.cg, controls)
-        self._widget = _laid_out(self._tokens, column, self._view)
-        for entry in controls.values():
-            entry.on_change(self._moved)
-        self._tokens.observe(self._chosen, names="value")
-        self._begin()
+    def __init__(self, hand: Hand, session: Session, token: str | None) -> None:
+        self._hand, self._session, self._runner = hand, session, session.runner
+        self._history = history_of(self._runner)
+        self._column = column(self._runner.cg, hand.controls)
+        self._still = Still(self._static)
+        self._tuning = tuning = Tuning(hand, session, self._history, self._still.update)
+        self._messages = Messages(tuning, self.save, self.load)
+        view = PictureView(lambda: tuning.worker.idle, self._later, self._messages.handlers, tuning.report)
+        self._screen = tuning.screen = Screen(view, session, self._history, token, self._setup, self.code)
+        self._cuts = _cuts(hand)
+        tuning.screen.change(cut=tuple(self._cuts), has_histogram=bool(self._cuts))
+        self._widget = ipywidgets.HBox([self._column.widget, view], _dom_classes=("epypes-panel",))
+        tuning.begin()
 
-    # -- for users ----------------------------------------------------------------------------------------------
+    # -- values -------------------------------------------------------------------------------------------------
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The values that the controls are at, by hyperparameter."""
+        return self._hand.values
+
+    def __getitem__(self, name: str) -> Any:
+        return self._hand.control(name).read()[name]
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        self.set(**{name: value})
+
+    def set(self, **values: Any) -> None:
+        """Move controls, all or none, and have the values computed.
+
+        Raises
+        ------
+        UnknownName
+            There is no such hyperparameter.
+        ValueError
+            A value is outside of its range.
+        """
+        self._require_open()
+        self._tuning.want(values)
+
+    def reset(self, *names: str) -> None:
+        """Set hyperparameters to the values that the runner had them frozen with; all without names."""
+        first = self._runner.first_hyperparameters
+        self.set(**{name: first[name] for name in names or self._hand.values})
+
+    def code(self) -> str:
+        """Return the line that leads from the runner's first hyperparameters to those of the panel."""
+        first = self._runner.first_hyperparameters
+        return code.line(code.name_of(self._runner), first, {**first, **self._hand.values}, self._hand.params)
+
+    # -- results ------------------------------------------------------------------------------------------------
+
+    @property
+    def result(self) -> Run:
+        """The last run that completed: of the tokens that are not looked at it may have none, or those of before.
+
+        Raises
+        ------
+        NotComputed
+            None has completed.
+        """
+        if self._session.result is None:
+            text = f"No run of this panel has completed. {self._screen.error or 'Call wait(timeout_s) first.'}"
+            raise NotComputed(self.token or "", text)
+        return self._session.result
+
+    @property
+    def error(self) -> str:
+        """What failed with the last values, as shown under the picture; empty if nothing did."""
+        return self._screen.error
+
+    @property
+    def log(self) -> tuple[str, ...]:
+        """What went wrong in the panel itself, as in its log drawer."""
+        return self._screen.lines
+
+    @property
+    def latency(self) -> Latency:
+        """How long the last frames took from the hand to the screen."""
+        return latency_of(self._screen.compute_ms, self._screen.view.to_screen_ms)
+
+    def wait(self, timeout_s: float) -> None:
+        """Return when everything that was set has been computed and committed; TimeoutError if that takes longer."""
+        self._tuning.worker.wait(timeout_s)
+
+    # -- looking ------------------------------------------------------------------------------------------------
+
+    @property
+    def token(self) -> str | None:
+        """The token that is shown; None before the first run has completed."""
+        return self._screen.shown.token
+
+    @token.setter
+    def token(self, token: str) -> None:
+        self._require_open()
+        self._runner.cg.require_token(token)
+        self._screen.change(token=self._screen.require_stage(token))
+        self._tuning.look()
 
     @property
     def widget(self) -> Any:
         """The ipywidgets box that is shown, to be put into a layout of one's own."""
         return self._widget
 
-    @property
-    def values(self) -> dict[str, Any]:
-        """The values that the controls are at, by hyperparameter."""
-        return {name: entry.read() for name, entry in self._controls.items()}
+    # -- remembering --------------------------------------------------------------------------------------------
 
     @property
-    def token(self) -> str | None:
-        """The token that is shown; None before the first run has completed."""
-        chosen: str | None = self._tokens.value
-        return chosen or self._asked
+    def history(self) -> HistoryFrame:
+        """The values that were committed, a row each, with the pictures that they made; the pandas table is a copy."""
+        return self._history.to_frame()
 
-    @property
-    def result(self) -> Run:
-        """The last run that completed.
+    def undo(self) -> bool:
+        """Go back to the values before; False if there are none."""
+        self._require_open()
+        return self._tuning.go_to(self._history.undo)
+
+    def redo(self) -> bool:
+        """Go on to the values that ``undo`` left; False if there are none."""
+        self._require_open()
+        return self._tuning.go_to(self._history.redo)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the values to a TOML file, and return its path; SettingsError with every reason why not."""
+        values = {**self._runner.hyperparameters, **self.values}
+        return settings.save(path, values, self._runner.cg, self._hand.params)
+
+    def load(self, path: str | Path) -> None:
+        """Set the values that are in a TOML file, all or none.
 
         Raises
         ------
-        NotComputed
-            None has, since the panel was made.
+        SettingsError
+            The file is not there or can't be read, or names what is no hyperparameter of the runner.
+        ValueError
+            A value is outside of its range.
         """
-        if self._result is None:
-            text = f"No run of this panel has completed. {self._view.error or 'Call wait(timeout_s) first.'}"
-            raise NotComputed(self.token or "", text)
-        return self._result
+        self._require_open()
+        self._tuning.want(settings.load(path, {**self._runner.hyperparameters, **self.values}))
 
-    @property
-    def error(self) -> str:
-        """What failed with the last values, as shown under the picture; empty if nothing did."""
-        return self._view.error
-
-    def code(self) -> str:
-        """Return the line that does what the hand has done since the panel was made."""
-        values = self.values
-        changed = {name: value for name, value in values.items() if _differs(value, self._initial[name])}
-        words = [f"{name}={_source(value)}" for name, value in changed.items() if name.isidentifier()]
-        others = [f"{name!r}: {_source(value)}" for name, value in changed.items() if not name.isidentifier()]
-        if others:
-            words.append(f"**{{{', '.join(others)}}}")
-        return f"runner.rerun({', '.join(words)})"
-
-    def wait(self, timeout_s: float) -> None:
-        """Return when everything that was set has been computed; TimeoutError if that takes longer."""
-        self._worker.wait(timeout_s)
+    # -- itself -------------------------------------------------------------------------------------------------
 
     def close(self, timeout_s: float = 5.0) -> None:
         """Stop following the controls; the picture stays. May be called twice and from any thread.
@@ -171,137 +262,65 @@ class Panel:
         StillRunning
             A function did not return in time.
         """
-        for entry in self._controls.values():
-            if entry.widget.has_trait("disabled"):
-                entry.widget.disabled = True
-        self._tokens.disabled = True
-        self._worker.close(timeout_s)
+        for control in self._hand.controls:
+            if control.widget.has_trait("disabled"):
+                control.widget.disabled = True
+        self._tuning.close(timeout_s)
 
-    def __getitem__(self, name: str) -> Any:
-        return self._control(name).read()
-
-    def __setitem__(self, name: str, value: Any) -> None:
-        entry = self._control(name)
-        if self._worker.closed:
+    def _require_open(self) -> None:
+        if self._tuning.worker.closed:
             raise RuntimeError("This panel is closed. Make a new one: tune(runner).")
-        with self._moving:
-            # A widget tells of what is written to it, unless it shows the same as before (a label, a slider between its
-            # steps); so it is not listened to, and the value is submitted here, once.
-            self._is_writing = True
-            try:
-                entry.write(value)
-            finally:
-                self._is_writing = False
-            self._moved(name, value)
 
     def __repr__(self) -> str:
-        state = "closed" if self._worker.closed else "failed" if self._view.error else "up to date"
-        if state == "up to date" and not self._worker.idle:
+        worker = self._tuning.worker
+        state = "closed" if worker.closed else "failed" if self.error else "up to date"
+        if state == "up to date" and not worker.idle:
             state = "computing"
-        return f"<Panel: {len(self._controls)} hyperparameters, shows {str(self.token)!r:.30}; {state}>"
+        return f"<Panel: {len(self.values)} hyperparameters, shows {str(self.token)!r:.30}; {state}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, Any]:
         bundle: dict[str, Any] = self._widget._repr_mimebundle_() or {}
         return {**bundle, "text/plain": repr(self)}
 
-    # -- what moves ---------------------------------------------------------------------------------------------
+    def _ipython_display_(self) -> None:
+        from IPython.display import display
 
-    def _control(self, name: str) -> Control:
-        if name not in self._controls:
-            raise UnknownName("hyperparameter", name, self._controls, "of this panel")
-        return self._controls[name]
+        display(self._repr_mimebundle_(), raw=True)
+        self._still.display()
 
-    def _moved(self, name: str, _value: Any) -> None:
-        # Read and submitted in one step, so that of two threads the one whose value stands submits last.
-        with self._moving:
-            if not self._is_writing:
-                self._worker.submit({name: self._controls[name].read()})
+    def _static(self) -> str:
+        run = self._session.result
+        if run is None:
+            return ""
+        index = self._session.image
+        title = "" if index is None else self._session.payloads[index].title
+        first = self._runner.first_hyperparameters
+        return static_html(run, self.token, run.hyperparameters, first, image=title, code=self.code())
 
-    def _chosen(self, _change: object) -> None:
-        self._worker.submit({})
+    def _setup(self) -> tuple[dict[str, Any], list[bytes]]:
+        """Return what a view has to know of the controls and images."""
+        films, values = self._session.payloads, plain_values(self.values)
+        content = {
+            "rows": [{**row, "value": [values.get(name) for name in row["names"]]} for row in self._column.rows],
+            "folders": list(self._column.folders),
+            "images": [{"index": index, "title": film.title} for index, film in enumerate(films)],
+            "live": self._tuning.is_live,
+            "cuts": [{"token": token, "names": names} for token, names in self._cuts.items()],
+            "rois": [{"name": name, "token": param.on} for name, param in self._hand.params.items() if isinstance(param, Roi)],
+            "runner_name": code.name_of(self._runner),
+            "promote_to": proposal(self.token),
+            "settings": list(settings.names(Path.cwd())),
+        }
+        return content, [film.thumbnail for film in films]
 
-    # -- what runs on the worker's thread, after _begin --------------------------------------------------------
-
-    def _begin(self) -> None:
-        """Show what the runner has, if that is up to date; else let the worker compute it."""
-        last = self._runner.last
-        if last is None or last.failure is not None or self._runner.stale:
-            self._worker.submit({})
-            return
-        self._result = last
-        self._offer_tokens(last)
-        self._compute({}, 0)
-
-    def _compute(self, values: Mapping[str, Any], changed_ns: int) -> None:
-        """Run what is stale and show it; without values only show, since another token was chosen."""
-        try:
-            run = self._result
-            if values or run is None:
-                run = self._runner.rerun(**values)
-                self._completed(run)
-            self._show(run, changed_ns)
-        except BaseException as exception:  # it is the user's function that raised: SystemExit, too, is for the screen
-            self._fail(exception)
-
-    def _completed(self, run: Run) -> None:
-        self._result = run
-        for function in self._failed:
-            self._headings[function].remove_class("epypes-failed")
-        self._failed.clear()
-        self._offer_tokens(run)
-
-    def _show(self, run: Run, changed_ns: int) -> None:
-        token = self.token
-        if token is not None:  # a graph may have no tokens
-            self._view.show(make_frame(run, token, self._seq(), changed_ns, stale=bool(self._failed)))
-
-    def _fail(self, exception: BaseException) -> None:
-        last = self._runner.last
-        failure = last.failure if last is not None else None
-        if failure is None or failure.exception is not exception:
-            self._view.fail(self._seq(), f"{type(exception).__name__}: {exception}")
-            return
-        self._view.fail(self._seq(), str(failure), failure.function)
-        self._failed.add(failure.function)
-        if failure.function in self._headings:
-            self._headings[failure.function].add_class("epypes-failed")
-
-    def _offer_tokens(self, run: Run) -> None:
-        """Let the user choose among the tokens that this run has pictures of; keep the choice if it is there."""
-        tokens = showable(run, self._asked)
-        if tokens == tuple(self._tokens.options):
-            return
-        shown = self.token
-        # Setting the options chooses the first of them: that is not the user's choice.
-        self._tokens.unobserve(self._chosen, names="value")
-        self._tokens.options = tokens
-        self._tokens.value = shown if shown in tokens else best_token(run, tokens)
-        self._tokens.observe(self._chosen, names="value")
+    def _later(self, delay_s: float, function: Any) -> None:
+        self._tuning.worker.later("lost frame", delay_s, function)
 
 
-_COLUMNS: Final = {"flex_flow": "row wrap", "width": "100%"}
-
-
-def _laid_out(tokens: Any, column: Any, view: Any) -> Any:
-    # A box, so that a page of CSS can reach what is in it without styling other people's widgets.
-    chooser = ipywidgets.Box([tokens])
-    right = ipywidgets.VBox([chooser, view], layout={"flex": "3 1 420px", "min_width": "320px"})
-    columns = ipywidgets.HBox([column, right], layout=_COLUMNS)
-    for box, name in ((chooser, "epypes-tokens"), (columns, "epypes-columns")):
-        box.add_class(name)
-    panel = ipywidgets.VBox([columns])
-    panel.add_class("epypes-panel")
-    return panel
-
-
-def _differs(value: Any, other: Any) -> bool:
-    if value is other:
-        return False
-    try:
-        return bool(value != other)
-    except ValueError:  # arrays: another object counts as another value
-        return True
-
-
-def _source(value: Any) -> str:
-    return f"{type(value).__name__}.{value.name}" if isinstance(value, enum.Enum) else repr(value)
+def _cuts(hand: Hand) -> dict[str, list[str]]:
+    """Return the hyperparameters that are thresholds, by the token that they cut."""
+    cuts: dict[str, list[str]] = {}
+    for name, param in hand.params.items():
+        if isinstance(param, Param) and param.cuts:
+            cuts.setdefault(param.cuts, []).append(name)
+    return cuts

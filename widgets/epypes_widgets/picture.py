@@ -1,78 +1,86 @@
-"""What does the screen show of a token, and what does it answer?
+"""How do a panel and its view in the browser talk?
 
-The picture travels as one binary message per frame, never in a trait: traits are kept, compared and saved. The front
-end (``picture.js``) sends ``{kind: "ready"}`` when it is mounted and ``{kind: "painted", seq}`` for each frame.
+Pictures travel as one binary message per frame, never in a trait: traits are kept, compared and saved. What the
+messages are is written down in ``view/protocol.js`` too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from time import perf_counter_ns
-from typing import Any
+from typing import Any, Final
 
 import anywidget
 
-from epypes_widgets.frames import Frame, FrameSender
+from epypes_widgets.sender import Frame, FrameSender
+from epypes_widgets.view.script import joined
 
-_HERE = Path(__file__).parent
+_CSS: Final = Path(__file__).parent / "view" / "view.css"
+
+Later = Callable[[float, Callable[[], None]], None]
+Message = Mapping[str, Any]
 
 
 class PictureView(anywidget.AnyWidget):
-    """One big picture with a header and a status line.
+    """The picture of a panel, and everything around it that is no control of ipywidgets.
 
     Parameters
     ----------
     idle
         Whether nothing is being computed. Only then the time to the screen is sent: a small message just before a
         frame would hold that frame back, since the websocket of JupyterLab waits to fill its packets.
+    later
+        Calls a function after a delay.
+    handlers
+        By kind of message, what is called with it on the thread that answers the front end.
+    failed
+        Is called with what a handler has raised.
     """
 
-    _esm = _HERE / "picture.js"
-    _css = _HERE / "picture.css"
+    _esm = joined()
+    _css = _CSS
 
-    def __init__(self, idle: Callable[[], bool]) -> None:
+    def __init__(
+        self,
+        idle: Callable[[], bool],
+        later: Later,
+        handlers: Mapping[str, Callable[[Message], None]],
+        failed: Callable[[BaseException], None],
+    ) -> None:
         super().__init__()
-        self.frames = FrameSender(self._send_frame)
-        self.to_screen_ms: float | None = None
-        self._idle = idle
-        self._error: dict[str, Any] | None = None
+        self.frames = FrameSender(self._send_frame, later)
+        self.to_screen_ms: list[float] = []
+        self._idle, self._failed = idle, failed
+        self._handlers = {"painted": self._painted, "closed": lambda _: self.frames.closed(), **handlers}
         self.on_msg(self._answer)
 
-    @property
-    def error(self) -> str:
-        """The message on the status line; empty if there is none."""
-        return str(self._error["text"]) if self._error else ""
-
-    def show(self, frame: Frame) -> None:
-        """Show a frame as soon as the one in flight is painted; clears the error unless the frame is marked stale."""
-        if not frame.content.get("stale"):
-            self._error = None
-        self.frames.offer(frame)
-
-    def fail(self, seq: int, text: str, function: str = "") -> None:
-        """Keep the picture, badge it stale and show why; ``seq`` puts this in line with the frames."""
-        self._error = {"kind": "error", "seq": seq, "text": text, "function": function}
-        self.send(self._error)
+    def tell(self, kind: str, content: Message, buffers: Sequence[bytes] = ()) -> None:
+        """Send a message other than a frame, if there is a view."""
+        if self.frames.mounted:
+            self.send({"kind": kind, **content}, list(buffers))
 
     def _send_frame(self, frame: Frame) -> None:
-        content = {**frame.content, "to_screen_ms": self.to_screen_ms}
-        self.send(content, [frame.data] if frame.data else [])
+        last = self.to_screen_ms[-1] if self.to_screen_ms else None
+        self.send({**frame.content, "to_screen_ms": last}, list(frame.buffers))
 
     def _answer(self, _widget: object, content: Any, _buffers: object) -> None:
-        kind = content.get("kind")
-        if kind == "ready":
-            self.frames.ready()
-            error = self._error
-            if error is not None:
-                self.send(error)
-        elif kind == "painted":
-            self._painted(self.frames.painted(int(content.get("seq", 0))))
+        try:
+            handler = self._handlers.get(content.get("kind"))
+            if handler is not None:
+                handler(content)
+        except Exception as error:
+            self._failed(error)
 
-    def _painted(self, frame: Frame | None) -> None:
+    def _painted(self, message: Message) -> None:
+        frame = self.frames.painted(int(message.get("seq", 0)))
         # The first frame of a panel shows values that nobody moved, so it has no time to the screen.
         if frame is None or not frame.changed_ns:
             return
-        self.to_screen_ms = (perf_counter_ns() - frame.changed_ns) / 1e6
+        self.to_screen_ms.append((perf_counter_ns() - frame.changed_ns) / 1e6)
+        del self.to_screen_ms[:-_MOST_TIMES]
         if self._idle() and self.frames.in_flight is None:
-            self.send({"kind": "latency", "seq": frame.seq, "to_screen_ms": self.to_screen_ms})
+            self.tell("latency", {"seq": frame.seq, "to_screen_ms": self.to_screen_ms[-1]})
+
+
+_MOST_TIMES: Final = 200

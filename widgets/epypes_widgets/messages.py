@@ -1,0 +1,134 @@
+"""What does a panel do when its view says something?
+
+Each answer is made on the thread that answers the front end, and returns at once: nothing is computed here but a probe,
+which reads a pixel of pictures that are there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from epypes.errors import EpypesError
+from epypes_widgets import settings
+from epypes_widgets.looking.probe import probe
+from epypes_widgets.picture import Message
+from epypes_widgets.promotion import Outcome, Promotion
+from epypes_widgets.shown import Comparison
+from epypes_widgets.tuning import Tuning
+
+
+class Messages:
+    """Takes the messages of a view.
+
+    Parameters
+    ----------
+    tuning
+        Does what they ask for.
+    save, load
+        Write the present values to a file, and set those of one.
+    """
+
+    def __init__(self, tuning: Tuning, save: Callable[[str], Path], load: Callable[[str], None]) -> None:
+        self._tuning, self._save_to, self._load_from = tuning, save, load
+        self.promotion = Promotion(self._promoted)
+
+    @property
+    def handlers(self) -> dict[str, Callable[[Message], None]]:
+        """What is called with each kind of message."""
+        tuning = self._tuning
+        return {
+            "ready": lambda _: tuning.screen.ready(),
+            "hold": lambda message: tuning.hand.hold(message["names"]),
+            "release": lambda _: tuning.release(),
+            "set": self._set,
+            "reset": self._reset,
+            "stage": lambda message: self._look(token=tuning.screen.require_stage(message["token"])),
+            "pin": self._pin,
+            "compare": self._compare,
+            "histogram": lambda message: self._look(has_histogram=bool(message["on"])),
+            "live": self._live,
+            "run": lambda _: tuning.run(),
+            "probe": self._probe,
+            "image": lambda message: tuning.want_image(int(message["index"])),
+            "undo": lambda _: tuning.go_to(tuning.history.undo),
+            "redo": lambda _: tuning.go_to(tuning.history.redo),
+            "goto": lambda message: tuning.go_to(lambda: tuning.history.goto(int(message["number"]))),
+            "save": lambda message: self._file(self._saved, message),
+            "load": lambda message: self._file(self._loaded, message),
+            "promote": self._promote,
+        }
+
+    # -- values -------------------------------------------------------------------------------------------------
+
+    def _set(self, message: Message) -> None:
+        values: Mapping[str, Any] = message["values"]
+        try:
+            self._tuning.want(values, commit=bool(message.get("commit", True)))
+        except ValueError as error:
+            self._tuning.screen.fail(str(error), names=tuple(values))
+
+    def _reset(self, message: Message) -> None:
+        first, controls = self._tuning.runner.first_hyperparameters, self._tuning.hand.values
+        names = message["names"] or controls
+        self._set({"values": {name: first[name] for name in names if name in first and name in controls}})
+
+    def _live(self, message: Message) -> None:
+        self._tuning.is_live = bool(message["on"])
+        self._tuning.run()
+
+    # -- looking ------------------------------------------------------------------------------------------------
+
+    def _look(self, **parts: Any) -> None:
+        self._tuning.screen.change(**parts)
+        self._tuning.look()
+
+    def _pin(self, message: Message) -> None:
+        screen = self._tuning.screen
+        token = screen.require_stage(message["token"])
+        self._look(pinned=screen.shown.with_pin(token, on=bool(message["on"])).pinned)
+
+    def _compare(self, message: Message) -> None:
+        asked, screen = message["with"], self._tuning.screen
+        if asked is None:
+            self._look(comparison=None)
+            return
+        token = screen.require_stage(asked["token"]) if asked["kind"] == "stage" else ""
+        self._look(comparison=Comparison(str(asked["kind"]), int(asked.get("number", 0)), token))
+
+    def _probe(self, message: Message) -> None:
+        tuning, run = self._tuning, self._tuning.session.result
+        size = tuning.screen.size
+        if run is None or size is None:
+            return
+        x, y = float(message["x"]), float(message["y"])
+        rows = probe(run, tuning.screen.stages, x, y, size)
+        tuning.screen.view.tell("probe", {"id": message["id"], "x": x, "y": y, "rows": rows})
+
+    # -- remembering --------------------------------------------------------------------------------------------
+
+    def _file(self, act: Callable[[str], str], message: Message) -> None:
+        """Read or write settings, and tell what came of it."""
+        try:
+            said, is_done = act(str(message["name"]).strip()), True
+        except (EpypesError, ValueError) as error:
+            said, is_done = str(error), False
+        names = list(settings.names(Path.cwd()))
+        self._tuning.screen.view.tell("settings", {"names": names, "said": said, "ok": is_done})
+
+    def _saved(self, name: str) -> str:
+        return f"Saved {self._save_to(name).name}."
+
+    def _loaded(self, name: str) -> str:
+        self._load_from(name)
+        return f"Loaded {name}."
+
+    def _promote(self, message: Message) -> None:
+        self.promotion.start(self._tuning.runner, str(message["to"]))
+
+    def _promoted(self, outcome: Outcome) -> None:
+        screen = self._tuning.screen
+        screen.view.tell("promoted", {"state": outcome.state, "text": outcome.text, "to": outcome.to})
+        if outcome.printed:
+            screen.log(f"Printed while promoting: {outcome.printed}")

@@ -1,0 +1,141 @@
+"""What has been asked of a runner, and what has it computed?
+
+Values that the hand sets wait here. They are tried on the runner, and taken over by it together with what was computed
+from them, in one step; so cells never see the one without the other. Values with which a function fails go on waiting.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+from epypes.run import CompGraphRunner, Run
+from epypes_widgets.looking.films import Payload
+
+# A cell that changes the runner all the time must not keep the picture from being shown.
+_MOST_ATTEMPTS: Final = 3
+
+
+class Session:
+    """Tries what is wanted on a runner.
+
+    Parameters
+    ----------
+    runner
+        Its hyperparameters and its last run change when a run has completed.
+    payloads
+        That may be chosen among.
+
+    Attributes
+    ----------
+    result
+        The last run that completed; None before the first.
+    image
+        The index of the payload that it was computed from; None for the runner's own.
+    """
+
+    def __init__(self, runner: CompGraphRunner, payloads: Sequence[Payload] = ()) -> None:
+        self.runner, self.payloads = runner, tuple(payloads)
+        self.result: Run | None = None
+        self.image: int | None = None
+        self._lock = threading.Lock()
+        self._wanted: dict[str, Any] = {}
+        self._image_wanted: int | None = None
+        self._seen = dict(runner.hyperparameters)
+
+    # -- from any thread ----------------------------------------------------------------------------------------
+
+    @property
+    def wanted(self) -> dict[str, Any]:
+        """The values that the runner has not taken over, by token."""
+        with self._lock:
+            return dict(self._wanted)
+
+    @property
+    def image_wanted(self) -> int | None:
+        """The index of the payload that is asked for; the present one if none is."""
+        return self.image if self._image_wanted is None else self._image_wanted
+
+    @property
+    def payload(self) -> tuple[Any, ...]:
+        """The values of the free source tokens in the last run that completed."""
+        run, free = self.result, self.runner.free_source_tokens
+        return () if run is None else tuple(run.tokens.values[run.tokens.program.slots[token]] for token in free)
+
+    def want(self, values: Mapping[str, Any]) -> None:
+        """Ask for values of hyperparameters."""
+        with self._lock:
+            self._wanted.update(values)
+
+    def want_image(self, index: int) -> None:
+        """Ask for another payload; IndexError if there is none of this index."""
+        if not 0 <= index < len(self.payloads):
+            raise IndexError(f"There is no image {index}; this panel has {len(self.payloads)}.")
+        with self._lock:
+            self._image_wanted = index
+
+    def changes_of_others(self) -> dict[str, Any]:
+        """Return the hyperparameters that somebody else has changed since this was last asked, with their values.
+
+        They count from then on: what was asked for these tokens before is dropped.
+        """
+        now = dict(self.runner.hyperparameters)
+        with self._lock:
+            changed = {name: value for name, value in now.items() if self._seen.get(name, self) is not value}
+            self._seen = now
+            for name in changed:
+                self._wanted.pop(name, None)
+        return changed
+
+    # -- on the worker's thread ---------------------------------------------------------------------------------
+
+    def bring_up_to_date(self, targets: Sequence[str]) -> tuple[Run, bool]:
+        """Compute what is wanted, as far as the targets need it.
+
+        Returns
+        -------
+        Run
+            It may have failed; the runner and ``result`` are then what they were.
+        bool
+            Whether everything that was wanted is settled. If not, somebody else has been changing the runner all the
+            time: the run can be shown, and is to be tried again.
+        """
+        for _ in range(_MOST_ATTEMPTS):
+            with self._lock:
+                wanted, image = dict(self._wanted), self._image_wanted
+            payload = None if image is None else self.payloads[image].values
+            run = self.runner.trial(wanted, *targets, payload=payload)
+            if run.failure is not None:
+                return run, True
+            if self._changes_nothing(run, wanted, payload) or self.runner.adopt(run):
+                self._settle(run, wanted, image)
+                return run, True
+        return run, False
+
+    def last_good(self, targets: Sequence[str]) -> Run | None:
+        """Return the last run that completed, with these targets; None if there is none or they fail, too."""
+        if self.result is None or all(token in self.result for token in targets):
+            return self.result
+        run = self.tried(self.result.hyperparameters, targets)
+        return None if run.failure is not None else run
+
+    def tried(self, values: Mapping[str, Any], targets: Sequence[str]) -> Run:
+        """Return a run with these hyperparameters on the present payload; nothing is changed by it."""
+        known = self.runner.hyperparameters
+        return self.runner.trial({name: value for name, value in values.items() if name in known}, *targets)
+
+    def _changes_nothing(self, run: Run, wanted: Mapping[str, Any], payload: object) -> bool:
+        return not wanted and payload is None and not run.report.ran
+
+    def _settle(self, run: Run, wanted: Mapping[str, Any], image: int | None) -> None:
+        with self._lock:
+            self.result = run
+            for name, value in wanted.items():
+                if self._wanted.get(name, self) is value:
+                    del self._wanted[name]
+                self._seen[name] = run.hyperparameters[name]
+            if image is not None:
+                self.image = image
+                if self._image_wanted == image:
+                    self._image_wanted = None

@@ -1,0 +1,239 @@
+"""What happens between the hand and the screen?
+
+A value that is set is wanted from then on (``session``), and the worker is asked. It tries what is wanted, shows what
+comes out, and when the hand has come to rest commits it to the history.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+from epypes.display import encode_image
+from epypes.run import CompGraphRunner, Run
+from epypes_widgets.hand import Hand
+from epypes_widgets.history import Entry, History
+from epypes_widgets.looking.overlay import scene
+from epypes_widgets.screen import Screen
+from epypes_widgets.session import Session
+from epypes_widgets.shown import Comparison
+from epypes_widgets.values import differing
+from epypes_widgets.worker import Worker
+
+_LOG: Final = logging.getLogger(__name__)
+# Keys come at most every 30 ms when one is held down; who stops for this long has chosen.
+REST_S: Final = 0.25
+# The last value of a drag may arrive after the word that the slider was let go.
+_AFTER_RELEASE_S: Final = 0.06
+_STILL_S: Final = 0.5
+_THUMBNAIL_PX: Final = 96
+
+
+class Tuning:
+    """Wires the parts of a panel.
+
+    Parameters
+    ----------
+    hand, session, history
+        What is moved, wanted and remembered.
+    settled
+        Is called on the worker's thread some time after values were committed.
+
+    Attributes
+    ----------
+    is_live
+        Whether values are computed as they come; if not, ``run`` computes them.
+    """
+
+    screen: Screen
+
+    def __init__(
+        self, hand: Hand, session: Session, history: History, settled: Callable[[], None]
+    ) -> None:
+        self.hand, self.session, self.history = hand, session, history
+        self.runner: CompGraphRunner = session.runner
+        self.is_live = True
+        self.worker = Worker(self._compute, self.report)
+        self._settled = settled
+        self._lock = threading.Lock()
+        self._commits = False
+        self._is_forced = False
+        self._forget = self.runner.watch(self._runner_changed)
+        for control in hand.controls:
+            control.on_change(self._moved)
+
+    def begin(self) -> None:
+        """Show what the runner has, if that is up to date; else have it computed."""
+        last = self.runner.last
+        if last is not None and last.failure is None and not self.runner.stale and self.session.image_wanted is None:
+            self.session.result = last
+            self.screen.follow(last)
+            self.screen.show(last, 0)
+            self._commit()
+        else:
+            self._commits = True
+            self.worker.ask()
+
+    def close(self, timeout_s: float) -> None:
+        """Follow nothing any more."""
+        self._forget()
+        self.worker.close(timeout_s)
+
+    # -- from any thread ----------------------------------------------------------------------------------------
+
+    def want(self, values: Mapping[str, Any], *, commit: bool = True) -> None:
+        """Move controls to values and have them computed; ValueError, and nothing is done, if one is out of range."""
+        with self._lock:  # of two threads the one whose value stands is wanted last
+            self.session.want(self.hand.set(values))
+        if commit:
+            self._commits = True
+        else:
+            self._commit_later(REST_S)
+        self.worker.ask()
+
+    def want_image(self, index: int) -> None:
+        """Have another payload computed; IndexError if there is none."""
+        self.session.want_image(index)
+        self._commits = True
+        self.worker.ask()
+
+    def look(self) -> None:
+        """Have what is looked at computed, live or not."""
+        self._is_forced = True
+        self.worker.ask()
+
+    def release(self) -> None:
+        """Commit what the hand has let go."""
+        self._log(self.hand.release())
+        if self.is_live:
+            self._commit_later(_AFTER_RELEASE_S)
+
+    def run(self) -> None:
+        """Compute what is wanted, live or not."""
+        self._is_forced = self._commits = True
+        self.worker.ask()
+
+    def go_to(self, find: Callable[[], Entry | None]) -> bool:
+        """Go to the entry of the history that is found after the present values were committed; False if none is."""
+        wanted = self.hand.values
+        current = self.history.current
+        if current is not None and differing(dict(current.values), {**current.values, **wanted}):
+            self.history.commit({**current.values, **wanted}, token=self.screen.shown.token, image=self.session.image)
+        entry = find()
+        if entry is None:
+            return False
+        values = {name: value for name, value in entry.values.items() if name in self.runner.hyperparameters}
+        with self._lock:
+            self._log(self.hand.follow(values))
+            self.session.want(values)
+        if entry.image is not None and entry.image != self.session.image_wanted:
+            self.session.want_image(entry.image)
+        self._is_forced = True
+        self.worker.ask()
+        self.screen.tell_history()
+        return True
+
+    def report(self, exception: BaseException) -> None:
+        """Tell of something that failed in the panel itself, in its log and in that of the process."""
+        _LOG.error("The panel has failed", exc_info=exception)
+        self.screen.log(f"{type(exception).__name__}: {exception}")
+
+    def _moved(self, values: Mapping[str, Any]) -> None:
+        """Take values from the hand, on the thread that answers the front end."""
+        with self._lock:
+            self.hand.moved(values)
+            self.session.want({name: self.hand.control(name).read()[name] for name in values})
+        self._commit_later(REST_S)
+        self.worker.ask()
+
+    def _runner_changed(self) -> None:
+        if not self.worker.is_current:
+            self.worker.ask()
+
+    def _commit_later(self, delay_s: float) -> None:
+        self.worker.later("commit", delay_s, self._commit, is_work=True)
+
+    def _log(self, sentences: list[str]) -> None:
+        for sentence in sentences:
+            self.screen.log(sentence)
+
+    # -- on the worker's thread ---------------------------------------------------------------------------------
+
+    def _compute(self, changed_ns: int) -> None:
+        """Bring the screen up to date with all that is wanted."""
+        foreign = self.session.changes_of_others()
+        if foreign:
+            self._log(self.hand.follow(foreign))
+            self._commit_later(REST_S)
+        is_forced, self._is_forced = self._is_forced, False
+        if not (self.is_live or is_forced or self.session.result is None):
+            return
+        try:
+            run, is_settled = self.session.bring_up_to_date(self.screen.shown.targets)
+        except Exception as error:  # what is wanted can't be run: a placeholder, a branch that is not there
+            self.screen.fail(str(error))
+            return
+        if run.failure is not None:
+            self._fail(run)
+            return
+        self.screen.follow(run)
+        self.screen.show(run, changed_ns)
+        if not is_settled:
+            self.worker.ask()
+        elif self._commits:
+            self._commits = False
+            self._commit()
+        self._compare()
+
+    def _fail(self, run: Run) -> None:
+        failure = run.failure
+        assert failure is not None
+        wanted, takes = self.session.wanted, self.runner.cg.func_inputs(failure.function)
+        names = [name for name in takes if name in wanted] or [name for name in takes if name in run.hyperparameters]
+        good = self.session.last_good(self.screen.shown.targets)
+        if good is not None:
+            self.screen.show(good, 0, failed=run)
+        self.screen.fail(str(failure), failure.function, names)
+
+    def _commit(self) -> None:
+        """Add the values that the runner has taken over to the history, unless they are there."""
+        run = self.session.result
+        if run is None or self.session.wanted:
+            return
+        token, image, compute_ms = self.screen.shown.token, self.session.image, self.screen.compute_ms
+        seen = _thumbnail(run, token)
+        if self.history.commit(run.hyperparameters, token=token, picture=seen, compute_ms=compute_ms, image=image):
+            self.screen.tell_history()
+        self.worker.later("still", _STILL_S, self._settled)
+
+    def _compare(self) -> None:
+        """Show what the picture is compared with, if that is not part of its own run."""
+        comparison, token = self.screen.shown.comparison, self.screen.shown.token
+        if comparison is None or token is None or comparison.kind == "stage":
+            self.screen.refer_to_nothing()
+            return
+        payload = self.session.payload
+        if self.screen.refers_to((comparison, token), payload):
+            return
+        values, label = self._compared(comparison)
+        run = self.session.tried(values, (token,))
+        if run.failure is not None:
+            self.screen.log(f"Nothing to compare with: with these values {run.failure}.")
+        else:
+            self.screen.refer((comparison, token), payload, label, run)
+
+    def _compared(self, comparison: Comparison) -> tuple[Mapping[str, Any], str]:
+        if comparison.kind == "default":
+            return self.runner.first_hyperparameters, "default"
+        entry = next((entry for entry in self.history.entries if entry.number == comparison.number), None)
+        if entry is None:
+            raise LookupError(f"No entry {comparison.number} in the history.")
+        return entry.values, f"history {entry.number}"
+
+
+def _thumbnail(run: Run, token: str | None) -> Any:
+    found = scene(run, token) if token is not None and token in run else None
+    seen = None if found is None else found.backdrop
+    return None if seen is None else encode_image(seen.image, _THUMBNAIL_PX, seen.order, seen.ends)
