@@ -15,7 +15,7 @@ from epypes.display.previews.ranges import is_of_dtype
 from epypes.display.previews.raster import THUMBNAIL_PX, encode_small, is_pooled, pillow_image
 from epypes.display.previews.registry import ours
 from epypes.display.previews.short import array_text, float_text, row_texts, short_repr
-from epypes.display.previews.shown import Look, Preview, Sketch
+from epypes.display.previews.shown import Backdrop, Look, Preview, Scene, Sketch
 from epypes.display.previews.statistics import few_of, some_of, statistics_text
 from epypes.display.previews.tables import record_sketch
 
@@ -102,6 +102,7 @@ def image_sketch(array: Array, look: Look) -> Sketch:
         Preview(text, ", ".join(said)),
         lambda most_bytes: encode_small(pillow_image(array, THUMBNAIL_PX, look.order, ends, kind), most_bytes),
         is_image=True,
+        scene=Scene(Backdrop(array, look.order, ends, "")),
     )
 
 

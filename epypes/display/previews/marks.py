@@ -8,13 +8,13 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display.previews.charts import place_chart, spread
 from epypes.display.previews.imagekinds import image_kind, sampled
 from epypes.display.previews.raster import THUMBNAIL_PX, Picture, encode_small, pillow_image
-from epypes.display.previews.shown import Backdrop, Chart
+from epypes.display.previews.shown import Backdrop, Chart, Marks, Most
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     Floats = npt.NDArray[np.float64]
 
-MOST_MARKS: Final = 200
 # More lines than that, from one image to another, cover both.
 MOST_PAIRS: Final = 40
 # Marks are drawn at twice the size and made smaller with the image, which smooths their edges.
@@ -45,40 +44,15 @@ _GREEN: Final = (60, 255, 120)
 _COLOURS: Final = ((255, 90, 90), (90, 220, 255), (255, 215, 70), (120, 255, 130), (240, 130, 255), (255, 165, 80))
 
 
-@dataclass(frozen=True, slots=True)
-class Marks:
-    """What is drawn over an image.
-
-    Attributes
-    ----------
-    points
-        (n, 2) of x and y, in pixels of the image.
-    lines
-        Each (k, 2).
-    are_closed
-        Whether lines return to where they began.
-    total
-        How many points or lines there are; fewer may be drawn.
-    """
-
-    points: Floats
-    lines: tuple[Floats, ...] = ()
-    are_closed: bool = False
-    total: int = 0
-
-    @property
-    def drawn(self) -> int:
-        """How many are drawn."""
-        return len(self.lines) or len(self.points)
-
-
-def some_points(points: Any, total: int | None = None) -> Marks:
+def some_points(points: Any, most: Most, total: int | None = None, extents: Floats | None = None) -> Marks:
     """Return points as marks: of many some, evenly spread in their order, none that is not finite."""
     import numpy as np
 
     total = len(points) if total is None else total
-    kept = points[spread(len(points), MOST_MARKS)].reshape(-1, 2).astype(np.float64)
-    return Marks(kept[_is_drawable(kept)], total=total)
+    chosen = spread(len(points), most.marks)
+    kept = points[chosen].reshape(-1, 2).astype(np.float64)
+    is_drawn = _is_drawable(kept)
+    return Marks(kept[is_drawn], total=total, extents=None if extents is None else extents[chosen][is_drawn])
 
 
 def some_pairs(places: Any) -> Floats:
@@ -89,12 +63,13 @@ def some_pairs(places: Any) -> Floats:
     return kept[_is_drawable(kept)]
 
 
-def some_lines(lines: Any, are_closed: bool, total: int | None = None) -> Marks:
+def some_lines(lines: Any, are_closed: bool, most: Most, total: int | None = None) -> Marks:
     """Return lines, each (k, 2), as marks: of many the longest, each with at most so many points."""
     import numpy as np
 
-    longest = sorted(lines, key=len, reverse=True)[:MOST_MARKS] if len(lines) > MOST_MARKS else lines
-    kept = [line[:: -(-len(line) // MOST_MARKS) or 1].reshape(-1, 2).astype(np.float64) for line in longest]
+    longest = sorted(lines, key=len, reverse=True)[: most.marks] if len(lines) > most.marks else lines
+    room = min(most.line, _share([len(line) for line in longest], most.places))
+    kept = [line[:: -(-len(line) // room) or 1].reshape(-1, 2).astype(np.float64) for line in longest]
     drawable = tuple(line[_is_drawable(line)] for line in kept if len(line))
     return Marks(
         np.empty((0, 2)),
@@ -104,13 +79,24 @@ def some_lines(lines: Any, are_closed: bool, total: int | None = None) -> Marks:
     )
 
 
-def rectangles(boxes: Any) -> Marks:
+def _share(lengths: Iterable[int], room: int) -> int:
+    """Return the places that each line may have, so that short ones stay whole and all fit into the room."""
+    waiting = sorted(lengths)
+    for place, length in enumerate(waiting):
+        share = room // (len(waiting) - place)
+        if length > share:
+            return max(share, 1)
+        room -= length
+    return max([1, *waiting[-1:]])
+
+
+def rectangles(boxes: Any, most: Most) -> Marks:
     """Return boxes (n, 4) of x, y, width and height as marks."""
     import numpy as np
 
-    x, y, width, height = boxes[:MOST_MARKS].astype(np.float64).T
+    x, y, width, height = boxes[: most.marks].astype(np.float64).T
     corners = np.stack([x, y, x + width, y, x + width, y + height, x, y + height], axis=1)
-    return replace(some_lines(list(corners.reshape(-1, 4, 2)), are_closed=True), total=len(boxes))
+    return replace(some_lines(list(corners.reshape(-1, 4, 2)), True, most), total=len(boxes))
 
 
 def lie_on(points: Floats, backdrop: Backdrop) -> bool:
