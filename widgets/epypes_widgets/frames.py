@@ -107,18 +107,6 @@ def plain(value: Any) -> Any:
         return reprlib.repr(value)
 
 
-def showable(run: Run, asked: str | None) -> tuple[str, ...]:
-    """Return the tokens that are images, and the sink tokens whatever they are, in graph order."""
-    found = tuple(token for token in run if is_image(run[token]) or token in run.cg.sink_tokens) or tuple(run)
-    return found if asked is None or asked in found else (*found, asked)
-
-
-def best_token(run: Run, tokens: tuple[str, ...]) -> str | None:
-    """Return the last of these that is an image, of sink tokens if there is one; else the last; None of none."""
-    sinks = run.cg.sink_tokens
-    return max(tokens, key=lambda token: (is_image(run[token]), token in sinks, tokens.index(token)), default=None)
-
-
 class FrameSender:
     """Sends frames one at a time, the newest next.
 

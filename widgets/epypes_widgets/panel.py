@@ -13,7 +13,8 @@ import ipywidgets
 from epypes.errors import NotComputed, PayloadError, UnknownName, run_call
 from epypes.run import CompGraphRunner, Run
 from epypes_widgets.controls import Control, control, grouped
-from epypes_widgets.frames import best_token, make_frame, showable
+from epypes_widgets.frames import make_frame
+from epypes_widgets.looking import best_stage, stages
 from epypes_widgets.picture import PictureView
 from epypes_widgets.ranges import ranges
 from epypes_widgets.worker import Worker
@@ -268,14 +269,15 @@ class Panel:
 
     def _offer_tokens(self, run: Run) -> None:
         """Let the user choose among the tokens that this run has pictures of; keep the choice if it is there."""
-        tokens = showable(run, self._asked)
+        found = stages(run, asked=self._asked)
+        tokens = tuple(stage.token for stage in found)
         if tokens == tuple(self._tokens.options):
             return
         shown = self.token
         # Setting the options chooses the first of them: that is not the user's choice.
         self._tokens.unobserve(self._chosen, names="value")
         self._tokens.options = tokens
-        self._tokens.value = shown if shown in tokens else best_token(run, tokens)
+        self._tokens.value = shown if shown in tokens else best_stage(run, found)
         self._tokens.observe(self._chosen, names="value")
 
 

@@ -71,7 +71,7 @@ def _array_sketch(array: Any, look: Look) -> Sketch | Preview:
 
 def _closer(array: Array) -> Callable[[Array, Look], Sketch | None] | None:
     """Return what draws an array of its shape; None if nothing can be drawn."""
-    if is_image(array) and not _is_strip(array):
+    if is_image(array) and not is_strip(array):
         return image_sketch
     if array.shape[1:] in _PLACES:
         return _places
@@ -79,7 +79,7 @@ def _closer(array: Array) -> Callable[[Array, Look], Sketch | None] | None:
     return _drawn_numbers if is_line else None
 
 
-def _is_strip(array: Array) -> bool:
+def is_strip(array: Array) -> bool:
     """Whether a thumbnail would be a line of pixels, as of 500 descriptors of 32 bytes."""
     height, width = array.shape[:2]
     return bool(max(height, width) > _MOST_ELONGATED * min(height, width))

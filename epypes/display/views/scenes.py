@@ -9,13 +9,13 @@ from epypes.display.previews.arrays import plain_array
 from epypes.display.previews.imagekinds import is_image
 from epypes.display.previews.preview import scene_in, sketch
 from epypes.display.previews.ranges import kept_range
-from epypes.display.previews.shown import Backdrop, Look, Most, Scene
+from epypes.display.previews.shown import Backdrop, Look, Marks, Most, Scene
 from epypes.display.views.backdrops import RunSurroundings
 from epypes.graph import colour_order
 from epypes.run import Run
 
 
-def scene_of(run: Run, token: str, most: Most | None = None) -> Scene | None:
+def scene_of(run: Run, token: str, most: Most | None = None, *, had_marks: bool = False) -> Scene | None:
     """Return a token as an image, and its marks if it is what was found in one; never raises for a value.
 
     Parameters
@@ -26,6 +26,8 @@ def scene_of(run: Run, token: str, most: Most | None = None) -> Scene | None:
         An image, what a preview function shows as an image, or keypoints, contours, boxes, segments, points.
     most
         How many marks there are at most; without, as many as on a thumbnail.
+    had_marks
+        Whether an earlier value of the token had marks: where nothing is found any more, the image alone is left.
 
     Returns
     -------
@@ -48,8 +50,16 @@ def scene_of(run: Run, token: str, most: Most | None = None) -> Scene | None:
     if is_image(value):
         array = plain_array(value)
         return Scene(Backdrop(array, order, kept_range(program, token, array), token))
-    look = Look(order, partial(kept_range, program, token), RunSurroundings(run, token), most or Most())
+    around = RunSurroundings(run, token)
+    look = Look(order, partial(kept_range, program, token), around, most or Most())
     scene = scene_in(sketch(value, look))
-    if scene is None or scene.backdrop.name:
-        return scene
-    return replace(scene, backdrop=replace(scene.backdrop, name=token))
+    if scene is None:
+        return _without_marks(around) if had_marks else None
+    return scene if scene.backdrop.name else replace(scene, backdrop=replace(scene.backdrop, name=token))
+
+
+def _without_marks(around: RunSurroundings) -> Scene | None:
+    import numpy as np
+
+    backdrop = around.nearest_image()
+    return None if backdrop is None else Scene(backdrop, Marks(np.empty((0, 2))))
