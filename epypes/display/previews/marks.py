@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -69,14 +69,27 @@ def some_lines(lines: Any, are_closed: bool, most: Most, total: int | None = Non
 
     longest = sorted(lines, key=len, reverse=True)[: most.marks] if len(lines) > most.marks else lines
     room = min(most.line, _share([len(line) for line in longest], most.places))
-    kept = [line[:: -(-len(line) // room) or 1].reshape(-1, 2).astype(np.float64) for line in longest]
-    drawable = tuple(line[_is_drawable(line)] for line in kept if len(line))
-    return Marks(
-        np.empty((0, 2)),
-        tuple(line for line in drawable if len(line)),
-        are_closed,
-        len(lines) if total is None else total,
-    )
+    kept = [line[:: -(-len(line) // room) or 1].reshape(-1, 2) for line in longest if len(line)]
+    count = len(lines) if total is None else total
+    return Marks(np.empty((0, 2)), tuple(_drawable_lines(kept)), are_closed, count)
+
+
+def _drawable_lines(lines: list[Any]) -> Iterator[Floats]:
+    """Yield the lines without what can't be drawn of them; looked at together, since there may be thousands."""
+    import numpy as np
+
+    if not lines:
+        return
+    places = np.concatenate(lines).astype(np.float64)
+    is_drawn = _is_drawable(places)
+    end = 0
+    for line in lines:
+        start, end = end, end + len(line)
+        found = places[start:end]
+        if not is_drawn[start:end].all():
+            found = found[is_drawn[start:end]]
+        if len(found):
+            yield found
 
 
 def _share(lengths: Iterable[int], room: int) -> int:

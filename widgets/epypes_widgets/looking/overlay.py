@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display import Marks, Most, Scene, scene_of
@@ -46,7 +47,7 @@ def overlay(scene: Scene) -> dict[str, Any] | None:
     shift = 0.0 if scene.what == "boxes" else _CENTRE
     return {
         "points": _plain(_points(marks, shift)),
-        "lines": [_plain((line + shift).reshape(-1)) for line in marks.lines],
+        "lines": list(_lines(marks, shift)),
         "closed": marks.are_closed,
         "total": marks.total,
         "what": scene.what,
@@ -61,6 +62,16 @@ def _points(marks: Marks, shift: float) -> Floats:
     # A keypoint may be of no size, or of one that is not a number.
     known = np.where(np.isfinite(extents), extents, (_NO_SIZE, _NO_ANGLE))
     return np.concatenate([marks.points + shift, known], axis=1)
+
+
+def _lines(marks: Marks, shift: float) -> Iterator[list[float]]:
+    import numpy as np
+
+    coordinates = _plain((np.concatenate([np.empty((0, 2)), *marks.lines]) + shift).reshape(-1))
+    end = 0
+    for line in marks.lines:
+        start, end = end, end + 2 * len(line)
+        yield coordinates[start:end]
 
 
 def _plain(numbers: Floats) -> list[Any]:

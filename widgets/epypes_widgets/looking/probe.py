@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, Final
+from weakref import ReferenceType, WeakKeyDictionary, ref
 
 from epypes.display import is_image
 from epypes.display.previews.arrays import plain_array
-from epypes.display.previews.imagekinds import image_kind, one_channel
+from epypes.display.previews.imagekinds import image_kind, one_channel, sampled
 from epypes.display.previews.looking import silent_numpy
 from epypes.graph import colour_order
 from epypes.images import Order
 from epypes.run import Run
+from epypes.run.program import Program
 from epypes_widgets.looking.stages import Stage
 
 if TYPE_CHECKING:
@@ -20,8 +22,8 @@ if TYPE_CHECKING:
 
     Array = npt.NDArray[Any]
 
-# Of each side: enough to tell that an image is one of labels, in microseconds.
-_LOOKED_AT_PX: Final = 32
+# Whether a token's last image was one of labels: a pointer asks for many pixels of one image.
+_seen: Final[WeakKeyDictionary[Program, dict[str, tuple[ReferenceType[Any], bool]]]] = WeakKeyDictionary()
 _CHANNELS: Final = {"bgr": "BGRA", "rgb": "RGBA"}
 
 
@@ -54,7 +56,9 @@ def probe(run: Run, stages: Iterable[Stage], x: float, y: float, size: tuple[int
         for token in (stage.token for stage in stages if stage.is_picture):
             value = run.tokens.values[run.tokens.program.slots[token]]
             if is_image(value):
-                text = _text_at(plain_array(value), x, y, size, colour_order(run.cg, token))
+                image = one_channel(plain_array(value))
+                noun = "label " * (image.ndim == 2 and _are_labels(run, token, value))
+                text = noun + _text_at(image, x, y, size, colour_order(run.cg, token))
                 state = "stale" if run.tokens.is_stale(token) else "fresh"
                 rows.append({"token": token, "text": text, "state": state})
     return rows
@@ -70,19 +74,21 @@ def _text_at(image: Array, x: float, y: float, size: tuple[int, int], order: Ord
 
 
 def _pixel_text(image: Array, column: int, row: int, order: Order) -> str:
-    image = one_channel(image)
     pixel = image[row, column].tolist()
     if image.ndim == 2:
-        return f"{'label ' * _are_labels(image)}{_number(pixel)}"
+        return _number(pixel)
     return " ".join(f"{name} {_number(level)}" for name, level in zip(_CHANNELS[order], pixel, strict=False))
 
 
-def _are_labels(image: Array) -> bool:
-    if image.dtype.kind not in "iu":
+def _are_labels(run: Run, token: str, value: Array) -> bool:
+    if value.dtype.kind not in "iu":
         return False
-    height, width = image.shape
-    rows, columns = (max(1, side // _LOOKED_AT_PX) for side in (height, width))
-    return image_kind(image, image[::rows, ::columns]) == "labels"
+    seen = _seen.setdefault(run.tokens.program, {})
+    known = seen.get(token)
+    if known is None or known[0]() is not value:
+        image = one_channel(plain_array(value))
+        known = seen[token] = ref(value), image_kind(image, sampled(image)) == "labels"
+    return known[1]
 
 
 def _number(level: float) -> str:
