@@ -102,7 +102,7 @@ def image_sketch(array: Array, look: Look) -> Sketch:
         Preview(text, ", ".join(said)),
         lambda most_bytes: encode_small(pillow_image(array, THUMBNAIL_PX, look.order, ends, kind), most_bytes),
         is_image=True,
-        scene=Scene(Backdrop(array, look.order, ends, "")),
+        scene=lambda: Scene(Backdrop(array, look.order, ends, "")),
     )
 
 

@@ -12,11 +12,11 @@ from epypes.display.markup import cut
 from epypes.display.previews.charts import drawn_in_chart
 from epypes.display.previews.kinds import dotted_name, is_of
 from epypes.display.previews.marks import (
-    MOST_PAIRS,
     drawer,
     lie_on,
     marks_lie_on,
     pair_drawer,
+    pair_scene,
     rectangles,
     share_on,
     some_lines,
@@ -136,16 +136,17 @@ def pair_sketch(array: Any, look: Look) -> Sketch | None:
     backdrops = look.around.image_pair()
     if backdrops is None or not len(array):
         return None
-    pairs = some_pairs(array)
+    pairs = some_pairs(array, look.most)
     first, second = backdrops
     if not len(pairs) or not lie_on(pairs[:, :2], first) or not lie_on(pairs[:, 2:], second):
         return None
-    return _between(backdrops, pairs, len(array), array_text(array), f"{array_text(array)}, places in two images")
+    said = f"{array_text(array)}, places in two images"
+    return _between(backdrops, pairs, len(array), Preview(array_text(array), said), "pairs")
 
 
 def _over(marks: Marks, what: str, text: str, said: str, look: Look) -> Sketch:
     backdrop = _backdrop(marks, look)
-    scene = Scene(backdrop, marks, what) if backdrop is not None else None
+    scene = None if backdrop is None else partial(Scene, backdrop, marks, what)
     drawn = marks.drawn if backdrop else drawn_in_chart(len(marks.points), len(marks.lines))
     if backdrop is not None:
         said += f", drawn over {cut(backdrop.name, _NAME_CHARACTERS)}"
@@ -159,11 +160,12 @@ def _backdrop(marks: Marks, look: Look) -> Backdrop | None:
     return backdrop if backdrop is not None and marks_lie_on(marks, backdrop) else None
 
 
-def _between(backdrops: tuple[Backdrop, Backdrop], pairs: Floats, total: int, text: str, said: str) -> Sketch:
-    said += ", drawn between the images"
+def _between(backdrops: tuple[Backdrop, Backdrop], pairs: Floats, total: int, shown: Preview, what: str) -> Sketch:
+    said = f"{shown.detail}, drawn between the images"
     if len(pairs) < total:
         said += f", {len(pairs)} of {total} drawn"
-    return Sketch(Preview(text, said), pair_drawer(backdrops, pairs))
+    scene = partial(pair_scene, backdrops, pairs, total, what)
+    return Sketch(Preview(shown.text, said), pair_drawer(backdrops, pairs), scene=scene)
 
 
 def _keypoints(value: Sequence[Any], shown: Preview, look: Look) -> Sketch:
@@ -188,12 +190,13 @@ def _matches(value: Sequence[Any], shown: Preview, look: Look) -> Sketch | None:
     distances = [match.distance for match in flat]
     said = f"{shown.detail}, distance {min(distances):.4g} to {max(distances):.4g}"
     backdrops, keypoints = look.around.image_pair(), look.around.keypoint_pair()
-    kept = flat[:MOST_PAIRS]
+    kept = flat[: look.most.pairs]
     if backdrops is not None and keypoints is not None and _indices_fit(kept, *keypoints):
         first, second = keypoints
-        pairs = some_pairs(np.array([(*first[m.queryIdx].pt, *second[m.trainIdx].pt) for m in kept]))
+        places = np.array([(*first[m.queryIdx].pt, *second[m.trainIdx].pt) for m in kept])
+        pairs = some_pairs(places, look.most)
         if len(pairs):
-            return _between(backdrops, pairs, len(value), shown.text, said)
+            return _between(backdrops, pairs, len(value), Preview(shown.text, said), "matches")
     return Sketch(Preview(shown.text, said, rows=_match_rows(flat, len(value))))
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from epypes.display.previews.charts import place_chart, spread
 from epypes.display.previews.imagekinds import image_kind, sampled
 from epypes.display.previews.raster import THUMBNAIL_PX, Picture, encode_small, pillow_image
-from epypes.display.previews.shown import Backdrop, Chart, Marks, Most
+from epypes.display.previews.shown import Backdrop, Chart, Marks, Most, Scene
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
     Floats = npt.NDArray[np.float64]
 
-# More lines than that, from one image to another, cover both.
-MOST_PAIRS: Final = 40
 # Marks are drawn at twice the size and made smaller with the image, which smooths their edges.
 _OVERSAMPLED: Final = 2
 _FARTHEST_PX: Final = 1e6
@@ -55,11 +53,11 @@ def some_points(points: Any, most: Most, total: int | None = None, extents: Floa
     return Marks(kept[is_drawn], total=total, extents=None if extents is None else extents[chosen][is_drawn])
 
 
-def some_pairs(places: Any) -> Floats:
+def some_pairs(places: Any, most: Most) -> Floats:
     """Return pairs (n, 4) of places as they are drawn: of many some, none that is not finite or far away."""
     import numpy as np
 
-    kept: Floats = places[spread(len(places), MOST_PAIRS)].astype(np.float64)
+    kept: Floats = places[spread(len(places), most.pairs)].astype(np.float64)
     return kept[_is_drawable(kept)]
 
 
@@ -147,6 +145,20 @@ def pair_drawer(backdrops: tuple[Backdrop, Backdrop], pairs: Floats) -> Callable
     return lambda most_bytes: encode_small(_drawn_between(backdrops, pairs), most_bytes, has_small_marks=True)
 
 
+def pair_scene(backdrops: tuple[Backdrop, Backdrop], pairs: Floats, total: int, what: str) -> Scene:
+    """Return two images side by side, at their full size, with lines; ``pairs`` are (n, 4): x and y in both."""
+    import numpy as np
+
+    left, right = (np.asarray(_picture(backdrop, None)) for backdrop in backdrops)
+    height, width = max(len(left), len(right)), left.shape[1]
+    joined = np.zeros((height, width + right.shape[1], 3), np.uint8)
+    joined[: len(left), :width] = left
+    joined[: len(right), width:] = right
+    ends = np.add(pairs, (0, 0, width, 0)).reshape(-1, 2, 2)
+    marks = Marks(ends.reshape(-1, 2), tuple(ends), total=total)
+    return Scene(Backdrop(joined, "rgb", (0.0, 255.0), ""), marks, what)
+
+
 def _is_drawable(places: Floats) -> npt.NDArray[np.bool_]:
     import numpy as np
 
@@ -188,14 +200,17 @@ def _canvas(backdrop: Backdrop, side: int) -> tuple[Image.Image, float]:
     """Return an image to be drawn upon, a little darker, and how many of its pixels are one of the image."""
     from PIL import Image
 
-    array = backdrop.image
-    kind = image_kind(array, sampled(array))
-    picture = pillow_image(array, side, backdrop.order, backdrop.ends, kind).convert("RGB")
+    array, picture = backdrop.image, _picture(backdrop, side)
     scale = side / max(array.shape[:2])
     # Even sides, so that each pixel of the thumbnail is made of four.
     height, width = (max(1, round(length * scale / _OVERSAMPLED)) * _OVERSAMPLED for length in array.shape[:2])
     picture = picture.resize((width, height), Image.Resampling.BILINEAR)
     return picture.point(lambda level: round(level * _DARKER)), scale
+
+
+def _picture(backdrop: Backdrop, side: int | None) -> Image.Image:
+    array = backdrop.image
+    return pillow_image(array, side, backdrop.order, backdrop.ends, image_kind(array, sampled(array))).convert("RGB")
 
 
 class _Pen:

@@ -65,9 +65,9 @@ def scene_in(sketched: Sketch) -> Scene | None:
     with looking():
         try:
             found = sketched if sketched.closer is None else sketched.closer()
+            return found.scene() if isinstance(found, Sketch) and found.scene is not None else None
         except Exception:  # what is wrong is said where the value is shown as text
             return None
-    return found.scene if isinstance(found, Sketch) else None
 
 
 def _limited(found: Sketch | Preview) -> Sketch:

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 # On a thumbnail.
 MOST_MARKS: Final = 200
+# More lines than that, from one image to another, cover both.
+MOST_PAIRS: Final = 40
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,14 +77,14 @@ class Sketch:
     is_image
         Whether the value itself is an image.
     scene
-        What the thumbnail is made of, if that is an image; None of charts and texts.
+        Returns the image that the thumbnail is made of, and what is drawn over it; None for charts and texts.
     """
 
     shown: Preview
     draw: Callable[[int], Picture | Chart] | None = None
     is_image: bool = False
     closer: Callable[[], Sketch | Preview] | None = None
-    scene: Scene | None = None
+    scene: Callable[[], Scene] | None = None
 
     @property
     def may_be_drawn(self) -> bool:
@@ -137,7 +139,7 @@ class Scene:
     Attributes
     ----------
     backdrop
-        The image: the value itself, or what its marks were found in.
+        The image: the value itself, or what its marks were found in; two side by side for what was found in both.
     marks
         What is drawn; None of an image.
     what
@@ -151,11 +153,12 @@ class Scene:
 
 @dataclass(frozen=True, slots=True)
 class Most:
-    """How many marks are drawn at most: points or lines, places of one line, places of all lines."""
+    """How many marks are drawn at most: points or lines, places of one line and of all lines, lines between images."""
 
     marks: int = MOST_MARKS
     line: int = MOST_MARKS
     places: int = MOST_MARKS * MOST_MARKS
+    pairs: int = MOST_PAIRS
 
 
 class Surroundings(Protocol):

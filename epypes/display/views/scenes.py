@@ -23,7 +23,7 @@ def scene_of(run: Run, token: str, most: Most | None = None, *, had_marks: bool 
     run
         Its tokens' values.
     token
-        An image, what a preview function shows as an image, or keypoints, contours, boxes, segments, points.
+        An image, what a preview function shows as an image, or keypoints, contours, boxes, segments, points, matches.
     most
         How many marks there are at most; without, as many as on a thumbnail.
     had_marks

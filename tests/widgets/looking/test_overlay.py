@@ -102,6 +102,32 @@ def test_boxes_lie_between_pixels_and_segments_on_them() -> None:
     assert (segments["closed"], segments["what"]) == (False, "segments")
 
 
+def test_matches_are_lines_between_the_two_images_side_by_side() -> None:
+    functions = {
+        "detect_left": lambda left: [cv2.KeyPoint(20, 30, 8), cv2.KeyPoint(40, 60, 8)],
+        "detect_right": lambda right: [cv2.KeyPoint(25, 35, 8), cv2.KeyPoint(45, 65, 8)],
+        "match": lambda keypoints_left, keypoints_right: [cv2.DMatch(0, 1, 1.0), cv2.DMatch(1, 0, 2.0)],
+    }
+    io = {
+        "detect_left": ("left", "keypoints_left"),
+        "detect_right": ("right", "keypoints_right"),
+        "match": (("keypoints_left", "keypoints_right"), "matches"),
+    }
+    left, right = np.random.default_rng(0).integers(64, 255, (2, 200, 300), np.uint8)
+    run = ep.CompGraphRunner(ep.CompGraph(functions, io)).run(left=left, right=right[:90])
+    found = scene(run, "matches")
+    assert found is not None
+    said = overlay(found)
+    assert said is not None
+    assert said["lines"] == [[20.5, 30.5, 345.5, 65.5], [40.5, 60.5, 325.5, 35.5]]
+    assert (said["what"], said["closed"], said["total"]) == ("matches", False, 2)
+    image = found.backdrop.image
+    assert image.shape == (200, 600, 3)
+    assert (image[:, :300, 0] == left).all()
+    assert (image[:90, 300:, 2] == right[:90]).all()
+    assert not image[90:, 300:].any()
+
+
 def test_what_is_not_a_number_is_not_drawn() -> None:
     places = np.array([[[10, 20]], [[math.nan, 5]], [[math.inf, 5]], [[30, 40]]], np.float32)
     said = drawn(lambda image: places)

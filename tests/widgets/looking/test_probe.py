@@ -12,17 +12,23 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import epypes as ep
+from epypes.display import Backdrop, Scene
 from epypes_widgets.looking import Stage, probe, stages
 from tests.colours import red_image, red_runner
 
 SIZE = (40, 30)
 
 
+def shown(run: ep.Run, token: str, size: tuple[int, int] = SIZE) -> Scene:
+    """Return a picture of this size that is shown for a token."""
+    return Scene(Backdrop(np.zeros(size[::-1], np.uint8), "bgr", (0, 255), token))
+
+
 def texts(images: dict[str, Any], x: float, y: float, size: tuple[int, int] = SIZE) -> list[str]:
     """Return what is told of these images at a pixel of one of this size."""
     cg = ep.CompGraph({"end": lambda *images: None}, {"end": (tuple(images), "end")})
     run = ep.CompGraphRunner(cg).run(**images)
-    told = probe(run, [Stage(token, True) for token in images], x, y, size)
+    told = probe(run, [Stage(token, True) for token in images], x, y, shown(run, next(iter(images)), size))
     assert {row["state"] for row in told} <= {"fresh"}
     assert [row["token"] for row in told] == list(images)[: len(told)]
     return [row["text"] for row in told]
@@ -64,7 +70,10 @@ def test_colours_are_named_in_their_order() -> None:
     assert texts({"image": image(np.uint8, (12, 40, 200), (3,))}, 7, 3) == ["B 12 G 40 R 200"]
     assert texts({"image": image(np.float32, (0.5, 1, 0, 0.25), (4,))}, 7, 3) == ["B 0.5 G 1 R 0 A 0.25"]
     run = red_runner().run(image=red_image())
-    assert [row["text"] for row in probe(run, stages(run), 3, 3, (64, 64))][:2] == ["R 200 G 20 B 10", "R 200 G 0 B 0"]
+    assert [row["text"] for row in probe(run, stages(run), 3, 3, shown(run, "red", (64, 64)))][:2] == [
+        "R 200 G 20 B 10",
+        "R 200 G 0 B 0",
+    ]
 
 
 def test_a_region_is_told_by_its_label_and_its_background_too() -> None:
@@ -79,9 +88,10 @@ def test_labels_of_a_new_run_are_looked_at_anew() -> None:
     labels = np.zeros((30, 40), np.int32)
     labels[5:20, 5:20] = 7
     runner = ep.CompGraphRunner(ep.CompGraph({"as_is": lambda image: image}, {"as_is": ("image", "same")}))
-    shown = [Stage("same", True)]
+    same = [Stage("same", True)]
     noise = np.random.default_rng(0).integers(0, 100_000, (30, 40))
-    told = [probe(runner.run(image=seen), shown, 6, 6, SIZE)[0]["text"] for seen in (labels, noise, labels)]
+    runs = (runner.run(image=seen) for seen in (labels, noise, labels))
+    told = [probe(run, same, 6, 6, shown(run, "same"))[0]["text"] for run in runs]
     assert told == ["label 7", str(noise[6, 6]), "label 7"]
 
 
@@ -103,19 +113,27 @@ def test_outside_of_the_picture_nothing_is_told(x: float, y: float) -> None:
 def test_what_is_no_image_or_not_computed_is_left_out_and_what_is_stale_is_said_to_be() -> None:
     cg = ep.CompGraph(
         {"add": lambda image, n: image + n, "double": lambda added: 2 * added, "count": lambda added: added.size},
-        {"add": (("image", "n"), "sum"), "double": ("sum", "doubled"), "count": ("sum", "count")},
+        {"add": (("image", "n"), "added"), "double": ("added", "doubled"), "count": ("added", "count")},
     )
     runner = ep.CompGraphRunner(cg, {"n": 1})
     run = runner.run(image=image(float, 10))
-    shown = stages(run)
-    assert [(row["token"], row["text"]) for row in probe(run, shown, 7, 3, SIZE)] == [
-        ("image", "10"), ("sum", "11"), ("doubled", "22"),
+    kept = stages(run)
+    assert [(row["token"], row["text"]) for row in probe(run, kept, 7, 3, shown(run, "added"))] == [
+        ("image", "10"), ("added", "11"), ("doubled", "22"),
     ]  # fmt: skip
-    run = runner.rerun("sum", n=2)
-    assert [(row["text"], row["state"]) for row in probe(run, shown, 7, 3, SIZE)] == [
+    run = runner.rerun("added", n=2)
+    assert [(row["text"], row["state"]) for row in probe(run, kept, 7, 3, shown(run, "added"))] == [
         ("10", "fresh"), ("12", "fresh"), ("22", "stale"),
     ]  # fmt: skip
-    assert [row["token"] for row in probe(runner.run("sum", image=run["image"]), shown, 7, 3, SIZE)] == ["image", "sum"]
+    run = runner.run("added", image=run["image"])
+    assert [row["token"] for row in probe(run, kept, 7, 3, shown(run, "added"))] == ["image", "added"]
+
+
+def test_in_a_picture_that_is_no_image_of_the_run_there_is_no_pixel() -> None:
+    cg = ep.CompGraph({"pose": lambda image: (1, 2)}, {"pose": ("image", "pose")})
+    run = ep.CompGraphRunner(cg).run(image=image(np.uint8, 1))
+    assert probe(run, stages(run), 7, 3, shown(run, "pose")) == []
+    assert len(probe(run, stages(run), 7, 3, shown(run, "image"))) == 1
 
 
 _SHAPES = st.tuples(st.integers(8, 50), st.integers(8, 50)) | st.tuples(

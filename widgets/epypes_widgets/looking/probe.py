@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, Final
 from weakref import ReferenceType, WeakKeyDictionary, ref
 
-from epypes.display import is_image
+from epypes.display import Scene, is_image
 from epypes.display.previews.arrays import plain_array
 from epypes.display.previews.imagekinds import image_kind, one_channel, sampled
 from epypes.display.previews.looking import silent_numpy
@@ -27,7 +27,7 @@ _seen: Final[WeakKeyDictionary[Program, dict[str, tuple[ReferenceType[Any], bool
 _CHANNELS: Final = {"bgr": "BGRA", "rgb": "RGBA"}
 
 
-def probe(run: Run, stages: Iterable[Stage], x: float, y: float, size: tuple[int, int]) -> list[dict[str, str]]:
+def probe(run: Run, stages: Iterable[Stage], x: float, y: float, shown: Scene) -> list[dict[str, str]]:
     """Return the values of all stages that are images at a pixel, ready for JSON; nothing is computed.
 
     Parameters
@@ -38,30 +38,35 @@ def probe(run: Run, stages: Iterable[Stage], x: float, y: float, size: tuple[int
         In the order in which they are listed.
     x, y
         Where, in pixels of the picture that is shown; the first pixel reaches from 0 to 1.
-    size
-        Width and height of the picture that is shown, in its own pixels. In an image of another size the pixel at the
-        same place is taken, and its column and row are told.
+    shown
+        The picture in which the pixel was chosen. In an image of another size than its backdrop's the pixel at the same
+        place is taken, and its column and row are told.
 
     Returns
     -------
     list of dict
         ``token``, ``text``, as ``"B 12 G 40 R 200"``, and ``state``: ``"fresh"`` or ``"stale"``. Empty if the pixel
-        lies outside.
+        lies outside, or if the picture is none of the images of the run: two of them side by side, or what a preview
+        function has drawn.
     """
-    width, height = size
-    if not (0 <= x < width and 0 <= y < height):  # false for NaN, too
+    height, width = shown.backdrop.image.shape[:2]
+    if not is_image(_value(run, shown.backdrop.name)) or not (0 <= x < width and 0 <= y < height):  # false for NaN, too
         return []
     rows = []
     with silent_numpy():
         for token in (stage.token for stage in stages if stage.is_picture):
-            value = run.tokens.values[run.tokens.program.slots[token]]
+            value = _value(run, token)
             if is_image(value):
                 image = one_channel(plain_array(value))
                 noun = "label " * (image.ndim == 2 and _are_labels(run, token, value))
-                text = noun + _text_at(image, x, y, size, colour_order(run.cg, token))
+                text = noun + _text_at(image, x, y, (width, height), colour_order(run.cg, token))
                 state = "stale" if run.tokens.is_stale(token) else "fresh"
                 rows.append({"token": token, "text": text, "state": state})
     return rows
+
+
+def _value(run: Run, token: str) -> Any:
+    return run.tokens.values[run.tokens.program.slots[token]]
 
 
 def _text_at(image: Array, x: float, y: float, size: tuple[int, int], order: Order) -> str:
