@@ -6,22 +6,29 @@ from epypes.display.previews.preview import Chart, Preview
 from epypes.display.previews.ranges import reset_display_ranges
 from epypes.display.previews.raster import Picture, encode_image
 from epypes.display.previews.registry import register_preview
+from epypes.display.previews.shown import Backdrop, Marks, Most, Scene
 from epypes.display.printed import to_text
 from epypes.display.show import Figure, show
 from epypes.display.views.graphview import GraphView
+from epypes.display.views.scenes import scene_of
 from epypes.display.views.view import view
 
 __all__ = [
+    "Backdrop",
     "Chart",
     "Figure",
     "GraphView",
+    "Marks",
+    "Most",
     "Picture",
     "Preview",
+    "Scene",
     "encode_image",
     "is_image",
     "mimebundle",
     "register_preview",
     "reset_display_ranges",
+    "scene_of",
     "show",
     "to_svg",
     "to_text",

@@ -10,6 +10,7 @@
 - ``ranges``: which values may each hyperparameter take
 - ``controls``: what moves it
 - ``worker``: when is it computed
+- ``looking``: what can be looked at in a run
 - ``frames``: which picture goes to the screen, and when
 - ``picture``: what the screen shows
 - ``panel``: all of it, for a user

@@ -15,7 +15,7 @@ from epypes.display.previews.ranges import is_of_dtype
 from epypes.display.previews.raster import THUMBNAIL_PX, encode_small, is_pooled, pillow_image
 from epypes.display.previews.registry import ours
 from epypes.display.previews.short import array_text, float_text, row_texts, short_repr
-from epypes.display.previews.shown import Look, Preview, Sketch
+from epypes.display.previews.shown import Backdrop, Look, Preview, Scene, Sketch
 from epypes.display.previews.statistics import few_of, some_of, statistics_text
 from epypes.display.previews.tables import record_sketch
 
@@ -71,7 +71,7 @@ def _array_sketch(array: Any, look: Look) -> Sketch | Preview:
 
 def _closer(array: Array) -> Callable[[Array, Look], Sketch | None] | None:
     """Return what draws an array of its shape; None if nothing can be drawn."""
-    if is_image(array) and not _is_strip(array):
+    if is_image(array) and not is_strip(array):
         return image_sketch
     if array.shape[1:] in _PLACES:
         return _places
@@ -79,7 +79,7 @@ def _closer(array: Array) -> Callable[[Array, Look], Sketch | None] | None:
     return _drawn_numbers if is_line else None
 
 
-def _is_strip(array: Array) -> bool:
+def is_strip(array: Array) -> bool:
     """Whether a thumbnail would be a line of pixels, as of 500 descriptors of 32 bytes."""
     height, width = array.shape[:2]
     return bool(max(height, width) > _MOST_ELONGATED * min(height, width))
@@ -102,6 +102,7 @@ def image_sketch(array: Array, look: Look) -> Sketch:
         Preview(text, ", ".join(said)),
         lambda most_bytes: encode_small(pillow_image(array, THUMBNAIL_PX, look.order, ends, kind), most_bytes),
         is_image=True,
+        scene=lambda: Scene(Backdrop(array, look.order, ends, "")),
     )
 
 

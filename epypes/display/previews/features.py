@@ -12,13 +12,11 @@ from epypes.display.markup import cut
 from epypes.display.previews.charts import drawn_in_chart
 from epypes.display.previews.kinds import dotted_name, is_of
 from epypes.display.previews.marks import (
-    MOST_MARKS,
-    MOST_PAIRS,
-    Marks,
     drawer,
     lie_on,
     marks_lie_on,
     pair_drawer,
+    pair_scene,
     rectangles,
     share_on,
     some_lines,
@@ -26,7 +24,7 @@ from epypes.display.previews.marks import (
     some_points,
 )
 from epypes.display.previews.short import array_text
-from epypes.display.previews.shown import Backdrop, Look, Preview, Sketch
+from epypes.display.previews.shown import Backdrop, Look, Marks, Most, Preview, Scene, Sketch
 
 if TYPE_CHECKING:
     import numpy as np
@@ -85,7 +83,7 @@ def point_sketch(array: Any, look: Look, *, needs_image: bool = False) -> Sketch
     """
     places = array.reshape(-1, 2)
     are_rows = array.ndim == 2 and array.dtype.itemsize == 8
-    marks, turned = (some_points(_x_and_y(places, order)) for order in (are_rows, not are_rows))
+    marks, turned = (some_points(_x_and_y(places, order), look.most) for order in (are_rows, not are_rows))
     image = look.around.nearest_image() if array.ndim == 2 else None
     if image is not None and share_on(turned.points, image) > share_on(marks.points, image):
         marks, are_rows = turned, not are_rows
@@ -93,7 +91,7 @@ def point_sketch(array: Any, look: Look, *, needs_image: bool = False) -> Sketch
         return None
     order = "(row, column)" if are_rows else "(x, y)"
     said = f"{array_text(array)}, points {order}{_extent(_x_and_y(places, are_rows))}"
-    return _over(marks, array_text(array), said, look)
+    return _over(marks, "points", array_text(array), said, look)
 
 
 def _x_and_y(places: Any, are_rows: bool) -> Any:
@@ -102,12 +100,14 @@ def _x_and_y(places: Any, are_rows: bool) -> Any:
 
 def segment_sketch(array: Any, look: Look) -> Sketch:
     """Look at an array (n, 1, 4) of the two ends of line segments."""
-    return _over(_segments(array), array_text(array), f"{array_text(array)}, segments{_extent(array)}", look)
+    said = f"{array_text(array)}, segments{_extent(array)}"
+    return _over(_segments(array, look.most), "segments", array_text(array), said, look)
 
 
-def _segments(array: Any) -> Marks:
-    lines = list(array.reshape(-1, 2, 2)[:MOST_MARKS])
-    return replace(some_lines(lines, are_closed=False), total=len(array))
+def _segments(array: Any, most: Most) -> Marks:
+    # The first ones: detectors list the strongest first.
+    lines = list(array.reshape(-1, 2, 2)[: most.marks])
+    return replace(some_lines(lines, False, most), total=len(array))
 
 
 def quad_sketch(array: Any, look: Look) -> Sketch | None:
@@ -123,11 +123,12 @@ def quad_sketch(array: Any, look: Look) -> Sketch | None:
     height, width = backdrop.image.shape[:2]
     ends = array[:, :2].astype("f8") + array[:, 2:]
     are_boxes = bool((array[:, 2:] > 0).all() and (ends <= (width, height)).all())
-    marks = rectangles(array) if are_boxes else _segments(array)
+    marks = rectangles(array, look.most) if are_boxes else _segments(array, look.most)
     if not marks_lie_on(marks, backdrop):
         return None
-    said = "boxes (x, y, width, height)" if are_boxes else "segments"
-    return _over(marks, array_text(array), f"{array_text(array)}, {said}", look)
+    what = "boxes" if are_boxes else "segments"
+    said = f"{array_text(array)}, {what}{' (x, y, width, height)' * are_boxes}"
+    return _over(marks, what, array_text(array), said, look)
 
 
 def pair_sketch(array: Any, look: Look) -> Sketch | None:
@@ -135,21 +136,23 @@ def pair_sketch(array: Any, look: Look) -> Sketch | None:
     backdrops = look.around.image_pair()
     if backdrops is None or not len(array):
         return None
-    pairs = some_pairs(array)
+    pairs = some_pairs(array, look.most)
     first, second = backdrops
     if not len(pairs) or not lie_on(pairs[:, :2], first) or not lie_on(pairs[:, 2:], second):
         return None
-    return _between(backdrops, pairs, len(array), array_text(array), f"{array_text(array)}, places in two images")
+    said = f"{array_text(array)}, places in two images"
+    return _between(backdrops, pairs, len(array), Preview(array_text(array), said), "pairs")
 
 
-def _over(marks: Marks, text: str, said: str, look: Look) -> Sketch:
+def _over(marks: Marks, what: str, text: str, said: str, look: Look) -> Sketch:
     backdrop = _backdrop(marks, look)
+    scene = None if backdrop is None else partial(Scene, backdrop, marks, what)
     drawn = marks.drawn if backdrop else drawn_in_chart(len(marks.points), len(marks.lines))
     if backdrop is not None:
         said += f", drawn over {cut(backdrop.name, _NAME_CHARACTERS)}"
     if drawn < marks.total:
         said += f", {drawn} of {marks.total} drawn"
-    return Sketch(Preview(text, said), drawer(marks, backdrop))
+    return Sketch(Preview(text, said), drawer(marks, backdrop), scene=scene)
 
 
 def _backdrop(marks: Marks, look: Look) -> Backdrop | None:
@@ -157,21 +160,24 @@ def _backdrop(marks: Marks, look: Look) -> Backdrop | None:
     return backdrop if backdrop is not None and marks_lie_on(marks, backdrop) else None
 
 
-def _between(backdrops: tuple[Backdrop, Backdrop], pairs: Floats, total: int, text: str, said: str) -> Sketch:
-    said += ", drawn between the images"
+def _between(backdrops: tuple[Backdrop, Backdrop], pairs: Floats, total: int, shown: Preview, what: str) -> Sketch:
+    said = f"{shown.detail}, drawn between the images"
     if len(pairs) < total:
         said += f", {len(pairs)} of {total} drawn"
-    return Sketch(Preview(text, said), pair_drawer(backdrops, pairs))
+    scene = partial(pair_scene, backdrops, pairs, total, what)
+    return Sketch(Preview(shown.text, said), pair_drawer(backdrops, pairs), scene=scene)
 
 
 def _keypoints(value: Sequence[Any], shown: Preview, look: Look) -> Sketch:
     import numpy as np
 
-    weighed = sorted(value[:_WEIGHED], key=lambda keypoint: -keypoint.response)[:MOST_MARKS]
-    marks = some_points(np.array([keypoint.pt for keypoint in weighed], dtype=np.float64), len(value))
-    sizes = [keypoint.size for keypoint in weighed]
+    weighed = sorted(value[:_WEIGHED], key=lambda keypoint: -keypoint.response)[: look.most.marks]
+    extents = np.array([(keypoint.size, keypoint.angle) for keypoint in weighed], dtype=np.float64)
+    points = np.array([keypoint.pt for keypoint in weighed], dtype=np.float64)
+    marks = some_points(points, look.most, len(value), extents)
+    sizes = extents[:, 0]
     said = f"{shown.detail}{_extent(marks.points)}, size {min(sizes):.4g} to {max(sizes):.4g}"
-    return _over(marks, shown.text, said, look)
+    return _over(marks, "keypoints", shown.text, said, look)
 
 
 def _matches(value: Sequence[Any], shown: Preview, look: Look) -> Sketch | None:
@@ -184,12 +190,13 @@ def _matches(value: Sequence[Any], shown: Preview, look: Look) -> Sketch | None:
     distances = [match.distance for match in flat]
     said = f"{shown.detail}, distance {min(distances):.4g} to {max(distances):.4g}"
     backdrops, keypoints = look.around.image_pair(), look.around.keypoint_pair()
-    kept = flat[:MOST_PAIRS]
+    kept = flat[: look.most.pairs]
     if backdrops is not None and keypoints is not None and _indices_fit(kept, *keypoints):
         first, second = keypoints
-        pairs = some_pairs(np.array([(*first[m.queryIdx].pt, *second[m.trainIdx].pt) for m in kept]))
+        places = np.array([(*first[m.queryIdx].pt, *second[m.trainIdx].pt) for m in kept])
+        pairs = some_pairs(places, look.most)
         if len(pairs):
-            return _between(backdrops, pairs, len(value), shown.text, said)
+            return _between(backdrops, pairs, len(value), Preview(shown.text, said), "matches")
     return Sketch(Preview(shown.text, said, rows=_match_rows(flat, len(value))))
 
 
@@ -211,11 +218,12 @@ def _contours(value: Sequence[Any], shown: Preview, look: Look) -> Sketch | None
     if not all(line.ndim == axes and _has_contour_shape(line) for line in known):
         return None
     are_rows = axes == 2
-    marks = some_lines([line[:, ::-1] for line in known] if are_rows else known, not are_rows, len(value))
+    turned = [line[:, ::-1] for line in known] if are_rows else known
+    marks = some_lines(turned, not are_rows, look.most, len(value))
     order = ", (row, column) as scikit-image has them" if are_rows else ""
     first = f" in the first {_WEIGHED}" * (len(known) < len(value))
     said = f"{shown.detail}, {sum(map(len, known))} points{first}, {value[0].dtype}{order}"
-    return _over(marks, shown.text, said, look)
+    return _over(marks, "contours", shown.text, said, look)
 
 
 def _extent(points: Any) -> str:

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display.previews.charts import place_chart, spread
 from epypes.display.previews.imagekinds import image_kind, sampled
 from epypes.display.previews.raster import THUMBNAIL_PX, Picture, encode_small, pillow_image
-from epypes.display.previews.shown import Backdrop, Chart
+from epypes.display.previews.shown import Backdrop, Chart, Marks, Most, Scene
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,9 +23,6 @@ if TYPE_CHECKING:
 
     Floats = npt.NDArray[np.float64]
 
-MOST_MARKS: Final = 200
-# More lines than that, from one image to another, cover both.
-MOST_PAIRS: Final = 40
 # Marks are drawn at twice the size and made smaller with the image, which smooths their edges.
 _OVERSAMPLED: Final = 2
 _FARTHEST_PX: Final = 1e6
@@ -45,72 +42,72 @@ _GREEN: Final = (60, 255, 120)
 _COLOURS: Final = ((255, 90, 90), (90, 220, 255), (255, 215, 70), (120, 255, 130), (240, 130, 255), (255, 165, 80))
 
 
-@dataclass(frozen=True, slots=True)
-class Marks:
-    """What is drawn over an image.
-
-    Attributes
-    ----------
-    points
-        (n, 2) of x and y, in pixels of the image.
-    lines
-        Each (k, 2).
-    are_closed
-        Whether lines return to where they began.
-    total
-        How many points or lines there are; fewer may be drawn.
-    """
-
-    points: Floats
-    lines: tuple[Floats, ...] = ()
-    are_closed: bool = False
-    total: int = 0
-
-    @property
-    def drawn(self) -> int:
-        """How many are drawn."""
-        return len(self.lines) or len(self.points)
-
-
-def some_points(points: Any, total: int | None = None) -> Marks:
+def some_points(points: Any, most: Most, total: int | None = None, extents: Floats | None = None) -> Marks:
     """Return points as marks: of many some, evenly spread in their order, none that is not finite."""
     import numpy as np
 
     total = len(points) if total is None else total
-    kept = points[spread(len(points), MOST_MARKS)].reshape(-1, 2).astype(np.float64)
-    return Marks(kept[_is_drawable(kept)], total=total)
+    chosen = spread(len(points), most.marks)
+    kept = points[chosen].reshape(-1, 2).astype(np.float64)
+    is_drawn = _is_drawable(kept)
+    return Marks(kept[is_drawn], total=total, extents=None if extents is None else extents[chosen][is_drawn])
 
 
-def some_pairs(places: Any) -> Floats:
+def some_pairs(places: Any, most: Most) -> Floats:
     """Return pairs (n, 4) of places as they are drawn: of many some, none that is not finite or far away."""
     import numpy as np
 
-    kept: Floats = places[spread(len(places), MOST_PAIRS)].astype(np.float64)
+    kept: Floats = places[spread(len(places), most.pairs)].astype(np.float64)
     return kept[_is_drawable(kept)]
 
 
-def some_lines(lines: Any, are_closed: bool, total: int | None = None) -> Marks:
+def some_lines(lines: Any, are_closed: bool, most: Most, total: int | None = None) -> Marks:
     """Return lines, each (k, 2), as marks: of many the longest, each with at most so many points."""
     import numpy as np
 
-    longest = sorted(lines, key=len, reverse=True)[:MOST_MARKS] if len(lines) > MOST_MARKS else lines
-    kept = [line[:: -(-len(line) // MOST_MARKS) or 1].reshape(-1, 2).astype(np.float64) for line in longest]
-    drawable = tuple(line[_is_drawable(line)] for line in kept if len(line))
-    return Marks(
-        np.empty((0, 2)),
-        tuple(line for line in drawable if len(line)),
-        are_closed,
-        len(lines) if total is None else total,
-    )
+    longest = sorted(lines, key=len, reverse=True)[: most.marks] if len(lines) > most.marks else lines
+    room = min(most.line, _share([len(line) for line in longest], most.places))
+    kept = [line[:: -(-len(line) // room) or 1].reshape(-1, 2) for line in longest if len(line)]
+    count = len(lines) if total is None else total
+    return Marks(np.empty((0, 2)), tuple(_drawable_lines(kept)), are_closed, count)
 
 
-def rectangles(boxes: Any) -> Marks:
+def _drawable_lines(lines: list[Any]) -> Iterator[Floats]:
+    """Yield the lines without what can't be drawn of them; looked at together, since there may be thousands."""
+    import numpy as np
+
+    if not lines:
+        return
+    places = np.concatenate(lines).astype(np.float64)
+    is_drawn = _is_drawable(places)
+    end = 0
+    for line in lines:
+        start, end = end, end + len(line)
+        found = places[start:end]
+        if not is_drawn[start:end].all():
+            found = found[is_drawn[start:end]]
+        if len(found):
+            yield found
+
+
+def _share(lengths: Iterable[int], room: int) -> int:
+    """Return the places that each line may have, so that short ones stay whole and all fit into the room."""
+    waiting = sorted(lengths)
+    for place, length in enumerate(waiting):
+        share = room // (len(waiting) - place)
+        if length > share:
+            return max(share, 1)
+        room -= length
+    return max([1, *waiting[-1:]])
+
+
+def rectangles(boxes: Any, most: Most) -> Marks:
     """Return boxes (n, 4) of x, y, width and height as marks."""
     import numpy as np
 
-    x, y, width, height = boxes[:MOST_MARKS].astype(np.float64).T
+    x, y, width, height = boxes[: most.marks].astype(np.float64).T
     corners = np.stack([x, y, x + width, y, x + width, y + height, x, y + height], axis=1)
-    return replace(some_lines(list(corners.reshape(-1, 4, 2)), are_closed=True), total=len(boxes))
+    return replace(some_lines(list(corners.reshape(-1, 4, 2)), True, most), total=len(boxes))
 
 
 def lie_on(points: Floats, backdrop: Backdrop) -> bool:
@@ -146,6 +143,20 @@ def drawer(marks: Marks, backdrop: Backdrop | None) -> Callable[[int], Picture |
 def pair_drawer(backdrops: tuple[Backdrop, Backdrop], pairs: Floats) -> Callable[[int], Picture | Chart]:
     """Return what draws two images side by side, with lines; ``pairs`` are (n, 4): x and y in both."""
     return lambda most_bytes: encode_small(_drawn_between(backdrops, pairs), most_bytes, has_small_marks=True)
+
+
+def pair_scene(backdrops: tuple[Backdrop, Backdrop], pairs: Floats, total: int, what: str) -> Scene:
+    """Return two images side by side, at their full size, with lines; ``pairs`` are (n, 4): x and y in both."""
+    import numpy as np
+
+    left, right = (np.asarray(_picture(backdrop, None)) for backdrop in backdrops)
+    height, width = max(len(left), len(right)), left.shape[1]
+    joined = np.zeros((height, width + right.shape[1], 3), np.uint8)
+    joined[: len(left), :width] = left
+    joined[: len(right), width:] = right
+    ends = np.add(pairs, (0, 0, width, 0)).reshape(-1, 2, 2)
+    marks = Marks(ends.reshape(-1, 2), tuple(ends), total=total)
+    return Scene(Backdrop(joined, "rgb", (0.0, 255.0), ""), marks, what)
 
 
 def _is_drawable(places: Floats) -> npt.NDArray[np.bool_]:
@@ -189,14 +200,17 @@ def _canvas(backdrop: Backdrop, side: int) -> tuple[Image.Image, float]:
     """Return an image to be drawn upon, a little darker, and how many of its pixels are one of the image."""
     from PIL import Image
 
-    array = backdrop.image
-    kind = image_kind(array, sampled(array))
-    picture = pillow_image(array, side, backdrop.order, backdrop.ends, kind).convert("RGB")
+    array, picture = backdrop.image, _picture(backdrop, side)
     scale = side / max(array.shape[:2])
     # Even sides, so that each pixel of the thumbnail is made of four.
     height, width = (max(1, round(length * scale / _OVERSAMPLED)) * _OVERSAMPLED for length in array.shape[:2])
     picture = picture.resize((width, height), Image.Resampling.BILINEAR)
     return picture.point(lambda level: round(level * _DARKER)), scale
+
+
+def _picture(backdrop: Backdrop, side: int | None) -> Image.Image:
+    array = backdrop.image
+    return pillow_image(array, side, backdrop.order, backdrop.ends, image_kind(array, sampled(array))).convert("RGB")
 
 
 class _Pen:

@@ -16,7 +16,7 @@ from epypes.display.previews.pictures import checked_chart, checked_picture
 from epypes.display.previews.raster import THUMBNAIL_BYTES, THUMBNAIL_PX, Picture
 from epypes.display.previews.registry import looker_of
 from epypes.display.previews.short import reason
-from epypes.display.previews.shown import Chart, Look, Preview, Sketch
+from epypes.display.previews.shown import Chart, Look, Preview, Scene, Sketch
 from epypes.images import Order
 
 __all__ = ["THUMBNAIL_PX", "Chart", "Preview", "finished", "preview", "sketch"]
@@ -60,6 +60,16 @@ def finished(sketched: Sketch, most_bytes: int = THUMBNAIL_BYTES) -> Preview:
     return replace(sketched.shown, picture=drawn)
 
 
+def scene_in(sketched: Sketch) -> Scene | None:
+    """Return the image of a sketch and what is drawn over it; None if it has none. Never raises."""
+    with looking():
+        try:
+            found = sketched if sketched.closer is None else sketched.closer()
+            return found.scene() if isinstance(found, Sketch) and found.scene is not None else None
+        except Exception:  # what is wrong is said where the value is shown as text
+            return None
+
+
 def _limited(found: Sketch | Preview) -> Sketch:
     sketched = found if isinstance(found, Sketch) else Sketch(found)
     return replace(sketched, shown=_trimmed(sketched.shown))
@@ -82,8 +92,10 @@ def _checked(found: Any, value: Any, look: Look) -> Sketch:
         return _limited(found)
     if issubclass(kind, Preview):
         detail = found.detail if found.detail != "" else _kind(value)
-        drawing = _drawing(found.picture, found.chart, look)
-        return Sketch(_trimmed(Preview(found.text, detail, rows=found.rows)), drawing)
+        shown = _trimmed(Preview(found.text, detail, rows=found.rows))
+        if is_image(found.picture):
+            return replace(arrays.image_sketch(arrays.plain_array(found.picture), look), shown=shown, is_image=False)
+        return Sketch(shown, _drawing(found.picture, found.chart))
     if issubclass(kind, str):
         return Sketch(_trimmed(Preview(found, f"{_kind(value)}, {plain_text(found)[:_DETAIL_CHARACTERS]}")))
     if is_image(found):
@@ -107,10 +119,8 @@ def _on_one_line(row: str) -> str:
     return "".join(mark if mark.isprintable() else " " for mark in plain_text(row)[:_ROW_CHARACTERS])
 
 
-def _drawing(picture: Any, chart: Any, look: Look) -> Callable[[int], Picture | Chart] | None:
+def _drawing(picture: Any, chart: Any) -> Callable[[int], Picture | Chart] | None:
     """Return what draws the picture or chart that a user's preview has."""
-    if is_image(picture):
-        return arrays.image_sketch(arrays.plain_array(picture), look).draw
     if picture is not None:
         if not issubclass(type(picture), Picture):
             raise TypeError("picture must be an image: an array of at least 8 x 8 pixels")

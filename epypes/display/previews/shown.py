@@ -4,11 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
 from epypes.display.previews.ranges import Range, display_range
 from epypes.display.previews.raster import Picture
 from epypes.images import Order
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    Floats = npt.NDArray[np.float64]
+
+# On a thumbnail.
+MOST_MARKS: Final = 200
+# More lines than that, from one image to another, cover both.
+MOST_PAIRS: Final = 40
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +76,15 @@ class Sketch:
         Makes the thumbnail, in so many bytes at most if it is encoded; None if there is none.
     is_image
         Whether the value itself is an image.
+    scene
+        Returns the image that the thumbnail is made of, and what is drawn over it; None for charts and texts.
     """
 
     shown: Preview
     draw: Callable[[int], Picture | Chart] | None = None
     is_image: bool = False
     closer: Callable[[], Sketch | Preview] | None = None
+    scene: Callable[[], Scene] | None = None
 
     @property
     def may_be_drawn(self) -> bool:
@@ -86,6 +100,65 @@ class Backdrop:
     order: Order
     ends: Range
     name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Marks:
+    """What is drawn over an image.
+
+    Attributes
+    ----------
+    points
+        (n, 2) of x and y, in pixels of the image.
+    lines
+        Each (k, 2).
+    are_closed
+        Whether lines return to where they began.
+    total
+        How many points or lines there are; fewer may be drawn.
+    extents
+        (n, 2) of the points' diameter in pixels and angle in degrees, as keypoints have them; None if they have none.
+    """
+
+    points: Floats
+    lines: tuple[Floats, ...] = ()
+    are_closed: bool = False
+    total: int = 0
+    extents: Floats | None = None
+
+    @property
+    def drawn(self) -> int:
+        """How many are drawn."""
+        return len(self.lines) or len(self.points)
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """A value as it is seen at its full size: an image, and what is drawn over it.
+
+    Attributes
+    ----------
+    backdrop
+        The image: the value itself, or what its marks were found in; two side by side for what was found in both.
+    marks
+        What is drawn; None of an image.
+    what
+        What the marks are, as ``"keypoints"``.
+    """
+
+    backdrop: Backdrop
+    marks: Marks | None = None
+    what: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Most:
+    """How many marks are drawn at most: points or lines, places of one line and of all lines, lines between images."""
+
+    marks: int = MOST_MARKS
+    line: int = MOST_MARKS
+    places: int = MOST_MARKS * MOST_MARKS
+    pairs: int = MOST_PAIRS
 
 
 class Surroundings(Protocol):
@@ -129,8 +202,11 @@ class Look:
         Returns the values that are shown black and white in an image.
     around
         What it may be drawn over.
+    most
+        How many marks are drawn over an image.
     """
 
     order: Order = "bgr"
     range_of: Callable[[Any], Range] = display_range
     around: Surroundings = field(default_factory=Nowhere)
+    most: Most = field(default_factory=Most)

@@ -1,0 +1,106 @@
+"""Which tokens of a run can be looked at, which first, and which pictures are up to date?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from epypes.display import is_image, scene_of
+from epypes.display.previews.arrays import is_strip
+from epypes.run import CompGraphRunner, Run
+
+State = Literal["fresh", "stale", "failed", "absent"]
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """A token that can be looked at.
+
+    Attributes
+    ----------
+    token
+        Its name.
+    is_picture
+        Whether it is an image, or can be drawn over one; any other is shown as text.
+    """
+
+    token: str
+    is_picture: bool
+
+
+def stages(run: Run, kept: Iterable[Stage] = (), asked: str | None = None) -> tuple[Stage, ...]:
+    """Return the tokens that have a picture, and the sink tokens whatever they are, in graph order.
+
+    Parameters
+    ----------
+    run
+        Its values are looked at, those that are stale only for whether they are images.
+    kept
+        The stages of an earlier run: what had a picture stays, whether or not it has one now, so that nothing comes
+        and goes under the hand.
+    asked
+        A token that is a stage in any case.
+
+    Returns
+    -------
+    tuple of Stage
+        Of a run that has neither pictures nor sink tokens with a value, all tokens that have one.
+    """
+    known = {stage.token: stage.is_picture for stage in kept}
+    sinks = run.cg.sink_tokens
+    found: dict[str, bool] = {}
+    for token in run.cg.tokens:
+        is_picture = known.get(token, False) or _has_picture(run, token)
+        if is_picture or token == asked or token in known or (token in sinks and run.tokens.is_computed(token)):
+            found[token] = is_picture
+    found = found or dict.fromkeys(run, False)
+    return tuple(Stage(token, is_picture) for token, is_picture in found.items())
+
+
+def best_stage(run: Run, stages: Iterable[Stage]) -> str | None:
+    """Return the token to show first: the last that has a picture, of sink tokens if one has; None of none.
+
+    An image of a few columns, such as descriptors are, comes after all other pictures.
+    """
+    sinks, offered = run.cg.sink_tokens, tuple(stages)
+
+    def rank(place: int) -> tuple[int, bool, int]:
+        stage = offered[place]
+        value = _value(run, stage.token)
+        is_wide = not (is_image(value) and is_strip(value))
+        return stage.is_picture * (1 + is_wide), stage.token in sinks, place
+
+    best = max(range(len(offered)), key=rank, default=None)
+    return None if best is None else offered[best].token
+
+
+def states(looked_at: Run | CompGraphRunner, stages: Iterable[Stage]) -> dict[str, State]:
+    """Return the state of every stage.
+
+    ``"failed"`` is what the function that failed would have made, ``"absent"`` what was not computed; of a runner, a
+    value is stale, too, if a hyperparameter has changed since its last run.
+    """
+    if isinstance(looked_at, CompGraphRunner):
+        run, outdated = looked_at.last, frozenset(looked_at.stale)
+    else:
+        run, outdated = looked_at, frozenset()
+    return {stage.token: "absent" if run is None else _state(run, stage.token, outdated) for stage in stages}
+
+
+def _state(run: Run, token: str, outdated: frozenset[str]) -> State:
+    maker = run.cg.digraph.producer.get(token)
+    if run.failure is not None and maker == run.failure.function:
+        return "failed"
+    if not run.tokens.is_computed(token):
+        return "absent"
+    return "stale" if run.tokens.is_stale(token) or maker in outdated else "fresh"
+
+
+def _has_picture(run: Run, token: str) -> bool:
+    return is_image(_value(run, token)) or scene_of(run, token) is not None
+
+
+def _value(run: Run, token: str) -> Any:
+    """Return a token's value even if it is stale; what stands for none of a token that was not computed."""
+    return run.tokens.values[run.tokens.program.slots[token]]
