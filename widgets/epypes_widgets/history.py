@@ -34,7 +34,7 @@ class Entry:
     values
         By hyperparameter; read-only.
     at
-        When, with the time zone of this machine.
+        When, to the second, with the time zone of this machine.
     token
         The token that was shown; None if none was.
     picture
@@ -111,7 +111,7 @@ class History:
                 return None
             kept = MappingProxyType({name: _kept(value) for name, value in values.items()})
             self._committed += 1
-            now = datetime.now().astimezone()
+            now = datetime.now().astimezone().replace(microsecond=0)
             entry = Entry(self._committed, kept, now, token, picture, compute_ms, label, image)
             self._entries = (*self._entries, entry)[-self.limit :]
             oldest = self._entries[0].number

@@ -10,7 +10,7 @@ import base64
 from collections.abc import Mapping
 from typing import Any, Final
 
-from epypes.display.markup import cut, escape
+from epypes.display.markup import content, cut, escape, fitted
 from epypes.display.previews.imagekinds import is_image
 from epypes.display.previews.preview import sketch
 from epypes.display.previews.ranges import kept_range
@@ -21,12 +21,14 @@ from epypes.graph import colour_order
 from epypes.run import Run
 from epypes_widgets.values import differing, said
 
-# As text, the picture is a third longer: together with the table it stays below 120 kB.
+# In a page a picture is a third longer. Together with 40 rows of 420 characters it stays below 120 kB.
 _PICTURE_BYTES: Final = 72_000
 _PICTURE_SIDE_PX: Final = 720
 _MOST_ROWS: Final = 40
 _NAME_CHARACTERS: Final = 40
-_CODE_CHARACTERS: Final = 400
+# What a text takes in the page at most.
+_CELL_ROOM: Final = 80
+_TEXT_ROOM: Final = 800
 _LEFT: Final = ' style="text-align:left;padding:2px 12px 2px 0"'
 
 
@@ -58,7 +60,7 @@ def static_html(
     """
     on = f" of {cut(image, _NAME_CHARACTERS)}" if image else ""
     picture = _shown(run, token, on) if token is not None else ""
-    line = f'<pre style="white-space:pre-wrap">{escape(code[:_CODE_CHARACTERS])}</pre>' if code else ""
+    line = f'<pre style="white-space:pre-wrap">{content(fitted(code, _TEXT_ROOM))}</pre>' if code else ""
     return f'<figure class="epypes-static" style="margin:0">{picture}{_table(values, defaults)}{line}</figure>'
 
 
@@ -82,7 +84,7 @@ def _shown(run: Run, token: str, on: str) -> str:
 
 
 def _caption(text: str) -> str:
-    return f'<figcaption style="margin:4px 0 8px">{escape(text)}</figcaption>'
+    return f'<figcaption style="margin:4px 0 8px">{content(fitted(text, _TEXT_ROOM))}</figcaption>'
 
 
 def _table(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> str:
@@ -112,4 +114,4 @@ def _row(name: str, value: Any, defaults: Mapping[str, Any], is_moved: bool) -> 
 
 
 def _cells(tag: str, *texts: str) -> str:
-    return f"<tr>{''.join(f'<{tag}{_LEFT}>{escape(text)}</{tag}>' for text in texts)}</tr>"
+    return f"<tr>{''.join(f'<{tag}{_LEFT}>{content(fitted(text, _CELL_ROOM))}</{tag}>' for text in texts)}</tr>"
