@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import enum
 import math
+import os
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -116,3 +120,10 @@ def test_a_runner_is_called_what_it_was_called_first() -> None:
 
 def test_outside_of_a_notebook_a_runner_is_called_runner() -> None:
     assert name_of(object()) == "runner"
+
+
+def test_in_a_notebook_a_runner_is_found_among_what_its_cells_defined(tmp_path: Path) -> None:
+    code = "from epypes_widgets.code import name_of; _hidden = edges = object(); assert name_of(edges) == 'edges'"
+    command = [sys.executable, "-m", "IPython", "--no-banner", "-c", code]
+    done = subprocess.run(command, env={**os.environ, "IPYTHONDIR": str(tmp_path)}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr

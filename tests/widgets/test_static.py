@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
+from epypes_widgets.pictures import thumbnail
 from epypes_widgets.static import static_html
 from tests.colours import red_image, red_runner
 
@@ -117,3 +118,19 @@ def test_the_same_gives_the_same_bytes(runner: ep.CompGraphRunner, image: Any) -
     again = ep.CompGraphRunner(runner.cg, runner.hyperparameters)
     one, two = (each.run(image=image) for each in (runner, again))
     assert static_html(one, "image", {"k": object()}, {}) == static_html(two, "image", {"k": object()}, {})
+
+
+def test_a_thumbnail_is_small_and_only_of_images_that_are_up_to_date(runner: ep.CompGraphRunner, image: Any) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (900, 1200), dtype=np.uint8)
+    small = thumbnail(runner.run(image=noise), "image")
+    assert small is not None
+    assert (max(small.width, small.height), len(small.data) < 5_000) == (96, True)
+    fresh = ep.CompGraphRunner(runner.cg, runner.hyperparameters)
+    partial = fresh.run("image_bright", image=image)
+    assert [thumbnail(partial, token) for token in ("mask", "gain", None)] == [None, None, None]
+    assert thumbnail(partial, "image_bright") is not None
+
+
+def test_a_code_line_is_whole_or_not_there() -> None:
+    assert "<pre" not in shown(1, code="runner.rerun(k='" + "x" * 5_000 + "')")
+    assert "rerun(k='a  b')</pre>" in shown(1, code="runner.rerun(k='a  b')")

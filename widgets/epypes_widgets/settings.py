@@ -109,7 +109,10 @@ def names(folder: str | Path) -> tuple[str, ...]:
 
 
 def _with_suffix(path: str | Path) -> Path:
-    file = Path(path).expanduser()
+    try:
+        file = Path(path).expanduser()
+    except RuntimeError as error:
+        raise SettingsError(path, [f"{path} is in the home folder of nobody. Name another file."]) from error
     if not file.name:
         raise SettingsError(path, ["Settings need a name, such as 'good'."])
     return file if file.suffix == _SUFFIX else file.with_name(file.name + _SUFFIX)

@@ -10,15 +10,14 @@ import base64
 from collections.abc import Mapping
 from typing import Any, Final
 
-from epypes.display.markup import content, cut, escape, fitted
+from epypes.display.markup import content, cut, escape, fitted, written_length
 from epypes.display.previews.imagekinds import is_image
 from epypes.display.previews.preview import sketch
-from epypes.display.previews.ranges import kept_range
-from epypes.display.previews.raster import encode_image
 from epypes.display.previews.shown import Look
 from epypes.errors import NotComputed
 from epypes.graph import colour_order
 from epypes.run import Run
+from epypes_widgets.pictures import picture_of
 from epypes_widgets.values import differing, said
 
 # In a page a picture is a third longer. Together with 40 rows of 420 characters it stays below 120 kB.
@@ -56,11 +55,13 @@ def static_html(
     image
         The title of the image that it was computed on; may be empty.
     code
-        The equivalent code line; may be empty.
+        The equivalent code line; may be empty, and is left out if it is very long.
     """
     on = f" of {cut(image, _NAME_CHARACTERS)}" if image else ""
     picture = _shown(run, token, on) if token is not None else ""
-    line = f'<pre style="white-space:pre-wrap">{content(fitted(code, _TEXT_ROOM))}</pre>' if code else ""
+    # Half a line of code is worse than none: the table has the values.
+    is_told = code and written_length(code) <= _TEXT_ROOM
+    line = f'<pre style="white-space:pre-wrap">{content(code)}</pre>' if is_told else ""
     return f'<figure class="epypes-static" style="margin:0">{picture}{_table(values, defaults)}{line}</figure>'
 
 
@@ -73,8 +74,7 @@ def _shown(run: Run, token: str, on: str) -> str:
     if not is_image(value):
         look = Look(colour_order(run.cg, token))
         return _caption(f"{name}{on}: {sketch(value, look).shown.detail}")
-    ends = kept_range(run.tokens.program, token, value)
-    picture = encode_image(value, _PICTURE_SIDE_PX, colour_order(run.cg, token), ends, _PICTURE_BYTES)
+    picture = picture_of(run, token, value, _PICTURE_SIDE_PX, _PICTURE_BYTES)
     about = f"{name}{on}, {' x '.join(map(str, value.shape))} {value.dtype}"
     data = base64.b64encode(picture.data).decode()
     return (
