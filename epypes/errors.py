@@ -19,6 +19,7 @@ Everything an error's text mentions is an attribute of it::
     +-- ImageFileError          an image file can't be read or written; .path
     +-- MessageError            a message can't be made or understood; .reason
     +-- AddressError            an address can't be bound or connected to; .address
+    +-- SettingsError           settings of hyperparameters can't be written or read; .path, .reasons
     +-- BundleError             a bundle is not what it says; .path
     |   +-- PromotionRefused    a graph can't become a bundle; .reasons
     |   +-- ReplayDiffers       a bundle computes something else; .report
@@ -235,6 +236,15 @@ class AddressError(EpypesError, OSError):
     def __init__(self, address: str, text: str) -> None:
         self.address = address
         super().__init__(text)
+
+
+class SettingsError(EpypesError):
+    """Settings of hyperparameters that can't be written to a file or read from one; ``reasons`` lists all of them."""
+
+    def __init__(self, path: object, reasons: Sequence[str]) -> None:
+        self.path, self.reasons = str(path), tuple(reasons)
+        listed = "".join(f"\n- {reason}" for reason in self.reasons)
+        super().__init__(self.reasons[0] if len(self.reasons) == 1 else f"{path}:{listed}")
 
 
 class BundleError(EpypesError):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from epypes.bundle.entries import fits, plain, read, written
 from epypes.errors import BundleError
 from epypes.graph import CompGraph, annotated_params
 from epypes.hints import Param
@@ -57,7 +58,7 @@ def unwritable(hyperparameters: Mapping[str, Any]) -> list[str]:
         f"Hyperparameter {token!r} is a {type(value).__name__}, which pipeline.toml can't hold. "
         "Use a number, string, bool, None, or a tuple or list of them; or unfreeze it and pass it to run()."
         for token, value in hyperparameters.items()
-        if not _fits(plain(value))
+        if not fits(plain(value))
     ]
 
 
@@ -66,22 +67,7 @@ def writable_defaults(cg: CompGraph, hyperparameters: Mapping[str, Any]) -> dict
 
     They may be missing: in the bundle every hyperparameter has a value. What an event brings has no default there.
     """
-    return {token: value for token, value in cg.defaults.items() if token in hyperparameters and _fits(plain(value))}
-
-
-def plain(value: Any) -> Any:
-    """Return a number of NumPy's as Python's own; whether that computes the same, the replay shows."""
-    is_number = type(value).__module__ == "numpy" and getattr(value, "shape", None) == ()
-    return value.item() if is_number else value
-
-
-def _fits(value: Any) -> bool:
-    if type(value) in (tuple, list):
-        # One kind per table entry: what is inside a sequence keeps its type only if TOML has it.
-        return all(type(item) in (bool, int, float, str) and _fits(item) for item in value)
-    if type(value) is int:
-        return -(2**63) <= value < 2**63
-    return value is None or type(value) in (bool, float, str)
+    return {token: value for token, value in cg.defaults.items() if token in hyperparameters and fits(plain(value))}
 
 
 def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
@@ -125,17 +111,13 @@ def _entry(value: Any, hint: Param | None) -> Any:
     import tomlkit
 
     table = tomlkit.table()
-    if value is None:
-        table.add("kind", "none")
-    else:
-        table.add("value", list(value) if isinstance(value, tuple) else value)
-        if isinstance(value, tuple):
-            table.add("kind", "tuple")
+    for key, part in written(value).items():
+        table.add(key, part)
     for key in ("low", "high", "step", "odd", "log", "unit"):
         setting = getattr(hint, key, None)
         if setting:
             table.add(key, setting)
-    if hint and hint.choices and all(_fits(choice) and choice is not None for choice in hint.choices):
+    if hint and hint.choices and all(fits(choice) and choice is not None for choice in hint.choices):
         table.add("choices", list(hint.choices))
     return table
 
@@ -177,10 +159,4 @@ def _strings(values: Sequence[Any]) -> tuple[str, ...]:
 
 
 def _values(entries: Mapping[str, Any]) -> dict[str, Any]:
-    return {token: _value(entry) for token, entry in entries.items()}
-
-
-def _value(entry: Mapping[str, Any]) -> Any:
-    if entry.get("kind") == "none":
-        return None
-    return tuple(entry["value"]) if entry.get("kind") == "tuple" else entry["value"]
+    return {token: read(entry) for token, entry in entries.items()}

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display.previews.imagekinds import image_kind, is_image, is_mask, one_channel, sampled
@@ -56,14 +56,18 @@ class Picture:
         Its size, in pixels.
     """
 
-    data: bytes
+    data: bytes = field(repr=False)
     media_type: str
     width: int
     height: int
 
 
 def encode_image(
-    array: Array, max_side_px: int | None = None, order: Order = "bgr", ends: Range | None = None
+    array: Array,
+    max_side_px: int | None = None,
+    order: Order = "bgr",
+    ends: Range | None = None,
+    most_bytes: int | None = None,
 ) -> Picture:
     """Encode an image: masks as 1-bit PNG without loss, labels as PNG with a palette, all others as JPEG.
 
@@ -79,13 +83,16 @@ def encode_image(
         ``"bgr"`` or ``"rgb"``: what three and four channels are.
     ends
         The values that are shown black and white; None takes those of ``display_range``.
+    most_bytes
+        The size of the file at most: at a lower quality if need be, then smaller. None for as many as it takes.
     """
     with silent_numpy():
         sample = sampled(array)
         kind = image_kind(array, sample)
         if kind == "mask" and sample is not array and not is_mask(one_channel(array)):
             kind = "photograph"
-        return _save(pillow_image(array, max_side_px, order, ends, kind))
+        picture = pillow_image(array, max_side_px, order, ends, kind)
+        return _save(picture) if most_bytes is None else encode_small(picture, most_bytes)
 
 
 def pillow_image(array: Array, max_side_px: int | None, order: Order, ends: Range | None, kind: str) -> Image.Image:

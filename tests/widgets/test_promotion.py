@@ -1,0 +1,242 @@
+"""Does the Promote button write a bundle that proves itself, and say what it did or why it did not?"""
+
+from __future__ import annotations
+
+import logging
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import epypes as ep
+from epypes_widgets.promotion import Outcome, Promotion, proposal
+from tests.bundle.test_slicer import notebook
+
+TIMEOUT_S = 60.0
+
+_CELL = """\
+def loud(image, gain):
+    print("brightening")
+    print("a warning", file=__import__("sys").stderr)
+    return image * gain
+"""
+
+
+class Told:
+    """Keeps what a promotion reports, and on which thread."""
+
+    def __init__(self) -> None:
+        self.outcomes: list[Outcome] = []
+        self.threads: list[threading.Thread] = []
+        self.promotion = Promotion(self._arrives)
+
+    def _arrives(self, outcome: Outcome) -> None:
+        self.outcomes.append(outcome)
+        self.threads.append(threading.current_thread())
+
+    def promoted(self, runner: ep.CompGraphRunner, to: object, outputs: Any = None) -> Outcome:
+        assert self.promotion.start(runner, str(to), outputs)
+        outcome = self.promotion.wait(TIMEOUT_S)
+        assert outcome is self.outcomes[-1]
+        return outcome
+
+
+@pytest.fixture
+def told() -> Told:
+    return Told()
+
+
+@pytest.fixture
+def edges(photograph: Any) -> ep.CompGraphRunner:
+    """Of OpenCV's own functions, which a bundle can have."""
+    cg = ep.CompGraph(
+        {"smooth": cv2.medianBlur, "canny": cv2.Canny},
+        {"smooth": (("image", "side"), "smoothed"), "canny": (("smoothed", "lo", "hi"), "edges")},
+    )
+    runner = ep.CompGraphRunner(cg, {"side": 5, "lo": 70, "hi": 200})
+    runner.run(image=photograph)
+    return runner
+
+
+def runner_of(function: Callable[..., Any], *inputs: str, **hparams: Any) -> ep.CompGraphRunner:
+    return ep.CompGraphRunner(ep.CompGraph({"f": function}, {"f": (inputs, "y")}), hparams)
+
+
+def test_a_bundle_is_written_and_said_to_be_identical(told: Told, edges: ep.CompGraphRunner, tmp_path: Path) -> None:
+    target = tmp_path / "edges"
+    outcome = told.promoted(edges, target, ["edges"])
+    assert outcome == Outcome(
+        "done", f"Promoted to {target}: output edges; 1 sample replayed in a fresh process, identical.", str(target)
+    )
+    assert [each.state for each in told.outcomes] == ["running", "done"]
+    assert told.threads[0] is threading.current_thread() is not told.threads[1]
+    assert told.threads[1].daemon
+    assert ep.load(target).hyperparameters == edges.hyperparameters
+    assert not told.promotion.is_running
+
+
+def test_a_runner_of_which_only_a_stage_was_run_is_completed(
+    told: Told, edges: ep.CompGraphRunner, tmp_path: Path, photograph: Any
+) -> None:
+    edges["side"] = 7
+    partial = edges.rerun("smoothed")
+    assert edges.stale == ("canny",)
+    outcome = told.promoted(edges, tmp_path / "b", ["smoothed", "edges"])
+    assert (outcome.state, "outputs smoothed and edges" in outcome.text) == ("done", True)
+    assert edges.last is partial, "what cells read is left alone"
+    served = ep.load(tmp_path / "b").run(image=photograph)
+    np.testing.assert_array_equal(served["edges"], edges.rerun()["edges"])
+
+
+def test_a_value_that_was_set_and_not_run_is_promoted(told: Told, edges: ep.CompGraphRunner, tmp_path: Path) -> None:
+    edges["lo"] = 10
+    assert told.promoted(edges, tmp_path / "b").state == "done"
+    assert ep.load(tmp_path / "b").hyperparameters["lo"] == 10
+
+
+def test_a_runner_that_has_not_been_run_is_refused(told: Told, tmp_path: Path) -> None:
+    outcome = told.promoted(runner_of(cv2.medianBlur, "image", "side", side=3), tmp_path / "b")
+    assert outcome.state == "refused"
+    assert outcome.text.startswith("Not promoted:\n- Nothing has been run")
+    assert not (tmp_path / "b").exists()
+
+
+def test_every_reason_is_said(told: Told, tmp_path: Path) -> None:
+    runner = runner_of(lambda x, k, m: x, "x", "k", "m", k=np.ones(3), m=len)
+    runner.run(x=1)
+    outcome = told.promoted(runner, tmp_path / "b")
+    assert outcome.state == "refused"
+    assert "Hyperparameter 'k' is a ndarray" in outcome.text
+    assert "Hyperparameter 'm'" in outcome.text
+
+
+@pytest.mark.parametrize("error", [ValueError("13 is bad"), SystemExit(3), KeyboardInterrupt()])
+def test_a_function_that_fails_is_a_refusal_that_names_it(told: Told, tmp_path: Path, error: BaseException) -> None:
+    fails = [False]
+
+    def moody(x: int) -> int:
+        if fails[0]:
+            raise error
+        return x
+
+    runner = runner_of(moody, "x")
+    runner.run(x=1)
+    fails[0] = True
+    outcome = told.promoted(runner, tmp_path / "b")
+    assert outcome.state == "refused"
+    assert type(error).__name__ in outcome.text
+    assert "'f'" in outcome.text, "the note names the function"
+
+
+@pytest.mark.parametrize("outputs", [["edgs"], [], "edges", [3]])
+def test_outputs_that_are_none_are_refused(told: Told, edges: ep.CompGraphRunner, tmp_path: Path, outputs: Any) -> None:
+    outcome = told.promoted(edges, tmp_path / "b", outputs)
+    assert outcome.state == "refused"
+    assert outcome.text.startswith("Not promoted:")
+    assert not (tmp_path / "b").exists()
+
+
+def test_a_folder_that_can_not_be_is_refused(told: Told, edges: ep.CompGraphRunner, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").touch()
+    for to in (tmp_path / "mine", "", "  ", "a\0b", "~nobody-of-this-name/x"):
+        outcome = told.promoted(edges, to)
+        assert (outcome.state, outcome.to) == ("refused", str(to))
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.tex"]
+
+
+def test_one_promotion_runs_at_a_time(told: Told, tmp_path: Path) -> None:
+    begun, go_on = threading.Event(), threading.Event()
+    go_on.set()
+
+    def slow(x: int) -> int:
+        begun.set()
+        go_on.wait(TIMEOUT_S)
+        return x
+
+    runner = runner_of(slow, "x")
+    runner.run(x=1)
+    go_on.clear()
+    begun.clear()
+    assert told.promotion.start(runner, str(tmp_path / "a"))
+    assert begun.wait(TIMEOUT_S)
+    assert told.promotion.is_running
+    assert not told.promotion.start(runner, str(tmp_path / "b"))
+    assert [outcome.to for outcome in told.outcomes] == [str(tmp_path / "a")]
+    with pytest.raises(TimeoutError, match="did not end within"):
+        told.promotion.wait(0.01)
+    go_on.set()
+    told.promotion.wait(TIMEOUT_S)
+    assert told.promotion.start(runner, str(tmp_path / "b")), "after it the next may begin"
+    told.promotion.wait(TIMEOUT_S)
+
+
+def test_what_a_function_prints_is_kept_and_printed_nowhere(
+    told: Told, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    runner = runner_of(notebook(_CELL)["loud"], "image", "gain", gain=2)
+    runner.run(image=3)
+    capsys.readouterr()
+    before = sys.stdout, sys.stderr
+    with caplog.at_level(logging.INFO):
+        outcome = told.promoted(runner, tmp_path / "b")
+    assert outcome.state == "done"
+    assert outcome.printed == "brightening\na warning\n"
+    assert "brightening" in caplog.text
+    assert capsys.readouterr() == ("", "")
+    assert (sys.stdout, sys.stderr) == before
+
+
+def test_what_other_threads_print_meanwhile_arrives(
+    told: Told, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begun, go_on = threading.Event(), threading.Event()
+    go_on.set()
+
+    def slow(x: int) -> int:
+        begun.set()
+        go_on.wait(TIMEOUT_S)
+        sys.stdout.write("of the function\n")
+        return x
+
+    runner = runner_of(slow, "x")
+    runner.run(x=1)
+    capsys.readouterr()
+    go_on.clear()
+    begun.clear()
+    told.promotion.start(runner, str(tmp_path / "b"))
+    assert begun.wait(TIMEOUT_S)
+    sys.stdout.write("of the cell\n")
+    kept_by_somebody = sys.stdout
+    go_on.set()
+    outcome = told.promotion.wait(TIMEOUT_S)
+    assert outcome is not None
+    assert outcome.printed == "of the function\n"
+    kept_by_somebody.write("later\n")
+    assert capsys.readouterr().out == "of the cell\nlater\n"
+
+
+def test_a_report_that_fails_ends_nothing(edges: ep.CompGraphRunner, tmp_path: Path) -> None:
+    def broken(_outcome: Outcome) -> None:
+        raise RuntimeError("the view is gone")
+
+    promotion = Promotion(broken)
+    assert promotion.wait(0.0) is None
+    assert promotion.start(edges, str(tmp_path / "b"))
+    outcome = promotion.wait(TIMEOUT_S)
+    assert outcome is not None
+    assert outcome.state == "done"
+
+
+@pytest.mark.parametrize(
+    ("token", "folder"),
+    [("edges", "services/edges"), ("a/b c", "services/a-b-c"), ("..", "services/graph"), ("", "services/graph"),
+     (None, "services/graph"), ("größe", "services/größe"), ("x" * 500, "services/" + "x" * 60)],
+)  # fmt: skip
+def test_a_folder_is_proposed_for_any_token(token: str | None, folder: str) -> None:
+    assert proposal(token) == folder

@@ -1,0 +1,224 @@
+"""Which values has the hand stopped at, and how does it get back to them?"""
+
+from __future__ import annotations
+
+import copy
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final
+from weakref import WeakKeyDictionary
+
+from epypes.display import Picture
+from epypes.run import CompGraphRunner
+from epypes_widgets.values import differing, said_change
+
+if TYPE_CHECKING:
+    from epypes_widgets.historyframe import HistoryFrame
+
+_KEPT: Final = 1_000
+_histories: WeakKeyDictionary[CompGraphRunner, History] = WeakKeyDictionary()
+_lock = threading.Lock()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Entry:
+    """Values that were committed; entries are told apart by identity, since values may be arrays.
+
+    Attributes
+    ----------
+    number
+        From 1, rising.
+    values
+        By hyperparameter; read-only.
+    at
+        When, to the second, with the time zone of this machine.
+    token
+        The token that was shown; None if none was.
+    picture
+        Its thumbnail, or None.
+    compute_ms
+        How long the run took; None if it is not known.
+    label
+        A word of the user's or the panel's on it; may be empty.
+    image
+        Which of the panel's images it was computed on, from 0; None if it has no list of them.
+    """
+
+    number: int
+    values: Mapping[str, Any]
+    at: datetime
+    token: str | None = None
+    picture: Picture | None = field(default=None, repr=False)
+    compute_ms: float | None = None
+    label: str = ""
+    image: int | None = None
+
+
+class History:
+    """The committed values of a runner, in the order in which they were committed; may be used from any thread.
+
+    Undo and redo walk along a path. A commit after an undo cuts off the path ahead; the entries that were on it stay
+    in ``entries`` and can be gone to.
+
+    Parameters
+    ----------
+    limit
+        How many entries are kept; the oldest are dropped.
+
+    Examples
+    --------
+    >>> history = History()
+    >>> for threshold in (70, 70, 90):
+    ...     entry = history.commit({"threshold": threshold})
+    >>> len(history), history.can_undo
+    (2, True)
+    >>> dict(history.undo().values)
+    {'threshold': 70}
+    """
+
+    def __init__(self, limit: int = _KEPT) -> None:
+        if type(limit) is not int or limit < 1:
+            raise ValueError(f"limit is how many entries are kept, 1 or more, not {limit!r}.")
+        self.limit = limit
+        self._lock = threading.Lock()
+        self._entries: tuple[Entry, ...] = ()
+        self._path: tuple[Entry, ...] = ()
+        self._place = -1
+        self._committed = 0
+
+    def commit(
+        self,
+        values: Mapping[str, Any],
+        *,
+        token: str | None = None,
+        picture: Picture | None = None,
+        compute_ms: float | None = None,
+        label: str = "",
+        image: int | None = None,
+    ) -> Entry | None:
+        """Add an entry and make it the current one; the parameters are what ``Entry`` has.
+
+        Returns
+        -------
+        Entry or None
+            None if values and image are those of the current entry: nothing is added then.
+        """
+        with self._lock:
+            if _is_at(self._current(), values, image):
+                return None
+            kept = MappingProxyType({name: _kept(value) for name, value in values.items()})
+            self._committed += 1
+            now = datetime.now().astimezone().replace(microsecond=0)
+            entry = Entry(self._committed, kept, now, token, picture, compute_ms, label, image)
+            self._entries = (*self._entries, entry)[-self.limit :]
+            oldest = self._entries[0].number
+            walked = self._path[: self._place + 1]
+            self._path = (*(old for old in walked if old.number >= oldest), entry)
+            self._place = len(self._path) - 1
+            return entry
+
+    def undo(self) -> Entry | None:
+        """Go one entry back and return it; None if there is none."""
+        return self._step(-1)
+
+    def redo(self) -> Entry | None:
+        """Go one entry on and return it; None if there is none."""
+        return self._step(1)
+
+    def goto(self, number: int) -> Entry:
+        """Go to an entry and return it. One that is no longer on the path becomes its end.
+
+        Raises
+        ------
+        LookupError
+            There is none of this number.
+        """
+        with self._lock:
+            entry = next((entry for entry in self._entries if entry.number == number), None)
+            if entry is None:
+                raise LookupError(f"No entry {number!r} in this history. {self._range()}")
+            if entry not in self._path:
+                self._path = (*self._path[: self._place + 1], entry)
+            self._place = self._path.index(entry)
+            return entry
+
+    @property
+    def current(self) -> Entry | None:
+        """The entry that was committed or gone to last; None before the first."""
+        with self._lock:
+            return self._current()
+
+    @property
+    def can_undo(self) -> bool:
+        """Whether there is an entry to go back to."""
+        return self._place > 0
+
+    @property
+    def can_redo(self) -> bool:
+        """Whether there is an entry to go on to."""
+        with self._lock:
+            return self._place < len(self._path) - 1
+
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        """All entries that are kept, the oldest first, wherever undo and redo lead."""
+        return self._entries
+
+    def to_frame(self) -> HistoryFrame:
+        """Return a pandas table by number that shows its thumbnails in a notebook.
+
+        Its columns are the hyperparameters, then at, token, image, compute_ms, label and picture; if a hyperparameter
+        is called like one of these, the latter has an underscore after its name.
+        """
+        from epypes_widgets.historyframe import frame_of
+
+        return frame_of(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __repr__(self) -> str:
+        count, current = len(self._entries), self.current
+        at = f"; at {current.number}" if current is not None else ""
+        return f"<History: {count} entr{'y' if count == 1 else 'ies'}{at}>"
+
+    def _current(self) -> Entry | None:
+        return self._path[self._place] if self._path else None
+
+    def _step(self, by: int) -> Entry | None:
+        with self._lock:
+            if not 0 <= self._place + by < len(self._path):
+                return None
+            self._place += by
+            return self._path[self._place]
+
+    def _range(self) -> str:
+        if not self._entries:
+            return "It is empty."
+        return f"It has {self._entries[0].number} to {self._entries[-1].number}."
+
+
+def history_of(runner: CompGraphRunner) -> History:
+    """Return the history of a runner: the same for all its panels, so that a cell that runs again goes on with it."""
+    with _lock:
+        return _histories.setdefault(runner, History())
+
+
+def changed(before: Entry | None, after: Entry) -> str:
+    """Return what an entry has changed, as ``"canny_lo 70 -> 90, blur 3 -> 5"``; empty for the first."""
+    if before is None:
+        return ""
+    moved = f"image {before.image} -> {after.image}" if before.image != after.image else ""
+    return ", ".join(filter(None, (said_change(before.values, after.values), moved)))
+
+
+def _is_at(current: Entry | None, values: Mapping[str, Any], image: int | None) -> bool:
+    return current is not None and current.image == image and not differing(current.values, values)
+
+
+def _kept(value: Any) -> Any:
+    """Return a list or dict as a copy, which the user does not write to later."""
+    return copy.copy(value) if type(value) in (list, dict, set) else value
