@@ -12,10 +12,9 @@ import ipywidgets
 
 from epypes.errors import NotComputed, PayloadError, UnknownName, run_call
 from epypes.run import CompGraphRunner, Run
-from epypes_widgets.controls import Control, control, grouped
+from epypes_widgets.controls import Control, column, controls
 from epypes_widgets.frames import best_token, make_frame, showable
 from epypes_widgets.picture import PictureView
-from epypes_widgets.ranges import ranges
 from epypes_widgets.worker import Worker
 
 
@@ -70,9 +69,7 @@ def tune(runner: CompGraphRunner, /, *, token: str | None = None, **hints: Any) 
         raise PayloadError(free, text)
     if token is not None:
         runner.cg.require_token(token)
-    params = ranges(runner, hints)
-    values = runner.hyperparameters
-    return Panel(runner, {name: control(name, values[name], param) for name, param in params.items()}, token)
+    return Panel(runner, controls(runner, hints), token)
 
 
 class Panel:
@@ -87,27 +84,28 @@ class Panel:
     runner
         Is run by the panel.
     controls
-        By hyperparameter, in the order in which they are listed.
+        Of its hyperparameters, in the order in which they are listed.
     token
         The token to show first; None for the best one.
     """
 
-    def __init__(self, runner: CompGraphRunner, controls: Mapping[str, Control], token: str | None) -> None:
+    def __init__(self, runner: CompGraphRunner, controls: tuple[Control, ...], token: str | None) -> None:
         self._runner = runner
-        self._controls = dict(controls)
-        self._initial = {name: entry.read() for name, entry in controls.items()}
+        self._controls = {name: entry for entry in controls for name in entry.names}
+        self._initial = self.values
         self._asked = token
         self._seq = count(1).__next__
         self._moving = threading.RLock()
-        self._is_writing = False
         self._result: Run | None = None
         self._failed: set[str] = set()
         self._worker = Worker(self._compute)
         self._view = PictureView(lambda: self._worker.idle)
         self._tokens = ipywidgets.ToggleButtons(options=[], style={"button_width": "auto"})
-        column, self._headings = grouped(runner.cg, controls)
-        self._widget = _laid_out(self._tokens, column, self._view)
-        for entry in controls.values():
+        listed = column(runner.cg, controls)
+        folders = zip(listed.folders, listed.widget.children[1:], strict=True)
+        self._headings = {folder["function"]: box.children[0] for folder, box in folders}
+        self._widget = _laid_out(self._tokens, listed.widget, self._view)
+        for entry in controls:
             entry.on_change(self._moved)
         self._tokens.observe(self._chosen, names="value")
         self._begin()
@@ -122,7 +120,7 @@ class Panel:
     @property
     def values(self) -> dict[str, Any]:
         """The values that the controls are at, by hyperparameter."""
-        return {name: entry.read() for name, entry in self._controls.items()}
+        return {name: entry.read()[name] for name, entry in self._controls.items()}
 
     @property
     def token(self) -> str | None:
@@ -178,21 +176,15 @@ class Panel:
         self._worker.close(timeout_s)
 
     def __getitem__(self, name: str) -> Any:
-        return self._control(name).read()
+        return self._control(name).read()[name]
 
     def __setitem__(self, name: str, value: Any) -> None:
         entry = self._control(name)
         if self._worker.closed:
             raise RuntimeError("This panel is closed. Make a new one: tune(runner).")
         with self._moving:
-            # A widget tells of what is written to it, unless it shows the same as before (a label, a slider between its
-            # steps); so it is not listened to, and the value is submitted here, once.
-            self._is_writing = True
-            try:
-                entry.write(value)
-            finally:
-                self._is_writing = False
-            self._moved(name, value)
+            entry.write({name: value})
+            self._moved({name: value})
 
     def __repr__(self) -> str:
         state = "closed" if self._worker.closed else "failed" if self._view.error else "up to date"
@@ -211,11 +203,10 @@ class Panel:
             raise UnknownName("hyperparameter", name, self._controls, "of this panel")
         return self._controls[name]
 
-    def _moved(self, name: str, _value: Any) -> None:
+    def _moved(self, values: Mapping[str, Any]) -> None:
         # Read and submitted in one step, so that of two threads the one whose value stands submits last.
         with self._moving:
-            if not self._is_writing:
-                self._worker.submit({name: self._controls[name].read()})
+            self._worker.submit({name: self._controls[name].read()[name] for name in values})
 
     def _chosen(self, _change: object) -> None:
         self._worker.submit({})
