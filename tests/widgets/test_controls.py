@@ -12,9 +12,10 @@ import pytest
 
 import epypes as ep
 from epypes.errors import UnknownName
-from epypes.hints import as_param
-from epypes_widgets.controls import Control, column, controls
+from epypes.hints import Roi, as_param
+from epypes_widgets.controls import Control, controls
 from epypes_widgets.ranges import ranges
+from tests.widgets.making import at
 
 
 class Mode(enum.Enum):
@@ -22,18 +23,12 @@ class Mode(enum.Enum):
     EXACT = 2
 
 
-def made(value: Any, hint: Any = None, function: Any = None) -> Any:
+def made(value: Any, hint: Any = None, function: Any = None) -> Control:
     """Return the control of a hyperparameter x with this value."""
     cg = ep.CompGraph({"f": function or (lambda x: x)}, {"f": ("x", "y")})
     runner = ep.CompGraphRunner(cg, {"x": value})
     (entry,) = controls(runner, {} if hint is None else {"x": hint})
     return entry
-
-
-def at(entry: Control) -> Any:
-    """Return the value of the one hyperparameter of a control."""
-    (value,) = entry.read().values()
-    return value
 
 
 @pytest.mark.parametrize(
@@ -56,7 +51,7 @@ def at(entry: Control) -> Any:
         (float("inf"), None, ipywidgets.Label),
         (float("nan"), None, ipywidgets.Label),
         ((1, 2), None, ipywidgets.Label),
-        (np.zeros((3, 3)), None, ipywidgets.Label),
+        ((1, 2, 3, 4), Roi(), ipywidgets.Label),
     ],
 )
 def test_the_hint_or_the_value_says_which_control(value: Any, hint: Any, kind: type) -> None:

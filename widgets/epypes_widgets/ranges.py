@@ -130,5 +130,5 @@ def _is_number(value: Any) -> bool:
     real = isinstance(value, numbers.Real) and not isinstance(value, bool)
     try:
         return real and math.isfinite(float(value))
-    except OverflowError:
+    except (OverflowError, TypeError):  # 10**400, or a duration of NumPy
         return False

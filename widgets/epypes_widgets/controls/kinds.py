@@ -39,6 +39,11 @@ def limits(value: Any) -> tuple[float, float]:
     return float(ends.min), float(ends.max)
 
 
+def plain(number: Any) -> Any:
+    """Return a number of NumPy as Python's, any other as it is: NumPy's overflow when compared with greater ones."""
+    return number.item() if kept_type(number) is not None else number
+
+
 def is_number(value: Any) -> bool:
     """Whether a value is a real, finite number that a float can be near to; truth values are none."""
     if not isinstance(value, numbers.Real) or isinstance(value, bool):

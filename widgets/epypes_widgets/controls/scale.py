@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from epypes.display.previews.short import short_repr
 from epypes.hints import Param
-from epypes_widgets.controls.kinds import is_integer, is_number, like, limits
+from epypes_widgets.controls.kinds import is_integer, is_number, like, limits, plain
 from epypes_widgets.ranges import allows, described
 
 # A browser's numbers are floats: whole ones beyond this can't be told from their neighbours.
@@ -77,7 +77,7 @@ class Scale:
         if self.integer and value != int(value):
             way_out = f"Give tune() a range of floats for it, as ({self.bottom:.1f}, {self.top:.1f})."
             raise ValueError(f"{self.name!r} takes whole numbers, not {short_repr(value)}. {way_out}")
-        number = int(value) if self.integer else value
+        number = int(value) if self.integer else plain(value)
         if not allows(self.param, number):
             raise refused(self.name, value, self.param)
         least, greatest = limits(self.first)
@@ -101,7 +101,7 @@ class Scale:
 
 def scale(name: str, value: Any, param: Param) -> Scale | None:
     """Return the scale of a hyperparameter; None if there is nothing to be moved, or no slider could do it."""
-    if param.choices is not None or not is_number(value) or not allows(param, value):
+    if param.choices is not None or not is_number(value) or not allows(param, plain(value)):
         return None
     whole = all(end is None or is_integer(end) for end in (param.low, param.high, param.step))
     integer = param.odd or (is_integer(value) and whole)
