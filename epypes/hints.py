@@ -7,6 +7,7 @@ annotation: ``Annotated[int, Param(1, 31, odd=True)]``.
 from __future__ import annotations
 
 import enum
+import numbers
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args, get_origin
@@ -34,6 +35,14 @@ class Param:
         For the label, as ``"px"``.
     soft
         A narrower range that is offered first.
+    labels
+        The names of the choices, as many as there are choices.
+    below
+        A token whose value this one never exceeds: both get one slider with two ends.
+    cuts
+        The token with whose values this one is compared.
+    about
+        What it does, in one sentence.
 
     Raises
     ------
@@ -54,6 +63,10 @@ class Param:
     choices: tuple[Any, ...] | None = None
     unit: str = ""
     soft: tuple[float, float] | None = None
+    labels: tuple[str, ...] | None = None
+    below: str = ""
+    cuts: str = ""
+    about: str = ""
 
     def __post_init__(self) -> None:
         if self.choices is not None:
@@ -80,7 +93,34 @@ class Param:
         return not self.odd or value % 2 == 1
 
 
-def as_param(hint: Any) -> Param | None:
+@dataclass(frozen=True, slots=True)
+class Roi:
+    """A rectangle of a picture: the value is (x, y, width, height), whole pixels.
+
+    Attributes
+    ----------
+    on
+        The token of the picture; empty for the first image among the inputs of the function that takes the rectangle.
+    """
+
+    on: str = ""
+
+    def allows(self, value: Any) -> bool:
+        """Whether a value is four whole numbers that are not negative."""
+        whole = isinstance(value, tuple | list) and len(value) == 4
+        return whole and all(isinstance(side, numbers.Integral) and int(side) >= 0 for side in value)
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """Any text."""
+
+    def allows(self, value: Any) -> bool:
+        """Whether a value is a text."""
+        return isinstance(value, str)
+
+
+def as_param(hint: Any) -> Param | Roi | None:
     """Read a hint: a Param, a tuple as a range (low, high[, step]), a list as choices; None if it is neither.
 
     Examples
@@ -90,7 +130,7 @@ def as_param(hint: Any) -> Param | None:
     >>> as_param(["canny", "sobel"]).choices
     ('canny', 'sobel')
     """
-    if isinstance(hint, Param):
+    if isinstance(hint, Param | Roi):
         return hint
     if isinstance(hint, tuple) and len(hint) in (2, 3) and all(isinstance(end, int | float) for end in hint):
         return Param(*hint)

@@ -12,9 +12,10 @@ import pytest
 
 import epypes as ep
 from epypes.errors import UnknownName
-from epypes.hints import as_param
-from epypes_widgets.controls import control
+from epypes.hints import Roi, as_param
+from epypes_widgets.controls import Control, controls
 from epypes_widgets.ranges import ranges
+from tests.widgets.making import at
 
 
 class Mode(enum.Enum):
@@ -22,11 +23,12 @@ class Mode(enum.Enum):
     EXACT = 2
 
 
-def made(value: Any, hint: Any = None, function: Any = None) -> Any:
+def made(value: Any, hint: Any = None, function: Any = None) -> Control:
     """Return the control of a hyperparameter x with this value."""
     cg = ep.CompGraph({"f": function or (lambda x: x)}, {"f": ("x", "y")})
     runner = ep.CompGraphRunner(cg, {"x": value})
-    return control("x", value, ranges(runner, {} if hint is None else {"x": hint})["x"])
+    (entry,) = controls(runner, {} if hint is None else {"x": hint})
+    return entry
 
 
 @pytest.mark.parametrize(
@@ -45,17 +47,17 @@ def made(value: Any, hint: Any = None, function: Any = None) -> Any:
         (Mode.FAST, None, ipywidgets.Dropdown),
         (True, None, ipywidgets.Checkbox),
         (None, None, ipywidgets.Label),
-        ("text", None, ipywidgets.Label),
+        ("text", None, ipywidgets.Text),
         (float("inf"), None, ipywidgets.Label),
         (float("nan"), None, ipywidgets.Label),
         ((1, 2), None, ipywidgets.Label),
-        (np.zeros((3, 3)), None, ipywidgets.Label),
+        ((1, 2, 3, 4), Roi(), ipywidgets.Label),
     ],
 )
 def test_the_hint_or_the_value_says_which_control(value: Any, hint: Any, kind: type) -> None:
     entry = made(value, hint)
     assert isinstance(entry.widget, kind)
-    assert entry.read() is value or entry.read() == value
+    assert at(entry) is value or at(entry) == value
 
 
 @pytest.mark.parametrize(
@@ -74,7 +76,7 @@ def test_the_annotation_says_it_where_there_is_no_hint(annotation: Any, kind: ty
     function.__annotations__["x"] = annotation
     entry = made(3, function=function)
     assert isinstance(entry.widget, kind)
-    assert entry.read() == 3
+    assert at(entry) == 3
 
 
 def test_an_annotation_that_does_not_fit_the_value_gives_way_to_it() -> None:
@@ -86,12 +88,13 @@ def test_an_annotation_that_does_not_fit_the_value_gives_way_to_it() -> None:
 
 
 def test_a_slider_of_odd_integers_has_odd_ends_and_takes_no_even_one() -> None:
-    slider = made(11, ep.Param(0, 30, odd=True)).widget
+    entry = made(11, ep.Param(0, 30, odd=True))
+    slider = entry.widget
     assert (slider.min, slider.max, slider.step, slider.continuous_update) == (1, 29, 2, True)
-    slider.value = 14
-    assert slider.value == 15
-    slider.value = 99
-    assert slider.value == 29
+    entry.widget.value = 14
+    assert at(entry) == 15
+    entry.widget.value = 99
+    assert at(entry) == 29
 
 
 def test_a_value_that_is_not_negative_never_gets_a_negative_range() -> None:
@@ -101,28 +104,26 @@ def test_a_value_that_is_not_negative_never_gets_a_negative_range() -> None:
 
 @pytest.mark.parametrize(("value", "new"), [(None, 1), ("a", "b"), (Mode.FAST, Mode.EXACT), (True, False)])
 def test_choices_can_be_moved_from_code(value: Any, new: Any) -> None:
-    heard: list[tuple[str, Any]] = []
     entry = made(value, None if isinstance(value, bool | enum.Enum) else [value, new])
-    entry.on_change(lambda name, at: heard.append((name, at)))
-    entry.write(new)
-    assert (entry.read(), heard) == (new, [("x", new)])
+    entry.write({"x": new})
+    assert at(entry) is new
 
 
 def test_code_may_leave_the_soft_range_but_not_the_hard_one() -> None:
     entry = made(5, ep.Param(0, 100, soft=(0, 10)))
     assert entry.widget.max == 10
-    entry.write(60)
-    assert (entry.read(), entry.widget.max) == (60, 60)
+    entry.write({"x": 60})
+    assert (at(entry), entry.widget.max) == (60, 60)
     with pytest.raises(ValueError, match=r"can't be 101.*0 to 100"):
-        entry.write(101)
-    assert entry.read() == 60
+        entry.write({"x": 101})
+    assert at(entry) == 60
 
 
 def test_a_whole_number_stays_one_on_a_logarithmic_slider() -> None:
     entry = made(10, ep.Param(1, 1000, log=True))
-    entry.write(100)
-    assert entry.read() == 100
-    assert isinstance(entry.read(), int)
+    entry.write({"x": 100})
+    assert at(entry) == 100
+    assert isinstance(at(entry), int)
 
 
 def test_a_hint_for_no_hyperparameter_names_the_nearest(runner: ep.CompGraphRunner) -> None:
@@ -162,9 +163,9 @@ def test_a_slider_that_snaps_to_its_steps_when_it_is_shown_was_not_moved(
     value: Any, hint: Any, snapped: Any, moved: Any
 ) -> None:
     entry, told = made(value, hint), []
-    entry.on_change(lambda name, new: told.append(new))
+    entry.on_change(lambda values: told.append(values["x"]))
     entry.widget.value = snapped
-    assert entry.read() == value
+    assert at(entry) == value
     assert told == []
     entry.widget.value = moved
     assert told == [moved]
@@ -173,14 +174,14 @@ def test_a_slider_that_snaps_to_its_steps_when_it_is_shown_was_not_moved(
 def test_a_hand_on_a_float_slider_means_round_numbers() -> None:
     entry = made(0.5, (0.0, 1.0))
     entry.widget.value = 0.1 + 0.2
-    assert entry.read() == 0.3
+    assert at(entry) == 0.3
 
 
 def test_a_whole_number_is_not_cut_from_another() -> None:
     entry = made(3, (0, 10))
     with pytest.raises(ValueError, match=r"whole numbers, not 2\.5"):
-        entry.write(2.5)
-    assert entry.read() == 3
+        entry.write({"x": 2.5})
+    assert at(entry) == 3
 
 
 @pytest.mark.parametrize(
@@ -191,9 +192,9 @@ def test_a_value_half_way_between_two_steps_is_kept_too_and_the_hand_still_moves
     value: Any, hint: Any, snapped: Any, moved: Any
 ) -> None:
     entry, told = made(value, hint), []
-    entry.on_change(lambda name, new: told.append(new))
+    entry.on_change(lambda values: told.append(values["x"]))
     entry.widget.value = snapped
-    assert entry.read() == value
+    assert at(entry) == value
     entry.widget.value = moved
     assert told == [moved]
     entry.widget.value = snapped

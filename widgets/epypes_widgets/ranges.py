@@ -14,11 +14,11 @@ from typing import Any
 
 from epypes.errors import UnknownName
 from epypes.graph import CompGraph, annotated_params
-from epypes.hints import Param, as_param, param_from_value
+from epypes.hints import Param, Roi, Text, as_param, param_from_value
 from epypes.run import CompGraphRunner
 
 
-def ranges(runner: CompGraphRunner, hints: Mapping[str, Any]) -> dict[str, Param | None]:
+def ranges(runner: CompGraphRunner, hints: Mapping[str, Any]) -> dict[str, Param | Roi | Text | None]:
     """Return the range of every hyperparameter, in graph order; None for one that can only be shown.
 
     Parameters
@@ -43,13 +43,13 @@ def ranges(runner: CompGraphRunner, hints: Mapping[str, Any]) -> dict[str, Param
             raise UnknownName("hyperparameter", name, values, "of this runner")
     given = {name: _read(name, hint, values[name]) for name, hint in hints.items()}
     return {
-        token: closed(given.get(token) or _guess(runner.cg, token, values[token]), values[token])
+        token: _settled(given.get(token) or _guess(runner.cg, token, values[token]), values[token])
         for token in runner.cg.source_tokens
         if token in values
     }
 
 
-def allows(param: Param, value: Any) -> bool:
+def allows(param: Param | Roi | Text, value: Any) -> bool:
     """Whether a value is within a range; one that can't be compared is not."""
     try:
         return bool(param.allows(value))
@@ -57,13 +57,21 @@ def allows(param: Param, value: Any) -> bool:
         return False
 
 
-def described(param: Param) -> str:
+def described(param: Param | Roi | Text) -> str:
     """Return a range in words, as "odd 1 to 31" or "one of 'canny', 'sobel'"."""
+    if not isinstance(param, Param):
+        return "any text" if isinstance(param, Text) else "(x, y, width, height), whole and not negative"
     if param.choices is not None:
         return f"one of {', '.join(map(repr, param.choices))}"
     low = "below" if param.low is None else f"{param.low:g}"
     high = "above" if param.high is None else f"{param.high:g}"
     return f"{'odd ' * param.odd}{low} to {high}"
+
+
+def _settled(param: Param | Roi | None, value: Any) -> Param | Roi | Text | None:
+    if isinstance(value, str) and param is None:
+        return Text()
+    return closed(param, value) if isinstance(param, Param) else param
 
 
 def closed(param: Param | None, value: Any) -> Param | None:
@@ -88,7 +96,7 @@ def closed(param: Param | None, value: Any) -> Param | None:
     return replace(param, low=low, high=high)
 
 
-def _read(name: str, hint: Any, value: Any) -> Param:
+def _read(name: str, hint: Any, value: Any) -> Param | Roi:
     try:
         param = as_param(hint)
     except ValueError as error:
@@ -120,4 +128,7 @@ def _plain(value: Any) -> Any:
 
 def _is_number(value: Any) -> bool:
     real = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    return real and math.isfinite(float(value))
+    try:
+        return real and math.isfinite(float(value))
+    except (OverflowError, TypeError):  # 10**400, or a duration of NumPy
+        return False

@@ -1,0 +1,119 @@
+"""How do the controls stand below each other, and what does the page have to know of each?"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import ipywidgets
+from ipywidgets.widgets.widget_string import HTMLStyle, TextStyle
+
+from epypes.graph import CompGraph
+from epypes.hints import Param
+from epypes_widgets.controls.control import Control
+from epypes_widgets.controls.kinds import is_number
+from epypes_widgets.controls.look import sendable
+from epypes_widgets.frames import plain
+from epypes_widgets.tips import tip
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """All controls, in one folder per function.
+
+    Attributes
+    ----------
+    widget
+        What is seen: a filter box, then the folders.
+    rows
+        What the page has to know of each control, ready for JSON.
+    folders
+        The same of each folder.
+    """
+
+    widget: Any = field(repr=False)
+    rows: tuple[dict[str, Any], ...]
+    folders: tuple[dict[str, Any], ...]
+
+
+def column(cg: CompGraph, controls: Iterable[Control]) -> Column:
+    """Return controls in a column, each under the name of the function that takes its first token first."""
+    # One layout and one style for all: each would be a model of its own in the browser.
+    layout, heading_style = ipywidgets.Layout(), HTMLStyle()
+    boxes: list[Any] = [_filter(layout)]
+    rows: list[dict[str, Any]] = []
+    folders: list[dict[str, Any]] = []
+    for function, own in _by_function(cg, controls):
+        inside = [_heading(function, layout, heading_style)]
+        for control in own:
+            css = f"epypes-row-{len(rows)}"
+            inside.append(ipywidgets.Box([control.widget], layout=layout, _dom_classes=("epypes-row", css)))
+            rows.append(_row(cg, control, css, function))
+        css = f"epypes-folder-{len(folders)}"
+        boxes.append(ipywidgets.VBox(inside, layout=layout, _dom_classes=("epypes-folder", css)))
+        folders.append({"css": css, "function": function})
+    widget = ipywidgets.VBox(boxes, layout=layout, _dom_classes=("epypes-controls",))
+    return Column(widget, tuple(rows), tuple(folders))
+
+
+def _by_function(cg: CompGraph, controls: Iterable[Control]) -> Iterator[tuple[str, list[Control]]]:
+    left = {control.names[0]: control for control in controls}
+    for function, inputs in cg.digraph.inputs.items():
+        own = [left.pop(token) for token in dict.fromkeys(inputs) if token in left]
+        if own:
+            yield function, own
+
+
+def _filter(layout: Any) -> Any:
+    tip = "Show only hyperparameters with these letters in their name, function or tip"
+    return ipywidgets.Text(
+        placeholder="Filter",
+        tooltip=tip,
+        continuous_update=False,
+        layout=layout,
+        style=TextStyle(),
+        _dom_classes=("epypes-filter",),
+    )
+
+
+def _heading(function: str, layout: Any, style: Any) -> Any:
+    name = html.escape(sendable(function))
+    value = f'<span class="epypes-name">{name}</span> <span class="epypes-time"></span>'
+    return ipywidgets.HTML(value, layout=layout, style=style, _dom_classes=("epypes-heading",))
+
+
+def _row(cg: CompGraph, control: Control, css: str, function: str) -> dict[str, Any]:
+    ranges = [param if isinstance(param, Param) else Param() for param in control.params]
+    values = control.read()
+    is_plain = control.kind != "shown"
+    return {
+        "css": css,
+        "names": list(control.names),
+        "kind": control.kind,
+        "function": function,
+        "model": control.widget.model_id,
+        "integer": control.integer,
+        "odd": any(param.odd for param in ranges),
+        "log": control.kind == "log",
+        "low": [_end(param.low) for param in ranges],
+        "high": [_end(param.high) for param in ranges],
+        "step": list(control.steps) or [None] * len(ranges),
+        "default": [_json(value) if is_plain else None for value in control.first],
+        "value": [_json(values[name]) if is_plain else None for name in control.names],
+        "unit": ranges[0].unit,
+        "tip": "\n".join(tip(cg, name, param) for name, param in zip(control.names, control.params, strict=True)),
+    }
+
+
+def _end(end: Any) -> Any:
+    return plain(end) if is_number(end) else None
+
+
+def _json(value: Any) -> Any:
+    """Return a value as frames write it, so that the page can compare the two; None if there is no such form."""
+    try:
+        return plain(value)
+    except Exception:  # a choice may be of any class
+        return None

@@ -1,0 +1,184 @@
+"""Where on a slider is a value, and which value does a place mean?"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Final
+
+from epypes.display.previews.short import short_repr
+from epypes.hints import Param
+from epypes_widgets.controls.kinds import is_integer, is_number, like, limits, plain
+from epypes_widgets.ranges import allows, described
+
+# A browser's numbers are floats: whole ones beyond this can't be told from their neighbours.
+_LAST_WHOLE: Final = 2**53
+# What a power of ten may be, so that neither it nor what is near to it is 0 or infinite.
+_EXPONENTS: Final = (-300.0, 308.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """The values of one hyperparameter along a slider.
+
+    Attributes
+    ----------
+    name
+        The token.
+    param
+        Its range.
+    first
+        The value that says of which type the others are.
+    integer
+        Whether all values are whole.
+    low, high
+        The ends that are offered.
+    bottom, top
+        The ends that no value passes, of the range and of the type.
+    step
+        The distance between two places; on a logarithmic scale that of two exponents of ten.
+    """
+
+    name: str
+    param: Param
+    first: Any
+    integer: bool
+    low: float
+    high: float
+    bottom: float
+    top: float
+    step: float
+
+    def along(self, value: Any) -> float:
+        """Return how far along the slider a value is, in the unit of ``step``."""
+        return exponent(value) if self.param.log else float(value)
+
+    def place(self, value: Any) -> int | float:
+        """Return the number that the slider is set to for a value."""
+        return int(value) if self.integer else float(value)
+
+    def meant(self, place: float) -> Any:
+        """Return the value that a hand means which moved the slider to a place."""
+        number: float = round(place) if self.integer else without_noise(place, self.step if not self.param.log else 0)
+        if self.param.odd:
+            number = round(number) | 1
+        return like(self.first)(min(max(number, self.bottom), self.top))
+
+    def checked(self, value: Any) -> Any:
+        """Return a value as the hyperparameter takes it.
+
+        Raises
+        ------
+        ValueError
+            It takes no such value.
+        """
+        if not is_number(value):
+            raise ValueError(f"{self.name!r} can't be {short_repr(value)}: it takes numbers, {described(self.param)}.")
+        if self.integer and value != int(value):
+            way_out = f"Give tune() a range of floats for it, as ({self.bottom:.1f}, {self.top:.1f})."
+            raise ValueError(f"{self.name!r} takes whole numbers, not {short_repr(value)}. {way_out}")
+        number = int(value) if self.integer else plain(value)
+        if not allows(self.param, number):
+            raise refused(self.name, value, self.param)
+        least, greatest = limits(self.first)
+        if not least <= number <= greatest:
+            kind = type(self.first).__name__
+            way_out = f"Set the runner to a number of Python first: runner[{self.name!r}] = {self.first.item()!r}"
+            raise ValueError(f"{self.name!r} can't be {short_repr(value)}: it is of type {kind}. {way_out}")
+        return like(self.first)(number)
+
+    def grown(self, low: float, high: float, value: Any) -> tuple[float, float]:
+        """Return ends of a slider that hold a value, by whole steps, so that the places between stay where they are."""
+        at = self.along(value)
+        if self.param.log:
+            return min(low, at), max(high, at)
+        if at < low:
+            low = min(max(low - math.ceil((low - at) / self.step) * self.step, self.bottom), self.place(value))
+        if at > high:
+            high = max(min(high + math.ceil((at - high) / self.step) * self.step, self.top), self.place(value))
+        return low, high
+
+
+def scale(name: str, value: Any, param: Param) -> Scale | None:
+    """Return the scale of a hyperparameter; None if there is nothing to be moved, or no slider could do it."""
+    if param.choices is not None or not is_number(value) or not allows(param, plain(value)):
+        return None
+    whole = all(end is None or is_integer(end) for end in (param.low, param.high, param.step))
+    integer = param.odd or (is_integer(value) and whole)
+    bottom, top = _hard_ends(param, value, integer)
+    ends = _offered(param, value, (bottom, top), integer)
+    if ends is None or (integer and max(map(abs, ends)) > _LAST_WHOLE):
+        return None
+    step = _step(param, *ends, integer)
+    found = Scale(name, param, value, integer, *ends, bottom, top, step)
+    if param.log:
+        return found
+    grown = found.grown(*ends, value)
+    return Scale(name, param, value, integer, *grown, bottom, top, step)
+
+
+def refused(name: str, value: Any, param: Any) -> ValueError:
+    """Return the error for a value outside of a range."""
+    return ValueError(
+        f"{name!r} can't be {short_repr(value)}: its range is {described(param)}. Give tune() a wider hint for it."
+    )
+
+
+def exponent(value: Any) -> float:
+    """Return the power of ten that a positive value is, as far as a slider can go."""
+    low, high = _EXPONENTS
+    return min(max(math.log10(value), low), high) if value > 0 else low
+
+
+def without_noise(place: float, step: float) -> float:
+    """Return what a hand on a slider means: 0.3, where adding up steps gives 0.30000000000000004."""
+    near = float(f"{place:.12g}")
+    return near if step == 0 or abs(near - place) <= min(step / 4, 64 * math.ulp(place)) else place
+
+
+def _hard_ends(param: Param, value: Any, integer: bool) -> tuple[float, float]:
+    least, greatest = limits(value)
+    low = least if param.low is None else max(param.low, least)
+    high = greatest if param.high is None else min(param.high, greatest)
+    if not integer:
+        return low, high
+    low = low if math.isinf(low) else math.ceil(low)
+    high = high if math.isinf(high) else math.floor(high)
+    return (low + (low % 2 == 0), high - (high % 2 == 0)) if param.odd else (low, high)
+
+
+def _offered(param: Param, value: Any, hard: tuple[float, float], integer: bool) -> tuple[float, float] | None:
+    """Return the ends to be offered, the soft ones if there are any; None if there is no span between them."""
+    for ends in filter(None, (param.soft, hard)):
+        low, high = _finite(*ends, value)
+        low, high = max(low, hard[0]), min(high, hard[1])
+        if param.odd:
+            low, high = math.ceil(low) | 1, (math.floor(high) - 1) | 1
+        elif integer:
+            low, high = math.ceil(low), math.floor(high)
+        if low < high and math.isfinite(float(high) - float(low)):
+            return low, high
+    return None
+
+
+def _finite(low: float, high: float, value: Any) -> tuple[float, float]:
+    """Return ends of which the open ones are taken from the value: from 0 to three times it."""
+    plain = int(value) if is_integer(value) else float(value)
+    reach = 3 * abs(plain) or 10
+    if not is_number(low):
+        low = min(-reach if plain < 0 else 0, high - reach if is_number(high) else 0)
+    if not is_number(high):
+        high = max(reach, low + reach)
+    return low, high
+
+
+def _step(param: Param, low: float, high: float, integer: bool) -> float:
+    if param.log:
+        span = exponent(high) - exponent(low)
+        return min(max(span / 200, 1e-3), span / 20)
+    if integer:
+        step = max(int(param.step or 1), 1)
+        return step + step % 2 if param.odd else step
+    # Smaller than what the greatest numbers of the range differ by, a step would lead nowhere.
+    least = math.ulp(max(abs(low), abs(high)))
+    return max(float(param.step or 10.0 ** math.floor(math.log10(max((high - low) / 100, least)))), least)
