@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from epypes.errors import BundleError
 from epypes.graph import CompGraph, annotated_params
-from epypes.hints import Param
+from epypes.hints import Param, Roi
 from epypes.images import Order
 
 FORMAT: Final = 1
@@ -121,7 +121,7 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
     path.write_text(tomlkit.dumps(document), encoding="utf-8")
 
 
-def _entry(value: Any, hint: Param | None) -> Any:
+def _entry(value: Any, hint: Param | Roi | None) -> Any:
     import tomlkit
 
     table = tomlkit.table()
@@ -135,8 +135,9 @@ def _entry(value: Any, hint: Param | None) -> Any:
         setting = getattr(hint, key, None)
         if setting:
             table.add(key, setting)
-    if hint and hint.choices and all(_fits(choice) and choice is not None for choice in hint.choices):
-        table.add("choices", list(hint.choices))
+    choices = getattr(hint, "choices", None)
+    if choices and all(_fits(choice) and choice is not None for choice in choices):
+        table.add("choices", list(choices))
     return table
 
 

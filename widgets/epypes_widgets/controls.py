@@ -16,7 +16,7 @@ import traitlets
 from epypes.graph import CompGraph
 from epypes.hints import Param
 from epypes.run.tokens import is_same_value
-from epypes_widgets.ranges import allows, described
+from epypes_widgets.ranges import Range, allows, described
 
 _WIDE: Final = {"width": "100%"}
 _STYLE: Final = {"description_width": "112px"}
@@ -90,16 +90,16 @@ class Control:
         self.widget.observe(moved, names=self.trait)
 
 
-def control(name: str, value: Any, param: Param | None) -> Control:
+def control(name: str, value: Any, param: Range) -> Control:
     """Return the control that fits a range: slider, logarithmic slider, drop-down, checkbox or a label."""
-    if param is None:
+    if not isinstance(param, Param):
         return _label(name, value)
     if param.choices is not None:
         both = len(param.choices) == 2 and all(isinstance(choice, bool) for choice in param.choices)
         return _checkbox(name, value, param) if both else _dropdown(name, value, param)
     if param.log:
         return _log_slider(name, value, param)
-    if _is_integer(value) and all(_is_whole(end) for end in (param.low, param.high, param.step or 1)):
+    if _is_integer(value) and all(end is None or _is_whole(end) for end in (param.low, param.high, param.step)):
         return _int_slider(name, value, param)
     return _float_slider(name, value, param)
 
@@ -222,7 +222,7 @@ def _log_slider(name: str, value: Any, param: Param) -> Control:
 def _dropdown(name: str, value: Any, param: Param) -> Control:
     choices = param.choices or ()
     # By index: ipywidgets takes a choice of None for "nothing chosen", and 1 for True.
-    names = [choice.name if isinstance(choice, enum.Enum) else str(choice) for choice in choices]
+    names = param.labels or [choice.name if isinstance(choice, enum.Enum) else str(choice) for choice in choices]
     box = ipywidgets.Dropdown(options=names, index=choices.index(value), **_labelled(name, param))
 
     def place(new: Any) -> None:
