@@ -6,6 +6,7 @@ The rooms, from the bottom up; imports point downwards only (checked by ``lint-i
 - ``annotations``: what a function's annotations say, once evaluated
 - ``hints``: which values a hyperparameter may take; ``images``: which arrays a function takes as images
 - ``graph``: what is connected to what
+- ``parameters``: which values the functions of OpenCV and scikit-image take
 - ``run``: which functions must run, and running them
 - ``pipeline``: the paper's ladder of nodes and pipelines; ``acquisition``: where images come from;
   ``display``: how a graph, a run and a value look; ``wire``: how a value travels
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from epypes.bundle import load, load_pipeline, promote, to_source, verify
     from epypes.display import Preview, register_preview, reset_display_ranges, show
     from epypes.graph import CompGraph, Placeholder, extend, group, outputs, rename, subgraph, suffix, switch, union
-    from epypes.hints import Param
+    from epypes.hints import Param, Roi
     from epypes.images import Image
     from epypes.pipeline import (
         EventLoop,
@@ -86,6 +87,7 @@ _HOMES = {
     "Node": "epypes.pipeline",
     "NodeBasedCompGraph": "epypes.pipeline",
     "Param": "epypes.hints",
+    "Roi": "epypes.hints",
     "Preview": "epypes.display",
     "register_preview": "epypes.display",
     "reset_display_ranges": "epypes.display",
@@ -122,6 +124,7 @@ __all__ = [
     "Placeholder",
     "Plan",
     "Preview",
+    "Roi",
     "Run",
     "RunReport",
     "SinkPipeline",

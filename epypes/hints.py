@@ -36,18 +36,19 @@ class Param:
     soft
         A narrower range that is offered first.
     labels
-        The names of the choices, as many as there are choices.
+        Names of the choices, as ``("INTER_NEAREST", "INTER_LINEAR")``.
     below
-        A token whose value this one never exceeds: both get one slider with two ends.
+        A token, or parameter of the function, whose value this one never exceeds. Both get one slider with two ends.
     cuts
-        The token with whose values this one is compared.
+        The token, or parameter of the function, with whose values this one is compared. It is drawn as a line on the
+        histogram of that token.
     about
-        What it does, in one sentence.
+        One sentence on what it does.
 
     Raises
     ------
     ValueError
-        The range is empty, or does not fit ``odd`` or ``log``.
+        The range is empty, or does not fit ``odd``, ``log`` or ``soft``; or choices go with what only a range has.
 
     Examples
     --------
@@ -69,10 +70,8 @@ class Param:
     about: str = ""
 
     def __post_init__(self) -> None:
-        if self.choices is not None:
-            object.__setattr__(self, "choices", tuple(self.choices))
-            if not self.choices:
-                raise ValueError("choices is empty. Name at least one value.")
+        self._check_choices()
+        self._check_soft()
         if self.low is not None and self.high is not None and self.low > self.high:
             raise ValueError(f"low ({self.low}) is above high ({self.high}). Exchange them.")
         if self.step is not None and self.step <= 0:
@@ -81,6 +80,32 @@ class Param:
             raise ValueError("A logarithmic range needs a positive low.")
         if self.odd and self.low is not None and self.low == self.high and self.low % 2 != 1:
             raise ValueError(f"There is no odd value between {self.low} and {self.high}.")
+
+    def _check_choices(self) -> None:
+        if self.choices is None:
+            if self.labels is not None:
+                raise ValueError("labels name choices, and there are none. Give choices too, or leave labels out.")
+            return
+        object.__setattr__(self, "choices", tuple(self.choices))
+        if not self.choices:
+            raise ValueError("choices is empty. Name at least one value.")
+        if self.labels is not None:
+            object.__setattr__(self, "labels", tuple(self.labels))
+            if len(self.labels) != len(self.choices):
+                told = f"labels has {len(self.labels)} names, and there are {len(self.choices)} choices."
+                raise ValueError(f"{told} Name each choice once.")
+        for setting in ("below", "cuts"):
+            if getattr(self, setting):
+                raise ValueError(f"{setting} is for a range, and this hint has choices. Leave one of them out.")
+
+    def _check_soft(self) -> None:
+        if self.soft is None:
+            return
+        soft_low, soft_high = self.soft
+        if soft_low > soft_high:
+            raise ValueError(f"soft begins at {soft_low}, above its end at {soft_high}. Exchange them.")
+        if (self.low is not None and soft_low < self.low) or (self.high is not None and soft_high > self.high):
+            raise ValueError(f"soft ({soft_low} to {soft_high}) reaches beyond low or high. Narrow it, or widen these.")
 
     def allows(self, value: Any) -> bool:
         """Whether a value is within the hint."""
@@ -95,33 +120,41 @@ class Param:
 
 @dataclass(frozen=True, slots=True)
 class Roi:
-    """A rectangle of a picture: the value is (x, y, width, height), whole pixels.
+    """A rectangle on a picture: ``(x, y, width, height)``, in pixels of the image, as integers.
 
     Attributes
     ----------
     on
-        The token of the picture; empty for the first image among the inputs of the function that takes the rectangle.
+        The token of the image; empty for the first image that the function takes.
+
+    Examples
+    --------
+    >>> Roi(on="image").allows((10, 20, 64, 48))
+    True
     """
 
     on: str = ""
 
     def allows(self, value: Any) -> bool:
-        """Whether a value is four whole numbers that are not negative."""
-        whole = isinstance(value, tuple | list) and len(value) == 4
-        return whole and all(isinstance(side, numbers.Integral) and int(side) >= 0 for side in value)
+        """Whether a value is a rectangle: a tuple or list of four integers, none of them negative."""
+        return isinstance(value, tuple | list) and len(value) == 4 and all(map(_is_length, value))
 
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """Any text."""
+    """Any text, typed in a box."""
 
     def allows(self, value: Any) -> bool:
         """Whether a value is a text."""
         return isinstance(value, str)
 
 
+def _is_length(value: Any) -> bool:
+    return isinstance(value, numbers.Integral) and not isinstance(value, bool) and value >= 0
+
+
 def as_param(hint: Any) -> Param | Roi | None:
-    """Read a hint: a Param, a tuple as a range (low, high[, step]), a list as choices; None if it is neither.
+    """Read a hint: a Param or Roi, a tuple as a range (low, high[, step]), a list as choices; None if it is neither.
 
     Examples
     --------
@@ -139,10 +172,10 @@ def as_param(hint: Any) -> Param | Roi | None:
     return None
 
 
-def annotated_param(function: Callable[..., Any], position: int) -> Param | None:
+def annotated_param(function: Callable[..., Any], position: int) -> Param | Roi | None:
     """Read the hint in the annotation of a function's positional parameter, if there is one.
 
-    ``Annotated`` with a Param or with the Ge, Gt, Le, Lt, Interval and MultipleOf of ``annotated_types``,
+    ``Annotated`` with a Param, a Roi or with the Ge, Gt, Le, Lt, Interval and MultipleOf of ``annotated_types``,
     ``Literal``, an ``Enum`` and ``bool`` are understood.
     """
     hints = hints_of(function)
@@ -153,10 +186,10 @@ def annotated_param(function: Callable[..., Any], position: int) -> Param | None
     return _from_annotation(hints.get(name))
 
 
-def _from_annotation(annotation: Any) -> Param | None:
+def _from_annotation(annotation: Any) -> Param | Roi | None:
     if get_origin(annotation) is Annotated:
         plain, *marks = get_args(annotation)
-        found = next((mark for mark in marks if isinstance(mark, Param)), None)
+        found = next((mark for mark in marks if isinstance(mark, Param | Roi)), None)
         return found or _from_marks(marks) or _from_annotation(plain)
     if get_origin(annotation) is Literal:
         return Param(choices=get_args(annotation))
@@ -195,7 +228,7 @@ def param_from_value(value: Any) -> Param | None:
     if isinstance(value, int):
         span = max(3 * abs(value), 10)
         return Param(-span if value < 0 else 0, span if value >= 0 else 0, 1)
-    if isinstance(value, float) and abs(value) < float("inf"):
+    if isinstance(value, float) and 3 * abs(value) < float("inf"):
         reach = 3 * abs(value) or 1.0
         return Param(-reach if value < 0 else 0.0, reach if value >= 0 else 0.0)
     return None

@@ -11,7 +11,7 @@ from typing import Any, Final
 from epypes.bundle.entries import fits, plain, read, written
 from epypes.errors import BundleError
 from epypes.graph import CompGraph, annotated_params
-from epypes.hints import Param
+from epypes.hints import Param, Roi
 from epypes.images import Order
 
 FORMAT: Final = 1
@@ -107,7 +107,7 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
     path.write_text(tomlkit.dumps(document), encoding="utf-8")
 
 
-def _entry(value: Any, hint: Param | None) -> Any:
+def _entry(value: Any, hint: Param | Roi | None) -> Any:
     import tomlkit
 
     table = tomlkit.table()
@@ -117,8 +117,14 @@ def _entry(value: Any, hint: Param | None) -> Any:
         setting = getattr(hint, key, None)
         if setting:
             table.add(key, setting)
+<<<<<<< HEAD
     if hint and hint.choices and all(fits(choice) and choice is not None for choice in hint.choices):
         table.add("choices", list(hint.choices))
+=======
+    choices = getattr(hint, "choices", None)
+    if choices and all(_fits(choice) and choice is not None for choice in choices):
+        table.add("choices", list(choices))
+>>>>>>> t1
     return table
 
 

@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from typing import Final
 
 from epypes.graph.compgraph import CompGraph
-from epypes.hints import Param, annotated_param
+from epypes.hints import Param, Roi, annotated_param
 from epypes.images import Contracts, Image, Order
 
 _NOTHING: Final[Contracts] = ((), ())
 
 
-def annotated_params(cg: CompGraph, token: str) -> Iterator[Param]:
+def annotated_params(cg: CompGraph, token: str) -> Iterator[Param | Roi]:
     """Give the hints in the annotations of the functions that take a token, in run order."""
     for function in cg.digraph.consumers.get(token, ()):
         found = annotated_param(cg.functions[function], cg.func_inputs(function).index(token))

@@ -1,24 +1,26 @@
 """Which values may each hyperparameter of a runner take?
 
-The hint that the user gave comes first, then the annotation of a function that takes the token, then the value.
-No widgets here.
+The hint that the user gave comes first, then the annotation of a function that takes the token, then the table of
+OpenCV's and scikit-image's parameters, then the value. No widgets here.
 """
 
 from __future__ import annotations
 
-import math
-import numbers
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 from epypes.errors import UnknownName
-from epypes.graph import CompGraph, annotated_params
 from epypes.hints import Param, Roi, Text, as_param, param_from_value
 from epypes.run import CompGraphRunner
+from epypes_widgets.guesses import guess
+from epypes_widgets.movable import is_number, plain
+from epypes_widgets.pairs import paired
+
+Range = Param | Roi | Text | None
 
 
-def ranges(runner: CompGraphRunner, hints: Mapping[str, Any]) -> dict[str, Param | Roi | Text | None]:
+def ranges(runner: CompGraphRunner, hints: Mapping[str, Any]) -> dict[str, Range]:
     """Return the range of every hyperparameter, in graph order; None for one that can only be shown.
 
     Parameters
@@ -26,14 +28,20 @@ def ranges(runner: CompGraphRunner, hints: Mapping[str, Any]) -> dict[str, Param
     runner
         Its hyperparameters and their values are read.
     hints
-        By token: a Param, a tuple as a range, a list as choices.
+        By token: a Param or Roi, a tuple as a range, a list as choices.
+
+    Returns
+    -------
+    dict
+        By token. A Param has choices, or two hard ends, or ``soft``. Of two tokens that bound a range, the lower one
+        says so by ``below``.
 
     Raises
     ------
     UnknownName
-        A hint is for a name that is not a hyperparameter of the runner.
+        A hint is for a name that is not a hyperparameter of the runner, or speaks of a token that isn't there.
     TypeError
-        A hint is neither a Param, nor a tuple, nor a list.
+        A hint is neither a Param or Roi, nor a tuple, nor a list.
     ValueError
         A hint contradicts itself, or the value that the hyperparameter has lies outside of it.
     """
@@ -41,12 +49,13 @@ def ranges(runner: CompGraphRunner, hints: Mapping[str, Any]) -> dict[str, Param
     for name in hints:
         if name not in values:
             raise UnknownName("hyperparameter", name, values, "of this runner")
-    given = {name: _read(name, hint, values[name]) for name, hint in hints.items()}
-    return {
-        token: _settled(given.get(token) or _guess(runner.cg, token, values[token]), values[token])
+    given = {name: _read(runner, name, hint) for name, hint in hints.items()}
+    found = {
+        token: closed(given[token] if token in given else guess(runner, token), values[token])
         for token in runner.cg.source_tokens
         if token in values
     }
+    return paired(runner, found, given)
 
 
 def allows(param: Param | Roi | Text, value: Any) -> bool:
@@ -58,77 +67,64 @@ def allows(param: Param | Roi | Text, value: Any) -> bool:
 
 
 def described(param: Param | Roi | Text) -> str:
-    """Return a range in words, as "odd 1 to 31" or "one of 'canny', 'sobel'"."""
-    if not isinstance(param, Param):
-        return "any text" if isinstance(param, Text) else "(x, y, width, height), whole and not negative"
+    """Return a range in words, as "odd 1 to 31", "from 0" or "one of 'canny', 'sobel'"."""
+    if isinstance(param, Roi):
+        return "x, y, width, height in pixels"
+    if isinstance(param, Text):
+        return "any text"
     if param.choices is not None:
-        return f"one of {', '.join(map(repr, param.choices))}"
-    low = "below" if param.low is None else f"{param.low:g}"
-    high = "above" if param.high is None else f"{param.high:g}"
-    return f"{'odd ' * param.odd}{low} to {high}"
+        return f"one of {', '.join(param.labels or map(repr, param.choices))}"
+    odd = "odd " * param.odd
+    if param.low is not None and param.high is not None:
+        return f"{odd}{param.low:g} to {param.high:g}"
+    if param.low is None and param.high is None:
+        return f"any {odd}number"
+    return f"{odd}from {param.low:g}" if param.high is None else f"{odd}up to {param.high:g}"
 
 
-def _settled(param: Param | Roi | None, value: Any) -> Param | Roi | Text | None:
-    if isinstance(value, str) and param is None:
-        return Text()
-    return closed(param, value) if isinstance(param, Param) else param
+def closed(param: Range, value: Any) -> Range:
+    """Return a range of which something can be offered: one with an open end gets a soft range, around the value.
 
-
-def closed(param: Param | None, value: Any) -> Param | None:
-    """Return a range whose open ends are taken from the value; None if it can't be moved along.
-
-    Notes
-    -----
-    Booleans, enumerations and choices have no ends. A value that is not a finite number has no range.
+    None if the value can't be moved along it: one that is not a finite number has no range.
     """
-    if param is None or param.choices is not None:
+    if not isinstance(param, Param) or param.choices is not None:
         return param
-    if not _is_number(value):
+    if not is_number(value):
         return None
-    guess = param_from_value(_plain(value))
-    if guess is None or guess.low is None or guess.high is None:
+    if param.soft is not None:
+        low, high = param.soft
+        return replace(param, soft=(min(low, plain(value)), max(high, plain(value))))
+    if param.low is not None and param.high is not None:
+        return param
+    around = param_from_value(plain(value))
+    if around is None or around.low is None or around.high is None:
         return None
-    low, high = param.low, param.high
-    if low is None:
-        low = min(guess.low, guess.high if high is None else high)
-    if high is None:
-        high = max(guess.high, 10 * low if param.log else low + 1)
-    return replace(param, low=low, high=high)
+    low = around.low if param.low is None else param.low
+    if param.low is None and param.high is not None:
+        low = min(low, param.high)
+    high = param.high if param.high is not None else max(around.high, 10 * low if param.log else low + 1)
+    return replace(param, soft=(low, high))
 
 
-def _read(name: str, hint: Any, value: Any) -> Param | Roi:
+def _read(runner: CompGraphRunner, name: str, hint: Any) -> Param | Roi:
+    value = runner.hyperparameters[name]
     try:
         param = as_param(hint)
-    except ValueError as error:
+    except (TypeError, ValueError) as error:
         raise ValueError(f"Hint of {name!r}: {error}") from error
     if param is None:
         raise TypeError(
-            f"Hint of {name!r} is {hint!r:.60}. Give an ep.Param, a tuple as a range (low, high), or a list of choices."
+            f"Hint of {name!r} is {hint!r:.60}. Give an ep.Param, a tuple as a range (low, high), a list of choices, "
+            "or an ep.Roi."
         )
     if not allows(param, value):
         raise ValueError(
             f"{name!r} is {value!r:.60}, outside of its hint ({described(param)}). "
             f"Set runner[{name!r}] to a value inside, or widen the hint."
         )
+    for token in (param.on,) if isinstance(param, Roi) else (param.cuts,):
+        if token:
+            runner.cg.require_token(token)
+    if isinstance(param, Param) and param.below and param.below not in runner.hyperparameters:
+        raise UnknownName("hyperparameter", param.below, runner.hyperparameters, "of this runner")
     return param
-
-
-def _guess(cg: CompGraph, token: str, value: Any) -> Param | None:
-    """Return what the annotations say, if it fits the value, else what the value says."""
-    fitting = (param for param in annotated_params(cg, token) if allows(param, value))
-    return next(fitting, None) or param_from_value(_plain(value))
-
-
-def _plain(value: Any) -> Any:
-    """Return a number of NumPy as Python's: ranges are guessed from Python's types."""
-    if not _is_number(value):
-        return value
-    return int(value) if isinstance(value, numbers.Integral) else float(value)
-
-
-def _is_number(value: Any) -> bool:
-    real = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    try:
-        return real and math.isfinite(float(value))
-    except (OverflowError, TypeError):  # 10**400, or a duration of NumPy
-        return False

@@ -1,0 +1,185 @@
+"""Which values may a hyperparameter take that the user gave no hint for?"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+from epypes.graph import CompGraph, annotated_params, as_switch
+from epypes.hints import Param, Roi, Text, param_from_value
+from epypes.parameters import TABLE, entry_of, parameter_names, uses, usual
+from epypes.run import CompGraphRunner
+from epypes_widgets.movable import is_integer, is_number, plain
+
+_RECTANGLES: Final = frozenset(("roi", "rect", "rectangle", "crop", "box", "bbox", "window"))
+_THRESHOLDS: Final = frozenset(("thresh", "threshold", "level", "cutoff"))
+
+
+@dataclass(frozen=True, slots=True)
+class Taker:
+    """A function that takes a hyperparameter, and where.
+
+    Attributes
+    ----------
+    name
+        The function's name in the graph.
+    function
+        The function.
+    parameter
+        What it calls the hyperparameter; empty if that is not known.
+    tokens
+        Its inputs by the names of its parameters, as far as they are known.
+    """
+
+    name: str
+    function: Any
+    parameter: str
+    tokens: dict[str, str]
+
+
+def takers(cg: CompGraph, token: str) -> Iterator[Taker]:
+    """Give the functions that take a token, in run order."""
+    for name in cg.digraph.consumers.get(token, ()):
+        inputs = cg.func_inputs(name)
+        parameters = parameter_names(cg.functions[name])
+        tokens = dict(zip(parameters, inputs, strict=False))
+        position = inputs.index(token)
+        parameter = parameters[position] if position < len(parameters) else ""
+        yield Taker(name, cg.functions[name], parameter, tokens)
+
+
+def guess(runner: CompGraphRunner, token: str) -> Param | Roi | Text | None:
+    """Return what annotations, the table or the value say of a hyperparameter; None if it can only be shown.
+
+    What says something that the value does not fit is passed over. Never raises.
+    """
+    value = runner.hyperparameters[token]
+    for source in (_annotated, _selected, _tabled, _valued):
+        try:
+            found = source(runner, token, value)
+            if found is not None and found.allows(value):
+                return found
+        except Exception:  # noqa: S112, PERF203 - values are any objects; one that can't be compared has no range
+            continue
+    return None
+
+
+def _annotated(runner: CompGraphRunner, token: str, value: Any) -> Param | Roi | None:
+    cg = runner.cg
+    for found in annotated_params(cg, token):
+        if found.allows(value):
+            return _with_tokens(runner, token, found)
+    return None
+
+
+def _with_tokens(runner: CompGraphRunner, token: str, found: Param | Roi) -> Param | Roi:
+    """Return a hint in which parameters of the function are named by the tokens they get; others are dropped."""
+    cg = runner.cg
+    tokens = {name: taken for taker in reversed([*takers(cg, token)]) for name, taken in taker.tokens.items()}
+
+    def named(name: str) -> str:
+        return name if name in cg.tokens else tokens.get(name, "")
+
+    if isinstance(found, Roi):
+        return replace(found, on=named(found.on))
+    if not found.below and not found.cuts:
+        return found
+    below = named(found.below)
+    return replace(found, below=below if below in runner.hyperparameters else "", cuts=named(found.cuts))
+
+
+def _selected(runner: CompGraphRunner, token: str, value: Any) -> Param | None:
+    """Return the branches that a hyperparameter chooses among."""
+    for taker in takers(runner.cg, token):
+        switch = as_switch(taker.function)
+        if switch is not None and runner.cg.func_inputs(taker.name)[0] == token:
+            return Param(choices=switch.branches)
+    return None
+
+
+def _tabled(runner: CompGraphRunner, token: str, value: Any) -> Param | None:
+    if not is_number(value) and not isinstance(value, str | bool):
+        return None
+    found = _by_function(runner, token, value) or _by_name(runner, token, value)
+    if found is None or found.choices is not None:
+        return found
+    return _without_negative(found, plain(value))
+
+
+def _by_function(runner: CompGraphRunner, token: str, value: Any) -> Param | None:
+    for taker in takers(runner.cg, token):
+        entry = entry_of(taker.function, taker.parameter)
+        image = "" if entry is None else entry.cuts
+        said = [(entry, image), *((use.entry, use.cuts) for use in uses(taker.function, taker.parameter))]
+        for known, parameter in said:
+            param = None if known is None else known.resolved()
+            if param is None or not _fits(param, value):
+                continue
+            if param.choices is not None:
+                return param
+            cuts = taker.tokens.get(parameter, "") if known is not None and known.cuts else ""
+            return replace(param, cuts=cuts)
+    return None
+
+
+def _by_name(runner: CompGraphRunner, token: str, value: Any) -> Param | None:
+    cuts = ""
+    names: dict[str, None] = {}
+    for taker in takers(runner.cg, token):
+        names[taker.parameter] = None
+        cuts = cuts or _cut_by(runner, taker, token)
+    found = next(filter(None, (usual(name, plain(value), TABLE) for name in (*names, token) if name)), None)
+    if cuts and found is None:
+        found = _valued(runner, token, value)
+    if found is None or not isinstance(found, Param) or not _fits(found, value):
+        return None
+    return replace(found, cuts=cuts) if cuts and found.choices is None else found
+
+
+def _cut_by(runner: CompGraphRunner, taker: Taker, token: str) -> str:
+    """Return the token that a function compares with this one; empty if that is not known."""
+    found = uses(taker.function, taker.parameter)
+    compared = next((use.cuts for use in found if use.entry is None), "")
+    if compared:
+        return _payload(runner, taker.tokens.get(compared, ""))
+    inputs = [name for name in runner.cg.func_inputs(taker.name) if _payload(runner, name)]
+    is_threshold = bool(_THRESHOLDS & {*words(taker.parameter), *words(token)})
+    known = any(use.entry is not None for use in found)  # a function whose thresholds are not of values, as Canny
+    return inputs[0] if is_threshold and len(inputs) == 1 and not known else ""
+
+
+def _payload(runner: CompGraphRunner, token: str) -> str:
+    return "" if token in runner.hyperparameters else token
+
+
+def _valued(runner: CompGraphRunner, token: str, value: Any) -> Param | Roi | Text | None:
+    if isinstance(value, str):
+        return Text()
+    if isinstance(value, tuple | list):
+        names = {word for name in (token, *(taker.parameter for taker in takers(runner.cg, token))) for word in words(name)}
+        return Roi() if names & _RECTANGLES and Roi().allows(value) else None
+    param = param_from_value(plain(value))
+    if param is None or param.choices is not None or param.low is None or param.high is None:
+        return param
+    return Param(step=param.step, soft=(param.low, param.high))
+
+
+def words(name: str) -> tuple[str, ...]:
+    """Return the words of a name in lower case, numbers apart: ("block", "size", "1") of ``blockSize_1``."""
+    return tuple(word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", name))
+
+
+def _fits(param: Param, value: Any) -> bool:
+    """Whether a range of the table holds a value of this type: 1 is not True, and only integers are odd."""
+    if param.choices is not None:
+        return isinstance(value, bool) == isinstance(param.choices[0], bool) and param.allows(value)
+    return is_number(value) and param.allows(value) and (is_integer(value) or not param.odd)
+
+
+def _without_negative(param: Param, value: Any) -> Param:
+    """Return a range that offers no negative values to one that is not negative; they may be typed."""
+    if param.soft is None or value < 0 or param.soft[0] >= 0:
+        return param
+    return replace(param, soft=(type(param.soft[0])(0), max(param.soft[1], value)))
