@@ -1,0 +1,152 @@
+// What does the view consist of, and who gets which message?
+import { barPart } from "./bar.js";
+import { blobs } from "./blobs.js";
+import { chipsPart } from "./chips.js";
+import { comparePart } from "./compare.js";
+import { element } from "./elements.js";
+import { footPart } from "./foot.js";
+import { headerPart } from "./header.js";
+import { histogramPart } from "./histogram.js";
+import { handleKeys } from "./keys.js";
+import { outbox } from "./outbox.js";
+import { probePart } from "./probe.js";
+import { arrivals } from "./protocol.js";
+import { roiPart } from "./roi.js";
+import { rowsPart } from "./rows.js";
+import { screen } from "./screen.js";
+import { stagePart } from "./stage.js";
+import { filmsPart, historyPart, pinnedPart } from "./strips.js";
+
+/** @param {{model: any, el: HTMLElement}} context given by anywidget */
+function render({ model, el }) {
+  const figure = element("figure", "epypes-view epypes-empty", { "data-lm-suppress-shortcuts": "true" });
+  const order = arrivals();
+  const send = (content) => model.send(content);
+  const out = outbox(send);
+  /** What the parts share. */
+  const panel = {
+    send,
+    set: out.set,
+    commit: out.commit,
+    hold: out.hold,
+    release: out.release,
+    blobs: blobs(),
+    state: { token: "", values: {} },
+    tell: (text) => header.tell(text),
+    later,
+    rowOf: (name) => rows.rowOf(name),
+    drawRoi: () => roi.toggle(),
+    widgetModel: (id) => model.widget_manager?.get_model(id).catch(() => null),
+    chooseStage(token) {
+      chips.select(token);
+      send({ kind: "stage", token });
+    },
+  };
+  const header = headerPart(panel);
+  const stage = stagePart(panel);
+  const compare = (panel.compare = comparePart(panel, stage));
+  const probe = probePart(panel, stage);
+  const roi = roiPart(panel, stage);
+  const histogram = histogramPart(panel);
+  const bar = barPart(panel, { stage, compare, histogram, probe, roi });
+  const chips = chipsPart(panel);
+  const rows = rowsPart(panel, figure);
+  const pinned = pinnedPart(panel);
+  const films = filmsPart(panel);
+  const history = historyPart(panel);
+  const foot = footPart(panel);
+  const shown = screen(panel, stage, order);
+  const parts = [header, bar, chips, rows, roi, histogram, probe, pinned, films, history, foot];
+  const all = (method, ...given) => parts.forEach((part) => part[method]?.(...given));
+
+  figure.append(
+    bar.element, chips.element, header.element, stage.element, header.status,
+    histogram.element, pinned.element, films.element, history.element, foot.element,
+  );
+  el.append(figure);
+
+  let latest = null;
+  /** Write down what a frame says once it has been acknowledged; only the newest if several come. */
+  function later(report) {
+    if (!latest) setTimeout(describe);
+    latest = report;
+  }
+
+  function describe() {
+    const report = latest;
+    latest = null;
+    if (!report) return;
+    const { frame } = report;
+    panel.state.token = frame.token;
+    for (const [name, value] of Object.entries(frame.values)) {
+      const isHeld = out.isPending(name) || roi.isHeld(name) || histogram.isHeld(name);
+      if (!isHeld) panel.state.values[name] = value;
+    }
+    figure.classList.remove("epypes-empty");
+    tellFailure();
+    all("frame", report);
+  }
+
+  let told = null;
+  function tellFailure() {
+    const failure = order.failure;
+    if (failure === told) return;
+    told = failure;
+    figure.classList.toggle("epypes-stale", failure !== null);
+    all("failure", failure);
+  }
+
+  function setup(message, buffers) {
+    panel.state.token = message.token ?? "";
+    all("setup", message, buffers);
+    const past = Array.isArray(message.history) ? { entries: message.history } : message.history;
+    if (past?.entries) all("history", { code: message.code, undo: message.undo, redo: message.redo, ...past }, buffers.slice(message.images?.length ?? 0));
+  }
+
+  const handlers = {
+    setup,
+    frame: shown.take,
+    reference: (message, buffers) => compare.take(message.picture, buffers[0], message.seq, message.label),
+    error: (message) => order.fail(message) && tellFailure(),
+    latency: header.latency,
+    history: (message, buffers) => all("history", message, buffers),
+    probe: probe.message,
+    settings: foot.settings,
+    promoted: foot.promoted,
+    log: foot.log,
+  };
+  const onMessage = (message, buffers) => handlers[message.kind]?.(message, buffers ?? []);
+  const stopKeys = handleKeys(figure, { stage, compare, probe, roi, bar, send });
+  const stopHiding = hideStatic(el);
+
+  model.on("msg:custom", onMessage);
+  send({ kind: "ready" });
+  return () => {
+    send({ kind: "closed" });
+    model.off("msg:custom", onMessage);
+    stopKeys();
+    stopHiding();
+    out.close();
+    rows.close();
+    stage.close();
+    panel.blobs.closeAll();
+    figure.remove();
+  };
+}
+
+/** The static picture that a notebook keeps is not needed beside a living panel. */
+function hideStatic(el) {
+  let area = null;
+  const hide = () => {
+    area = el.closest(".jp-OutputArea");
+    area?.classList.add("epypes-live");
+  };
+  hide();
+  const timer = area ? 0 : setTimeout(hide);
+  return () => {
+    clearTimeout(timer);
+    area?.classList.remove("epypes-live");
+  };
+}
+
+export default { render };

@@ -1,0 +1,52 @@
+// How are keypoints, contours and boxes drawn above a picture?
+import { note, shape } from "./elements.js";
+
+const LEAST_RADIUS = 2;
+
+/** Return a point as a circle of its size with a hand that shows its angle; a dot for one without size. */
+export function pointPath([x, y, size, angle]) {
+  const at = (number) => Number(number.toFixed(2));
+  if (!(size > 0)) return `M${at(x)} ${at(y)}h0`;
+  const radius = Math.max(size / 2, LEAST_RADIUS);
+  const circle = `M${at(x - radius)} ${at(y)}a${at(radius)} ${at(radius)} 0 1 0 ${at(2 * radius)} 0a${at(radius)} ${at(radius)} 0 1 0 ${at(-2 * radius)} 0`;
+  if (!(angle >= 0)) return circle;
+  const turned = (angle * Math.PI) / 180;
+  return `${circle}M${at(x)} ${at(y)}l${at(radius * Math.cos(turned))} ${at(radius * Math.sin(turned))}`;
+}
+
+/** Return a line of flat coordinates as a path. */
+export function linePath(line, isClosed) {
+  let path = "";
+  for (let i = 0; i + 1 < line.length; i += 2) path += `${i ? "L" : "M"}${line[i]} ${line[i + 1]}`;
+  return path && isClosed ? `${path}Z` : path;
+}
+
+const LAYERS = [
+  ["epypes-halo", "lines"],
+  ["epypes-halo epypes-dots", "dots"],
+  ["epypes-mark-line", "lines"],
+  ["epypes-mark-line epypes-dots", "dots"],
+];
+
+/** Draw marks, or take away those of the frame before. Coordinates name pixels, whose middles are half a pixel on. */
+export function drawOverlay(svg, overlay) {
+  if (!svg.firstChild) {
+    // Two strokes, dark under bright, can be seen on any picture.
+    for (const [name] of LAYERS) svg.append(shape("path", { class: name, transform: "translate(0.5 0.5)" }));
+  }
+  const points = overlay?.points ?? [];
+  const lines = (overlay?.lines ?? []).map((line) => linePath(line, overlay.closed));
+  const paths = {
+    dots: points.filter(([, , size]) => !(size > 0)).map(pointPath).join(""),
+    lines: points.filter(([, , size]) => size > 0).map(pointPath).join("") + lines.join(""),
+  };
+  LAYERS.forEach(([, kind], at) => note(svg.children[at], "d", paths[kind]));
+}
+
+/** Return how many marks there are, and how many of them are drawn if not all. */
+export function overlayCount(overlay) {
+  if (!overlay) return "";
+  const drawn = overlay.points.length + overlay.lines.length;
+  const of = drawn < overlay.total ? ` (${drawn} drawn)` : "";
+  return `${overlay.total} ${overlay.what}${of}`;
+}

@@ -1,0 +1,255 @@
+// What is added to the controls of the kernel's side: number boxes, resets, marks, folding and the filter?
+import { numberBox } from "./boxes.js";
+import { element, iconButton, note, say } from "./elements.js";
+import { inMs, same, shortly } from "./numbers.js";
+
+const NUMERIC = ["slider", "range", "log"];
+const RETRY_MS = 100;
+const RETRIES = 100;
+
+/** Decorates the rows of the panel that this view is in; they may come later than the view. */
+export function rowsPart(panel, figure) {
+  let rows = [];
+  let folders = [];
+  let root = null;
+  /** @type {Map<any, any>} by row */
+  const found = new Map();
+  /** @type {Map<any, any>} by folder */
+  const headings = new Map();
+  let last = null;
+  let failed = null;
+  const closing = new AbortController();
+  const seeker = new MutationObserver(() => seek());
+
+  const at = (css) => root.querySelector(`.${CSS.escape(css)}`);
+  const until = { signal: closing.signal };
+
+  function seekRoot(tries) {
+    root ??= figure.closest(".epypes-panel");
+    if (!root) {
+      if (tries > 0 && !closing.signal.aborted) setTimeout(() => seekRoot(tries - 1), RETRY_MS);
+      return;
+    }
+    listen();
+    seek();
+  }
+
+  function listen() {
+    if (root.dataset.epypesHeard) return;
+    root.dataset.epypesHeard = "yes";
+    root.addEventListener("pointerdown", onDown, { capture: true, ...until });
+    root.addEventListener("keydown", onEnter, { capture: true, ...until });
+    root.addEventListener("input", (event) => event.target.closest?.(".epypes-filter") && filter(), until);
+    root.addEventListener("focusin", (event) => nameHandles(event.target.closest?.(".epypes-row")), until);
+    closing.signal.addEventListener("abort", () => delete root.dataset.epypesHeard);
+    seeker.observe(root, { childList: true, subtree: true });
+  }
+
+  function seek() {
+    for (const row of rows) if (!found.get(row)?.tail.isConnected) decorate(row);
+    for (const folder of folders) if (!headings.get(folder)?.node.isConnected) decorateHeading(folder);
+    const isAll = rows.every((row) => found.has(row)) && folders.every((folder) => headings.has(folder));
+    if (isAll) seeker.disconnect();
+  }
+
+  function decorate(row) {
+    const node = at(row.css);
+    if (!node) return;
+    found.get(row)?.tail.remove();
+    const boxes = NUMERIC.includes(row.kind) ? row.names.map((_, index) => numberBox(panel, row, index)) : [];
+    const sign = element("span", "epypes-fault", { role: "img" });
+    const reset = iconButton("reset", `Reset ${row.names.join(", ")} to ${shortly(defaultOf(row))}`, () => onReset(row), "epypes-reset");
+    const tail = element("span", "epypes-tail", { "data-lm-suppress-shortcuts": "true" });
+    boxes.forEach((box, index) => tail.append(...(index ? ["–"] : []), box.input));
+    if (row.kind === "roi") tail.append(iconButton("roi", `Draw ${row.names[0]} on the picture`, () => panel.drawRoi(), "epypes-draw"));
+    if (row.kind !== "shown") tail.append(reset);
+    tail.append(sign);
+    note(node, "data-kind", row.kind);
+    if (row.tip && !node.title) node.title = row.tip;
+    node.append(tail);
+    found.set(row, { node, tail, boxes, reset, sign, title: row.tip ?? "" });
+    nameHandles(node);
+    bind(row);
+    markChanged(row);
+    markFault(row);
+  }
+
+  const defaultOf = (row) => (row.names.length > 1 ? row.default : Array.isArray(row.default) && row.kind !== "roi" ? row.default[0] : row.default);
+
+  function onReset(row) {
+    panel.send({ kind: "reset", names: row.names });
+  }
+
+  /** Sliders of the library have no names of their own. */
+  function nameHandles(node) {
+    const row = rows.find((one) => node && found.get(one)?.node === node);
+    if (!row) return;
+    node.querySelectorAll(".noUi-handle").forEach((handle, index) => note(handle, "aria-label", row.names[index] ?? row.names[0]));
+  }
+
+  async function bind(row) {
+    if (!row.model || !NUMERIC.includes(row.kind)) return;
+    const model = await panel.widgetModel(row.model);
+    if (!model || closing.signal.aborted) return;
+    const moved = () => {
+      const value = model.get("value");
+      const parts = found.get(row);
+      const each = Array.isArray(value) ? value : [value];
+      parts?.boxes.forEach((box, index) => box.moved(each[index]));
+      markChanged(row);
+    };
+    if (row.isBound) return moved();
+    row.isBound = true;
+    model.on("change:value", moved);
+    closing.signal.addEventListener("abort", () => model.off("change:value", moved));
+    moved();
+  }
+
+  function valueOf(row, index) {
+    const box = found.get(row)?.boxes[index];
+    return box ? box.value : panel.state.values[row.names[index]];
+  }
+
+  function markChanged(row) {
+    const parts = found.get(row);
+    if (!parts) return;
+    const defaults = row.names.length > 1 || (Array.isArray(row.default) && row.kind !== "roi") ? row.default : [row.default];
+    const isChanged = defaults !== null && row.names.some((_, index) => {
+      const value = valueOf(row, index);
+      return value !== undefined && defaults?.[index] !== null && !same(value, defaults?.[index]);
+    });
+    parts.node.classList.toggle("epypes-changed", isChanged);
+    parts.reset.disabled = !isChanged;
+  }
+
+  function markFault(row) {
+    const parts = found.get(row);
+    if (!parts) return;
+    const isAtFault = Boolean(failed && row.names.some((name) => failed.names?.includes(name)));
+    parts.node.classList.toggle("epypes-failed", isAtFault);
+    say(parts.sign, isAtFault ? "!" : "");
+    if (isAtFault) note(parts.sign, "aria-label", failed.text);
+    const title = isAtFault ? failed.text : parts.title;
+    if (parts.node.title !== title) parts.node.title = title;
+  }
+
+  function decorateHeading(folder) {
+    const node = at(folder.css);
+    const heading = node?.querySelector(".epypes-heading");
+    if (!heading?.querySelector(".epypes-name")) return;
+    const sign = element("span", "epypes-fault epypes-heading-fault");
+    note(heading, "role", "button");
+    note(heading, "tabindex", "0");
+    note(heading, "aria-expanded", "true");
+    note(heading, "data-lm-suppress-shortcuts", "true");
+    heading.append(sign);
+    const fold = () => {
+      const isFolded = node.classList.toggle("epypes-folded");
+      note(heading, "aria-expanded", String(!isFolded));
+    };
+    heading.addEventListener("click", fold, until);
+    heading.addEventListener("keydown", (event) => {
+      if (!["Enter", " "].includes(event.key)) return;
+      event.preventDefault();
+      event.stopPropagation();
+      fold();
+    }, until);
+    headings.set(folder, { node, heading, sign });
+    describe(folder);
+  }
+
+  function describe(folder) {
+    const parts = headings.get(folder);
+    if (!parts) return;
+    const ms = last?.times_ms?.[folder.function];
+    if (ms !== undefined) say(parts.heading.querySelector(".epypes-time"), inMs(ms));
+    const isAtFault = failed?.function === folder.function;
+    parts.heading.classList.toggle("epypes-failed", isAtFault);
+    say(parts.sign, isAtFault ? "! failed" : "");
+    if (isAtFault) note(parts.heading, "title", failed.text);
+    else parts.heading.removeAttribute("title");
+  }
+
+  function filter() {
+    const asked = (root.querySelector(".epypes-filter input")?.value ?? "").trim().toLowerCase();
+    const words = asked.split(/\s+/).filter(Boolean);
+    let matches = 0;
+    for (const row of rows) {
+      const said = [...row.names, row.function, row.tip, row.unit].join(" ").toLowerCase();
+      const isMatch = words.every((word) => said.includes(word));
+      matches += Number(isMatch);
+      found.get(row)?.node.classList.toggle("epypes-unmatched", !isMatch);
+    }
+    for (const { node } of headings.values()) {
+      node.classList.toggle("epypes-unmatched", !node.querySelector(".epypes-row:not(.epypes-unmatched)"));
+      node.classList.toggle("epypes-filtered", words.length > 0);
+    }
+    panel.tell(words.length && !matches ? `No hyperparameter matches "${asked}".` : "");
+  }
+
+  const namesAt = (node) => rows.find((row) => found.get(row)?.node === node?.closest?.(".epypes-row"))?.names;
+
+  function onDown(event) {
+    const names = event.target.closest?.(".noUi-target") && namesAt(event.target);
+    if (!names || event.button !== 0) return;
+    panel.hold(names);
+    const over = new AbortController();
+    const release = () => {
+      over.abort();
+      panel.release(names);
+    };
+    for (const end of ["pointerup", "pointercancel", "blur"]) window.addEventListener(end, release, { capture: true, signal: over.signal });
+  }
+
+  function onEnter(event) {
+    const names = event.key === "Enter" && event.target.closest?.(".noUi-handle") && namesAt(event.target);
+    if (names) panel.release(names);
+  }
+
+  function clear() {
+    for (const { tail } of found.values()) tail.remove();
+    for (const { sign } of headings.values()) sign.remove();
+    found.clear();
+    headings.clear();
+  }
+
+  return {
+    setup(message) {
+      const isSame = same(message.rows, rows.map(({ isBound, ...row }) => row)) && same(message.folders, folders);
+      if (!isSame) {
+        clear();
+        rows = message.rows.map((row) => ({ ...row }));
+        folders = message.folders;
+        for (const row of rows) row.names.forEach((name, index) => { panel.state.values[name] ??= row.kind === "roi" ? row.value : row.value?.[index]; });
+      }
+      if (root) seeker.observe(root, { childList: true, subtree: true });
+      seekRoot(RETRIES);
+    },
+    frame({ frame }) {
+      last = frame;
+      for (const row of rows) {
+        const parts = found.get(row);
+        parts?.boxes.forEach((box) => box.name in frame.values && box.ran(frame.values[box.name]));
+        markChanged(row);
+      }
+      folders.forEach(describe);
+    },
+    failure(failure) {
+      failed = failure;
+      rows.forEach(markFault);
+      folders.forEach(describe);
+    },
+    rowOf(name) {
+      for (const row of rows) {
+        const index = row.names.indexOf(name);
+        if (index >= 0) return { row, index };
+      }
+      return null;
+    },
+    close() {
+      closing.abort();
+      seeker.disconnect();
+      clear();
+    },
+  };
+}
