@@ -117,14 +117,9 @@ def _entry(value: Any, hint: Param | Roi | None) -> Any:
         setting = getattr(hint, key, None)
         if setting:
             table.add(key, setting)
-<<<<<<< HEAD
-    if hint and hint.choices and all(fits(choice) and choice is not None for choice in hint.choices):
-        table.add("choices", list(hint.choices))
-=======
     choices = getattr(hint, "choices", None)
-    if choices and all(_fits(choice) and choice is not None for choice in choices):
+    if choices and all(fits(choice) and choice is not None for choice in choices):
         table.add("choices", list(choices))
->>>>>>> t1
     return table
 
 

@@ -45,9 +45,47 @@ _COMMON: Final[dict[str, tuple[Param, ...]]] = {
 
 # In the table, and common words with other meanings too.
 _VAGUE: Final = frozenset(
-    "type mode method flags code shape order delta distance level levels left right top bottom high low scale theta "
-    "offset beta ratio weight method history amount closed strength truncate order bandwidth rotation resize classes "
-    "attempts frequency compactness tolerance overlap".split()
+    [
+        "type",
+        "mode",
+        "method",
+        "flags",
+        "code",
+        "shape",
+        "order",
+        "delta",
+        "distance",
+        "level",
+        "levels",
+        "left",
+        "right",
+        "top",
+        "bottom",
+        "high",
+        "low",
+        "scale",
+        "theta",
+        "offset",
+        "beta",
+        "ratio",
+        "weight",
+        "method",
+        "history",
+        "amount",
+        "closed",
+        "strength",
+        "truncate",
+        "order",
+        "bandwidth",
+        "rotation",
+        "resize",
+        "classes",
+        "attempts",
+        "frequency",
+        "compactness",
+        "tolerance",
+        "overlap",
+    ]
 )
 _SHORTEST: Final = 3
 

@@ -171,7 +171,9 @@ SKIMAGE: Final[tuple[Entry, ...]] = entries(
         },
         "segmentation.quickshift": {
             "ratio": Param(0.0, 1.0, step=0.01, about="Weight of colours against distance."),
-            "kernel_size": Param(1.0, soft=(1.0, 15.0), unit="px", about="Blur of the density; larger: fewer segments."),
+            "kernel_size": Param(
+                1.0, soft=(1.0, 15.0), unit="px", about="Blur of the density; larger: fewer segments."
+            ),
             "max_dist": Param(0.1, soft=(1.0, 50.0), about="Largest distance within a segment."),
             "sigma": Param(0.0, soft=(0.0, 5.0), unit="px", about="Blur before."),
         },

@@ -26,35 +26,36 @@ _TEXT_LENGTH: Final = 400
 Picture = tuple[dict[str, Any], bytes]
 
 
-def make_frame(run: Run, seq: int, shown: Shown, changed_ns: int = 0, **content: Any) -> Frame:
+def make_frame(run: Run, token: str, seq: int, shown: Shown, changed_ns: int = 0, **content: Any) -> Frame:
     """Return what is shown of a run that has the tokens for it.
 
     Parameters
     ----------
     run
         Has not failed in what is shown.
+    token
+        Of the big picture.
     seq
         Of the frame.
     shown
-        Has a token.
+        What else is shown.
     changed_ns
         When the newest of its values was set.
     content
         Is told to the front end as it is.
     """
-    assert shown.token is not None
-    pictures = [picture(run, shown.token, "main")]
+    pictures = [picture(run, token, "main")]
     if shown.other:
         pictures.append(picture(run, shown.other, "other"))
     pictures += [picture(run, token, "pinned", PINNED_SIDE_PX) for token in shown.pinned]
     content = {
         "kind": "frame",
         "seq": seq,
-        "token": shown.token,
+        "token": token,
         "values": plain_values(run.hyperparameters),
         **_times(run),
         "pictures": [described for described, _ in pictures],
-        "histogram": histogram_of(run, shown.token) if shown.has_histogram else None,
+        "histogram": histogram_of(run, token) if shown.has_histogram else None,
         "histograms": {token: histogram_of(run, token) for token in shown.cut} if shown.has_histogram else {},
         **content,
     }

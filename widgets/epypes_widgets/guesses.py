@@ -61,7 +61,7 @@ def guess(runner: CompGraphRunner, token: str) -> Param | Roi | Text | None:
             found = source(runner, token, value)
             if found is not None and found.allows(value):
                 return found
-        except Exception:  # noqa: S112, PERF203 - values are any objects; one that can't be compared has no range
+        except Exception:  # noqa: S112 - values are any objects; one that can't be compared has no range
             continue
     return None
 
@@ -158,7 +158,9 @@ def _valued(runner: CompGraphRunner, token: str, value: Any) -> Param | Roi | Te
     if isinstance(value, str):
         return Text()
     if isinstance(value, tuple | list):
-        names = {word for name in (token, *(taker.parameter for taker in takers(runner.cg, token))) for word in words(name)}
+        names = {
+            word for name in (token, *(taker.parameter for taker in takers(runner.cg, token))) for word in words(name)
+        }
         return Roi() if names & _RECTANGLES and Roi().allows(value) else None
     param = param_from_value(plain(value))
     if param is None or param.choices is not None or param.low is None or param.high is None:

@@ -40,9 +40,7 @@ class Hand:
     def params(self) -> dict[str, Param | Roi | Text | None]:
         """What each hyperparameter may be, by token."""
         return {
-            name: param
-            for control in self.controls
-            for name, param in zip(control.names, control.params, strict=True)
+            name: param for control in self.controls for name, param in zip(control.names, control.params, strict=True)
         }
 
     def control(self, name: str) -> Control:

@@ -12,6 +12,7 @@ from typing import Any
 
 from epypes.errors import EpypesError
 from epypes_widgets import settings
+from epypes_widgets.looking.overlay import scene
 from epypes_widgets.looking.probe import probe
 from epypes_widgets.picture import Message
 from epypes_widgets.promotion import Outcome, Promotion
@@ -35,7 +36,7 @@ class Messages:
         self.promotion = Promotion(self._promoted)
 
     @property
-    def handlers(self) -> dict[str, Callable[[Message], None]]:
+    def handlers(self) -> dict[str, Callable[[Message], object]]:
         """What is called with each kind of message."""
         tuning = self._tuning
         return {
@@ -98,13 +99,14 @@ class Messages:
         self._look(comparison=Comparison(str(asked["kind"]), int(asked.get("number", 0)), token))
 
     def _probe(self, message: Message) -> None:
-        tuning, run = self._tuning, self._tuning.session.result
-        size = tuning.screen.size
-        if run is None or size is None:
+        screen, run = self._tuning.screen, self._tuning.session.result
+        token = screen.shown.token
+        seen = None if run is None or token is None else scene(run, token)
+        if run is None or seen is None:
             return
         x, y = float(message["x"]), float(message["y"])
-        rows = probe(run, tuning.screen.stages, x, y, size)
-        tuning.screen.view.tell("probe", {"id": message["id"], "x": x, "y": y, "rows": rows})
+        rows = probe(run, screen.stages, x, y, seen)
+        screen.view.tell("probe", {"id": message["id"], "x": x, "y": y, "rows": rows})
 
     # -- remembering --------------------------------------------------------------------------------------------
 

@@ -299,14 +299,14 @@ class Panel:
 
     def _setup(self) -> tuple[dict[str, Any], list[bytes]]:
         """Return what a view has to know of the controls and images."""
-        films, values = self._session.payloads, plain_values(self.values)
+        films, params, values = self._session.payloads, self._hand.params, plain_values(self.values)
         content = {
             "rows": [{**row, "value": [values.get(name) for name in row["names"]]} for row in self._column.rows],
             "folders": list(self._column.folders),
             "images": [{"index": index, "title": film.title} for index, film in enumerate(films)],
             "live": self._tuning.is_live,
             "cuts": [{"token": token, "names": names} for token, names in self._cuts.items()],
-            "rois": [{"name": name, "token": param.on} for name, param in self._hand.params.items() if isinstance(param, Roi)],
+            "rois": [{"name": name, "token": param.on} for name, param in params.items() if isinstance(param, Roi)],
             "runner_name": code.name_of(self._runner),
             "promote_to": proposal(self.token),
             "settings": list(settings.names(Path.cwd())),

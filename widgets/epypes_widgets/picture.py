@@ -45,14 +45,18 @@ class PictureView(anywidget.AnyWidget):
         self,
         idle: Callable[[], bool],
         later: Later,
-        handlers: Mapping[str, Callable[[Message], None]],
+        handlers: Mapping[str, Callable[[Message], object]],
         failed: Callable[[BaseException], None],
     ) -> None:
         super().__init__()
         self.frames = FrameSender(self._send_frame, later)
         self.to_screen_ms: list[float] = []
         self._idle, self._failed = idle, failed
-        self._handlers = {"painted": self._painted, "closed": lambda _: self.frames.closed(), **handlers}
+        self._handlers: dict[str, Callable[[Message], object]] = {
+            "painted": self._painted,
+            "closed": lambda _: self.frames.closed(),
+            **handlers,
+        }
         self.on_msg(self._answer)
 
     def tell(self, kind: str, content: Message, buffers: Sequence[bytes] = ()) -> None:

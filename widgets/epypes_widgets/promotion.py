@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from epypes.bundle import promote
-from epypes.display.markup import counted
 from epypes.errors import EpypesError, PromotionRefused
 from epypes.run import CompGraphRunner
+from epypes.wording import counted
 from epypes_widgets.values import listed
 
 _LOG: Final = logging.getLogger(__name__)

@@ -50,8 +50,6 @@ class Screen:
         What failed with the last values; empty if nothing did.
     compute_ms
         How long the run that is shown took; None before the first.
-    size
-        Width and height of the image that is shown; None if it is no image.
     """
 
     def __init__(
@@ -68,7 +66,6 @@ class Screen:
         self.stages: tuple[Stage, ...] = ()
         self.error = ""
         self.compute_ms: float | None = None
-        self.size: tuple[int, int] | None = None
         self._session, self._history, self._asked, self._setup, self._code = session, history, asked, setup, code
         self._lock = threading.Lock()
         self._seq = count(1).__next__
@@ -113,6 +110,7 @@ class Screen:
             self.compute_ms = run.report.total_ns / 1e6
         frame = make_frame(
             run,
+            shown.token,
             self._seq(),
             shown,
             changed_ns,
@@ -120,8 +118,6 @@ class Screen:
             image=self._session.image,
             stages=states(failed or run, self.stages),
         )
-        main = frame.content["pictures"][0]
-        self.size = (main["full_width"], main["full_height"]) if "full_width" in main else None
         self.view.frames.offer(frame)
 
     def fail(self, text: str, function: str = "", names: Sequence[str] = ()) -> None:
@@ -135,10 +131,8 @@ class Screen:
         before, values = self._referred
         return before == key and len(values) == len(payload) and all(map(is_, values, payload))
 
-    def refer(self, key: object, payload: Sequence[Any], label: str, run: Run) -> None:
-        """Show the stage of another run to compare with."""
-        token = self.shown.token
-        assert token is not None
+    def refer(self, key: object, payload: Sequence[Any], label: str, run: Run, token: str) -> None:
+        """Show a token of another run to compare with."""
         self._referred = key, tuple(payload)
         described, data = picture(run, token, "other")
         self._reference = {"seq": self._seq(), "label": label, "picture": described}, (data,) if data else ()

@@ -11,11 +11,10 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from epypes.display import encode_image
-from epypes.run import CompGraphRunner, Run
+from epypes.run import CompGraphRunner, Failure, Run
 from epypes_widgets.hand import Hand
 from epypes_widgets.history import Entry, History
-from epypes_widgets.looking.overlay import scene
+from epypes_widgets.pictures import thumbnail
 from epypes_widgets.screen import Screen
 from epypes_widgets.session import Session
 from epypes_widgets.shown import Comparison
@@ -28,7 +27,6 @@ REST_S: Final = 0.25
 # The last value of a drag may arrive after the word that the slider was let go.
 _AFTER_RELEASE_S: Final = 0.06
 _STILL_S: Final = 0.5
-_THUMBNAIL_PX: Final = 96
 
 
 class Tuning:
@@ -49,9 +47,7 @@ class Tuning:
 
     screen: Screen
 
-    def __init__(
-        self, hand: Hand, session: Session, history: History, settled: Callable[[], None]
-    ) -> None:
+    def __init__(self, hand: Hand, session: Session, history: History, settled: Callable[[], None]) -> None:
         self.hand, self.session, self.history = hand, session, history
         self.runner: CompGraphRunner = session.runner
         self.is_live = True
@@ -176,7 +172,7 @@ class Tuning:
             self.screen.fail(str(error))
             return
         if run.failure is not None:
-            self._fail(run)
+            self._fail(run, run.failure)
             return
         self.screen.follow(run)
         self.screen.show(run, changed_ns)
@@ -187,9 +183,7 @@ class Tuning:
             self._commit()
         self._compare()
 
-    def _fail(self, run: Run) -> None:
-        failure = run.failure
-        assert failure is not None
+    def _fail(self, run: Run, failure: Failure) -> None:
         wanted, takes = self.session.wanted, self.runner.cg.func_inputs(failure.function)
         names = [name for name in takes if name in wanted] or [name for name in takes if name in run.hyperparameters]
         good = self.session.last_good(self.screen.shown.targets)
@@ -203,7 +197,7 @@ class Tuning:
         if run is None or self.session.wanted:
             return
         token, image, compute_ms = self.screen.shown.token, self.session.image, self.screen.compute_ms
-        seen = _thumbnail(run, token)
+        seen = thumbnail(run, token)
         if self.history.commit(run.hyperparameters, token=token, picture=seen, compute_ms=compute_ms, image=image):
             self.screen.tell_history()
         self.worker.later("still", _STILL_S, self._settled)
@@ -222,7 +216,7 @@ class Tuning:
         if run.failure is not None:
             self.screen.log(f"Nothing to compare with: with these values {run.failure}.")
         else:
-            self.screen.refer((comparison, token), payload, label, run)
+            self.screen.refer((comparison, token), payload, label, run, token)
 
     def _compared(self, comparison: Comparison) -> tuple[Mapping[str, Any], str]:
         if comparison.kind == "default":
@@ -231,9 +225,3 @@ class Tuning:
         if entry is None:
             raise LookupError(f"No entry {comparison.number} in the history.")
         return entry.values, f"history {entry.number}"
-
-
-def _thumbnail(run: Run, token: str | None) -> Any:
-    found = scene(run, token) if token is not None and token in run else None
-    seen = None if found is None else found.backdrop
-    return None if seen is None else encode_image(seen.image, _THUMBNAIL_PX, seen.order, seen.ends)
