@@ -124,7 +124,8 @@ class Panel:
         self._screen = tuning.screen = Screen(view, session, self._history, token, self._setup, self.code)
         self._cuts = _cuts(hand)
         tuning.screen.change(cut=tuple(self._cuts), has_histogram=bool(self._cuts))
-        self._widget = ipywidgets.HBox([self._column.widget, view], _dom_classes=("epypes-panel",))
+        columns = ipywidgets.HBox([self._column.widget, view], _dom_classes=("epypes-columns",))
+        self._widget = ipywidgets.VBox([columns], _dom_classes=("epypes-panel",))
         tuning.begin()
 
     # -- values -------------------------------------------------------------------------------------------------
