@@ -88,9 +88,10 @@ def test_what_is_no_list_is_refused_with_the_way_out(images: Any) -> None:
         payloads(single(), images)
 
 
-def test_an_empty_list_is_refused() -> None:
+@pytest.mark.parametrize("images", [[], iter([])])
+def test_an_empty_list_is_refused(images: Any) -> None:
     with pytest.raises(ValueError, match="empty"):
-        payloads(single(), [])
+        payloads(single(), images)
 
 
 def test_an_image_alone_does_not_tell_which_of_two_tokens_it_is() -> None:

@@ -93,6 +93,13 @@ def test_what_lies_beyond_the_display_range_is_in_the_outer_bins() -> None:
     assert (counts[0], counts[-1], sum(counts)) == (12, 6, 100)
 
 
+def test_a_range_that_is_hardly_any_is_counted_too() -> None:
+    image = np.zeros((10, 10))
+    image[0] = 1e-309
+    counts = gray(counted(image, ends=(0.0, 1e-309)))
+    assert (counts[0], counts[-1]) == (90, 10)
+
+
 def test_the_range_of_a_tokens_first_image_is_kept() -> None:
     cg = ep.CompGraph({"scaled": lambda image, gain: image * gain}, {"scaled": (("image", "gain"), "scaled")})
     runner = ep.CompGraphRunner(cg, {"gain": 1.0})

@@ -132,6 +132,11 @@ def test_what_is_not_a_number_is_not_drawn() -> None:
     places = np.array([[[10, 20]], [[math.nan, 5]], [[math.inf, 5]], [[30, 40]]], np.float32)
     said = drawn(lambda image: places)
     assert [point[:2] for point in said["points"]] == [[10.5, 20.5], [30.5, 40.5]]
+    line = np.array([[[10, 20]], [[math.nan, 20]], [[30, 60]]], np.float32)
+    square = np.array([[[5, 5]], [[9, 5]], [[9, 9]]], np.float32)
+    assert drawn(lambda image: [line, square])["lines"] == [[10.5, 20.5, 30.5, 60.5], [5.5, 5.5, 9.5, 5.5, 9.5, 9.5]]
+    keypoints = [cv2.KeyPoint(math.nan, 5, 6, 7), cv2.KeyPoint(20, 30, 8, 45)]
+    assert drawn(lambda image: keypoints)["points"] == [[20.5, 30.5, 8, 45]]
     broken = drawn(lambda image: [cv2.KeyPoint(20, 30, math.nan, math.inf)])
     assert broken["points"] == [[20.5, 30.5, 0, -1]]
 

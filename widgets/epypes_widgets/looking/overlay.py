@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     Floats = npt.NDArray[np.float64]
 
 # More points hide the image, and make messages of hundreds of kilobytes. A place has two coordinates.
-MOST_DRAWN: Final = Most(marks=2_000, line=10_000, places=10_000, pairs=300)
+MOST_DRAWN: Final = Most(marks=2_000, line=10_000, places=10_000, pairs=150)
 _NO_SIZE: Final = 0.0
 _NO_ANGLE: Final = -1.0
 _DECIMALS: Final = 2

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from epypes.display import is_image, scene_of
 from epypes.display.previews.arrays import is_strip
 from epypes.run import CompGraphRunner, Run
+from epypes.run.guard import ARRAYLESS
 
 State = Literal["fresh", "stale", "failed", "absent"]
 
@@ -98,7 +99,9 @@ def _state(run: Run, token: str, outdated: frozenset[str]) -> State:
 
 
 def _has_picture(run: Run, token: str) -> bool:
-    return is_image(_value(run, token)) or scene_of(run, token) is not None
+    value = _value(run, token)
+    # Numbers and texts are known at a glance: a graph of a thousand of them is looked at after every run.
+    return type(value) not in ARRAYLESS and (is_image(value) or scene_of(run, token) is not None)
 
 
 def _value(run: Run, token: str) -> Any:
