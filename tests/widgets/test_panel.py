@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 import threading
@@ -14,43 +13,21 @@ import pytest
 import epypes as ep
 from epypes.errors import NotComputed, PayloadError, UnknownName
 from epypes_widgets import Panel, tune
-
-
-class Screen:
-    """A front end of a panel's picture: keeps what arrives and answers as picture.js does."""
-
-    def __init__(self, panel: Panel, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.messages: list[dict[str, Any]] = []
-        self.view = panel._view
-        monkeypatch.setattr(self.view, "send", self._arrives)
-        self.tell({"kind": "ready"})
-
-    @property
-    def frames(self) -> list[dict[str, Any]]:
-        return [message for message in self.messages if message["kind"] == "frame"]
-
-    def tell(self, content: dict[str, Any]) -> None:
-        self.view._answer(self.view, content, [])
-
-    def _arrives(self, content: dict[str, Any], buffers: list[bytes] | None = None) -> None:
-        json.dumps(content, allow_nan=False)
-        self.messages.append(content)
-        if content["kind"] == "frame":
-            self.tell({"kind": "painted", "seq": content["seq"]})
+from tests.widgets.frontend import FrontEnd
 
 
 @pytest.fixture
-def screen(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> Screen:
-    return Screen(panel, monkeypatch)
+def screen(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> FrontEnd:
+    return FrontEnd(panel, monkeypatch)
 
 
-def test_a_new_view_gets_the_picture_of_the_last_run(panel: Panel, screen: Screen, calls: Any) -> None:
+def test_a_new_view_gets_the_picture_of_the_last_run(panel: Panel, screen: FrontEnd, calls: Any) -> None:
     assert [frame["token"] for frame in screen.frames] == ["mask"]
     assert screen.frames[0]["values"] == {"gain": 2, "threshold": 100}
     assert calls.counts == {}
 
 
-def test_moving_a_control_runs_the_stale_functions_only(panel: Panel, screen: Screen, calls: Any) -> None:
+def test_moving_a_control_runs_the_stale_functions_only(panel: Panel, screen: FrontEnd, calls: Any) -> None:
     panel["threshold"] = 60
     panel.wait(10)
     assert calls.counts == {"above": 1}
@@ -61,56 +38,134 @@ def test_moving_a_control_runs_the_stale_functions_only(panel: Panel, screen: Sc
 
 
 def test_the_front_end_moving_a_slider_does_the_same(panel: Panel, runner: ep.CompGraphRunner) -> None:
-    panel._controls["threshold"].widget.value = 61
+    panel._hand.control("threshold").widget.value = 61
     panel.wait(10)
     assert (panel["threshold"], runner["threshold"]) == (61, 61)
 
 
-def test_a_function_that_fails_keeps_the_picture_and_says_so(panel: Panel, screen: Screen) -> None:
+def test_a_function_that_fails_keeps_the_result_and_says_so(panel: Panel, screen: FrontEnd) -> None:
     panel["threshold"] = 13
     panel.wait(10)
-    assert [message["kind"] for message in screen.messages if message["kind"] != "latency"] == ["frame", "error"]
-    assert screen.messages[-1]["text"] == "above: ValueError: 13 is not a threshold"
-    assert panel.error == screen.messages[-1]["text"]
+    assert panel.error == screen.last("error")["text"] == "above: ValueError: 13 is not a threshold"
     assert panel.result.hyperparameters["threshold"] == 100
-    assert "epypes-failed" in panel._headings["above"]._dom_classes
     assert "failed" in repr(panel)
+    panel["threshold"] = 14
+    panel.wait(10)
+    assert (panel.error, screen.frames[-1]["stale"]) == ("", False)
 
 
-def test_the_next_good_value_clears_the_failure(panel: Panel, screen: Screen) -> None:
-    for threshold in (13, 14):
-        panel["threshold"] = threshold
-        panel.wait(10)
-    assert panel.error == ""
-    assert screen.frames[-1]["stale"] is False
-    assert "epypes-failed" not in panel._headings["above"]._dom_classes
-
-
-def test_another_token_can_be_looked_at_while_the_last_values_fail(panel: Panel, screen: Screen) -> None:
+def test_cells_read_the_last_run_that_completed(panel: Panel, runner: ep.CompGraphRunner) -> None:
+    before = runner["mask"].copy()
     panel["threshold"] = 13
     panel.wait(10)
-    panel._tokens.value = "image_bright"
+    np.testing.assert_array_equal(runner["mask"], before)
+    assert (runner["threshold"], panel["threshold"], runner.last and runner.last.failure) == (100, 13, None)
+
+
+def test_a_stage_that_does_not_need_what_fails_can_be_looked_at(panel: Panel, screen: FrontEnd) -> None:
+    panel["threshold"] = 13
     panel.wait(10)
-    assert (screen.frames[-1]["token"], screen.frames[-1]["stale"]) == ("image_bright", True)
-    assert panel.error
+    panel.token = "image_bright"
+    panel.wait(10)
+    assert (screen.frames[-1]["token"], screen.frames[-1]["stale"], panel.error) == ("image_bright", False, "")
+    panel.token = "mask"
+    panel.wait(10)
+    assert panel.error == "above: ValueError: 13 is not a threshold"
+    assert "not been computed" in screen.frames[-1]["pictures"][0]["text"]
 
 
 def test_choosing_a_token_shows_it_without_running_anything(
-    panel: Panel, screen: Screen, runner: ep.CompGraphRunner
+    panel: Panel, screen: FrontEnd, runner: ep.CompGraphRunner
 ) -> None:
     reports = len(runner.reports)
-    assert panel._tokens.options == ("image", "image_bright", "mask")
-    panel._tokens.value = "image"
+    assert [stage["token"] for stage in screen.last("setup")["stages"]] == ["image", "image_bright", "mask"]
+    panel.token = "image"
     panel.wait(10)
     assert (screen.frames[-1]["token"], len(runner.reports)) == ("image", reports)
+    with pytest.raises(LookupError, match="'gain' has no picture"):
+        panel.token = "gain"
 
 
-def test_a_view_mounted_later_hears_of_the_failure(panel: Panel, screen: Screen) -> None:
-    panel["threshold"] = 13
+def test_test_images_can_be_switched_between(
+    image: Any, runner: ep.CompGraphRunner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fresh = ep.CompGraphRunner(runner.cg, {"gain": 1, "threshold": 100})
+    panel = tune(fresh, images=[image, 255 - image], threshold=(0, 255))
     panel.wait(10)
-    screen.messages.clear()
-    screen.tell({"kind": "ready"})
-    assert [message["kind"] for message in screen.messages] == ["frame", "error"]
+    screen = FrontEnd(panel, monkeypatch)
+    assert [film["title"] for film in screen.last("setup")["images"]] == ["image 1", "image 2"]
+    assert screen.frames[-1]["image"] == 0
+    screen.tell("image", index=1)
+    panel["threshold"] = 90
+    panel.wait(10)
+    assert screen.frames[-1]["image"] == 1
+    np.testing.assert_array_equal(fresh["image"], 255 - image)
+    np.testing.assert_array_equal(fresh["mask"] == 255, 255 - image > 90)
+    screen.tell("undo")
+    screen.tell("undo")
+    panel.wait(10)
+    assert screen.frames[-1]["image"] == 0
+    panel.close(10)
+
+
+def test_settings_go_to_a_file_and_come_back(panel: Panel, screen: FrontEnd, tmp_path: Any, monkeypatch: Any) -> None:
+    monkeypatch.chdir(tmp_path)
+    panel["threshold"] = 77
+    panel.wait(10)
+    assert panel.save("good").name == "good.toml"
+    panel.reset()
+    panel.load("good.toml")
+    panel.wait(10)
+    assert panel.values == {"gain": 2, "threshold": 77}
+    screen.tell("save", name="better")
+    assert screen.last("settings") == {
+        "kind": "settings",
+        "names": ["better", "good"],
+        "said": "Saved better.toml.",
+        "ok": True,
+    }
+    screen.tell("load", name="bettr")
+    assert screen.last("settings")["ok"] is False
+    assert "better" in screen.last("settings")["said"]
+    (tmp_path / "good.toml").write_text((tmp_path / "good.toml").read_text().replace("77", "777"))
+    with pytest.raises(ValueError, match="can't be 777"):
+        panel.load("good")
+    assert panel["threshold"] == 77
+
+
+def test_a_panel_made_again_goes_on_with_values_history_and_undo(panel: Panel, runner: ep.CompGraphRunner) -> None:
+    for threshold in (60, 70):
+        panel["threshold"] = threshold
+        panel.wait(10)
+    again = tune(runner, gain=(1, 5), threshold=(0, 255))
+    assert again["threshold"] == 70
+    assert list(again.history["threshold"]) == [100, 60, 70]
+    again.undo()
+    again.wait(10)
+    assert (again["threshold"], runner["threshold"]) == (60, 60)
+    again.close(10)
+
+
+def test_several_values_are_set_all_or_none(panel: Panel) -> None:
+    with pytest.raises(ValueError, match="can't be 300"):
+        panel.set(gain=3, threshold=300)
+    assert panel.values == {"gain": 2, "threshold": 100}
+    panel.set(gain=3, threshold=30)
+    panel.wait(10)
+    assert dict(panel.result.hyperparameters) == {"gain": 3, "threshold": 30}
+    assert len(panel.history) == 2
+
+
+def test_the_time_to_the_screen_is_told(panel: Panel, screen: FrontEnd) -> None:
+    assert panel.latency.frames == 0
+    panel["threshold"] = 60
+    panel.wait(10)
+    latency = panel.latency
+    assert latency.frames == 1
+    assert latency.to_screen_ms == latency.p50_ms == latency.p95_ms
+    assert latency.to_screen_ms is not None
+    assert latency.compute_ms is not None
+    assert latency.to_screen_ms > latency.compute_ms
 
 
 def test_many_values_while_a_function_is_busy_make_few_runs_and_the_last_one_counts(image: Any) -> None:
@@ -205,8 +260,9 @@ def test_a_graph_without_images_is_shown_as_text(monkeypatch: pytest.MonkeyPatch
     runner = ep.CompGraphRunner(ep.CompGraph({"add": lambda x, y: x + y}, {"add": (("x", "y"), "total")}), {"y": 1})
     runner.run(x=2)
     panel = tune(runner)
-    screen = Screen(panel, monkeypatch)
-    assert (screen.frames[-1]["media_type"], screen.frames[-1]["text"]) == ("text/plain", "3")
+    screen = FrontEnd(panel, monkeypatch)
+    picture = screen.frames[-1]["pictures"][0]
+    assert (picture["media_type"], picture["text"]) == ("text/plain", "3")
     panel.close(10)
 
 
@@ -232,7 +288,7 @@ def test_a_closed_panel_takes_no_values_and_its_controls_are_off(panel: Panel, c
     panel.close(10)
     with pytest.raises(RuntimeError, match="closed"):
         panel["threshold"] = 60
-    assert all(entry.widget.disabled for entry in panel._controls.values())
+    assert all(entry.widget.disabled for entry in panel._hand.controls)
     assert calls.counts == {}
 
 
@@ -277,10 +333,10 @@ def test_values_set_from_many_threads_leave_panel_and_runner_agreed(runner: ep.C
     panel.close()
 
 
-def test_a_value_that_is_set_is_submitted_once(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> None:
-    submitted: list[Any] = []
-    monkeypatch.setattr(panel._worker, "submit", submitted.append)
+def test_a_value_that_is_set_is_asked_for_once(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[dict[str, Any]] = []
+    monkeypatch.setattr(panel._tuning.worker, "ask", lambda: asked.append(panel._session.wanted))
     panel["threshold"] = 60
     panel["threshold"] = 60
-    panel._controls["threshold"].widget.value = 61
-    assert submitted == [{"threshold": 60}, {"threshold": 60}, {"threshold": 61}]
+    panel._hand.control("threshold").widget.value = 61
+    assert asked == [{"threshold": 60}, {"threshold": 60}, {"threshold": 61}]

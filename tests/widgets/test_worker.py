@@ -1,11 +1,10 @@
-"""Are values computed on another thread, the latest first and the last always?"""
+"""Is everything computed on another thread, once after any number of wishes, and the last always?"""
 
 from __future__ import annotations
 
-import logging
 import threading
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable
+from time import monotonic
 
 import pytest
 
@@ -13,97 +12,121 @@ from epypes.errors import StillRunning
 from epypes_widgets.worker import Worker
 
 
+def unexpected(exception: BaseException) -> None:
+    raise AssertionError from exception
+
+
+def worker_of(compute: Callable[[int], None]) -> Worker:
+    return Worker(compute, unexpected)
+
+
 class Slow:
     """A computation that waits until it is let go."""
 
     def __init__(self) -> None:
-        self.seen: list[Mapping[str, Any]] = []
+        self.count = 0
         self.started, self.go_on = threading.Event(), threading.Event()
 
-    def __call__(self, values: Mapping[str, Any], changed_ns: int) -> None:
-        self.seen.append(dict(values))
+    def __call__(self, asked_ns: int) -> None:
+        self.count += 1
         self.started.set()
         assert self.go_on.wait(10)
 
 
-def test_values_that_arrive_meanwhile_overwrite_each_other_and_the_last_is_computed() -> None:
+def test_wishes_that_arrive_meanwhile_are_one() -> None:
     slow = Slow()
-    worker = Worker(slow)
-    worker.submit({"x": 0})
+    worker = worker_of(slow)
+    worker.ask()
     assert slow.started.wait(10)
-    for x in range(1, 120):
-        worker.submit({"x": x})
+    for _ in range(120):
+        worker.ask()
     slow.go_on.set()
     worker.wait(10)
-    assert slow.seen == [{"x": 0}, {"x": 119}]
+    assert slow.count == 2
     worker.close(10)
 
 
-def test_values_of_several_hyperparameters_are_merged() -> None:
-    slow = Slow()
-    worker = Worker(slow)
-    worker.submit({"x": 0})
-    assert slow.started.wait(10)
-    for values in ({"y": 1}, {"x": 2}, {"y": 3}):
-        worker.submit(values)
-    slow.go_on.set()
-    worker.wait(10)
-    assert slow.seen[1:] == [{"x": 2, "y": 3}]
-    worker.close(10)
+def test_what_was_wanted_before_asking_is_always_computed() -> None:
+    """Of four threads that each want and then ask, nobody's last wish is missed."""
+    wanted: dict[str, int] = {}
+    computed: dict[str, int] = {}
+    worker = worker_of(lambda _: computed.update(wanted))
 
-
-def test_values_may_come_from_any_thread() -> None:
-    latest: dict[str, int] = {}
-    worker = Worker(lambda values, _: latest.update(values))
-
-    def submit(name: str) -> None:
+    def want(name: str) -> None:
         for x in range(200):
-            worker.submit({name: x})
+            wanted[name] = x
+            worker.ask()
 
-    threads = [threading.Thread(target=submit, args=(name,)) for name in "abcd"]
+    threads = [threading.Thread(target=want, args=(name,)) for name in "abcd"]
+    wanted.update(dict.fromkeys("abcd", -1))
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join(10)
     worker.wait(10)
-    assert latest == dict.fromkeys("abcd", 199)
+    assert computed == dict.fromkeys("abcd", 199)
     worker.close(10)
 
 
 @pytest.mark.parametrize("error", [ValueError("no"), SystemExit(1)])
-def test_a_computation_that_raises_does_not_end_the_worker(
-    error: BaseException, caplog: pytest.LogCaptureFixture
-) -> None:
-    seen: list[int] = []
+def test_a_computation_that_raises_is_told_and_does_not_end_the_worker(error: BaseException) -> None:
+    told: list[BaseException] = []
+    rest = [error]
 
-    def compute(values: Mapping[str, Any], changed_ns: int) -> None:
-        if values["x"] == 0:
-            raise error
-        seen.append(values["x"])
+    def compute(asked_ns: int) -> None:
+        if rest:
+            raise rest.pop()
 
-    worker = Worker(compute)
-    with caplog.at_level(logging.CRITICAL + 1):
-        worker.submit({"x": 0})
+    worker = Worker(compute, told.append)
+    for _ in range(2):
+        worker.ask()
         worker.wait(10)
-        worker.submit({"x": 1})
-        worker.wait(10)
-    assert seen == [1]
+    assert told == [error]
+    worker.close(10)
+
+
+def test_work_that_is_put_off_is_done_when_nothing_is_computed_and_waited_for() -> None:
+    order: list[str] = []
+    slow = Slow()
+    worker = worker_of(lambda asked_ns: (slow(asked_ns), order.append("computed"))[1])
+    worker.ask()
+    assert slow.started.wait(10)
+    worker.later("commit", 0.0, lambda: order.append("early"), is_work=True)
+    worker.later("commit", 0.02, lambda: order.append("commit"), is_work=True)
+    worker.later("never", 3600.0, lambda: order.append("never"))
+    slow.go_on.set()
+    worker.wait(10)
+    assert order == ["computed", "commit"]
+    worker.close(10)
+
+
+def test_what_is_due_first_is_done_first_whenever_it_was_put_off() -> None:
+    done: list[str] = []
+    both = threading.Event()
+    worker = worker_of(lambda _: None)
+    start_s = monotonic()
+    worker.later("second", 0.06, lambda: (done.append("second"), both.set())[0])
+    worker.later("first", 0.02, lambda: done.append("first"))
+    assert both.wait(10)
+    assert done == ["first", "second"]
+    assert monotonic() - start_s >= 0.06
     worker.close(10)
 
 
 def test_closing_is_bounded_and_may_come_twice_or_first() -> None:
-    worker = Worker(lambda values, _: None)
+    worker = worker_of(lambda _: None)
     worker.close(1)
     worker.close(1)
-    worker.submit({"x": 1})
+    worker.ask()
+    worker.later("a", 0.0, lambda: None, is_work=True)
     worker.wait(1)
     assert worker.idle
 
 
 def test_a_function_that_does_not_return_is_reported_when_closing() -> None:
     slow = Slow()
-    worker = Worker(slow)
-    worker.submit({"x": 0})
+    worker = worker_of(slow)
+    worker.ask()
     assert slow.started.wait(10)
     with pytest.raises(StillRunning):
         worker.close(0.05)
@@ -117,14 +140,14 @@ def test_a_function_that_does_not_return_is_reported_when_closing() -> None:
 def test_the_worker_does_not_wait_for_itself() -> None:
     caught: list[BaseException] = []
 
-    def compute(values: Mapping[str, Any], changed_ns: int) -> None:
+    def compute(asked_ns: int) -> None:
         try:
             worker.wait(10)
         except RuntimeError as error:
             caught.append(error)
 
-    worker = Worker(compute)
-    worker.submit({})
+    worker = worker_of(compute)
+    worker.ask()
     worker.wait(10)
     assert len(caught) == 1
     worker.close(10)

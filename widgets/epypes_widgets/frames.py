@@ -67,7 +67,8 @@ def picture(run: Run, token: str, role: str, max_side_px: int = MAX_SIDE_PX) -> 
     found = scene(run, token)
     described: dict[str, Any] = {"token": token, "role": role, "overlay": None}
     if found is None:
-        return {**described, "media_type": "text/plain", "text": text_of(run[token])}, b""
+        text = text_of(run[token]) if token in run else f"{token} has not been computed with these values."
+        return {**described, "media_type": "text/plain", "text": text}, b""
     image = found.backdrop.image
     encoded = encode_image(image, max_side_px, found.backdrop.order, found.backdrop.ends)
     described |= {

@@ -113,13 +113,6 @@ class Session:
                 return run, True
         return run, False
 
-    def last_good(self, targets: Sequence[str]) -> Run | None:
-        """Return the last run that completed, with these targets; None if there is none or they fail, too."""
-        if self.result is None or all(token in self.result for token in targets):
-            return self.result
-        run = self.tried(self.result.hyperparameters, targets)
-        return None if run.failure is not None else run
-
     def tried(self, values: Mapping[str, Any], targets: Sequence[str]) -> Run:
         """Return a run with these hyperparameters on the present payload; nothing is changed by it."""
         known = self.runner.hyperparameters

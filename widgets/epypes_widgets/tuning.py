@@ -186,7 +186,7 @@ class Tuning:
     def _fail(self, run: Run, failure: Failure) -> None:
         wanted, takes = self.session.wanted, self.runner.cg.func_inputs(failure.function)
         names = [name for name in takes if name in wanted] or [name for name in takes if name in run.hyperparameters]
-        good = self.session.last_good(self.screen.shown.targets)
+        good = self.session.result
         if good is not None:
             self.screen.show(good, 0, failed=run)
         self.screen.fail(str(failure), failure.function, names)

@@ -1,0 +1,311 @@
+"""Is the final picture that of the final value, whatever happens between the kernel and the browser?"""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import pytest
+
+import epypes as ep
+from epypes_widgets import Panel, sender
+from tests.widgets.frontend import BadLine, FrontEnd
+
+
+@pytest.fixture
+def front_end(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> FrontEnd:
+    return FrontEnd(panel, monkeypatch)
+
+
+def move(panel: Panel, name: str, value: Any) -> None:
+    """Move a slider as the front end does."""
+    panel._hand.control(name).widget.value = value
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_last_value_is_shown_over_a_line_that_loses_doubles_delays_and_exchanges(
+    panel: Panel, monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    monkeypatch.setattr(sender, "FIRST_TIMEOUT_S", 0.01)
+    monkeypatch.setattr(sender, "LAST_TIMEOUT_S", 0.02)
+    down, up = BadLine(seed), BadLine(seed + 100)
+    try:
+        front_end = FrontEnd(panel, monkeypatch, down, up)
+        front_end.tell("ready")
+        for value in range(101, 221):
+            move(panel, "threshold", value)
+        panel.wait(10)
+        # The browser says "ready" until it is heard: the page of a notebook is mounted for good.
+        while not front_end.painted:
+            front_end.tell("ready")
+            panel._tuning.worker.wait(10)
+        front_end.wait_for_values(10, threshold=220)
+        assert down.lost + up.lost > 0
+        seqs = [frame["seq"] for frame in front_end.painted]
+        assert seqs == sorted(seqs)
+    finally:
+        down.close()
+        up.close()
+
+
+def test_values_from_another_thread_than_the_answers_are_all_shown_in_the_end(
+    panel: Panel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """ipykernel answers the first message on the main thread and the rest on another."""
+    line = BadLine(0)
+    line.mend()
+    try:
+        front_end = FrontEnd(panel, monkeypatch, line, line)
+        hands = [
+            threading.Thread(target=lambda: [move(panel, "threshold", value) for value in range(101, 181)]),
+            threading.Thread(target=lambda: [move(panel, "gain", value % 5 + 1) for value in range(83)]),
+        ]
+        for hand in hands:
+            hand.start()
+        for hand in hands:
+            hand.join(10)
+        front_end.wait_for_values(10, threshold=180, gain=3)
+    finally:
+        line.close()
+
+
+def test_one_frame_is_in_flight_however_many_values_come(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> None:
+    answers: list[Any] = []
+    front_end = FrontEnd(panel, monkeypatch)
+    front_end._up = answers.append
+    for value in range(101, 121):
+        panel["threshold"] = value
+        panel.wait(10)
+    assert len(front_end.frames) == 2
+    while answers:
+        answers.pop(0)()
+    assert [frame["values"]["threshold"] for frame in front_end.frames] == [100, 101, 120]
+
+
+def test_a_view_that_is_mounted_later_hears_everything(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> None:
+    panel["threshold"] = 13
+    panel.wait(10)
+    front_end = FrontEnd(panel, monkeypatch)
+    kinds = [message["kind"] for message in front_end.messages]
+    assert kinds == ["setup", "history", "frame", "error"]
+    assert front_end.last("setup")["token"] == "mask"
+    assert [row["names"] for row in front_end.last("setup")["rows"]] == [["gain"], ["threshold"]]
+    assert front_end.last("setup")["rows"][1]["value"] == [13]
+
+
+def test_a_drag_is_computed_and_committed_when_it_is_let_go(
+    panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner
+) -> None:
+    before = len(panel.history)
+    front_end.tell("hold", names=["threshold"])
+    for value in (110, 120, 130):
+        move(panel, "threshold", value)
+        front_end.wait_for_values(10, threshold=value)
+    front_end.tell("release", names=["threshold"])
+    panel.wait(10)
+    assert list(panel.history["threshold"])[before:] == [130]
+    assert runner["threshold"] == 130
+
+
+def test_a_hand_that_rests_commits(panel: Panel, front_end: FrontEnd) -> None:
+    move(panel, "threshold", 110)
+    move(panel, "threshold", 111)
+    panel.wait(10)
+    move(panel, "threshold", 112)
+    panel.wait(10)
+    assert list(panel.history["threshold"]) == [100, 111, 112]
+
+
+def test_a_control_that_is_held_is_never_written_to(
+    panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner
+) -> None:
+    front_end.tell("hold", names=["threshold"])
+    move(panel, "threshold", 110)
+    panel.wait(10)
+    runner["threshold"] = 50
+    runner["gain"] = 3
+    panel.wait(10)
+    assert panel.values == {"gain": 3, "threshold": 110}
+    front_end.tell("release", names=["threshold"])
+    panel.wait(10)
+    assert panel.values == {"gain": 3, "threshold": 50} == dict(runner.hyperparameters)
+
+
+def test_what_the_hand_does_after_a_cell_wins(panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner) -> None:
+    front_end.tell("hold", names=["threshold"])
+    runner["threshold"] = 50
+    panel.wait(10)
+    move(panel, "threshold", 111)
+    front_end.tell("release", names=["threshold"])
+    panel.wait(10)
+    assert (panel["threshold"], runner["threshold"]) == (111, 111)
+
+
+def test_a_cell_that_sets_a_hyperparameter_moves_the_control_and_the_picture(
+    panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner, calls: Any
+) -> None:
+    runner["threshold"] = 60
+    panel.wait(10)
+    front_end.wait_for_values(10, threshold=60)
+    assert panel["threshold"] == 60
+    assert calls.counts == {"above": 1}
+    runner.rerun(gain=3)
+    panel.wait(10)
+    front_end.wait_for_values(10, gain=3)
+    assert calls.counts == {"above": 2, "brighten": 1}
+
+
+def test_a_value_that_a_cell_sets_out_of_range_is_shown_and_said(
+    panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner
+) -> None:
+    runner["threshold"] = 300
+    panel.wait(10)
+    front_end.wait_for_values(10, threshold=300)
+    assert panel["threshold"] == 100
+    assert "can't be 300" in panel.log[-1]
+
+
+def test_typed_values_are_checked_by_the_kernel(panel: Panel, front_end: FrontEnd) -> None:
+    front_end.tell("set", values={"threshold": 300}, commit=True)
+    assert front_end.last("error")["names"] == ["threshold"]
+    assert "can't be 300" in front_end.last("error")["text"]
+    front_end.tell("set", values={"threshold": 77}, commit=True)
+    panel.wait(10)
+    front_end.wait_for_values(10, threshold=77)
+    assert panel.error == ""
+    front_end.tell("reset", names=[])
+    panel.wait(10)
+    assert panel.values == {"gain": 2, "threshold": 100}
+
+
+def test_only_what_is_visible_is_computed(panel: Panel, front_end: FrontEnd, calls: Any) -> None:
+    front_end.tell("stage", token="image_bright")
+    panel["threshold"] = 50
+    panel["gain"] = 4
+    panel.wait(10)
+    assert calls.counts == {"brighten": 1}
+    front_end.tell("pin", token="mask", on=True)
+    panel.wait(10)
+    assert calls.counts == {"brighten": 1, "above": 1}
+    assert [picture["token"] for picture in front_end.frames[-1]["pictures"]] == ["image_bright", "mask"]
+    panel["threshold"] = 51
+    panel.wait(10)
+    assert calls.counts == {"brighten": 1, "above": 2}
+
+
+def test_with_live_off_values_wait_until_they_are_run(panel: Panel, front_end: FrontEnd, calls: Any) -> None:
+    front_end.tell("live", on=False)
+    panel.wait(10)
+    panel["threshold"] = 50
+    panel["gain"] = 3
+    panel.wait(10)
+    assert calls.counts == {}
+    front_end.tell("run")
+    panel.wait(10)
+    front_end.wait_for_values(10, threshold=50, gain=3)
+    assert calls.counts == {"brighten": 1, "above": 1}
+
+
+def test_undo_and_redo_walk_through_what_was_committed(
+    panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner
+) -> None:
+    for threshold in (110, 120):
+        panel["threshold"] = threshold
+        panel.wait(10)
+    front_end.tell("undo")
+    panel.wait(10)
+    assert (panel["threshold"], runner["threshold"]) == (110, 110)
+    assert (front_end.last("history")["undo"], front_end.last("history")["redo"]) == (True, True)
+    front_end.tell("undo")
+    front_end.tell("undo")
+    panel.wait(10)
+    front_end.wait_for_values(10, threshold=100)
+    front_end.tell("redo")
+    panel.wait(10)
+    assert runner["threshold"] == 110
+    front_end.tell("goto", number=3)
+    panel.wait(10)
+    assert runner["threshold"] == 120
+    assert len(panel.history) == 3
+
+
+def test_thumbnails_of_the_history_are_sent_once(panel: Panel, front_end: FrontEnd) -> None:
+    for threshold in (110, 120):
+        panel["threshold"] = threshold
+        panel.wait(10)
+    front_end.tell("ready")
+    sizes = [
+        [bool(data) for data in buffers]
+        for message, buffers in zip(front_end.messages, front_end.buffers, strict=True)
+        if message["kind"] == "history"
+    ]
+    assert sizes == [[True], [False, True], [False, False, True], [True, True, True]]
+
+
+def test_the_picture_is_compared_with_the_first_values_and_with_those_of_the_history(
+    panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner, calls: Any
+) -> None:
+    panel["threshold"] = 110
+    panel.wait(10)
+    panel["threshold"] = 120
+    panel.wait(10)
+    calls.clear()
+    front_end.tell("compare", **{"with": {"kind": "default"}})
+    panel.wait(10)
+    assert front_end.last("reference")["label"] == "default"
+    assert calls.counts == {"above": 1}
+    front_end.tell("compare", **{"with": {"kind": "history", "number": 2}})
+    panel.wait(10)
+    assert front_end.last("reference")["label"] == "history 2"
+    panel["threshold"] = 130
+    panel.wait(10)
+    assert len(front_end.of("reference")) == 2
+    assert runner["threshold"] == 130
+    front_end.tell("stage", token="image_bright")
+    panel.wait(10)
+    assert front_end.last("reference")["picture"]["token"] == "image_bright"
+    front_end.tell("compare", **{"with": {"kind": "stage", "token": "image"}})
+    panel.wait(10)
+    assert [picture["role"] for picture in front_end.frames[-1]["pictures"]] == ["main", "other"]
+
+
+def test_a_pixel_is_told_through_all_stages(panel: Panel, front_end: FrontEnd) -> None:
+    front_end.tell("probe", id=7, x=3.5, y=2.5)
+    told = front_end.last("probe")
+    assert (told["id"], [row["token"] for row in told["rows"]]) == (7, ["image", "image_bright", "mask"])
+    front_end.tell("probe", id=8, x=-1, y=0)
+    assert front_end.last("probe")["rows"] == []
+
+
+def test_a_function_that_fails_keeps_the_picture_and_names_what_was_set(panel: Panel, front_end: FrontEnd) -> None:
+    before = front_end.painted[-1]["values"]
+    panel["threshold"] = 13
+    panel.wait(10)
+    error = front_end.last("error")
+    assert (error["text"], error["function"]) == ("above: ValueError: 13 is not a threshold", "above")
+    assert error["names"] == ["threshold"]
+    assert (front_end.painted[-1]["stale"], front_end.painted[-1]["values"]) == (True, before)
+    assert front_end.painted[-1]["stages"]["mask"] == "failed"
+    assert front_end.painted[-1]["seq"] < error["seq"]
+    panel["threshold"] = 14
+    panel.wait(10)
+    assert (front_end.painted[-1]["stale"], front_end.painted[-1]["values"]["threshold"]) == (False, 14)
+
+
+def test_a_message_that_makes_no_sense_is_logged_and_harms_nothing(panel: Panel, front_end: FrontEnd) -> None:
+    for kind, content in (
+        ("stage", {"token": "nothing"}),
+        ("goto", {"number": 99}),
+        ("image", {"index": 3}),
+        ("set", {}),
+        ("set", {"values": {"nothing": 1}}),
+        ("compare", {"with": {"kind": "stage", "token": 5}}),
+        ("probe", {"id": 1, "x": "a", "y": None}),
+        ("unheard of", {}),
+    ):
+        front_end.tell(kind, **content)
+    panel["threshold"] = 60
+    panel.wait(10)
+    front_end.wait_for_values(10, threshold=60)
+    assert len(panel.log) == 7
+    assert front_end.last("log")["lines"]
