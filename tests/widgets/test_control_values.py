@@ -88,6 +88,8 @@ def test_a_recursive_list_and_an_array_are_shown() -> None:
         (1e16, (1e16, 1e16 + 4)),
         (1.0, ep.Param(1.0, 1.0 + 1e-9, log=True)),
         (2**60, (0, 2**61)),
+        (1e10, ep.Param(1e10, 1e10 + 1e-5, log=True)),
+        (1e-310, ep.Param(5e-324, 1e-309, log=True)),
     ],
 )
 def test_ranges_at_the_limits_of_numbers_make_controls_of_finite_numbers(value: Any, hint: Any) -> None:
@@ -296,9 +298,60 @@ def test_a_hand_that_moves_while_code_writes_is_heard_unless_it_was_written_over
     thread.start()
     start.wait(10)
     for value in range(1, 1000, 2):
-        entry.widget.value = value
+        entry.widget.set_state({"value": value})  # as a message of the front end does
     thread.join(10)
-    last = entry.widget.value
-    assert at(entry) == last
-    assert last == 998 or told[-1] == {"x": last}
-    assert all(values["x"] % 2 == 1 or values["x"] < 998 for values in told)
+    assert at(entry) == entry.widget.value
+    assert at(entry) == 998 or told[-1] == {"x": 999}
+    assert {values["x"] % 2 for values in told} <= {1}
+
+
+def test_a_hand_on_a_logarithmic_slider_means_short_numbers_one_for_each_place() -> None:
+    for value, low, high in ((0.5, 0.001, 10.0), (1.2, 1.0, 1.5), (1.0, 1.0, 1.0 + 1e-9), (5.0, 1e-300, 1e300)):
+        entry = made(value, ep.Param(low, high, log=True))
+        widget, seen = entry.widget, []
+        for place in range(1, 20):
+            widget.value = 10 ** (widget.min + place * widget.step)
+            seen.append(at(entry))
+        assert seen == sorted(set(seen))
+        assert low <= seen[0]
+        assert seen[-1] <= high
+    wide = made(0.5, ep.Param(0.001, 10, log=True))
+    wide.widget.value = 0.036307805477
+    assert at(wide) == 0.03631
+
+
+def test_what_is_only_shown_stands_beside_its_name_and_is_no_markup() -> None:
+    entry = made(["<b>"])
+    assert (entry.widget.description, entry.widget.value) == ("x", "[&#x27;&lt;b&gt;&#x27;]")
+    entry.write({"x": ["<i>"]})
+    assert entry.widget.value == "[&#x27;&lt;i&gt;&#x27;]"
+
+
+@pytest.mark.parametrize(
+    ("value", "hint", "written", "trait", "moved", "meant"),
+    [
+        (5, (0, 10), 7, "value", 9, 9),
+        (0.5, (0.0, 1.0), 0.123456, "value", 0.9, 0.9),
+        (5, ep.Param(1, 1000, log=True), 7, "value", 100.0, 100),
+        ("a", ["a", "b", "c"], "b", "index", 2, "c"),
+        ("one", None, "two", "value", "three", "three"),
+    ],
+)
+def test_a_hand_that_moves_in_the_middle_of_a_write_is_heard(
+    value: Any, hint: Any, written: Any, trait: str, moved: Any, meant: Any
+) -> None:
+    entry = made(value, hint)
+    told = moves(entry)
+    hands: list[threading.Thread] = []
+
+    def interfere(_change: object) -> None:
+        if not hands:
+            hands.append(threading.Thread(target=setattr, args=(entry.widget, trait, moved)))
+            hands[0].start()
+            while getattr(entry.widget, trait) != moved:  # it is heard only when the write is over
+                pass
+
+    entry.widget.observe(interfere, trait)
+    entry.write({"x": written})
+    hands[0].join(10)
+    assert (at(entry), told) == (meant, [{"x": meant}])

@@ -46,12 +46,12 @@ def made(value: Any, hint: Any = None, function: Any = None) -> Control:
         (None, [1, None], ipywidgets.Dropdown),
         (Mode.FAST, None, ipywidgets.Dropdown),
         (True, None, ipywidgets.Checkbox),
-        (None, None, ipywidgets.Label),
+        (None, None, ipywidgets.HTML),
         ("text", None, ipywidgets.Text),
-        (float("inf"), None, ipywidgets.Label),
-        (float("nan"), None, ipywidgets.Label),
-        ((1, 2), None, ipywidgets.Label),
-        ((1, 2, 3, 4), Roi(), ipywidgets.Label),
+        (float("inf"), None, ipywidgets.HTML),
+        (float("nan"), None, ipywidgets.HTML),
+        ((1, 2), None, ipywidgets.HTML),
+        ((1, 2, 3, 4), Roi(), ipywidgets.HTML),
     ],
 )
 def test_the_hint_or_the_value_says_which_control(value: Any, hint: Any, kind: type) -> None:

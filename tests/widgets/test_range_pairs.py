@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import ipywidgets
@@ -140,3 +141,21 @@ def test_whatever_is_moved_and_written_the_two_stay_in_order_and_range(
         assert low.allows(values["lo"])
         assert high.allows(values["hi"])
         assert values == shadow
+
+
+def test_a_hand_that_moves_in_the_middle_of_a_write_is_heard() -> None:
+    entry = paired(70, 200)
+    told = moves(entry)
+    hands: list[threading.Thread] = []
+
+    def interfere(_change: object) -> None:
+        if not hands:
+            hands.append(threading.Thread(target=setattr, args=(entry.widget, "value", (90, 210))))
+            hands[0].start()
+            while entry.widget.value != (90, 210):  # it is heard only when the write is over
+                pass
+
+    entry.widget.observe(interfere, "value")
+    entry.write({"lo": 80})
+    hands[0].join(10)
+    assert (entry.read(), told) == ({"lo": 90, "hi": 210}, [{"lo": 90, "hi": 210}])

@@ -42,9 +42,8 @@ class _Chosen:
 
     def place(self, values: Mapping[str, Any]) -> None:
         for value in values.values():
-            index = index_of(self._choices, value)
-            setattr(self._widget, self._trait, index)
-            self._exact, self._index = value, getattr(self._widget, self._trait)
+            self._exact, self._index = value, index_of(self._choices, value)
+            setattr(self._widget, self._trait, self._index)
 
     def _one(self, value: Any) -> Any:
         index = index_of(self._choices, value)

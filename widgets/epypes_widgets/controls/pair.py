@@ -22,9 +22,9 @@ class _Pair:
 
     def __init__(self, slider: Any, scales: tuple[Scale, Scale], values: _Two) -> None:
         self._slider, self._scales, self._values = slider, scales, values
-        self._places: tuple[float, float] = slider.value
         self._snaps = tuple(Snap(scale, value, slider.step) for scale, value in zip(scales, values, strict=True))
-        self._settle(values)
+        self._places: tuple[float, float] = slider.value
+        self._settle(values, slider.value)
 
     def read(self) -> dict[str, Any]:
         places = self._slider.value
@@ -44,12 +44,14 @@ class _Pair:
         low, high = {**self.read(), **values}.values()
         for scale, value in zip(self._scales, (low, high), strict=True):
             self._slider.min, self._slider.max = scale.grown(self._slider.min, self._slider.max, value)
-        self._slider.value = self._scales[0].place(low), self._scales[1].place(high)
-        self._settle((low, high))
+        places = self._scales[0].place(low), self._scales[1].place(high)
+        # First: a hand that moves the slider at this very moment, on another thread, means places of its own.
+        self._settle((low, high), places)
+        self._slider.value = places
 
-    def _settle(self, values: _Two) -> None:
-        self._values, self._places = values, self._slider.value
-        for snap, value, place in zip(self._snaps, values, self._places, strict=True):
+    def _settle(self, values: _Two, places: tuple[float, float]) -> None:
+        self._values, self._places = values, places
+        for snap, value, place in zip(self._snaps, values, places, strict=True):
             snap.put(value, place)
 
     def _named(self, values: _Two) -> dict[str, Any]:

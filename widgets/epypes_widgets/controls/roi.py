@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from typing import Any
 
-import ipywidgets
-from ipywidgets.widgets.widget_string import LabelStyle
+from ipywidgets.widgets.widget_string import HTMLStyle
 
 from epypes.display.previews.short import short_repr
 from epypes.hints import Roi
 from epypes_widgets.controls.control import Control
 from epypes_widgets.controls.kinds import is_integer
 from epypes_widgets.controls.look import Look
-from epypes_widgets.controls.shown import Words, said
+from epypes_widgets.controls.shown import Words, line_of, said
 from epypes_widgets.ranges import allows
 
 
 def roi(name: str, value: Any, param: Roi, first: Any, look: Look, tip: str) -> Control:
-    """Return a label that says where the rectangle is; it stays a list if it was one."""
+    """Return a line that says where the rectangle is; it stays a list if it was one."""
     kind = list if isinstance(value, list) else tuple
 
     def checked(new: Any) -> Any:
@@ -29,8 +28,8 @@ def roi(name: str, value: Any, param: Roi, first: Any, look: Look, tip: str) -> 
             raise ValueError(f"{name!r} can't be {short_repr(new)}: it is a rectangle. {way_out}")
         return kind(int(side) for side in sides)
 
-    label = ipywidgets.Label(value=in_words(value), **look.words((name,), param, tip, LabelStyle))
-    return Control((name,), "roi", (param,), label, Words(name, value, label, in_words, checked), first=(first,))
+    line = line_of(in_words(value), look.words((name,), param, tip, HTMLStyle))
+    return Control((name,), "roi", (param,), line, Words(name, value, line, in_words, checked), first=(first,))
 
 
 def in_words(value: Any) -> str:

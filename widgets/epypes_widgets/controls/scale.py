@@ -59,10 +59,18 @@ class Scale:
 
     def meant(self, place: float) -> Any:
         """Return the value that a hand means which moved the slider to a place."""
-        number: float = round(place) if self.integer else without_noise(place, self.step if not self.param.log else 0)
+        number = round(place) if self.integer else self._rounded(place)
         if self.param.odd:
             number = round(number) | 1
         return like(self.first)(min(max(number, self.bottom), self.top))
+
+    def _rounded(self, place: float) -> float:
+        """Return the shortest decimal number that is surely meant by a place."""
+        if not self.param.log:
+            return without_noise(place, self.step)
+        # Two places differ by this share of them; digits far below it are of the scale, not of the hand.
+        share = math.expm1(self.step * math.log(10))
+        return float(f"{place:.{max(3, 2 - math.floor(math.log10(share)))}g}")
 
     def checked(self, value: Any) -> Any:
         """Return a value as the hyperparameter takes it.
@@ -133,7 +141,7 @@ def exponent(value: Any) -> float:
 def without_noise(place: float, step: float) -> float:
     """Return what a hand on a slider means: 0.3, where adding up steps gives 0.30000000000000004."""
     near = float(f"{place:.12g}")
-    return near if step == 0 or abs(near - place) <= min(step / 4, 64 * math.ulp(place)) else place
+    return near if abs(near - place) <= min(step / 4, 64 * math.ulp(place)) else place
 
 
 def _hard_ends(param: Param, value: Any, integer: bool) -> tuple[float, float]:
@@ -156,9 +164,16 @@ def _offered(param: Param, value: Any, hard: tuple[float, float], integer: bool)
             low, high = math.ceil(low) | 1, (math.floor(high) - 1) | 1
         elif integer:
             low, high = math.ceil(low), math.floor(high)
-        if low < high and math.isfinite(float(high) - float(low)):
+        if _is_span(param, low, high):
             return low, high
     return None
+
+
+def _is_span(param: Param, low: float, high: float) -> bool:
+    """Whether a slider can stand at several places between two ends."""
+    if param.log:
+        return exponent(low) < exponent(high)
+    return low < high and math.isfinite(float(high) - float(low))
 
 
 def _finite(low: float, high: float, value: Any) -> tuple[float, float]:

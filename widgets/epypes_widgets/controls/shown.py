@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import ipywidgets
-from ipywidgets.widgets.widget_string import LabelStyle
+from ipywidgets.widgets.widget_string import HTMLStyle
 
 from epypes.display.previews.short import short_repr
 from epypes.hints import Param, Roi, Text
@@ -17,7 +18,7 @@ from epypes_widgets.ranges import allows
 
 
 class Words:
-    """A label that says a value in words.
+    """A line that says a value in words.
 
     Parameters
     ----------
@@ -25,18 +26,18 @@ class Words:
         The token.
     value
         What is said at first.
-    label
+    line
         The widget.
     said
-        Returns the words for a value.
+        Returns the words for a value, as plain text.
     checked
         Returns a value as the hyperparameter takes it, or raises ValueError.
     """
 
     def __init__(
-        self, name: str, value: Any, label: Any, said: Callable[[Any], str], checked: Callable[[Any], Any]
+        self, name: str, value: Any, line: Any, said: Callable[[Any], str], checked: Callable[[Any], Any]
     ) -> None:
-        self._name, self._value, self._label, self._said, self._checked = name, value, label, said, checked
+        self._name, self._value, self._line, self._said, self._checked = name, value, line, said, checked
 
     def read(self) -> dict[str, Any]:
         """Return the value."""
@@ -49,20 +50,26 @@ class Words:
     def place(self, values: Mapping[str, Any]) -> None:
         """Say another value."""
         for value in values.values():
-            self._value, self._label.value = value, self._said(value)
+            self._value, self._line.value = value, html.escape(self._said(value))
 
 
 def shown(name: str, value: Any, param: Param | Roi | Text | None, first: Any, look: Look, tip: str) -> Control:
-    """Return a label with a short repr of any value."""
+    """Return a line with a short repr of any value."""
 
     def checked(new: Any) -> Any:
         if param is not None and not allows(param, new):
             raise refused(name, new, param)
         return new
 
-    label = ipywidgets.Label(value=said(value), **look.words((name,), param, tip, LabelStyle))
-    label.add_class("epypes-read-only")
-    return Control((name,), "shown", (param,), label, Words(name, value, label, said, checked), first=(first,))
+    line = line_of(said(value), look.words((name,), param, tip, HTMLStyle))
+    return Control((name,), "shown", (param,), line, Words(name, value, line, said, checked), first=(first,))
+
+
+def line_of(words: str, look: Mapping[str, Any]) -> Any:
+    """Return a line of text that nobody can type into; unlike a Label it stands beside its name."""
+    line = ipywidgets.HTML(value=html.escape(words), **look)
+    line.add_class("epypes-read-only")
+    return line
 
 
 def said(value: Any) -> str:

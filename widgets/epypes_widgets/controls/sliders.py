@@ -56,8 +56,16 @@ class _Single:
         for value in values.values():
             # Only the soft range is offered at first; code may go to the ends of the hard one.
             self._slider.min, self._slider.max = self._scale.grown(self._slider.min, self._slider.max, value)
+            # First: a hand that moves the slider at this very moment, on another thread, means a place of its own.
+            self._snap.put(value, self._accepted(value))
             self._slider.value = self._scale.place(value)
-            self._snap.put(value, self._slider.value)
+
+    def _accepted(self, value: Any) -> float:
+        """Return where the slider will stand for a value: one of exponents clamps to what its ends come to."""
+        place = self._scale.place(value)
+        if not self._scale.param.log:
+            return place
+        return float(min(max(place, 10.0**self._slider.min), 10.0**self._slider.max))
 
 
 def slider(scale: Scale, value: Any, first: Any, look: Look, tip: str) -> Control:

@@ -37,8 +37,8 @@ class _Typed:
 
     def place(self, values: Mapping[str, Any]) -> None:
         for value in values.values():
-            self._box.value = sendable(value)
-            self._exact, self._shown = value, self._box.value
+            self._exact, self._shown = value, sendable(value)
+            self._box.value = self._shown
 
 
 def text(name: str, value: Any, param: Text, first: Any, look: Look, tip: str) -> Control | None:
