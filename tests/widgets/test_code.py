@@ -43,7 +43,7 @@ def evaluated(text: str) -> Any:
     "value",
     [3, -2.5, 0.1 + 0.2, -0.0, float("inf"), -math.inf, float("nan"), True, None, 'it\'s "x"\n', b"\x00", 1j, (), (3,), (3, 5), [1, [2]],
      {"a": (1, 2)}, {1, 2}, Method.SOBEL, Flags.A | Flags.B, (Method.CANNY, np.uint8(3)), [float("nan")], np.uint8(7), np.int64(-3),
-     np.float32(0.1), np.float64(1 / 3), np.bool_(True), np.float32("nan"), np.float64("-inf"), np.float16(0.1), np.complex64(1 + 2j)],
+     np.float32(0.1), np.float64(1 / 3), np.bool_(True), np.float32("nan"), np.float64("-inf"), np.float16(0.1), np.complex64(1 + 2j), np.longdouble("0.1")],
     ids=repr,
 )  # fmt: skip
 def test_what_is_written_makes_the_value_again(value: Any) -> None:

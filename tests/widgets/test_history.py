@@ -69,6 +69,11 @@ def test_values_that_compute_something_else_are_an_entry(one: Any, other: Any) -
     assert numbers(committed(one, other)) == [1, 2]
 
 
+def test_another_nan_is_no_entry_but_another_unit_of_time_is() -> None:
+    assert numbers(committed(float("nan"), float("nan"), [float("nan")], [float("nan")])) == [1, 2]
+    assert numbers(committed(np.datetime64(1, "D"), np.datetime64(1, "h"))) == [1, 2]
+
+
 def test_an_array_read_twice_from_a_runner_is_the_same() -> None:
     runner = ep.CompGraphRunner(ep.CompGraph({"add": np.add}, {"add": (("x", "k"), "y")}), {"k": np.ones(3)})
     assert numbers(committed(runner["k"], runner["k"], runner.hyperparameters["k"])) == [1]

@@ -28,6 +28,8 @@ _NAME_CHARACTERS: Final = 40
 # What a text takes in the page at most.
 _CELL_ROOM: Final = 80
 _TEXT_ROOM: Final = 800
+# Within the picture, since an output cuts off what is around it.
+_FRAME: Final = "max-width:100%;height:auto;outline:1px solid currentColor;outline-offset:-1px"
 _LEFT: Final = ' style="text-align:left;padding:2px 12px 2px 0"'
 
 
@@ -61,7 +63,7 @@ def static_html(
     picture = _shown(run, token, on) if token is not None else ""
     # Half a line of code is worse than none: the table has the values.
     is_told = code and written_length(code) <= _TEXT_ROOM
-    line = f'<pre style="white-space:pre-wrap">{content(code)}</pre>' if is_told else ""
+    line = f'<pre style="white-space:pre-wrap;font-family:monospace">{content(code)}</pre>' if is_told else ""
     return f'<figure class="epypes-static" style="margin:0">{picture}{_table(values, defaults)}{line}</figure>'
 
 
@@ -79,7 +81,7 @@ def _shown(run: Run, token: str, on: str) -> str:
     data = base64.b64encode(picture.data).decode()
     return (
         f'<img src="data:{escape(picture.media_type)};base64,{data}" alt="{escape(about)}" '
-        f'width="{picture.width}" style="max-width:100%;height:auto;outline:1px solid currentColor">{_caption(about)}'
+        f'width="{picture.width}" style="{_FRAME}">{_caption(about)}'
     )
 
 
