@@ -260,16 +260,22 @@ class Notebook:
         self.page.context.close()
 
 
-@contextmanager
-def chromium() -> Iterator[Any]:
-    """Give a headless Chromium, driven by Playwright."""
-    from playwright.sync_api import sync_playwright
-
+def browser_path() -> str:
+    """Return where Chromium is; RuntimeError if it is nowhere."""
     path = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, _BROWSERS)), None)
     if path is None:
         raise RuntimeError(
             "No Chromium was found. Install one (apt install chromium), or name it: CHROMIUM=/path/to/chromium."
         )
+    return path
+
+
+@contextmanager
+def chromium() -> Iterator[Any]:
+    """Give a headless Chromium, driven by Playwright."""
+    from playwright.sync_api import sync_playwright
+
+    path = browser_path()
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, headless=True, args=_FLAGS)
         try:
