@@ -19,7 +19,7 @@ test: $(VENV)/.test chromium
 		tests epypes widgets/epypes_widgets notebooks
 
 lab: $(VENV)/.all
-	$(BIN)/jupyter lab --ip=127.0.0.1 $(if $(filter 0,$(shell id -u)),--allow-root) notebooks
+	$(BIN)/epypes lab notebooks
 
 bench: $(VENV)/.bench
 	$(BIN)/python -m tests.benchmarks

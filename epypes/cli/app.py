@@ -6,6 +6,7 @@ import typer
 
 from epypes.cli.call import call
 from epypes.cli.demo import demo
+from epypes.cli.lab import lab
 from epypes.cli.promote import promote
 from epypes.cli.serve import serve
 from epypes.cli.verify import verify
@@ -18,5 +19,5 @@ app = typer.Typer(
     # A traceback's locals would print whole images.
     pretty_exceptions_enable=False,
 )
-for command in (promote, verify, serve, call, demo):
+for command in (promote, verify, serve, call, demo, lab):
     app.command()(command)

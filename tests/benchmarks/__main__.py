@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from tests.benchmarks import engine, imports, peers, picture, sockets
+from tests.benchmarks import engine, imports, peers, picture, sockets, tuning
 from tests.benchmarks.table import as_table, write_json
 from tests.benchmarks.timing import Effort
 
@@ -21,13 +21,15 @@ def main() -> None:
     console = Console()
     console = console if console.is_terminal else Console(width=_WIDTH)
     rows = []
-    for module in (imports, engine, picture, sockets):
+    for module in (imports, engine, picture, sockets, tuning):
         console.print(module.__doc__, style="dim")
         rows += module.rows(effort)
     console.print(as_table(rows))
     absent = {peer.name for peer in peers.ALL} - {peer.name for peer in peers.present(effort)}
     if absent:
         console.print(f"Left out: {', '.join(sorted(absent))}" + (" (quick)." if effort.quick else " (not installed)."))
+    if tuning.missing():
+        console.print(f"Left out: tuning in a browser. {tuning.missing()}")
     write_json(rows, absent, Path("test-output") / "benchmarks.json")
 
 

@@ -13,21 +13,23 @@ OURS = "EPypes"
 
 @dataclass(frozen=True)
 class Goal:
-    """What EPypes must not exceed.
+    """What EPypes must not exceed, or must have at least.
 
     Attributes
     ----------
     of
         ``ratio`` to the limit (the medians' and the median of the rounds'), ``total`` time, time ``above`` the
-        limit, or time above the limit ``per function``.
+        limit, time above the limit ``per function``, or ``least``: the number that must be reached.
     most
-        The ratio, or nanoseconds.
+        The ratio, or nanoseconds; of ``least`` the number.
     """
 
-    of: Literal["ratio", "total", "above", "per function"]
+    of: Literal["ratio", "total", "above", "per function", "least"]
     most: float
 
     def __str__(self) -> str:
+        if self.of == "least":
+            return f">= {self.most:g}"
         if self.of == "ratio":
             return f"<= {self.most:g} times"
         return f"<= {_plain_duration(self.most)}" + ("" if self.of == "total" else f" {self.of}")
@@ -35,7 +37,10 @@ class Goal:
 
 @dataclass(frozen=True)
 class Row:
-    """One piece of work: medians in nanoseconds by contender, of which one is the limit and one is ours."""
+    """One piece of work: medians in nanoseconds by contender, of which one is the limit and one is ours.
+
+    Where ``unit`` is ``count`` they are no times, but how many there were of something.
+    """
 
     work: str
     medians_ns: Mapping[str, float]
@@ -45,6 +50,7 @@ class Row:
     ours: str = OURS
     pairwise_ratio: float | None = None
     note: str = ""
+    unit: Literal["ns", "count"] = "ns"
 
     @property
     def limit_ns(self) -> float:
@@ -67,6 +73,8 @@ class Row:
         """Whether the goal is reached; None without a goal."""
         if self.goal is None:
             return None
+        if self.goal.of == "least":
+            return self.ours_ns >= self.goal.most
         value = {
             "ratio": max(self.ratio(self.ours) or 0, self.pairwise_ratio or 0),
             "total": self.ours_ns,
@@ -82,7 +90,7 @@ class Row:
             "functions": self.functions,
             "limit": self.limit,
             "ours": self.ours,
-            "medians_ns": dict(self.medians_ns),
+            f"medians_{self.unit}": dict(self.medians_ns),
             "ratio": self.ratio(self.ours),
             "pairwise_ratio": self.pairwise_ratio,
             "us_per_function_above": self.us_per_function(self.ours),
@@ -105,6 +113,11 @@ def row(
     """Make a line of what was measured."""
     pairwise = times.pairwise_ratio(limit, ours)
     return Row(work, times.medians_ns, functions, goal, limit, ours, pairwise, note)
+
+
+def amount_text(amount: float, unit: Literal["ns", "count"]) -> str:
+    """Return a duration, or a number, as the table shows it."""
+    return duration_text(amount) if unit == "ns" else f"{amount:.3g}"
 
 
 def duration_text(duration_ns: float) -> str:

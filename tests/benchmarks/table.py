@@ -10,7 +10,7 @@ from rich.table import Table
 
 from tests.benchmarks import peers
 from tests.benchmarks.functions import TIMED
-from tests.benchmarks.row import Row, duration_text
+from tests.benchmarks.row import Row, amount_text
 
 _VERDICTS = {True: "yes", False: "[bold]no[/]", None: ""}
 
@@ -35,8 +35,8 @@ def _takes_part(name: str, rows: Sequence[Row]) -> bool:
 def _cells(row: Row) -> tuple[str, ...]:
     work = f"{row.work}\n[dim]{row.note}[/]" if row.note else row.work
     goal = str(row.goal or "")
-    times = duration_text(row.limit_ns), duration_text(row.ours_ns)
-    return work, *times, _beside(row, row.ours), goal, _VERDICTS[row.reached]
+    amounts = amount_text(row.limit_ns, row.unit), amount_text(row.ours_ns, row.unit)
+    return work, *amounts, _beside(row, row.ours), goal, _VERDICTS[row.reached]
 
 
 def _beside(row: Row, name: str) -> str:

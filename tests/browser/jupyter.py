@@ -58,10 +58,12 @@ class JupyterLab:
         An empty folder for its settings, its log and its runtime files.
     theme
         ``"light"`` or ``"dark"``.
+    plain
+        Whether it is started by itself, not by ``epypes lab``.
     """
 
-    def __init__(self, root: Path, state: Path, theme: str = "light") -> None:
-        self.root, self.state, self.theme = root.resolve(), state, theme
+    def __init__(self, root: Path, state: Path, theme: str = "light", *, plain: bool = True) -> None:
+        self.root, self.state, self.theme, self.plain = root.resolve(), state, theme, plain
         self.port, self.token = _free_port(), secrets.token_hex(16)
         self.log: list[str] = []
         self._listening = threading.Event()
@@ -69,7 +71,7 @@ class JupyterLab:
     def __enter__(self) -> Self:
         self._write_settings()
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "jupyterlab", *self._arguments()],
+            [sys.executable, "-m", *self._command(), *self._arguments()],
             env=self._environment(),
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -78,7 +80,7 @@ class JupyterLab:
         )
         self._reader = threading.Thread(target=self._read_log, daemon=True)
         self._reader.start()
-        if not self._listening.wait(START_TIMEOUT_S) or self._process.poll() is not None:
+        if not self._listening.wait(START_TIMEOUT_S) or not self._takes_calls():
             self.stop()
             raise RuntimeError("JupyterLab did not start:\n" + "".join(self.log))
         return self
@@ -95,8 +97,8 @@ class JupyterLab:
     def stop(self) -> None:
         """End the kernels, then the server; kill its process group if it does not end by itself."""
         with suppress(OSError):
-            for kernel in self._api("kernels"):
-                self._api(f"kernels/{kernel['id']}", "DELETE")
+            for kernel in self.api("kernels"):
+                self.api(f"kernels/{kernel['id']}", "DELETE")
         self._process.terminate()
         try:
             self._process.wait(STOP_TIMEOUT_S)
@@ -107,7 +109,8 @@ class JupyterLab:
         if self._process.stdout is not None:
             self._process.stdout.close()
 
-    def _api(self, path: str, method: str = "GET") -> Any:
+    def api(self, path: str, method: str = "GET") -> Any:
+        """Ask the server itself; return what it answers."""
         request = urllib.request.Request(
             f"http://127.0.0.1:{self.port}/api/{path}",
             method=method,
@@ -116,6 +119,13 @@ class JupyterLab:
         with urllib.request.urlopen(request, timeout=STOP_TIMEOUT_S) as answer:
             body = answer.read()
         return json.loads(body) if body else None
+
+    def _takes_calls(self) -> bool:
+        """Return once the port can be connected to: it says that it is running before it listens."""
+        while self._process.poll() is None:
+            with suppress(OSError), socket.create_connection(("127.0.0.1", self.port), STOP_TIMEOUT_S):
+                return True
+        return False
 
     def _read_log(self) -> None:
         assert self._process.stdout is not None
@@ -145,6 +155,9 @@ class JupyterLab:
             "IPYTHONDIR": str(self.state / "ipython"),
             "PYTHONUNBUFFERED": "1",
         }
+
+    def _command(self) -> list[str]:
+        return ["jupyterlab"] if self.plain else ["epypes.cli", "lab", str(self.root), "--"]
 
     def _arguments(self) -> list[str]:
         return [
@@ -247,16 +260,22 @@ class Notebook:
         self.page.context.close()
 
 
-@contextmanager
-def chromium() -> Iterator[Any]:
-    """Give a headless Chromium, driven by Playwright."""
-    from playwright.sync_api import sync_playwright
-
+def browser_path() -> str:
+    """Return where Chromium is; RuntimeError if it is nowhere."""
     path = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, _BROWSERS)), None)
     if path is None:
         raise RuntimeError(
             "No Chromium was found. Install one (apt install chromium), or name it: CHROMIUM=/path/to/chromium."
         )
+    return path
+
+
+@contextmanager
+def chromium() -> Iterator[Any]:
+    """Give a headless Chromium, driven by Playwright."""
+    from playwright.sync_api import sync_playwright
+
+    path = browser_path()
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=path, headless=True, args=_FLAGS)
         try:

@@ -1,0 +1,148 @@
+"""Does ``epypes lab`` start JupyterLab as it should, and does its websocket send at once?"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import subprocess
+import sys
+import time
+
+import pytest
+
+from epypes.cli.lab import lab_arguments
+from epypes.cli.websocket import SETTING, _load_jupyter_server_extension
+from epypes.errors import ServiceError
+from tests.browser.jupyter import JupyterLab
+
+# Tells about the sockets between pages and kernels that the server has open.
+TELLS = """
+import socket
+from jupyter_server.base.handlers import JupyterHandler
+from jupyter_server.services.kernels.connection.channels import ZMQChannelsWebsocketConnection
+from tornado.web import authenticated
+
+class Sockets(JupyterHandler):
+    @authenticated
+    def get(self):
+        streams = [each.websocket_handler.ws_connection.stream for each in ZMQChannelsWebsocketConnection._open_sockets]
+        self.finish({"nodelay": [s.socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) for s in streams]})
+
+def _jupyter_server_extension_points():
+    return [{"module": __name__}]
+
+def _load_jupyter_server_extension(server):
+    server.web_app.add_handlers(".*", [("/api/sockets", Sockets)])
+"""
+DEADLINE_S = 60
+
+
+def run_lab(*words):
+    command = [sys.executable, "-m", "epypes.cli", "lab", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=DEADLINE_S)
+
+
+@pytest.fixture
+def state(tmp_path, monkeypatch):
+    """A folder for a server's settings, by which it tells about its sockets."""
+    (tmp_path / "modules").mkdir()
+    (tmp_path / "modules" / "tells.py").write_text(TELLS)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path / "modules"), *filter(None, sys.path)]))
+    settings = tmp_path / "state" / "config" / "jupyter_server_config.d" / "tells.json"
+    settings.parent.mkdir(parents=True)
+    settings.write_text(json.dumps({"ServerApp": {"jpserver_extensions": {"tells": True}}}))
+    return tmp_path / "state"
+
+
+async def nodelay_of(lab):
+    """Open a websocket to a new kernel; return TCP_NODELAY of the server's end of it."""
+    from tornado.websocket import websocket_connect
+
+    kernel = await asyncio.to_thread(lab.api, "kernels", "POST")
+    address = f"ws://127.0.0.1:{lab.port}/api/kernels/{kernel['id']}/channels?session_id=x&token={lab.token}"
+    connection = await websocket_connect(address)
+    deadline = time.monotonic() + DEADLINE_S
+    while not (said := await asyncio.to_thread(lab.api, "sockets"))["nodelay"]:
+        assert time.monotonic() < deadline
+    connection.close()
+    while await connection.read_message() is not None:
+        pass
+    (nodelay,) = said["nodelay"]
+    return bool(nodelay)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("plain", [False, True], ids=["epypes lab", "jupyter lab"])
+def test_a_kernels_websocket_sends_at_once(plain, state, tmp_path):
+    with JupyterLab(tmp_path, state, plain=plain) as lab:
+        assert asyncio.run(nodelay_of(lab)) is not plain
+
+
+@pytest.mark.slow
+def test_options_reach_jupyterlab_and_its_exit_status_comes_back(tmp_path):
+    import jupyterlab
+
+    done = run_lab(tmp_path, "--", "--version")
+    assert (done.stdout.strip(), done.returncode) == (jupyterlab.__version__, 0)
+    assert run_lab("--", "--version").stdout == done.stdout, "without a folder"
+    assert run_lab(tmp_path, "--", "--ServerApp.port=none").returncode == 1
+
+
+def test_it_listens_on_this_machine_alone_unless_told_otherwise(tmp_path):
+    assert "--ip=127.0.0.1" in lab_arguments([str(tmp_path)])
+    told = lab_arguments([str(tmp_path), "--ServerApp.ip=0.0.0.0"])
+    assert "--ServerApp.ip=0.0.0.0" in told
+    assert "--ip=127.0.0.1" not in told, "JupyterLab refuses two"
+
+
+def test_root_may_start_it_too():
+    assert "--allow-root" in lab_arguments([], is_root=True)
+    assert "--allow-root" not in lab_arguments([])
+
+
+def test_a_folder_that_is_not_there_is_said_in_a_sentence(tmp_path):
+    with pytest.raises(ServiceError, match="There is no folder '.*nowhere' to show in JupyterLab"):
+        lab_arguments([str(tmp_path / "nowhere")])
+    done = run_lab(tmp_path / "nowhere")
+    assert done.returncode == 1
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_without_jupyterlab_it_says_what_to_install(tmp_path):
+    code = (
+        "import importlib.util as u; find = u.find_spec\n"
+        "u.find_spec = lambda name, *rest: None if name == 'jupyterlab' else find(name, *rest)\n"
+        f"from epypes.cli import main; main(['lab', {str(tmp_path)!r}])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=DEADLINE_S)
+    assert done.returncode == 1
+    assert done.stderr.strip() == "epypes: module 'jupyterlab' is missing. Run: pip install 'epypes[all]'"
+
+
+class Server:
+    """As much of a server as an extension changes."""
+
+    def __init__(self, chosen):
+        self.web_app = self
+        self.settings = {SETTING: chosen}
+
+
+def test_the_websocket_of_a_gateway_is_left_alone():
+    from jupyter_server.gateway.connections import GatewayWebSocketConnection
+
+    server = Server(GatewayWebSocketConnection)
+    _load_jupyter_server_extension(server)
+    assert server.settings[SETTING] is GatewayWebSocketConnection
+
+
+def test_a_websocket_that_was_configured_is_kept():
+    from jupyter_server.services.kernels.connection.channels import ZMQChannelsWebsocketConnection
+
+    class Own(ZMQChannelsWebsocketConnection):
+        pass
+
+    server = Server(Own)
+    _load_jupyter_server_extension(server)
+    assert issubclass(server.settings[SETTING], Own)
+    assert server.settings[SETTING] is not Own
