@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from operator import or_
 from functools import reduce
+from operator import or_
 from typing import Any
 
 from epypes.hints import Param
