@@ -150,7 +150,7 @@ class Text:
 
 
 def _is_length(value: Any) -> bool:
-    return isinstance(value, numbers.Integral) and not isinstance(value, bool) and value >= 0
+    return isinstance(value, numbers.Integral) and not isinstance(value, bool) and int(value) >= 0
 
 
 def as_param(hint: Any) -> Param | Roi | None:

@@ -59,7 +59,7 @@ def _is_called(function: Any, library: str, full: str) -> bool:
     home = sys.modules.get(f"{library}.{path}" if path else library)
     if home is None or (path and not str(getattr(function, "__module__", "")).startswith(library)):
         return False  # not asked: scikit-image imports what it is asked for
-    spellings = [(home, last)]
+    spellings: list[tuple[object, str]] = [(home, last)]
     if last.endswith(_MAKER):
         made = getattr(home, last.removesuffix(_MAKER), None)
         spellings += [(made, "create"), (home, last.removesuffix(_MAKER))]

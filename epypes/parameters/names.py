@@ -44,49 +44,12 @@ _COMMON: Final[dict[str, tuple[Param, ...]]] = {
 }  # fmt: skip
 
 # In the table, and common words with other meanings too.
-_VAGUE: Final = frozenset(
-    [
-        "type",
-        "mode",
-        "method",
-        "flags",
-        "code",
-        "shape",
-        "order",
-        "delta",
-        "distance",
-        "level",
-        "levels",
-        "left",
-        "right",
-        "top",
-        "bottom",
-        "high",
-        "low",
-        "scale",
-        "theta",
-        "offset",
-        "beta",
-        "ratio",
-        "weight",
-        "method",
-        "history",
-        "amount",
-        "closed",
-        "strength",
-        "truncate",
-        "order",
-        "bandwidth",
-        "rotation",
-        "resize",
-        "classes",
-        "attempts",
-        "frequency",
-        "compactness",
-        "tolerance",
-        "overlap",
-    ]
-)
+_VAGUE: Final = frozenset((
+    "type", "mode", "method", "flags", "code", "shape", "order", "delta", "distance", "level", "levels", "left",
+    "right", "top", "bottom", "high", "low", "scale", "theta", "offset", "beta", "ratio", "weight", "history",
+    "amount", "closed", "strength", "truncate", "bandwidth", "rotation", "resize", "classes", "attempts",
+    "frequency", "compactness", "tolerance", "overlap",
+))  # fmt: skip
 _SHORTEST: Final = 3
 
 
@@ -149,7 +112,7 @@ def _is_usual(param: Param, value: Any) -> bool:
 
 
 def _allows(param: Param, value: Any) -> bool:
-    if isinstance(value, str) or isinstance(value, bool):
+    if isinstance(value, str | bool):
         return param.choices is not None and any(type(choice) is type(value) for choice in param.choices)
     return param.allows(value) and (isinstance(value, int) or not param.odd)
 

@@ -17,7 +17,7 @@ _HARRIS: Final = Param(0.0, soft=(0.0, 0.25), step=0.005, about="Harris' free pa
 _CORNER_BLOCK: Final = Param(1, soft=(1, 31), unit="px", about="Side of the neighbourhood of a corner.")
 _RANSAC: Final = Param(0.0, soft=(0.5, 20.0), unit="px", about="How far an inlier may be off.")
 _TRIALS: Final = Param(1, soft=(100, 10000), about="At most so many trials.")
-_CONFIDENCE: Final = Param(0.0, 1.0, soft=(0.5, 0.999), step=0.001, about="Confidence that the result is right.")
+_CONFIDENCE: Final = Param(0.001, 0.9999, soft=(0.5, 0.999), step=0.001, about="Confidence that the result is right.")
 _CONNECTED: Final = Param(choices=(4, 8), about="Neighbours that count as connected.")
 _DISPARITIES: Final = Param(16, soft=(16, 256), step=16, unit="px", about="Disparities searched, a multiple of 16.")
 _NORM: Final = Named(("NORM_L1", "NORM_L2", "NORM_HAMMING", "NORM_HAMMING2"), "How descriptors are compared.")

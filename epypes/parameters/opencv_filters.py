@@ -110,10 +110,10 @@ FILTERS: Final[tuple[Entry, ...]] = entries(
         "Laplacian": {"ksize": _DERIVATIVE, "scale": _SCALE, "delta": _OFFSET},
         "getGaborKernel": {
             "sigma": Param(0.1, soft=(0.5, 20.0), unit="px", about="Standard deviation of the envelope."),
-            "theta": Param(soft=(0.0, 3.1416), unit="rad", about="Direction of the stripes."),
+            "theta": Param(soft=(0.0, 3.1416), step=0.01, unit="rad", about="Direction of the stripes."),
             "lambd": Param(0.1, soft=(2.0, 50.0), unit="px", about="Wave length of the stripes."),
             "gamma": Param(0.0, soft=(0.1, 2.0), about="Aspect ratio of the envelope."),
-            "psi": Param(soft=(0.0, 6.2832), unit="rad", about="Phase."),
+            "psi": Param(soft=(0.0, 6.2832), step=0.01, unit="rad", about="Phase."),
         },
         "createCLAHE": {
             "clipLimit": Param(0.0, soft=(0.0, 40.0), about="Limit of the contrast."),
@@ -121,16 +121,16 @@ FILTERS: Final[tuple[Entry, ...]] = entries(
         },
         "cvtColor": {"code": _COLOURS},
         "resize": {
-            "fx": Param(0.0, soft=(0.05, 4.0), about="Scale of the width."),
-            "fy": Param(0.0, soft=(0.05, 4.0), about="Scale of the height."),
+            "fx": Param(0.01, soft=(0.05, 4.0), about="Scale of the width."),
+            "fy": Param(0.01, soft=(0.05, 4.0), about="Scale of the height."),
             "interpolation": _RESIZING,
         },
         "warpAffine": {"flags": _WARPING, "borderMode": _ALL_BORDERS},
         "warpPerspective": {"flags": _WARPING, "borderMode": _ALL_BORDERS},
         "remap": {"interpolation": _WARPING, "borderMode": _ALL_BORDERS},
         "getRotationMatrix2D": {
-            "angle": Param(soft=(-180.0, 180.0), unit="deg", about="Angle, against the clock."),
-            "scale": Param(soft=(0.1, 4.0), about="Scale."),
+            "angle": Param(soft=(-180.0, 180.0), step=0.5, unit="deg", about="Angle, against the clock."),
+            "scale": Param(soft=(0.1, 4.0), step=0.01, about="Scale."),
         },
         "rotate": {
             "rotateCode": Named(("ROTATE_90_CLOCKWISE", "ROTATE_180", "ROTATE_90_COUNTERCLOCKWISE"), "The turn.")
@@ -143,12 +143,12 @@ FILTERS: Final[tuple[Entry, ...]] = entries(
             "borderType": _ALL_BORDERS,
         },
         "convertScaleAbs": {
-            "alpha": Param(soft=(0.0, 5.0), about="Factor: the contrast."),
+            "alpha": Param(soft=(0.0, 5.0), step=0.01, about="Factor: the contrast."),
             "beta": Param(soft=(-128, 128), about="Added: the brightness."),
         },
         "addWeighted": {
-            "alpha": Param(soft=(0.0, 2.0), about="Weight of the first image."),
-            "beta": Param(soft=(0.0, 2.0), about="Weight of the second image."),
+            "alpha": Param(soft=(0.0, 2.0), step=0.01, about="Weight of the first image."),
+            "beta": Param(soft=(0.0, 2.0), step=0.01, about="Weight of the second image."),
             "gamma": Param(soft=(-128, 128), about="Added to the sum."),
         },
         "distanceTransform": {

@@ -14,14 +14,14 @@ _SIGMA: Final = Param(0.0, soft=(0.0, 10.0), unit="px", about="Standard deviatio
 _YES_NO: Final = (False, True)
 _SIDE: Final = Param(1, soft=(3, 101), odd=True, unit="px", about="Side of the neighbourhood, odd.")
 _STRUCTURE: Final = Param(0, soft=(0, 50), unit="px", about="Radius of the structuring element.")
-_SPLINE: Final = Param(choices=(0, 1, 2, 3, 4, 5), about="Order of the interpolation.")
+_SPLINE: Final = Param(choices=(0, 1, 3, 4, 5), about="Order of the interpolation.")
 _BLOB_LOW: Final = Param(0.1, soft=(0.5, 30.0), unit="px", about="Smallest standard deviation of a blob.")
 _BLOB_HIGH: Final = Param(0.1, soft=(1.0, 100.0), unit="px", about="Largest standard deviation of a blob.")
 _BLOB_THRESHOLD: Final = Param(0.0, soft=(0.0, 1.0), step=0.01, about="Weaker blobs are dropped.")
 _BLOB_OVERLAP: Final = Param(0.0, 1.0, step=0.01, about="Blobs that overlap more are one.")
 _STEPS: Final = Param(1, soft=(1, 30), about="Standard deviations tried in between.")
 _ROUNDS: Final = Param(1, soft=(1, 500), about="At most so many iterations.")
-_PEAKS: Final = Param(0, soft=(0, 50), unit="px", about="Least distance of two peaks.")
+_PEAKS: Final = Param(1, soft=(1, 50), unit="px", about="Least distance of two peaks.")
 
 SKIMAGE: Final[tuple[Entry, ...]] = entries(
     "skimage",
@@ -53,24 +53,24 @@ SKIMAGE: Final[tuple[Entry, ...]] = entries(
         },
         "filters.unsharp_mask": {
             "radius": Param(0.0, soft=(0.0, 20.0), unit="px", about="Blur that is taken off."),
-            "amount": Param(soft=(0.0, 5.0), about="How much the details are amplified."),
+            "amount": Param(soft=(0.0, 5.0), step=0.05, about="How much the details are amplified."),
         },
         "filters.laplace": {"ksize": Param(choices=(3, 5, 7), about="Side of the operator.")},
         "filters.butterworth": {
-            "cutoff_frequency_ratio": Param(0.0, 0.5, step=0.001, about="Where it cuts, in sampling frequencies."),
+            "cutoff_frequency_ratio": Param(0.001, 0.5, step=0.001, about="Where it cuts, in sampling frequencies."),
             "high_pass": Param(choices=_YES_NO, about="Whether what is fast is kept."),
             "order": Param(0.1, soft=(1.0, 10.0), about="How sharply it cuts."),
         },
         "filters.gabor": {
-            "frequency": Param(0.01, soft=(0.05, 0.5), step=0.01, unit="1/px", about="Frequency of the stripes."),
-            "theta": Param(soft=(0.0, 3.1416), unit="rad", about="Direction of the stripes."),
-            "bandwidth": Param(0.1, soft=(0.5, 3.0), about="Bandwidth, in octaves."),
+            "frequency": Param(0.02, soft=(0.1, 0.5), step=0.01, unit="1/px", about="Frequency of the stripes."),
+            "theta": Param(soft=(0.0, 3.1416), step=0.01, unit="rad", about="Direction of the stripes."),
+            "bandwidth": Param(0.3, soft=(0.5, 3.0), about="Bandwidth, in octaves."),
         },
         "filters.threshold_multiotsu": {"classes": Param(2, soft=(2, 4), about="Classes; slow above 4.")},
         "feature.canny": {
             "sigma": _SIGMA,
-            "low_threshold": Param(0.0, about="Gradient from which an edge is followed."),
-            "high_threshold": Param(0.0, about="Gradient at which an edge begins."),
+            "low_threshold": Param(0.0, soft=(0.0, 1.0), step=0.01, about="Gradient from which an edge is followed."),
+            "high_threshold": Param(0.0, soft=(0.0, 1.0), step=0.01, about="Gradient at which an edge begins."),
             "use_quantiles": Param(choices=_YES_NO, about="Whether the thresholds are shares of all pixels."),
         },
         "feature.peak_local_max": {
@@ -153,10 +153,6 @@ SKIMAGE: Final[tuple[Entry, ...]] = entries(
             "h": Param(0.001, soft=(0.01, 0.5), step=0.01, about="Strength: removes noise, and with it details."),
             "sigma": Param(0.0, soft=(0.0, 0.5), step=0.01, about="Standard deviation of the noise."),
         },
-        "restoration.denoise_wavelet": {
-            "method": Param(choices=("BayesShrink", "VisuShrink"), about="How the threshold is found."),
-            "mode": Param(choices=("soft", "hard"), about="How the threshold is applied."),
-        },
         "restoration.rolling_ball": {"radius": Param(1, soft=(1, 200), unit="px", about="Radius of the ball.")},
         "segmentation.felzenszwalb": {
             "scale": Param(0.0, soft=(1.0, 1000.0), about="Larger values make larger segments."),
@@ -171,9 +167,7 @@ SKIMAGE: Final[tuple[Entry, ...]] = entries(
         },
         "segmentation.quickshift": {
             "ratio": Param(0.0, 1.0, step=0.01, about="Weight of colours against distance."),
-            "kernel_size": Param(
-                1.0, soft=(1.0, 15.0), unit="px", about="Blur of the density; larger: fewer segments."
-            ),
+            "kernel_size": Param(1.0, soft=(1.0, 15.0), unit="px", about="Larger values make fewer segments."),
             "max_dist": Param(0.1, soft=(1.0, 50.0), about="Largest distance within a segment."),
             "sigma": Param(0.0, soft=(0.0, 5.0), unit="px", about="Blur before."),
         },
@@ -209,8 +203,8 @@ SKIMAGE: Final[tuple[Entry, ...]] = entries(
             "area_threshold": Param(0, soft=(0, 1000), unit="px²", about="Smaller holes are filled."),
             "max_size": Param(0, soft=(0, 1000), unit="px²", about="Holes up to this size are filled."),
         },
-        "morphology.h_maxima": {"h": Param(0, soft=(0, 100), about="Lower maxima are dropped.")},
-        "morphology.h_minima": {"h": Param(0, soft=(0, 100), about="Shallower minima are dropped.")},
+        "morphology.h_maxima": {"h": Param(0.001, soft=(0.001, 100.0), log=True, about="Lower maxima are dropped.")},
+        "morphology.h_minima": {"h": Param(0.001, soft=(0.001, 100.0), log=True, about="Other minima are dropped.")},
         "morphology.area_opening": {
             "area_threshold": Param(0, soft=(0, 1000), unit="px²", about="Smaller bright structures are removed."),
         },
@@ -224,22 +218,22 @@ SKIMAGE: Final[tuple[Entry, ...]] = entries(
         },
         "exposure.adjust_sigmoid": {
             "cutoff": Param(soft=(0.0, 1.0), step=0.01, about="Brightness that stays in the middle."),
-            "gain": Param(soft=(0.0, 30.0), about="Contrast."),
+            "gain": Param(soft=(0.0, 30.0), step=0.1, about="Contrast."),
         },
-        "exposure.adjust_log": {"gain": Param(soft=(0.0, 5.0), about="Factor.")},
+        "exposure.adjust_log": {"gain": Param(soft=(0.0, 5.0), step=0.05, about="Factor.")},
         "transform.rescale": {
             "scale": Param(0.01, soft=(0.05, 4.0), about="Size of the result by that of the image."),
             "order": _SPLINE,
         },
         "transform.rotate": {
-            "angle": Param(soft=(-180.0, 180.0), unit="deg", about="Angle, against the clock."),
+            "angle": Param(soft=(-180.0, 180.0), step=0.5, unit="deg", about="Angle, against the clock."),
             "order": _SPLINE,
             "resize": Param(choices=_YES_NO, about="Whether the whole result is kept."),
         },
         "transform.swirl": {
-            "strength": Param(soft=(0.0, 20.0), about="How much is turned."),
+            "strength": Param(soft=(0.0, 20.0), step=0.1, about="How much is turned."),
             "radius": Param(0.1, soft=(1.0, 500.0), unit="px", about="How far it reaches."),
-            "rotation": Param(soft=(-3.1416, 3.1416), unit="rad", about="Turn of the whole."),
+            "rotation": Param(soft=(-3.1416, 3.1416), step=0.01, unit="rad", about="Turn of the whole."),
         },
         "transform.pyramid_reduce": {"downscale": Param(1.01, soft=(1.1, 8.0), about="How much smaller.")},
         "transform.probabilistic_hough_line": {

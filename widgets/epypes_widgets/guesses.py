@@ -112,15 +112,14 @@ def _by_function(runner: CompGraphRunner, token: str, value: Any) -> Param | Non
     for taker in takers(runner.cg, token):
         entry = entry_of(taker.function, taker.parameter)
         image = "" if entry is None else entry.cuts
-        said = [(entry, image), *((use.entry, use.cuts) for use in uses(taker.function, taker.parameter))]
+        said = [(entry, image), *((use.entry, use.cuts) for use in uses(taker.function, taker.parameter) if use.entry)]
         for known, parameter in said:
             param = None if known is None else known.resolved()
             if param is None or not _fits(param, value):
                 continue
             if param.choices is not None:
                 return param
-            cuts = taker.tokens.get(parameter, "") if known is not None and known.cuts else ""
-            return replace(param, cuts=cuts)
+            return replace(param, cuts=_payload(runner, taker.tokens.get(parameter, "")))
     return None
 
 
@@ -130,10 +129,10 @@ def _by_name(runner: CompGraphRunner, token: str, value: Any) -> Param | None:
     for taker in takers(runner.cg, token):
         names[taker.parameter] = None
         cuts = cuts or _cut_by(runner, taker, token)
-    found = next(filter(None, (usual(name, plain(value), TABLE) for name in (*names, token) if name)), None)
-    if cuts and found is None:
-        found = _valued(runner, token, value)
-    if found is None or not isinstance(found, Param) or not _fits(found, value):
+    # What is compared with an image is a threshold, whatever it is called.
+    asked = (*names, token, "threshold") if cuts else (*names, token)
+    found = next(filter(None, (usual(name, plain(value), TABLE) for name in asked if name)), None)
+    if found is None or not _fits(found, value):
         return None
     return replace(found, cuts=cuts) if cuts and found.choices is None else found
 
