@@ -10,7 +10,7 @@ from PIL import Image
 
 import epypes as ep
 from epypes.display import encode_image, view
-from epypes_widgets.frames import make_frame
+from epypes_widgets.frames import picture
 
 
 def steps(*values: float, dtype: str = "float64") -> np.ndarray:
@@ -37,7 +37,7 @@ def shown(run: ep.Run, count: int) -> list[int]:
     """Return the brightness of each stripe, which panel and thumbnail must agree about."""
     thumbnail = next(token.preview.picture.data for token in view(run).tokens if token.name == "y")
     found = levels(thumbnail, count)
-    assert levels(make_frame(run, "y", 1).data, count) == pytest.approx(found, abs=4)
+    assert levels(picture(run, "y", "main")[1], count) == pytest.approx(found, abs=4)
     return found
 
 
@@ -81,7 +81,7 @@ def test_values_beyond_the_kept_range_are_clipped():
 
 def test_the_panel_decides_for_the_picture_where_it_was_first():
     ours = runner()
-    make_frame(ours.run(x=steps(0.0, 50.0, 100.0)), "y", 1)
+    picture(ours.run(x=steps(0.0, 50.0, 100.0)), "y", "main")
     assert shown(ours.run(x=steps(0.0, 10.0, 20.0)), 3) == pytest.approx([0, 25, 51], abs=4)
 
 
