@@ -349,7 +349,9 @@ def test_an_even_number_becomes_the_next_odd_one(view: ViewPage) -> None:
     assert view.page.input_value(KERNEL) == "9"
 
 
-@pytest.mark.parametrize(("typed", "said"), [("99", "its range is 1 to 31"), ("2.5", "takes whole numbers"), ("", "no number")])
+@pytest.mark.parametrize(
+    ("typed", "said"), [("99", "its range is 1 to 31"), ("2.5", "takes whole numbers"), ("", "no number")]
+)
 def test_what_can_not_be_taken_is_marked_and_not_sent(view: ViewPage, typed: str, said: str) -> None:
     view.page.fill(KERNEL, typed)
     view.press("Enter")
@@ -552,7 +554,9 @@ def test_a_rectangle_is_moved_by_keys_and_given_up_by_delete(view: ViewPage) -> 
     view.click(".epypes-chip[data-token=image]")
     view.until("document.querySelector('.epypes-roi-one').style.display === ''")
     view.focus(".epypes-roi-frame")
-    view.press("ArrowRight", "Shift+ArrowDown")
+    view.press("ArrowRight", "ArrowRight", "ArrowRight", "Shift+ArrowDown", "Alt+ArrowUp")
+    view.until("kernel.kinds('set').at(-1)?.values.crop[0] === 63")
+    assert _crop(view) == [63, 30, 200, 161]
     view.press("Delete")
     assert view.attribute(".epypes-roi-frame", "width") == "512"
     assert _values(view)[-1] == {"crop": [0, 0, 512, 384]}
@@ -600,7 +604,9 @@ def test_settings_are_saved_and_loaded_by_name(view: ViewPage) -> None:
 
 def test_promote_tells_its_outcome(view: ViewPage) -> None:
     view.click(".epypes-promote")
-    view.until("document.querySelector('.epypes-outcome').textContent.startsWith('3 functions written to services/edges')")
+    view.until(
+        "document.querySelector('.epypes-outcome').textContent.startsWith('3 functions written to services/edges')"
+    )
     assert view.sent("promote") == [{"kind": "promote", "to": "services/edges"}]
 
 
@@ -632,7 +638,16 @@ def test_everything_that_can_be_used_has_a_name_and_can_be_reached(view: ViewPag
     for _ in range(40):
         reached.append(str(view.js("document.activeElement.className")))
         view.press("Tab")
-    for name in ("epypes-undo", "epypes-compare", "epypes-wipe", "epypes-chip", "epypes-box", "epypes-entry", "epypes-copy", "epypes-promote"):
+    for name in (
+        "epypes-scale",
+        "epypes-compare",
+        "epypes-wipe",
+        "epypes-chip",
+        "epypes-box",
+        "epypes-entry",
+        "epypes-copy",
+        "epypes-promote",
+    ):
         assert any(name in each.split() for each in reached), name
 
 

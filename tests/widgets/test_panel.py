@@ -17,7 +17,7 @@ from epypes_widgets import Panel, tune
 
 
 class Screen:
-    """A front end of a panel's picture: keeps what arrives and answers as picture.js does."""
+    """A front end of a panel's picture: keeps what arrives and answers as the view does."""
 
     def __init__(self, panel: Panel, monkeypatch: pytest.MonkeyPatch) -> None:
         self.messages: list[dict[str, Any]] = []

@@ -1,21 +1,19 @@
 """What does the screen show of a token, and what does it answer?
 
 The picture travels as one binary message per frame, never in a trait: traits are kept, compared and saved. The front
-end (``picture.js``) sends ``{kind: "ready"}`` when it is mounted and ``{kind: "painted", seq}`` for each frame.
+end (``view/``) sends ``{kind: "ready"}`` when it is mounted and ``{kind: "painted", seq}`` for each frame.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from time import perf_counter_ns
 from typing import Any
 
 import anywidget
 
 from epypes_widgets.frames import Frame, FrameSender
-
-_HERE = Path(__file__).parent
+from epypes_widgets.view.script import joined, styles
 
 
 class PictureView(anywidget.AnyWidget):
@@ -28,8 +26,8 @@ class PictureView(anywidget.AnyWidget):
         frame would hold that frame back, since the websocket of JupyterLab waits to fill its packets.
     """
 
-    _esm = _HERE / "picture.js"
-    _css = _HERE / "picture.css"
+    _esm = joined()
+    _css = styles()
 
     def __init__(self, idle: Callable[[], bool]) -> None:
         super().__init__()
