@@ -46,8 +46,8 @@ def test_the_wheel_holds_both_packages_and_their_data(wheel):
         "epypes/wire/schema.binpb",
         "epypes/display/paint/explore.js",
         "epypes/display/paint/explore.css",
-        "epypes_widgets/picture.js",
-        "epypes_widgets/picture.css",
+        "epypes_widgets/view/main.js",
+        "epypes_widgets/view/view.css",
     ):
         assert name in names
     tops = {name.partition("/")[0] for name in names}

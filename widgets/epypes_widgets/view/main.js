@@ -17,12 +17,17 @@ import { screen } from "./screen.js";
 import { stagePart } from "./stage.js";
 import { filmsPart, historyPart, pinnedPart } from "./strips.js";
 
+const GIVES_VALUES = ["reset", "undo", "redo", "goto", "load"];
+
 /** @param {{model: any, el: HTMLElement}} context given by anywidget */
 function render({ model, el }) {
   const figure = element("figure", "epypes-view epypes-empty", { "data-lm-suppress-shortcuts": "true" });
   const order = arrivals();
-  const send = (content) => model.send(content);
-  const out = outbox(send);
+  const out = outbox((content) => model.send(content));
+  const send = (content) => {
+    if (GIVES_VALUES.includes(content.kind)) out.forget();
+    model.send(content);
+  };
   /** What the parts share. */
   const panel = {
     send,
@@ -79,8 +84,8 @@ function render({ model, el }) {
     const { frame } = report;
     panel.state.token = frame.token;
     for (const [name, value] of Object.entries(frame.values)) {
-      const isHeld = out.isPending(name) || roi.isHeld(name) || histogram.isHeld(name);
-      if (!isHeld) panel.state.values[name] = value;
+      const isHeld = roi.isHeld(name) || histogram.isHeld(name);
+      if (!isHeld && out.takes(name, value)) panel.state.values[name] = value;
     }
     figure.classList.remove("epypes-empty");
     tellFailure();

@@ -1,0 +1,136 @@
+// Is the final picture always the final value's, whatever becomes of the messages?
+import assert from "node:assert/strict";
+import { test } from "node:test";
+import { outbox } from "../../../widgets/epypes_widgets/view/outbox.js";
+import { arrivals, newestOnly, oneAtATime } from "../../../widgets/epypes_widgets/view/protocol.js";
+import { withBytes } from "../../../widgets/epypes_widgets/view/screen.js";
+
+test("a newer frame is shown, an older one acknowledged only", () => {
+  const order = arrivals();
+  assert.equal(order.frame(2), "show");
+  assert.equal(order.frame(1), "acknowledge");
+  assert.equal(order.frame(3), "show");
+  assert.ok(order.isOvertaken(2));
+});
+test("a frame that comes again while it is decoded waits, and is acknowledged afterwards", () => {
+  const order = arrivals();
+  order.frame(1);
+  assert.equal(order.frame(1), "wait");
+  order.paint({ seq: 1 });
+  assert.equal(order.frame(1), "acknowledge");
+});
+test("a frame that could not be shown may come again", () => {
+  const order = arrivals();
+  order.frame(1);
+  order.lose(1);
+  assert.equal(order.frame(1), "show");
+});
+test("in any order the newest is painted last", () => {
+  for (const seqs of permutations([1, 2, 3, 4, 4])) {
+    const order = arrivals();
+    let shown = 0;
+    for (const seq of seqs) {
+      if (order.frame(seq) !== "show") continue;
+      shown = seq;
+      order.paint({ seq });
+    }
+    assert.equal(shown, 4);
+  }
+});
+test("an error stays until a better frame comes", () => {
+  const order = arrivals();
+  assert.ok(order.fail({ seq: 5, text: "no" }));
+  order.paint({ seq: 6, stale: true });
+  assert.equal(order.failure.text, "no");
+  order.paint({ seq: 4 });
+  assert.equal(order.failure.text, "no");
+  order.paint({ seq: 7 });
+  assert.equal(order.failure, null);
+});
+test("an error that comes after a better frame is not told", () => {
+  const order = arrivals();
+  order.paint({ seq: 7 });
+  assert.ok(!order.fail({ seq: 6, text: "late" }));
+  assert.ok(order.fail({ seq: 8, text: "new" }));
+  assert.ok(!order.fail({ seq: 7.5, text: "older" }));
+  assert.equal(order.failure.text, "new");
+});
+test("of messages that replace one another the newest passes", () => {
+  const isNewest = newestOnly();
+  assert.deepEqual([1, 3, 2, 3, 4].map(isNewest), [true, true, false, true, true]);
+});
+
+test("one question is asked at a time, the latest next", () => {
+  const asked = [];
+  const questions = oneAtATime((question) => asked.push(question), 1000, () => 0);
+  for (const question of ["a", "b", "c"]) questions.ask(question);
+  assert.deepEqual(asked, ["a"]);
+  assert.ok(questions.answer(1));
+  assert.deepEqual(asked, ["a", "c"]);
+  assert.ok(!questions.answer(1));
+});
+test("a lost answer is not waited for", () => {
+  let now_ms = 0;
+  const asked = [];
+  const questions = oneAtATime((question) => asked.push(question), 1000, () => now_ms);
+  questions.ask("a");
+  now_ms = 1001;
+  questions.ask("b");
+  assert.deepEqual(asked, ["a", "b"]);
+});
+
+function recorded() {
+  const sent = [];
+  const waiting = [];
+  let now_ms = 0;
+  const out = outbox((content) => sent.push(content), (callback) => waiting.push(callback), () => now_ms);
+  return { out, sent, tick: () => waiting.splice(0).forEach((callback) => callback()), later: (ms) => { now_ms += ms; } };
+}
+test("many moves between two paints are one message", () => {
+  const { out, sent, tick } = recorded();
+  for (let x = 0; x < 50; x++) out.set({ x, y: 1 }, false);
+  assert.equal(sent.length, 0);
+  tick();
+  assert.deepEqual(sent, [{ kind: "set", values: { x: 49, y: 1 }, commit: false }]);
+});
+test("a committed value goes at once and takes what waits along", () => {
+  const { out, sent, tick } = recorded();
+  out.set({ x: 1 }, false);
+  out.set({ y: 2 }, true);
+  tick();
+  assert.deepEqual(sent, [{ kind: "set", values: { x: 1, y: 2 }, commit: true }]);
+});
+test("what was moved by keys is committed once", () => {
+  const { out, sent, tick } = recorded();
+  out.set({ x: 1 }, false);
+  tick();
+  out.commit();
+  out.commit();
+  assert.deepEqual(sent.map(({ commit }) => commit), [false, true]);
+});
+test("an older frame does not take back what the hand did", () => {
+  const { out, later } = recorded();
+  out.set({ x: 5 }, true);
+  assert.ok(!out.takes("x", 4));
+  assert.ok(out.takes("x", 5));
+  assert.ok(out.takes("x", 4));
+  out.set({ x: 9 }, true);
+  later(3001);
+  assert.ok(out.takes("x", 4));
+});
+test("an undo may give back any value", () => {
+  const { out } = recorded();
+  out.set({ x: 5 }, true);
+  out.forget();
+  assert.ok(out.takes("x", 4));
+});
+
+test("bytes belong to the pictures in order, and texts have none", () => {
+  const pictures = ["image/jpeg", "text/plain", "image/png"].map((media_type) => ({ media_type }));
+  assert.deepEqual(withBytes(pictures, ["a", "b"]).map(({ bytes }) => bytes), ["a", undefined, "b"]);
+});
+
+function permutations(items) {
+  if (items.length < 2) return [items];
+  return items.flatMap((item, at) => permutations([...items.slice(0, at), ...items.slice(at + 1)]).map((rest) => [item, ...rest]));
+}
