@@ -79,6 +79,8 @@ def test_constants_have_their_names() -> None:
     how = found(runner_of(lambda im, how: cv2.resize(im, (9, 9), interpolation=how), "im", how=1))["how"]
     assert dict(zip(how.labels, how.choices, strict=True))["INTER_LINEAR"] == 1
     assert "INTER_LINEAR" in described(how)
+    kind = found(runner_of(lambda im, t: cv2.threshold(im, 0, 255, t)[1], "im", t=cv2.THRESH_OTSU))["t"]
+    assert dict(zip(kind.labels, kind.choices, strict=True))["THRESH_BINARY_INV|THRESH_OTSU"] == 9
 
 
 @pytest.mark.parametrize(
@@ -107,6 +109,24 @@ def test_a_text_is_typed_and_a_branch_is_chosen() -> None:
     choose = ep.switch("choose", {"canny": "a", "sobel": "b"}, by="method", output="out")
     branches = ep.CompGraph({"f": lambda x: x, "g": lambda x: x}, {"f": ("image", "a"), "g": ("image", "b")})
     assert found(ep.CompGraphRunner(branches | choose, {"method": "canny"}))["method"].choices == ("canny", "sobel")
+
+
+def test_what_a_switch_chooses_among_comes_before_what_its_name_says() -> None:
+    choose = ep.switch("choose", {4: "a", 5: "b"}, by="connectivity", output="out")
+    branches = ep.CompGraph({"f": lambda x: x, "g": lambda x: x}, {"f": ("image", "a"), "g": ("image", "b")})
+    assert found(ep.CompGraphRunner(branches | choose, {"connectivity": 4}))["connectivity"].choices == (4, 5)
+
+
+def test_one_is_not_true() -> None:
+    def match(cross):
+        return cv2.BFMatcher(cv2.NORM_L2, cross)
+
+    assert found(runner_of(match, cross=True))["cross"].choices == (False, True)
+    assert found(runner_of(match, cross=1))["cross"].choices is None
+
+
+def test_a_value_that_the_table_does_not_know_makes_no_threshold_of_an_edge_s_gradient() -> None:
+    assert found(runner_of(lambda im, threshold1: cv2.Canny(im, threshold1, 9), "im", t=-5))["t"].cuts == ""
 
 
 @pytest.mark.parametrize("name", ["roi", "crop_box", "searchWindow", "rect_1"])
