@@ -11,11 +11,13 @@ import builtins
 import linecache
 import sys
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
-from types import CodeType, FunctionType, ModuleType
+from types import CellType, CodeType, FunctionType, ModuleType
 from typing import Any, Final
 
+from epypes.graph.redefined import unwrapped
 from epypes.parameters.entry import Entry
 from epypes.parameters.lookup import entry_of
 from epypes.parameters.signatures import parameter_names
@@ -46,7 +48,7 @@ class Use:
 def uses(function: Any, parameter: str) -> tuple[Use, ...]:
     """Return what a function does with a parameter, as far as the table knows and its source is there; never raises."""
     try:
-        return tuple(_uses(function, parameter, _DEEPEST))
+        return tuple(_uses(unwrapped(function), parameter, _DEEPEST))
     except Exception:  # whatever odd objects are among the names of a function, this is a guess
         return ()
 
@@ -166,8 +168,13 @@ def _names_of(function: FunctionType, node: _Definition) -> dict[str, Any]:
     """Return what the names in a function mean: those imported in it, around it, in its module, and Python's own."""
     code: CodeType = function.__code__
     cells = zip(code.co_freevars, function.__closure__ or (), strict=False)
-    around = {name: cell.cell_contents for name, cell in cells if cell != type(cell)()}
+    around = {name: found for name, cell in cells for found in _content(cell)}
     return {**vars(builtins), **function.__globals__, **around, **dict(_imported(node))}
+
+
+def _content(cell: CellType) -> Iterator[Any]:
+    with suppress(ValueError):  # empty: the name has no value yet
+        yield cell.cell_contents
 
 
 def _imported(node: _Definition) -> Iterator[tuple[str, Any]]:

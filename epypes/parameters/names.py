@@ -6,12 +6,13 @@ A name says less than a function: these ranges are careful, and a name that mean
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
 from epypes.hints import Param
 from epypes.parameters.entry import Entry
+from epypes.parameters.lookup import TABLE
 
 _ODD: Final = (Param(1, soft=(1, 31), odd=True, unit="px"),)
 _WINDOW: Final = (Param(1, soft=(1, 101), odd=True, unit="px"),)
@@ -22,7 +23,7 @@ _LEVEL: Final = (Param(0.0, soft=(0.0, 1.0)), Param(0, soft=(0, 255)))
 _WEIGHT: Final = (Param(0.0, soft=(0.0, 1.0)), Param(0.0, soft=(0.0, 5.0)))
 _DEGREES: Final = (Param(soft=(-180.0, 180.0), step=0.5, unit="deg"),)
 
-# Of several, the first whose usual values hold the present one is taken. Written as _bare() writes them.
+# Of several, the first whose usual values hold the present one is taken. Written without what parts their words.
 _COMMON: Final[dict[str, tuple[Param, ...]]] = {
     "ksize": _ODD, "kernelsize": _ODD, "kernel": _ODD, "blurkernel": _ODD, "aperture": _ODD,
     "blocksize": _WINDOW, "windowsize": _WINDOW, "winsize": _WINDOW, "window": _WINDOW,
@@ -53,7 +54,20 @@ _VAGUE: Final = frozenset((
 _SHORTEST: Final = 3
 
 
-def usual(name: str, value: float | str, table: Iterable[Entry]) -> Param | None:
+def _by_name() -> Mapping[str, tuple[Entry, ...]]:
+    """Return the entries by the parameter's name: ``blockSize`` and ``block_size`` are one."""
+    found: dict[str, tuple[Entry, ...]] = {}
+    for entry in TABLE:
+        name = entry.parameter.replace("_", "").lower()
+        if len(name) >= _SHORTEST and name not in _VAGUE:
+            found[name] = (*found.get(name, ()), entry)
+    return found
+
+
+_BY_NAME: Final = _by_name()
+
+
+def usual(name: str, value: float | str) -> Param | None:
     """Return the usual values of a parameter of this name; None if nothing fits.
 
     Parameters
@@ -62,11 +76,9 @@ def usual(name: str, value: float | str, table: Iterable[Entry]) -> Param | None
         A parameter, or a token: of ``blur_sigma_1`` its last words count too.
     value
         What it is now. A range that does not hold it is not returned.
-    table
-        Where else to look: for names that mean the same in all functions.
     """
-    for bare in _bare_names(name):
-        found = _first_fitting(_COMMON.get(bare, ()), value) or _agreed(bare, value, table)
+    for known in _bare_names(name):
+        found = _first_fitting(_COMMON.get(known, ()), value) or _agreed(known, value)
         if found is not None:
             return found
     return None
@@ -78,11 +90,6 @@ def _bare_names(name: str) -> list[str]:
     while len(words) > 1 and words[-1].isdigit():
         words.pop()  # the suffix of one of several graphs
     return list(dict.fromkeys(("".join(words), "".join(words[-2:]), "".join(words[-1:]))))
-
-
-def bare(name: str) -> str:
-    """Return a name as it is compared with others: ``blockSize`` and ``block_size`` are one."""
-    return name.replace("_", "").lower()
 
 
 def _first_fitting(params: Sequence[Param], value: Any) -> Param | None:
@@ -112,21 +119,18 @@ def _is_usual(param: Param, value: Any) -> bool:
 
 
 def _allows(param: Param, value: Any) -> bool:
-    if isinstance(value, str | bool):
-        return param.choices is not None and any(type(choice) is type(value) for choice in param.choices)
+    if param.choices is not None and isinstance(value, bool) != isinstance(param.choices[0], bool):
+        return False  # 1 equals True
+    if isinstance(value, str | bool) and param.choices is None:
+        return False
     return param.allows(value) and (isinstance(value, int) or not param.odd)
 
 
-def _agreed(name: str, value: Any, table: Iterable[Entry]) -> Param | None:
+def _agreed(name: str, value: Any) -> Param | None:
     """Return what all entries of a name say, if it is the same."""
-    if len(name) < _SHORTEST or name in _VAGUE:
-        return None
-    found = [entry for entry in table if bare(entry.parameter) == name]
-    params = [param for entry in found if (param := entry.resolved()) is not None]
-    if not params or len(params) < len(found):
-        return None
-    first = params[0]
-    if any(_plain(param) != _plain(first) for param in params):
+    params = [entry.resolved() for entry in _BY_NAME.get(name, ())]
+    first = params[0] if params else None
+    if first is None or any(param is None or _plain(param) != _plain(first) for param in params):
         return None
     return _first_fitting((first,), value)
 

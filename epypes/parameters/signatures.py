@@ -12,7 +12,7 @@ _SIGNATURE = re.compile(r"[\w.]+\(([^()]*)\)")
 
 
 def parameter_names(function: Callable[..., Any]) -> tuple[str, ...]:
-    """Return the names of the parameters that can be given by position; empty if they are not known.
+    """Return the names of the parameters that can be given by position; empty if they are not known. Never raises.
 
     Examples
     --------
@@ -21,7 +21,7 @@ def parameter_names(function: Callable[..., Any]) -> tuple[str, ...]:
     """
     try:
         signature = inspect.signature(function)
-    except (TypeError, ValueError):
+    except Exception:  # C functions have no signature, and what odd objects raise is their own
         return _documented_names(function)
     positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     names = tuple(name for name, parameter in signature.parameters.items() if parameter.kind in positional)
@@ -31,7 +31,8 @@ def parameter_names(function: Callable[..., Any]) -> tuple[str, ...]:
 def _documented_names(function: Callable[..., Any]) -> tuple[str, ...]:
     if isinstance(function, type):
         function = getattr(function, "create", function)  # an object of OpenCV is made as its create() makes it
-    found = _SIGNATURE.match(str(getattr(function, "__doc__", None) or "").lstrip())
+    text = getattr(function, "__doc__", None)
+    found = _SIGNATURE.match(text.lstrip()) if isinstance(text, str) else None
     if found is None:
         return ()
     parts = (part.strip() for part in re.sub(r"[\[\]]", "", found[1]).split(","))

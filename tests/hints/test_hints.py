@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import annotated_types
 import pytest
 
-from epypes import Param
+from epypes import Param, Roi
 from epypes.hints import annotated_param, as_param, param_from_value
 
 
@@ -81,6 +81,12 @@ def test_tuples_are_ranges_and_lists_are_choices():
         ({"step": 0}, "step must be positive"),
         ({"low": 0, "high": 1, "log": True}, "positive low"),
         ({"low": 2, "high": 2, "odd": True}, "no odd value"),
+        ({"labels": ("A",)}, "Give choices too"),
+        ({"choices": (1, 2), "labels": ("A",)}, "Name each choice once"),
+        ({"choices": (1, 2), "below": "hi"}, "below is for a range"),
+        ({"choices": (1, 2), "cuts": "image"}, "cuts is for a range"),
+        ({"soft": (3, 1)}, "Exchange them"),
+        ({"low": 0, "high": 9, "soft": (0, 10)}, "Narrow it"),
     ],
 )
 def test_a_hint_that_allows_nothing_is_refused(settings, words):
@@ -95,3 +101,17 @@ def test_a_hint_says_what_it_allows():
     assert not Param(1, 31).allows(32)
     assert Param(choices=("a",)).allows("a")
     assert not Param(choices=("a",)).allows("b")
+
+
+def test_a_rectangle_is_four_integers_none_of_them_negative():
+    assert Roi().allows((0, 0, 10, 20))
+    assert Roi("image").allows([1, 2, 3, 4])
+    for value in ((1, 2, 3), (1, 2, -3, 4), (1.0, 2, 3, 4), (True, 2, 3, 4), "1234", None, 7):
+        assert not Roi().allows(value)
+    assert as_param(Roi("image")) == Roi("image")
+
+
+def test_an_annotation_may_be_a_rectangle():
+    def cut(image, part: Annotated[tuple, Roi("image")]): ...
+
+    assert annotated_param(cut, 1) == Roi("image")

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from epypes.graph import CompGraph, annotated_params, as_switch
 from epypes.hints import Param, Roi, Text, param_from_value
-from epypes.parameters import TABLE, entry_of, parameter_names, uses, usual
+from epypes.parameters import entry_of, parameter_names, uses, usual
 from epypes.run import CompGraphRunner
 from epypes_widgets.movable import is_integer, is_number, plain
 
@@ -131,7 +131,7 @@ def _by_name(runner: CompGraphRunner, token: str, value: Any) -> Param | None:
         cuts = cuts or _cut_by(runner, taker, token)
     # What is compared with an image is a threshold, whatever it is called.
     asked = (*names, token, "threshold") if cuts else (*names, token)
-    found = next(filter(None, (usual(name, plain(value), TABLE) for name in asked if name)), None)
+    found = next(filter(None, (usual(name, plain(value)) for name in asked if name)), None)
     if found is None or not _fits(found, value):
         return None
     return replace(found, cuts=cuts) if cuts and found.choices is None else found
@@ -140,9 +140,10 @@ def _by_name(runner: CompGraphRunner, token: str, value: Any) -> Param | None:
 def _cut_by(runner: CompGraphRunner, taker: Taker, token: str) -> str:
     """Return the token that a function compares with this one; empty if that is not known."""
     found = uses(taker.function, taker.parameter)
-    compared = next((use.cuts for use in found if use.entry is None), "")
-    if compared:
-        return _payload(runner, taker.tokens.get(compared, ""))
+    compared = (_payload(runner, taker.tokens.get(use.cuts, "")) for use in found if use.entry is None)
+    image = next(filter(None, compared), "")
+    if image:
+        return image
     inputs = [name for name in runner.cg.func_inputs(taker.name) if _payload(runner, name)]
     is_threshold = bool(_THRESHOLDS & {*words(taker.parameter), *words(token)})
     known = any(use.entry is not None for use in found)  # a function whose thresholds are not of values, as Canny

@@ -21,7 +21,7 @@ _SIGNATURE: Final = re.compile(r"^[\w.]+\(.*\)(\s*->.*)?$")
 
 
 def tip(cg: CompGraph, token: str, param: Param | Roi | Text | None) -> str:
-    """Return what is known of a hyperparameter in one line of plain text, at most 300 characters; never raises.
+    """Return what is known of a hyperparameter in one line of plain text, at most 300 characters.
 
     It is what the docstring of a function that takes it says of its parameter, else what the hint says, else the first
     line of the docstring; then the unit and the range.
