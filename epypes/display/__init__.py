@@ -2,6 +2,7 @@
 
 from epypes.display.mime import mimebundle, to_svg
 from epypes.display.previews.imagekinds import is_image
+from epypes.display.previews.marks import scene_picture
 from epypes.display.previews.preview import Chart, Preview
 from epypes.display.previews.ranges import reset_display_ranges
 from epypes.display.previews.raster import Picture, encode_image
@@ -29,6 +30,7 @@ __all__ = [
     "register_preview",
     "reset_display_ranges",
     "scene_of",
+    "scene_picture",
     "show",
     "to_svg",
     "to_text",

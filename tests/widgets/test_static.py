@@ -35,7 +35,7 @@ def test_the_last_picture_and_the_values_are_there(runner: ep.CompGraphRunner) -
     )
     assert html.startswith('<figure class="epypes-static"')
     assert html.endswith("</figure>")
-    assert 'alt="mask of ramp, 48 x 64 uint8"' in html
+    assert 'alt="mask of ramp: uint8 48 x 64' in html
     np.testing.assert_array_equal(picture(html)[:, :, 0], run["mask"])
     assert re.sub("<[^>]+>", " ", html).split()[-12:] == [
         "since", "the", "start", "gain", "3", "●", "changed", "from", "2", "threshold", "100", "runner.rerun(gain=3)",

@@ -1,31 +1,22 @@
-"""Which picture does a token of a run have?"""
+"""Which picture does a token of a run have where there is one for good: in the history, in a saved notebook?"""
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
-from epypes.display import Picture, encode_image, is_image
-from epypes.display.previews.ranges import kept_range
-from epypes.display.previews.raster import THUMBNAIL_BYTES
-from epypes.errors import NotComputed
-from epypes.graph import colour_order
+from epypes.display import Picture, scene_of, scene_picture
 from epypes.run import Run
 
-THUMBNAIL_PX: Final = 96
+_THUMBNAIL_PX: Final = 96
+_THUMBNAIL_BYTES: Final = 4_000
 
 
-def picture_of(run: Run, token: str, value: Any, max_side_px: int, most_bytes: int | None = None) -> Picture:
-    """Return an image of a run as a picture, with the colours and the range of values that its token has."""
-    ends = kept_range(run.tokens.program, token, value)
-    return encode_image(value, max_side_px, colour_order(run.cg, token), ends, most_bytes)
+def picture_of(run: Run, token: str, max_side_px: int, most_bytes: int) -> Picture | None:
+    """Return a token as one picture, its marks drawn over their image; None if it is none, or not up to date."""
+    seen = scene_of(run, token)
+    return None if seen is None else scene_picture(seen, max_side_px, most_bytes)
 
 
 def thumbnail(run: Run, token: str | None) -> Picture | None:
-    """Return the thumbnail of a token, of at most 96 x 96 pixels; None if it is no image, or not up to date."""
-    try:
-        value = None if token is None else run[token]
-    except NotComputed:
-        return None
-    if token is None or not is_image(value):
-        return None
-    return picture_of(run, token, value, THUMBNAIL_PX, THUMBNAIL_BYTES)
+    """Return the thumbnail of a token, of at most 96 x 96 pixels; None if it is no picture, or not up to date."""
+    return None if token is None else picture_of(run, token, _THUMBNAIL_PX, _THUMBNAIL_BYTES)

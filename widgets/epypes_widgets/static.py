@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from epypes.display.markup import content, cut, escape, fitted, written_length
-from epypes.display.previews.imagekinds import is_image
 from epypes.display.previews.preview import sketch
 from epypes.display.previews.shown import Look
 from epypes.errors import NotComputed
@@ -73,11 +72,11 @@ def _shown(run: Run, token: str, on: str) -> str:
         value = run[token]
     except NotComputed as error:
         return _caption(f"{name}{on}: {cut(str(error), 200)}")
-    if not is_image(value):
-        look = Look(colour_order(run.cg, token))
-        return _caption(f"{name}{on}: {sketch(value, look).shown.detail}")
-    picture = picture_of(run, token, value, _PICTURE_SIDE_PX, _PICTURE_BYTES)
-    about = f"{name}{on}, {' x '.join(map(str, value.shape))} {value.dtype}"
+    look = Look(colour_order(run.cg, token))
+    about = f"{name}{on}: {sketch(value, look).shown.detail}"
+    picture = picture_of(run, token, _PICTURE_SIDE_PX, _PICTURE_BYTES)
+    if picture is None:
+        return _caption(about)
     data = base64.b64encode(picture.data).decode()
     return (
         f'<img src="data:{escape(picture.media_type)};base64,{data}" alt="{escape(about)}" '

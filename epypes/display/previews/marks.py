@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from epypes.display.previews.charts import place_chart, spread
 from epypes.display.previews.imagekinds import image_kind, sampled
-from epypes.display.previews.raster import THUMBNAIL_PX, Picture, encode_small, pillow_image
+from epypes.display.previews.raster import THUMBNAIL_PX, Picture, encode_image, encode_small, pillow_image
 from epypes.display.previews.shown import Backdrop, Chart, Marks, Most, Scene
 
 if TYPE_CHECKING:
@@ -140,6 +140,15 @@ def drawer(marks: Marks, backdrop: Backdrop | None) -> Callable[[int], Picture |
     return lambda most_bytes: encode_small(_drawn_over(backdrop, marks), most_bytes, has_small_marks=True)
 
 
+def scene_picture(scene: Scene, max_side_px: int, most_bytes: int) -> Picture:
+    """Return a scene as one picture, its marks drawn, whose longer side and whose bytes are at most these."""
+    seen = scene.backdrop
+    if scene.marks is None:
+        return encode_image(seen.image, max_side_px, seen.order, seen.ends, most_bytes)
+    side = min(max_side_px, max(THUMBNAIL_PX, *seen.image.shape[:2]))
+    return encode_small(_drawn_over(seen, scene.marks, side), most_bytes, has_small_marks=True)
+
+
 def pair_drawer(backdrops: tuple[Backdrop, Backdrop], pairs: Floats) -> Callable[[int], Picture | Chart]:
     """Return what draws two images side by side, with lines; ``pairs`` are (n, 4): x and y in both."""
     return lambda most_bytes: encode_small(_drawn_between(backdrops, pairs), most_bytes, has_small_marks=True)
@@ -165,8 +174,8 @@ def _is_drawable(places: Floats) -> npt.NDArray[np.bool_]:
     return np.asarray((np.abs(np.nan_to_num(places, nan=np.inf)) < _FARTHEST_PX).all(axis=1))
 
 
-def _drawn_over(backdrop: Backdrop, marks: Marks) -> Image.Image:
-    canvas, scale = _canvas(backdrop, THUMBNAIL_PX * _OVERSAMPLED)
+def _drawn_over(backdrop: Backdrop, marks: Marks, side: int = THUMBNAIL_PX) -> Image.Image:
+    canvas, scale = _canvas(backdrop, side * _OVERSAMPLED)
     pen = _Pen(canvas)
     for line in marks.lines:
         pen.line((line + 0.5) * scale, _GREEN, _LINE_PX, is_closed=marks.are_closed)
