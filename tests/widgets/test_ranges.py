@@ -84,7 +84,8 @@ def test_constants_have_their_names() -> None:
 
 
 @pytest.mark.parametrize(
-    "value", [None, object(), np.zeros(1), [1], (1, 2), float("nan"), 10**400, -(10**30), b"x", {}]
+    "value",
+    [None, object(), np.zeros(1), [1], (1, 2), float("nan"), 10**400, -(10**30), b"x", {}, np.timedelta64(5, "s")],
 )
 def test_what_no_control_can_move_is_shown(value: Any) -> None:
     assert alone(value) is None
@@ -102,6 +103,18 @@ def test_an_object_that_can_not_be_asked_is_shown() -> None:
     assert alone(Odd()) is None
     with pytest.raises(ValueError, match="soft"):
         found(runner_of(lambda x: x, x=1), x=ep.Param(0, 3, soft=(0, 9)))
+
+
+def test_an_annotation_that_can_not_be_compared_gives_way_to_that_of_the_next_function() -> None:
+    def first(image, mode: Annotated[int, ep.Param(0, 9)]):
+        return image
+
+    def second(image, mode: Annotated[str, ep.Param(choices=("fast", "exact"))]):
+        return image
+
+    graph = {"f": (("image", "mode"), "a"), "g": (("image", "mode"), "b")}
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": first, "g": second}, graph, types=False), {"mode": "fast"})
+    assert found(runner)["mode"].choices == ("fast", "exact")
 
 
 def test_a_text_is_typed_and_a_branch_is_chosen() -> None:

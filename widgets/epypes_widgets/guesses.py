@@ -59,7 +59,7 @@ def guess(runner: CompGraphRunner, token: str) -> Param | Roi | Text | None:
     for source in (_annotated, _selected, _tabled, _valued):
         try:
             found = source(runner, token, value)
-            if found is not None and found.allows(value):
+            if found is not None and _holds(found, value):
                 return found
         except Exception:  # noqa: S112 - values are any objects; one that can't be compared has no range
             continue
@@ -67,11 +67,16 @@ def guess(runner: CompGraphRunner, token: str) -> Param | Roi | Text | None:
 
 
 def _annotated(runner: CompGraphRunner, token: str, value: Any) -> Param | Roi | None:
-    cg = runner.cg
-    for found in annotated_params(cg, token):
-        if found.allows(value):
-            return _with_tokens(runner, token, found)
-    return None
+    fitting = (param for param in annotated_params(runner.cg, token) if _holds(param, value))
+    found = next(fitting, None)
+    return None if found is None else _with_tokens(runner, token, found)
+
+
+def _holds(param: Param | Roi | Text, value: Any) -> bool:
+    try:
+        return bool(param.allows(value))
+    except Exception:  # a value that can't be compared with numbers
+        return False
 
 
 def _with_tokens(runner: CompGraphRunner, token: str, found: Param | Roi) -> Param | Roi:

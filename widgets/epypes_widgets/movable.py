@@ -14,9 +14,11 @@ def is_number(value: Any) -> bool:
     """Whether a value is a finite number, not a bool, that the front end can show exactly."""
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         return False
-    if isinstance(value, numbers.Integral):
-        return abs(int(value)) <= _LARGEST_INTEGER
-    return math.isfinite(float(value))
+    try:
+        size = abs(float(value))
+    except (OverflowError, TypeError, ValueError):  # 10**400, or a duration of NumPy, which calls itself an integer
+        return False
+    return math.isfinite(size) and (size <= _LARGEST_INTEGER or not isinstance(value, numbers.Integral))
 
 
 def is_integer(value: Any) -> bool:
