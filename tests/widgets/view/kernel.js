@@ -11,7 +11,7 @@ const row = (css, names, kind, of, more) => ({
   default: names.map((name) => DEFAULTS[name]), value: names.map((name) => DEFAULTS[name]), ...more,
 });
 const ROWS = [
-  row(0, ["crop"], "roi", "crop", { default: DEFAULTS.crop, value: DEFAULTS.crop, low: [null], high: [null], tip: "The part of the image that is looked at." }),
+  row(0, ["crop"], "roi", "crop", { low: [null], high: [null], tip: "The part of the image that is looked at." }),
   row(1, ["blur_kernel"], "slider", "blur", { integer: true, odd: true, low: [1], high: [31], step: [2], unit: "px", tip: "Side of the kernel." }),
   row(2, ["sigma"], "log", "blur", { log: true, low: [0.1], high: [10], step: [0.05], tip: "Standard deviation." }),
   row(3, ["border"], "choice", "blur", { low: [null], high: [null], step: [null] }),
@@ -184,7 +184,7 @@ function moved(one, value) {
 }
 
 for (const one of ROWS) {
-  const value = one.names.length > 1 ? one.value : one.kind === "roi" ? one.value : one.value[0];
+  const value = one.names.length > 1 ? one.value : one.value[0];
   kernel.models[one.model] = fakeModel(value, (next) => moved(one, next));
 }
 

@@ -2,6 +2,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { clamped, inMs, means, read, shortly, stepped, written } from "../../../widgets/epypes_widgets/view/numbers.js";
+import { perName } from "../../../widgets/epypes_widgets/view/rows.js";
 
 const row = (more = {}) => ({ names: ["x"], integer: false, odd: false, log: false, low: [0], high: [10], step: [0.1], ...more });
 const odd = row({ integer: true, odd: true, low: [1], high: [31], step: [2] });
@@ -61,4 +62,14 @@ test("a slider means the exact value within half a step", () => {
   assert.ok(!means(row(), 0, 1.6, 1.66));
   assert.ok(means(row({ log: true, step: [0.1] }), 0, 1.1, 1));
   assert.ok(!means(row({ log: true, step: [0.1] }), 0, 1.2, 1));
+});
+
+test("what a row says of its names is a list for each", () => {
+  const found = perName({ kind: "slider", names: ["x"], low: 0, high: null, step: [1], default: 5, value: [7] });
+  assert.deepEqual([found.low, found.high, found.step, found.default, found.value], [[0], [null], [1], [5], [7]]);
+});
+test("four numbers of a rectangle are one value", () => {
+  const four = [1, 2, 3, 4];
+  assert.deepEqual(perName({ kind: "roi", names: ["crop"], value: four }).value, [four]);
+  assert.deepEqual(perName({ kind: "roi", names: ["crop"], value: [four] }).value, [four]);
 });

@@ -2,8 +2,8 @@
 
 - ``main.js``: what the view consists of, and who gets which message
 - ``screen.js``, ``protocol.js``, ``outbox.js``, ``blobs.js``: how frames arrive and values leave
-- ``stage.js``, ``geometry.js``, ``compare.js``, ``overlay.js``, ``probe.js``, ``roi.js``, ``rectangles.js``: the big picture
-- ``bar.js``, ``chips.js``, ``header.js``, ``histogram.js``, ``strips.js``, ``foot.js``, ``keys.js``: what stands around it
+- ``stage.js``, ``geometry.js``, ``compare.js``, ``overlay.js``, ``probe.js``, ``roi.js``: the big picture
+- ``bar.js``, ``chips.js``, ``header.js``, ``histogram.js``, ``strips.js``, ``foot.js``: what is around it
 - ``rows.js``, ``boxes.js``, ``numbers.js``: what is added to the controls of the kernel's side
 - ``script``: all of it as one ES module
 """

@@ -11,6 +11,7 @@ export function barPart(panel, parts) {
   const run = textButton("Run", () => panel.send({ kind: "run" }), "epypes-run", "Compute the values now");
   const undo = iconButton("undo", "Undo", () => panel.send({ kind: "undo" }), "epypes-undo");
   const redo = iconButton("redo", "Redo", () => panel.send({ kind: "redo" }), "epypes-redo");
+  const reset = iconButton("reset", "Reset all to default", () => panel.send({ kind: "reset", names: [] }), "epypes-reset-all");
   const scale = element("button", "epypes-button epypes-worded epypes-scale", { type: "button", title: "Pixel for pixel (1)", "aria-label": "Pixel for pixel" }, "100 %");
   const select = element("select", "epypes-compare", { "aria-label": "Compare with", title: "Compare with" });
   const flip = iconButton("flip", "Flip to the other picture while held (f)", () => undefined, "epypes-flip");
@@ -27,7 +28,7 @@ export function barPart(panel, parts) {
     "epypes-bar",
     { role: "toolbar", "aria-label": "Panel" },
     group("Computing", live, run),
-    group("History", undo, redo),
+    group("History", undo, redo, reset),
     group("Zoom", iconButton("minus", "Zoom out (-)", stage.zoomOut), scale, iconButton("plus", "Zoom in (+)", stage.zoomIn), iconButton("fit", "Fit (0)", stage.fit, "epypes-fit")),
     group("Compare", select, flip, wipe, side),
     group("Look", bars, log, marks, probed, draw),

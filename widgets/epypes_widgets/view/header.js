@@ -15,6 +15,7 @@ export function headerPart(panel) {
   const status = element("div", "epypes-status", { role: "status", "aria-live": "polite" });
   let noted = "";
   let failed = "";
+  let passes = false;
 
   function tellTimes(compute, screen) {
     note(times, "data-compute", String(compute));
@@ -30,6 +31,8 @@ export function headerPart(panel) {
     element: root,
     status,
     frame({ frame, main }) {
+      if (passes) noted = "";
+      tell();
       say(token, frame.token);
       say(kind, main.shape ? `${main.dtype} ${main.shape}` : "");
       say(marks, overlayCount(main.overlay));
@@ -43,9 +46,10 @@ export function headerPart(panel) {
       failed = failure ? failure.text : "";
       tell();
     },
-    /** Say something that is no failure of a function; it gives way to one. */
-    tell(text) {
+    /** Say something that is no failure of a function; it gives way to one, and to the next frame if it passes. */
+    tell(text, isPassing = false) {
       noted = text;
+      passes = isPassing;
       tell();
     },
   };

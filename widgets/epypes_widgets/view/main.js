@@ -37,7 +37,7 @@ function render({ model, el }) {
     release: out.release,
     blobs: blobs(),
     state: { token: "", values: {} },
-    tell: (text) => header.tell(text),
+    tell: (text, isPassing) => header.tell(text, isPassing),
     later,
     rowOf: (name) => rows.rowOf(name),
     drawRoi: () => roi.toggle(),

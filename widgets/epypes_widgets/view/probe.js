@@ -87,7 +87,11 @@ export function probePart(panel, stage) {
       move();
     },
     /** Other values are in the pixel now. */
-    frame: () => pixel && isOn && questions.ask(pixel),
+    frame() {
+      if (stage.canvas.hidden) hide();
+      else if (pixel && isOn) questions.ask(pixel);
+      putCross();
+    },
     toggle() {
       isOn = !isOn;
       if (!isOn) stopCross();

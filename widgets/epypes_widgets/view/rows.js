@@ -7,10 +7,18 @@ const NUMERIC = ["slider", "range", "log"];
 const RETRY_MS = 100;
 const RETRIES = 100;
 
+/** Return a row whose every field that is given by name is a list as long as its names. */
+export function perName(row) {
+  const each = (value) => (Array.isArray(value) && !(row.kind === "roi" && value.length === 4) ? value : row.names.map(() => value ?? null));
+  const fields = ["low", "high", "step", "default", "value"].map((field) => [field, each(row[field])]);
+  return { ...row, ...Object.fromEntries(fields) };
+}
+
 /** Decorates the rows of the panel that this view is in; they may come later than the view. */
 export function rowsPart(panel, figure) {
   let rows = [];
   let folders = [];
+  let given = "";
   let root = null;
   /** @type {Map<any, any>} by row */
   const found = new Map();
@@ -18,6 +26,7 @@ export function rowsPart(panel, figure) {
   const headings = new Map();
   let last = null;
   let failed = null;
+  const bound = new Set();
   const closing = new AbortController();
   const seeker = new MutationObserver(() => seek());
 
@@ -58,7 +67,7 @@ export function rowsPart(panel, figure) {
     found.get(row)?.tail.remove();
     const boxes = NUMERIC.includes(row.kind) ? row.names.map((_, index) => numberBox(panel, row, index)) : [];
     const sign = element("span", "epypes-fault", { role: "img" });
-    const reset = iconButton("reset", `Reset ${row.names.join(", ")} to ${shortly(defaultOf(row))}`, () => onReset(row), "epypes-reset");
+    const reset = iconButton("reset", `Reset ${row.names.join(", ")} to ${row.default.map(shortly).join(", ")}`, () => onReset(row), "epypes-reset");
     const tail = element("span", "epypes-tail", { "data-lm-suppress-shortcuts": "true" });
     boxes.forEach((box, index) => tail.append(...(index ? ["–"] : []), box.input));
     if (row.kind === "roi") tail.append(iconButton("roi", `Draw ${row.names[0]} on the picture`, () => panel.drawRoi(), "epypes-draw"));
@@ -73,8 +82,6 @@ export function rowsPart(panel, figure) {
     markChanged(row);
     markFault(row);
   }
-
-  const defaultOf = (row) => (row.names.length > 1 ? row.default : Array.isArray(row.default) && row.kind !== "roi" ? row.default[0] : row.default);
 
   function onReset(row) {
     panel.send({ kind: "reset", names: row.names });
@@ -98,8 +105,8 @@ export function rowsPart(panel, figure) {
       parts?.boxes.forEach((box, index) => box.moved(each[index]));
       markChanged(row);
     };
-    if (row.isBound) return moved();
-    row.isBound = true;
+    if (bound.has(row)) return moved();
+    bound.add(row);
     model.on("change:value", moved);
     closing.signal.addEventListener("abort", () => model.off("change:value", moved));
     moved();
@@ -113,10 +120,10 @@ export function rowsPart(panel, figure) {
   function markChanged(row) {
     const parts = found.get(row);
     if (!parts) return;
-    const defaults = row.names.length > 1 || (Array.isArray(row.default) && row.kind !== "roi") ? row.default : [row.default];
-    const isChanged = defaults !== null && row.names.some((_, index) => {
+    const isChanged = row.names.some((_, index) => {
       const value = valueOf(row, index);
-      return value !== undefined && defaults?.[index] !== null && !same(value, defaults?.[index]);
+      const first = row.default[index];
+      return value !== undefined && first !== null && !same(value, first);
     });
     parts.node.classList.toggle("epypes-changed", isChanged);
     parts.reset.disabled = !isChanged;
@@ -215,12 +222,13 @@ export function rowsPart(panel, figure) {
 
   return {
     setup(message) {
-      const isSame = same(message.rows, rows.map(({ isBound, ...row }) => row)) && same(message.folders, folders);
-      if (!isSame) {
+      const told = JSON.stringify([message.rows, message.folders]);
+      if (told !== given) {
+        given = told;
         clear();
-        rows = message.rows.map((row) => ({ ...row }));
+        rows = message.rows.map(perName);
         folders = message.folders;
-        for (const row of rows) row.names.forEach((name, index) => { panel.state.values[name] ??= row.kind === "roi" ? row.value : row.value?.[index]; });
+        for (const row of rows) row.names.forEach((name, index) => (panel.state.values[name] ??= row.value[index]));
       }
       if (root) seeker.observe(root, { childList: true, subtree: true });
       seekRoot(RETRIES);

@@ -43,8 +43,7 @@ export function screen(panel, stage, arrivals) {
     const [main] = await Promise.all([decoded(url), other]);
     if (!main || arrivals.isOvertaken(frame.seq)) {
       panel.blobs.close(url);
-      if (!main) panel.tell(`The picture of ${frame.token} can't be decoded (${picture.media_type}).`);
-      if (!main) arrivals.lose(frame.seq);
+      if (!main) throw new Error(`its bytes are no ${picture.media_type}`);
       return;
     }
     stage.picture.src = url;
@@ -80,7 +79,7 @@ export function screen(panel, stage, arrivals) {
         if (todo === "show") await show(frame, buffers);
       } catch (error) {
         arrivals.lose(frame.seq);
-        panel.tell(`This view could not show ${frame.token}: ${error}`);
+        panel.tell(`The picture of ${frame.token} can't be shown: ${error.message}.`, true);
       }
       panel.send({ kind: "painted", seq: frame.seq });
     },

@@ -142,7 +142,8 @@ export function stagePart(panel) {
     zoomOut: () => zoomTo(place.scale / BUTTON_STEP),
     actualSize: () => zoomTo(1),
     pan: (right, down) => panBy(-right * PAN_PX, -down * PAN_PX),
-    pixelAt: (point) => pixelAt(place, point, size),
+    /** The pixel at a point of a pane; null where there is no picture. */
+    pixelAt: (point) => (canvas.hidden ? null : pixelAt(place, point, size)),
     onPicture: (point) => onPicture(place, point),
     inBox: (pixel) => inBox(place, pixel),
     /** Call back whenever the picture has moved in its box. */
