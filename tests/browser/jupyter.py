@@ -179,8 +179,15 @@ class JupyterLab:
 class Notebook:
     """A notebook in a page of JupyterLab, with the file browser folded away."""
 
-    def __init__(self, browser: Any, lab: JupyterLab, name: str, width: int = 1280, height: int = 900) -> None:
+    # The kernel of the notebook that is open, in JavaScript.
+    KERNEL = _KERNEL
+
+    def __init__(
+        self, browser: Any, lab: JupyterLab, name: str, width: int = 1280, height: int = 900, script: str = ""
+    ) -> None:
         self.page = browser.new_context(viewport={"width": width, "height": height}).new_page()
+        if script:
+            self.page.add_init_script(script)
         self.page_errors: list[str] = []
         self.page.on("pageerror", lambda error: self.page_errors.append(str(error)))
         self.page.goto(lab.url(name))
@@ -204,6 +211,18 @@ class Notebook:
                 .map(output => output.traceback.join('\\n'))"""
         )
         assert not failed, "\n".join(failed)
+
+    def save(self) -> None:
+        """Save the notebook."""
+        self.page.evaluate("() => jupyterapp.commands.execute('docmanager:save')")
+        self.page.wait_for_function("() => !jupyterapp.shell.currentWidget.context.model.dirty")
+
+    def start(self, code: str) -> None:
+        """Begin to run code in the kernel outside of any cell, and return at once."""
+        self.page.evaluate(
+            f"code => {{ {_KERNEL}.requestExecute({{ code, store_history: false }}); }}",
+            code,
+        )
 
     def execute(self, code: str) -> str:
         """Run code in the kernel outside of any cell; return what it printed, or its traceback."""

@@ -11,12 +11,12 @@ import pytest
 
 from tests.browser.conftest import SCREENSHOTS, TUTORIAL
 from tests.browser.jupyter import JupyterLab, Notebook
+from tests.browser.panel import PanelOnScreen
 
 pytestmark = pytest.mark.browser
 
 LOG = logging.getLogger(__name__)
 PRESSES = 10
-TIMEOUT_MS = 20_000
 
 # The time of a key press, and the time at which the picture says that it shows the value that came of it.
 WATCH = """() => {
@@ -26,86 +26,12 @@ WATCH = """() => {
     new MutationObserver(() => window.shown.push([performance.now(), img.dataset.values]))
         .observe(img, { attributeFilter: ['data-values'] });
 }"""
-DIGEST = """async () => {
-    const bytes = await (await fetch(document.querySelector('img.epypes-picture').src)).arrayBuffer();
-    const digest = await crypto.subtle.digest('SHA-256', bytes);
-    return [...new Uint8Array(digest)].map(byte => byte.toString(16).padStart(2, '0')).join('');
-}"""
 KERNEL_DIGEST = """
 import hashlib
 from epypes.display.previews.raster import encode_image
 panel.wait(10)
 print(hashlib.sha256(encode_image(panel.result[panel.token], max_side_px=1400).data).hexdigest())
 """
-
-
-class PanelOnScreen:
-    """The panel of a notebook as a hand and an eye have it."""
-
-    def __init__(self, notebook: Notebook) -> None:
-        self.page = notebook.page
-        self.page.wait_for_function(
-            "() => document.querySelector('img.epypes-picture')?.dataset.seq", timeout=TIMEOUT_MS
-        )
-
-    @property
-    def seq(self) -> int:
-        return int(self._read("seq"))
-
-    @property
-    def values(self) -> dict[str, Any]:
-        values: dict[str, Any] = json.loads(self._read("values"))
-        return values
-
-    @property
-    def digest(self) -> str:
-        """The hash of the picture's bytes."""
-        return str(self.page.evaluate(DIGEST))
-
-    def focus(self, name: str) -> None:
-        """Put the keyboard on the slider of a hyperparameter."""
-        handle = self.page.locator(".widget-slider", has_text=name).first.locator(".noUi-handle")
-        handle.scroll_into_view_if_needed()
-        handle.focus()
-
-    def press(self, key: str, name: str, value: Any) -> None:
-        """Press a key and wait until the picture shows the value that it makes."""
-        self.page.keyboard.press(key)
-        self.wait_for(name, value)
-
-    def wait_for(self, name: str, value: Any) -> None:
-        self.page.wait_for_function(
-            "([name, value]) => JSON.parse("
-            "document.querySelector('img.epypes-picture').dataset.values)[name] === value",
-            arg=[name, value],
-            timeout=TIMEOUT_MS,
-        )
-
-    @property
-    def height(self) -> float:
-        """Of the whole panel, in pixels."""
-        return float(self.page.locator(".epypes-panel").bounding_box()["height"])
-
-    def wait_for_status(self, text: str) -> None:
-        """Return when the status line has this text in it; when it is empty, if the text is."""
-        self.page.wait_for_function(
-            "text => { const said = document.querySelector('.epypes-status').textContent;"
-            " return text ? said.includes(text) : said === ''; }",
-            arg=text,
-            timeout=TIMEOUT_MS,
-        )
-
-    def choose(self, token: str) -> None:
-        """Click a token and wait for its picture."""
-        self.page.locator(".epypes-tokens button").get_by_text(token, exact=True).click()
-        self.page.wait_for_function(
-            "token => document.querySelector('img.epypes-picture').alt.startsWith(token + ' ')",
-            arg=token,
-            timeout=TIMEOUT_MS,
-        )
-
-    def _read(self, key: str) -> str:
-        return str(self.page.evaluate(f"document.querySelector('img.epypes-picture').dataset.{key}"))
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,119 @@
+"""How is a panel in JupyterLab moved and read by a test?"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from tests.browser.jupyter import Notebook
+
+TIMEOUT_MS = 20_000
+
+DIGEST = """async () => {
+    const bytes = await (await fetch(document.querySelector('img.epypes-picture').src)).arrayBuffer();
+    const digest = await crypto.subtle.digest('SHA-256', bytes);
+    return [...new Uint8Array(digest)].map(byte => byte.toString(16).padStart(2, '0')).join('');
+}"""
+
+
+class PanelOnScreen:
+    """The panel of a notebook as a hand and an eye have it."""
+
+    def __init__(self, notebook: Notebook) -> None:
+        self.page = notebook.page
+        self.page.wait_for_function(
+            "() => document.querySelector('img.epypes-picture')?.dataset.seq", timeout=TIMEOUT_MS
+        )
+
+    @property
+    def seq(self) -> int:
+        return int(self._read("seq"))
+
+    @property
+    def values(self) -> dict[str, Any]:
+        values: dict[str, Any] = json.loads(self._read("values"))
+        return values
+
+    @property
+    def digest(self) -> str:
+        """The hash of the picture's bytes."""
+        return str(self.page.evaluate(DIGEST))
+
+    def focus(self, name: str) -> None:
+        """Put the keyboard on the slider of a hyperparameter."""
+        handle = self.page.locator(".widget-slider", has_text=name).first.locator(".noUi-handle")
+        handle.scroll_into_view_if_needed()
+        handle.focus()
+
+    def press(self, key: str, name: str, value: Any) -> None:
+        """Press a key and wait until the picture shows the value that it makes."""
+        self.page.keyboard.press(key)
+        self.wait_for(name, value)
+
+    def wait_for(self, name: str, value: Any) -> None:
+        self.page.wait_for_function(
+            "([name, value]) => JSON.parse("
+            "document.querySelector('img.epypes-picture').dataset.values)[name] === value",
+            arg=[name, value],
+            timeout=TIMEOUT_MS,
+        )
+
+    def row(self, name: str) -> Any:
+        """The row of a hyperparameter."""
+        return self.page.locator(".epypes-row", has_text=name).first
+
+    def number(self, name: str) -> float:
+        """What the number box of a hyperparameter shows."""
+        return float(self.row(name).locator("input.epypes-number").first.input_value())
+
+    def middle(self, selector: str) -> tuple[float, float]:
+        """The middle of an element, which is scrolled to, in pixels of the window."""
+        found = self.page.locator(selector).first
+        found.scroll_into_view_if_needed()
+        box = found.bounding_box()
+        return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+    def grab(self, name: str) -> tuple[float, float]:
+        """Press the mouse on the handle of a slider and return where it is; it stays pressed."""
+        handle = self.row(name).locator(".noUi-handle").first
+        handle.scroll_into_view_if_needed()
+        box = handle.bounding_box()
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        self.page.mouse.move(x, y)
+        self.page.mouse.down()
+        return x, y
+
+    def wait(self, condition: str, argument: Any = None) -> None:
+        """Return when a condition in JavaScript holds."""
+        self.page.wait_for_function(condition, arg=argument, timeout=TIMEOUT_MS)
+
+    @property
+    def history(self) -> int:
+        """How many entries the history on the screen has."""
+        return int(self.page.locator(".epypes-history [data-number]").count())
+
+    @property
+    def height(self) -> float:
+        """Of the whole panel, in pixels."""
+        return float(self.page.locator(".epypes-panel").bounding_box()["height"])
+
+    def wait_for_status(self, text: str) -> None:
+        """Return when the status line has this text in it; when it is empty, if the text is."""
+        self.page.wait_for_function(
+            "text => { const said = document.querySelector('.epypes-status').textContent;"
+            " return text ? said.includes(text) : said === ''; }",
+            arg=text,
+            timeout=TIMEOUT_MS,
+        )
+
+    def choose(self, token: str) -> None:
+        """Click a token and wait for its picture."""
+        self.page.locator(f".epypes-chip[data-token={token}]").click()
+        self.page.wait_for_function(
+            "token => document.querySelector('img.epypes-picture').alt.startsWith(token + ' ')",
+            arg=token,
+            timeout=TIMEOUT_MS,
+        )
+
+    def _read(self, key: str) -> str:
+        return str(self.page.evaluate(f"document.querySelector('img.epypes-picture').dataset.{key}"))

@@ -1,0 +1,307 @@
+"""Does a panel in JupyterLab do what its tutorial says: look, remember, follow cells, fail well and stay in the file?"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import nbformat
+import pytest
+
+from tests.browser.conftest import SCREENSHOTS
+from tests.browser.contrast import unreadable
+from tests.browser.jupyter import JupyterLab, Notebook
+from tests.browser.panel import PanelOnScreen
+
+pytestmark = pytest.mark.browser
+
+SET_UP = """
+import threading, cv2, numpy as np, epypes as ep
+from typing import Annotated
+from skimage import data
+from epypes_widgets import tune
+
+def cut(image, region: Annotated[tuple, ep.Roi("image")] = (0, 0, 600, 400)):
+    x, y, width, height = region
+    return image[y:y + height, x:x + width]
+
+def gray(cut):
+    return cv2.cvtColor(cut, cv2.COLOR_BGR2GRAY)
+
+def above(gray, threshold: Annotated[int, ep.Param(1, 255, cuts="gray")] = 100):
+    return cv2.threshold(gray, threshold, 255, cv2.THRESH_BINARY)[1]
+
+def outlines(above):
+    return cv2.findContours(above, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+
+photograph = cv2.cvtColor(data.coffee(), cv2.COLOR_RGB2BGR)
+runner = ep.CompGraphRunner(ep.CompGraph.from_functions(cut, gray, above, outlines))
+panel = tune(runner, images=[photograph, photograph[:, ::-1].copy()], token="above")
+panel
+"""
+# A page counts the addresses of blobs that it has not given back.
+COUNT_BLOBS = """
+window.blobs = new Set();
+const make = URL.createObjectURL.bind(URL), give = URL.revokeObjectURL.bind(URL);
+URL.createObjectURL = blob => { const url = make(blob); window.blobs.add(url); return url; };
+URL.revokeObjectURL = url => { window.blobs.delete(url); give(url); };
+"""
+THOUSAND_FRAMES = """
+frames, pause = panel._screen.view.frames, threading.Event()
+for count in range(1000):
+    panel["threshold"] = 60 + count % 100
+    panel.wait(10)
+    while frames.in_flight is not None:
+        pause.wait(0.001)
+print(len(panel.history))
+"""
+
+
+def written(folder: Path, name: str, *cells: str) -> Path:
+    """Write a notebook."""
+    path = folder / name
+    # Without a kernel named, JupyterLab would ask for one.
+    metadata = {"kernelspec": {"name": "python3", "display_name": "Python 3"}}
+    nbformat.write(
+        nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in cells], metadata=metadata), path
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def notebook(browser: Any, lab: JupyterLab) -> Iterator[Notebook]:
+    written(lab.root, "panel.ipynb", SET_UP.strip())
+    notebook = Notebook(browser, lab, "panel.ipynb", script=COUNT_BLOBS)
+    notebook.run_all()
+    yield notebook
+    notebook.close()
+
+
+@pytest.fixture
+def panel(notebook: Notebook) -> PanelOnScreen:
+    """The panel at its first values, on its first image."""
+    panel = PanelOnScreen(notebook)
+    said = "panel.reset(); panel.token = 'above'; panel._tuning.want_image(0); panel.wait(20)"
+    assert notebook.execute(said) == ""
+    panel.wait_for("threshold", 100)
+    return panel
+
+
+def test_a_drag_is_followed_and_committed_once(notebook: Notebook, panel: PanelOnScreen) -> None:
+    assert notebook.execute("before = len(panel.history)") == ""
+    seq, height = panel.seq, panel.height
+    x, y = panel.grab("threshold")
+    for step in range(1, 21):
+        panel.page.mouse.move(x + step, y)
+        panel.page.evaluate("() => new Promise(done => requestAnimationFrame(done))")
+    panel.wait("() => JSON.parse(document.querySelector('img.epypes-picture').dataset.values).threshold > 110")
+    panel.page.mouse.up()
+    assert notebook.execute("panel.wait(10); print(len(panel.history) - before)").strip() == "1"
+    assert panel.seq > seq + 2
+    assert panel.height == height
+    said = notebook.execute("print(runner['threshold'], panel['threshold'], panel.result.hyperparameters['threshold'])")
+    assert set(said.split()) == {str(int(panel.number("threshold")))}
+
+
+def test_a_cell_that_runs_for_ten_seconds_does_not_stop_the_panel(notebook: Notebook, panel: PanelOnScreen) -> None:
+    notebook.start("busy = threading.Event(); busy.wait(10)")
+    panel.wait(f"() => {notebook.KERNEL}.status === 'busy'")
+    panel.focus("threshold")
+    for step in range(1, 6):
+        panel.press("ArrowRight", "threshold", 100 + step)
+    panel.choose("gray")
+    assert panel.page.evaluate(f"() => {notebook.KERNEL}.status") == "busy"
+    notebook.wait_idle()
+
+
+def test_a_cell_moves_the_control_but_never_under_the_hand(notebook: Notebook, panel: PanelOnScreen) -> None:
+    assert notebook.execute("runner['threshold'] = 120; panel.wait(10)") == ""
+    panel.wait_for("threshold", 120)
+    assert panel.number("threshold") == 120
+    panel.grab("threshold")
+    assert notebook.execute("runner['threshold'] = 50; panel.wait(10); print(panel['threshold'])").strip() == "120"
+    assert panel.number("threshold") == 120
+    panel.page.mouse.up()
+    panel.wait_for("threshold", 50)
+    panel.wait("() => [...document.querySelectorAll('input.epypes-number')].some(box => box.value === '50')")
+
+
+def test_typed_numbers_steps_and_reset(panel: PanelOnScreen) -> None:
+    box = panel.row("threshold").locator("input.epypes-number")
+    box.fill("77")
+    box.press("Enter")
+    panel.wait_for("threshold", 77)
+    box.press("ArrowUp")
+    panel.wait_for("threshold", 78)
+    box.fill("700")
+    box.press("Enter")
+    panel.wait_for_status("255")
+    assert panel.values["threshold"] == 78
+    box.press("Escape")
+    panel.row("threshold").locator(".epypes-reset").click()
+    panel.wait_for("threshold", 100)
+
+
+def test_undo_and_redo_from_the_toolbar_and_history(notebook: Notebook, panel: PanelOnScreen) -> None:
+    for value in (110, 120):
+        assert notebook.execute(f"panel['threshold'] = {value}; panel.wait(10)") == ""
+    panel.page.locator(".epypes-undo").click()
+    panel.wait_for("threshold", 110)
+    panel.page.locator(".epypes-redo").click()
+    panel.wait_for("threshold", 120)
+    panel.page.locator(".epypes-history [data-number]").first.click()
+    first = int(notebook.execute("print(panel.history['threshold'].iloc[0])"))
+    panel.wait_for("threshold", first)
+
+
+def test_a_threshold_is_dragged_on_the_histogram_of_what_it_cuts(panel: PanelOnScreen) -> None:
+    line = panel.page.locator(".epypes-cut[data-name=threshold]")
+    line.scroll_into_view_if_needed()
+    box = line.bounding_box()
+    panel.page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    panel.page.mouse.down()
+    panel.page.mouse.move(box["x"] + box["width"] / 2 + 40, box["y"] + box["height"] / 2, steps=8)
+    panel.page.mouse.up()
+    panel.wait("() => JSON.parse(document.querySelector('img.epypes-picture').dataset.values).threshold > 105")
+    panel.wait("() => +document.querySelector('.epypes-changed input.epypes-number').value > 105")
+
+
+def test_a_region_is_drawn_on_the_picture_that_it_is_of(panel: PanelOnScreen, theme: str) -> None:
+    panel.choose("image")
+    panel.page.locator(".epypes-roi-button").first.click()
+    x, y = panel.middle(".epypes-box")
+    panel.page.mouse.move(x - 90, y - 60)
+    panel.page.mouse.down()
+    panel.page.mouse.move(x + 90, y + 60, steps=10)
+    panel.page.mouse.up()
+    panel.wait("() => JSON.parse(document.querySelector('img.epypes-picture').dataset.values).region[0] > 50")
+    region = panel.values["region"]
+    assert 0.8 < region[2] / region[3] / 1.5 < 1.25
+    panel.page.locator(".epypes-panel").screenshot(path=SCREENSHOTS / f"panel-region-{theme}.png")
+    panel.choose("gray")
+    shape = panel.page.locator(".epypes-kind").inner_text()
+    assert f"{region[3]} x {region[2]}" in shape
+
+
+def test_stages_are_compared_probed_and_zoomed(panel: PanelOnScreen, theme: str) -> None:
+    panel.choose("outlines")
+    panel.wait("() => document.querySelectorAll('svg.epypes-overlay path, svg.epypes-overlay polygon').length > 0")
+    x, y = panel.middle(".epypes-box")
+    panel.page.mouse.move(x, y)
+    panel.wait("() => document.querySelector('.epypes-probe').textContent.includes('gray')")
+    panel.page.locator(".epypes-panel").screenshot(path=SCREENSHOTS / f"panel-probe-{theme}.png")
+    panel.page.select_option(".epypes-compare", '{"kind":"default"}')
+    panel.page.locator(".epypes-side-button, [aria-label^='Side by side']").first.click()
+    panel.wait("() => document.querySelector('img.epypes-other')?.naturalWidth > 0")
+    panel.page.locator(".epypes-panel").screenshot(path=SCREENSHOTS / f"panel-side-{theme}.png")
+    panel.page.select_option(".epypes-compare", index=0)
+
+
+def test_test_images_are_switched_on_the_film(notebook: Notebook, panel: PanelOnScreen) -> None:
+    digest = panel.digest
+    panel.page.locator(".epypes-filmstrip [data-index='1']").click()
+    panel.wait("before => document.querySelector('img.epypes-picture').dataset.seq > before", panel.seq)
+    assert notebook.execute("panel.wait(10); print(panel._session.image)").strip() == "1"
+    assert panel.digest != digest
+
+
+def test_what_fails_is_said_at_its_chip_and_control(notebook: Notebook, panel: PanelOnScreen, theme: str) -> None:
+    values, digest, height = panel.values, panel.digest, panel.height
+    assert notebook.execute("panel['region'] = (0, 0, 0, 0); panel.wait(10)") == ""
+    panel.wait_for_status("gray")
+    assert panel.row("region").evaluate("row => row.classList.contains('epypes-failed')")
+    assert panel.page.locator(".epypes-chip[data-token=gray].epypes-failed").count() == 1
+    assert (panel.values, panel.digest, panel.height) == (values, digest, height)
+    assert notebook.execute("print(runner['region'])").strip() == "(0, 0, 600, 400)"
+    panel.page.locator(".epypes-panel").screenshot(path=SCREENSHOTS / f"panel-error-{theme}.png")
+    unread = unreadable(panel.page, ".epypes-panel")
+    assert unread == []
+    assert notebook.execute("panel.reset(); panel.wait(10)") == ""
+    panel.wait_for_status("")
+    assert panel.page.locator(".epypes-failed").count() == 0
+
+
+def test_what_fails_in_the_panel_itself_is_in_its_log(notebook: Notebook, panel: PanelOnScreen) -> None:
+    assert notebook.execute("runner['threshold'] = 300; panel.wait(10)") == ""
+    panel.wait("() => document.querySelector('.epypes-log').textContent.includes(\"can't be 300\")")
+    assert notebook.execute("panel.reset(); panel.wait(10)") == ""
+
+
+def test_settings_are_saved_and_loaded(notebook: Notebook, panel: PanelOnScreen, lab: JupyterLab) -> None:
+    assert notebook.execute("panel['threshold'] = 88; panel.wait(10)") == ""
+    panel.page.locator(".epypes-settings-name").fill("afternoon")
+    panel.page.locator(".epypes-save").click()
+    panel.wait("() => document.querySelector('.epypes-foot').textContent.includes('Saved afternoon.toml')")
+    assert "threshold = 88" in (lab.root / "afternoon.toml").read_text()
+    assert notebook.execute("panel.reset(); panel.wait(10)") == ""
+    panel.page.locator(".epypes-load").click()
+    panel.wait_for("threshold", 88)
+
+
+def test_promote_tells_whether_the_bundle_computes_the_same(
+    notebook: Notebook, panel: PanelOnScreen, lab: JupyterLab
+) -> None:
+    panel.page.locator(".epypes-promote").click()
+    panel.page.wait_for_function(
+        "() => document.querySelector('.epypes-foot').textContent.includes('identical')", timeout=60_000
+    )
+    assert (lab.root / "services" / "above" / "pipeline.py").is_file()
+
+
+def test_at_600_px_everything_is_there_and_nothing_jumps(panel: PanelOnScreen, theme: str) -> None:
+    size = panel.page.viewport_size
+    panel.page.set_viewport_size({"width": 740, "height": 1200})
+    try:
+        panel.wait("() => document.querySelector('.epypes-panel').getBoundingClientRect().width < 640")
+        place = panel.page.locator(".epypes-box").bounding_box()
+        panel.focus("threshold")
+        panel.press("ArrowRight", "threshold", 101)
+        panel.focus("threshold")
+        assert panel.page.locator(".epypes-box").bounding_box()["height"] == place["height"]
+        assert panel.page.evaluate(
+            "() => { const panel = document.querySelector('.epypes-panel');"
+            " return panel.scrollWidth <= panel.clientWidth; }"
+        )
+        panel.page.locator(".epypes-panel").screenshot(path=SCREENSHOTS / f"panel-narrow-{theme}.png")
+    finally:
+        panel.page.set_viewport_size(size)
+
+
+def test_a_thousand_frames_leave_neither_blobs_nor_bytes_behind(
+    notebook: Notebook, panel: PanelOnScreen, lab: JupyterLab, theme: str
+) -> None:
+    path = lab.root / "panel.ipynb"
+    notebook.save()
+    before, blobs = path.stat().st_size, panel.page.evaluate("() => window.blobs.size")
+    seq = panel.seq
+    assert int(notebook.execute(THOUSAND_FRAMES)) > 3
+    panel.wait("before => document.querySelector('img.epypes-picture').dataset.seq >= before + 1000", seq)
+    # The films and the history, of which so many are listed, are pictures too.
+    assert panel.page.evaluate("() => window.blobs.size") <= blobs + 45
+    notebook.save()
+    assert path.stat().st_size - before < 200_000
+    assert path.stat().st_size < 300_000
+
+
+def test_opened_again_without_its_kernel_the_last_picture_and_values_are_there(
+    browser: Any, notebook: Notebook, panel: PanelOnScreen, lab: JupyterLab, theme: str
+) -> None:
+    assert notebook.execute("panel['threshold'] = 66; panel.wait(10); panel._still.update()") == ""
+    assert panel.page.locator(".epypes-static").is_hidden()
+    panel.wait("() => JSON.stringify(jupyterapp.shell.currentWidget.content.model.toJSON()).includes('66')")
+    notebook.save()
+    shutil.copy(lab.root / "panel.ipynb", lab.root / "again.ipynb")
+    again = Notebook(browser, lab, "again.ipynb")
+    try:
+        static = again.page.locator(".epypes-static")
+        static.scroll_into_view_if_needed()
+        assert static.is_visible()
+        assert static.locator("img").evaluate("async img => { await img.decode(); return img.naturalWidth; }") > 300
+        assert "66" in static.inner_text()
+        again.screenshot(SCREENSHOTS / f"panel-again-{theme}.png")
+    finally:
+        again.close()
+    assert json.loads((lab.root / "again.ipynb").read_text())["cells"][0]["outputs"][1]["output_type"] == "display_data"
