@@ -46,6 +46,17 @@ def test_an_older_frame_that_comes_late_is_acknowledged_and_not_shown(view: View
     assert {view.js("one[0].seq"), view.js("two[0].seq")} <= {message["seq"] for message in view.sent("painted")}
 
 
+def test_a_picture_that_takes_long_to_decode_does_not_replace_a_newer_one(view: ViewPage) -> None:
+    view.do(
+        "window.large = await kernel.bytesOf('image', 5000); window.one = await kernel.frame(); window.two = await kernel.frame()"
+    )
+    view.do(
+        "kernel.deliver(one[0], [large]); kernel.deliver(...two); await kernel.painted(); await kernel.painted(one[0].seq)"
+    )
+    view.until("kernel.kinds('painted').some(each => each.seq === one[0].seq)")
+    assert view.seen() == view.js("two[0].seq")
+
+
 def test_a_frame_that_comes_twice_is_acknowledged_twice(view: ViewPage) -> None:
     view.do("window.one = await kernel.frame(); kernel.deliver(...one); await kernel.painted()")
     view.do("kernel.deliver(...one)")
@@ -566,6 +577,19 @@ def test_a_rectangle_is_moved_by_keys_and_given_up_by_delete(view: ViewPage) -> 
     view.press("Delete")
     assert view.attribute(".epypes-roi-frame", "width") == "512"
     assert _values(view)[-1] == {"crop": [0, 0, 512, 384]}
+
+
+def test_a_frame_of_older_values_does_not_take_a_rectangle_back(view: ViewPage) -> None:
+    view.click(".epypes-chip[data-token=image]")
+    view.until("document.querySelector('.epypes-roi-one').style.display === ''")
+    view.settle()
+    view.do("kernel.isQuiet = true")
+    view.focus(".epypes-roi-frame")
+    view.press("ArrowRight")
+    view.do("await kernel.run()")
+    view.settle()
+    view.press("ArrowRight")
+    view.until("kernel.kinds('set').at(-1)?.values.crop[0] === 62")
 
 
 def test_escape_gives_back_the_rectangle_that_was(view: ViewPage) -> None:
