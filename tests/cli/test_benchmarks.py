@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 
 import pytest
+from rich.console import Console
 
-from tests.benchmarks import engine
+from tests.benchmarks import engine, tuning
 from tests.benchmarks.peers import natural_functions
-from tests.benchmarks.row import OURS, Goal, row
+from tests.benchmarks.row import OURS, Goal, Row, row
 from tests.benchmarks.table import as_table, write_json
 from tests.benchmarks.timing import Effort, Times
+from tests.benchmarks.tuning.goals import compared
+from tests.benchmarks.tuning.latency import Seen, p95
+from tests.benchmarks.tuning.session import IMAGE, MATPLOTLIB, Measured
 from tests.benchmarks.work import add_one, tuned_chain
 
 QUICK = Effort(quick=True)
@@ -106,3 +111,83 @@ def test_only_what_depends_on_a_token_is_downstream_of_it():
     work = tuned_chain(3, add_one, 0, lambda x, k: x + k)
     assert list(work.downstream("k")) == ["last"]
     assert list(work.downstream("t1")) == ["f1", "last"]
+
+
+def seen_of(moves, pictures):
+    return Seen([(float(at), value) for at, value in moves], [(float(at), value) for at, value in pictures])
+
+
+def test_a_value_waits_for_the_first_picture_of_it_or_of_a_later_one():
+    seen = seen_of([(0, 70), (10, 71), (20, 72)], [(30, 70), (50, 72)])
+    assert seen.latencies_ms == [30, 40, 30]
+    assert (seen.values_shown, seen.last_late_ms, seen.duration_ms) == (2, 30, 50)
+
+
+def test_a_picture_from_before_the_move_and_one_of_another_value_do_not_count():
+    seen = seen_of([(10, 70), (20, 71)], [(5, 71), (15, 69), (40, 71), (90, 71)])
+    assert seen.latencies_ms == [30, 20]
+
+
+def test_a_value_that_is_never_shown_waits_for_ever():
+    assert seen_of([(0, 70), (1, 71)], [(5, 70)]).latencies_ms == [5, math.inf]
+
+
+def test_of_twenty_values_the_nineteenth_is_the_95th_percentile():
+    assert p95(range(20, 0, -1)) == 19
+    assert p95([3.0]) == 3
+
+
+def measured_of(ours, image=(), server="epypes lab"):
+    image = image or ours
+    peers = {OURS: [ours], IMAGE: [image], MATPLOTLIB: [image]}
+    return Measured(server, [10.0, 10.0], peers, peers, slow=ours, slow_runs=3)
+
+
+def test_the_floor_and_the_peers_of_the_same_page_are_what_a_drag_is_held_to():
+    fast, late = seen_of([(0, 1), (1, 2)], [(21, 1), (22, 2)]), seen_of([(0, 1), (1, 2)], [(26, 1), (27, 2)])
+    verdicts = {each.work: each.reached for each in compared(measured_of(fast, late))}
+    assert verdicts["epypes lab: a key press, p50, to echo"] is True
+    assert verdicts["epypes lab: a drag of 60 moves, p95, to ipywidgets.Image"] is True
+    verdicts = {each.work: each.reached for each in compared(measured_of(late, fast))}
+    assert verdicts["epypes lab: a key press, p50, to echo"] is False
+    assert verdicts["epypes lab: a drag of 60 moves, p95, to ipywidgets.Image"] is False
+
+
+def test_fifty_pictures_are_asked_of_our_websocket_alone():
+    def verdict(count, server):
+        moves = [(at, at) for at in range(60)]
+        found = compared(measured_of(seen_of(moves, [(at + 1, at) for at in range(60 - count, 60)]), server=server))
+        return next(each.reached for each in found if "pictures" in each.work)
+
+    assert verdict(50, "epypes lab") is True
+    assert verdict(49, "epypes lab") is False
+    assert verdict(49, "jupyter lab") is None
+
+
+def test_what_is_counted_is_shown_and_kept_as_a_number():
+    counted = Row("runs", {"allowed": 8.0, OURS: 6.0}, goal=Goal("ratio", 1), limit="allowed", unit="count")
+    assert counted.as_dict()["medians_count"] == {"allowed": 8.0, OURS: 6.0}
+    console = Console(width=150)
+    with console.capture() as printed:
+        console.print(as_table([counted]))
+    assert "ms" not in printed.get()
+    assert "0.750" in printed.get()
+
+
+@pytest.mark.browser
+def test_a_quick_run_moves_the_sliders_of_both_servers_and_keeps_every_row(tmp_path):
+    rows = tuning.rows(QUICK)
+    write_json(rows, [], tmp_path / "benchmarks.json")
+    kept = json.loads((tmp_path / "benchmarks.json").read_text())["rows"]
+    servers = [each["work"].partition(":")[0] for each in kept]
+    assert servers == ["jupyter lab"] * 9 + ["epypes lab"] * 9
+    for each in kept:
+        amounts = each.get("medians_ns") or each["medians_count"]
+        assert all(0 < amount < math.inf for amount in amounts.values()), each
+
+
+def test_without_a_browser_the_sliders_are_left_out_and_it_says_why(monkeypatch):
+    monkeypatch.delenv("CHROMIUM", raising=False)
+    monkeypatch.setenv("PATH", "")
+    assert "No Chromium was found" in tuning.missing()
+    assert tuning.rows(QUICK) == []

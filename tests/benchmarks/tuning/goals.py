@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from statistics import median
 
 from tests.benchmarks.row import OURS, Goal, Row
@@ -37,15 +37,14 @@ def compared(measured: Measured) -> list[Row]:
 def _beside_echo(measured: Measured, work: str, seen: Sequence[Seen], share: Share, most: float) -> Row:
     amounts = {_ECHO: p50(measured.echoes_ms) * 1e6, OURS: share(_latencies(seen)) * 1e6}
     note = "limit: p50 of an integer's way to the kernel and back"
-    return Row(f"{measured.server}: {work}", amounts, goal=Goal("ratio", most), limit=_ECHO, note=note)
+    return Row(f"{measured.server}: {work}, to {_ECHO}", amounts, goal=Goal("ratio", most), limit=_ECHO, note=note)
 
 
 def _beside_peer(
-    measured: Measured, work: str, seen: dict[str, Sequence[Seen]], peer: str, share: Share, most: float
+    measured: Measured, work: str, seen: Mapping[str, Sequence[Seen]], peer: str, share: Share, most: float
 ) -> Row:
     amounts = {name: share(_latencies(seen[name])) * 1e6 for name in (peer, OURS)}
-    goal = Goal("ratio", most)
-    return Row(f"{measured.server}: {work}", amounts, goal=goal, limit=peer, note=f"limit: {peer}")
+    return Row(f"{measured.server}: {work}, to {peer}", amounts, goal=Goal("ratio", most), limit=peer)
 
 
 def _pictures(measured: Measured) -> Row:

@@ -25,19 +25,27 @@
     },
     // The value stands in the last bytes of the picture, behind its end.
     blob(root, label, shown) {
-      const onLoad = (event) => {
-        const blob = blobs.get(event.target.src);
-        const at = shown(undefined);
-        blob?.slice(-3).text().then((text) => (at.value = Number(text)));
-      };
-      root.addEventListener("load", onLoad, true);
+      whenDecoded(root, (img) => blobs.get(img.src)?.slice(-3).text(), shown);
     },
     // The value stands in the title that the file carries.
     png(root, label, shown) {
-      const onLoad = ({ target: { src } }) => shown(Number(/Title\0(\d+)/.exec(atob(src.split(",")[1]))?.[1]));
-      root.addEventListener("load", onLoad, true);
+      whenDecoded(root, (img) => /Title\0(\d+)/.exec(atob(img.src.split(",")[1]))?.[1], shown);
     },
   };
+
+  /** A picture that has been loaded is not on the screen: the panel's are decoded, too, before they are announced. */
+  function whenDecoded(root, value, shown) {
+    const onLoad = async ({ target }) => {
+      const read = value(target);
+      try {
+        await target.decode();
+      } catch {
+        return; // replaced before it could be seen
+      }
+      shown(Number(await read));
+    };
+    root.addEventListener("load", onLoad, true);
+  }
 
   window.bench = {
     watch(name, cell, label, kind) {
@@ -50,18 +58,14 @@
       new MutationObserver(() => entry.moves.push([performance.now(), value()])).observe(handle, {
         attributeFilter: ["aria-valuenow"],
       });
-      const onShown = (shown) => {
-        const picture = { at: 0, value: shown };
-        entry.pictures.push(picture);
-        requestAnimationFrame(() => (picture.at = performance.now()));
-        return picture;
-      };
-      SHOWS[kind](root, label, onShown);
+      SHOWS[kind](root, label, (value) => {
+        requestAnimationFrame(() => entry.pictures.push([performance.now(), value]));
+      });
     },
     /** Resolves when the last picture shows the value that the slider has; false if that takes too long. */
     settled(name, timeout) {
       const entry = seen[name];
-      const isSettled = () => entry.pictures.at(-1)?.value === entry.value() && entry.pictures.at(-1).at > 0;
+      const isSettled = () => entry.pictures.at(-1)?.[1] === entry.value();
       return new Promise((resolve) => {
         const timer = setInterval(() => isSettled() && done(true), 4);
         const limit = setTimeout(() => done(false), timeout);
@@ -76,7 +80,7 @@
       const { moves, pictures } = seen[name];
       seen[name].moves = [];
       seen[name].pictures = pictures.slice(-1);
-      return { moves, pictures: pictures.filter(({ at }) => at).map(({ at, value }) => [at, value]) };
+      return { moves, pictures };
     },
   };
 })();
