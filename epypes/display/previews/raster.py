@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
+from epypes.display.previews.bitmap import bitmap_png
 from epypes.display.previews.imagekinds import image_kind, is_image, is_mask, one_channel, sampled
 from epypes.display.previews.labels import label_picture
 from epypes.display.previews.looking import silent_numpy
@@ -91,6 +92,9 @@ def encode_image(
         kind = image_kind(array, sample)
         if kind == "mask" and sample is not array and not is_mask(one_channel(array)):
             kind = "photograph"
+        if kind == "mask" and most_bytes is None and not _is_thumbnail(array, max_side_px):
+            bits = _mask_bits(one_channel(array), max_side_px)
+            return Picture(bitmap_png(bits), "image/png", bits.shape[1], bits.shape[0])
         picture = pillow_image(array, max_side_px, order, ends, kind)
         return _save(picture) if most_bytes is None else encode_small(picture, most_bytes)
 
@@ -99,7 +103,7 @@ def pillow_image(array: Array, max_side_px: int | None, order: Order, ends: Rang
     """Return an image of this kind as a picture that is not encoded yet."""
     image = one_channel(array)
     if kind == "mask":
-        is_small = max_side_px is not None and max_side_px <= THUMBNAIL_PX < max(image.shape)
+        is_small = max_side_px is not None and _is_thumbnail(image, max_side_px)
         return _mask_thumbnail(image, max_side_px) if is_small and max_side_px else _mask_picture(image, max_side_px)
     if kind == "labels":
         return label_picture(image, max_side_px)
@@ -193,10 +197,20 @@ def _mask_thumbnail(mask: Array, max_side_px: int) -> Image.Image:
     return picture
 
 
+def _is_thumbnail(image: Array, max_side_px: int | None) -> bool:
+    """Whether an image is to become so small that its masks get grey edges."""
+    return max_side_px is not None and max_side_px <= THUMBNAIL_PX < max(image.shape[:2])
+
+
 def _mask_picture(mask: Array, max_side_px: int | None) -> Image.Image:
+    from PIL import Image
+
+    return Image.fromarray(_mask_bits(mask, max_side_px)).convert("1")
+
+
+def _mask_bits(mask: Array, max_side_px: int | None) -> npt.NDArray[np.bool_]:
     """Shrink by maximum: thin lines averaged over their black surroundings would vanish."""
     import numpy as np
-    from PIL import Image
 
     bits = mask.view(np.uint8) if mask.dtype.kind == "b" else mask
     if max_side_px is not None and not is_pooled(mask):
@@ -206,7 +220,7 @@ def _mask_picture(mask: Array, max_side_px: int | None) -> Image.Image:
     if pool > 1:
         # Every pixel counts, or lines between those of a sample would vanish; by whole rows, 12 MP take 0.4 ms.
         bits = _pooled(np.ascontiguousarray(_pooled(bits, pool).T), pool).T
-    return Image.fromarray(np.ascontiguousarray(bits != 0)).convert("1")
+    return np.ascontiguousarray(bits != 0)
 
 
 def is_pooled(mask: Array) -> bool:
