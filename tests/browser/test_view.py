@@ -343,7 +343,7 @@ KERNEL = ".epypes-row-1 .epypes-number"
 
 
 def _values(view: ViewPage, commit: bool = True) -> list[dict[str, Any]]:
-    return [message["values"] for message in view.sent("set") if message["commit"] is commit]
+    return [message["values"] for message in (view.sent("set") if commit else view.moves)]
 
 
 def test_a_typed_number_is_committed_by_enter(view: ViewPage) -> None:
@@ -430,6 +430,24 @@ def test_a_drag_of_a_slider_is_held_and_released(view: ViewPage) -> None:
     assert len(view.sent("hold")) == 1
     view.press("Enter")
     assert len(view.sent("release")) == 2
+
+
+def test_a_drag_is_told_on_the_way_also_if_something_else_had_the_focus(view: ViewPage) -> None:
+    view.focus(".epypes-row-2 .epypes-number")
+    x, y = view.middle(".epypes-row-1 .noUi-handle")
+    view.page.mouse.move(x, y)
+    view.page.mouse.down()
+    for step in range(1, 9):
+        view.page.mouse.move(x + 8 * step, y)
+        view.settle()
+    model = view.js("kernel.rows[1].model")
+    places = [message["places"][model] for message in view.moves]
+    assert len(places) > 2
+    assert places == sorted(places)
+    assert view.page.input_value(KERNEL) == str(places[-1])
+    assert view.sent("release") == []
+    view.page.mouse.up()
+    assert len(view.sent("release")) == 1
 
 
 def test_a_changed_row_is_marked_and_can_be_reset(view: ViewPage) -> None:
@@ -545,7 +563,7 @@ def test_a_threshold_is_moved_by_keys(view: ViewPage) -> None:
 
 
 def _crop(view: ViewPage) -> list[int]:
-    found: list[int] = view.sent("set")[-1]["values"]["crop"]
+    found: list[int] = (view.sent("set") or view.moves)[-1]["values"]["crop"]
     return found
 
 

@@ -83,6 +83,14 @@ class ViewPage:
         found: list[dict[str, Any]] = self.js(f"kernel.kinds({kind!r})")
         return found
 
+    @property
+    def moves(self) -> list[dict[str, Any]]:
+        """What was moved and not committed, as it was sent: by itself, or with an acknowledgement."""
+        found: list[dict[str, Any]] = self.js(
+            "kernel.sent.map(message => message.kind === 'move' ? message : message.move).filter(Boolean)"
+        )
+        return found
+
     def click(self, selector: str) -> None:
         self.page.click(selector)
 

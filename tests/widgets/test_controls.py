@@ -90,7 +90,7 @@ def test_an_annotation_that_does_not_fit_the_value_gives_way_to_it() -> None:
 def test_a_slider_of_odd_integers_has_odd_ends_and_takes_no_even_one() -> None:
     entry = made(11, ep.Param(0, 30, odd=True))
     slider = entry.widget
-    assert (slider.min, slider.max, slider.step, slider.continuous_update) == (1, 29, 2, True)
+    assert (slider.min, slider.max, slider.step, slider.continuous_update) == (1, 29, 2, False)
     entry.widget.value = 14
     assert at(entry) == 15
     entry.widget.value = 99

@@ -166,10 +166,10 @@ def test_a_value_that_a_cell_sets_out_of_range_is_shown_and_said(
 
 
 def test_typed_values_are_checked_by_the_kernel(panel: Panel, front_end: FrontEnd) -> None:
-    front_end.tell("set", values={"threshold": 300}, commit=True)
+    front_end.tell("set", values={"threshold": 300})
     assert front_end.last("error")["names"] == ["threshold"]
     assert "can't be 300" in front_end.last("error")["text"]
-    front_end.tell("set", values={"threshold": 77}, commit=True)
+    front_end.tell("set", values={"threshold": 77})
     panel.wait(10)
     front_end.wait_for_values(10, threshold=77)
     assert panel.error == ""

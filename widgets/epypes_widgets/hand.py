@@ -12,6 +12,7 @@ from typing import Any
 from epypes.errors import UnknownName
 from epypes.hints import Param, Roi, Text
 from epypes_widgets.controls import Control
+from epypes_widgets.controls.quiet import slide
 from epypes_widgets.values import differing
 
 
@@ -73,6 +74,13 @@ class Hand:
             for name in values:
                 self._waiting.pop(name, None)
             return {name: control.read()[name] for control, own in parts for name in own}
+
+    def slide(self, places: Mapping[str, Any]) -> None:
+        """Take where sliders are that are being dragged, by the id of their model; they tell as if let go there."""
+        sliders = {control.widget.model_id: control.widget for control in self.controls}
+        for model, place in places.items():
+            if model in sliders:
+                slide(sliders[model], place)
 
     def follow(self, values: Mapping[str, Any]) -> list[str]:
         """Move controls to what the runner has got from elsewhere; those that are held follow when they are let go.

@@ -43,7 +43,8 @@ class Messages:
             "ready": lambda _: tuning.screen.ready(),
             "hold": lambda message: tuning.hand.hold(message["names"]),
             "release": lambda _: tuning.release(),
-            "set": self._set,
+            "set": lambda message: self._set(message["values"]),
+            "move": self._move,
             "reset": self._reset,
             "stage": lambda message: self._look(token=tuning.screen.require_stage(message["token"])),
             "pin": self._pin,
@@ -63,17 +64,21 @@ class Messages:
 
     # -- values -------------------------------------------------------------------------------------------------
 
-    def _set(self, message: Message) -> None:
-        values: Mapping[str, Any] = message["values"]
+    def _move(self, message: Message) -> None:
+        self._tuning.hand.slide(message["places"])
+        if message["values"]:
+            self._set(message["values"], commit=False)
+
+    def _set(self, values: Mapping[str, Any], *, commit: bool = True) -> None:
         try:
-            self._tuning.want(values, commit=bool(message.get("commit", True)))
+            self._tuning.want(values, commit=commit)
         except ValueError as error:
             self._tuning.screen.fail(str(error), names=tuple(values))
 
     def _reset(self, message: Message) -> None:
         first, controls = self._tuning.runner.first_hyperparameters, self._tuning.hand.values
         names = message["names"] or controls
-        self._set({"values": {name: first[name] for name in names if name in first and name in controls}})
+        self._set({name: first[name] for name in names if name in first and name in controls})
 
     def _live(self, message: Message) -> None:
         self._tuning.is_live = bool(message["on"])

@@ -78,6 +78,8 @@ class PictureView(anywidget.AnyWidget):
 
     def _painted(self, message: Message) -> None:
         frame = self.frames.painted(int(message.get("seq", 0)))
+        if "move" in message:
+            self._answer(None, {**message["move"], "kind": "move"}, ())
         # The first frame of a panel shows values that nobody moved, so it has no time to the screen.
         if frame is None or not frame.changed_ns:
             return

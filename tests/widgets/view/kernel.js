@@ -48,27 +48,45 @@ function slider(one, model) {
     target.append(handle);
     return handle;
   });
-  const values = () => [model.get()].flat();
+  // While a pointer drags, the place is told to listeners alone; the model has it when the pointer is let go.
+  let places = null;
+  const listeners = new Map();
+  target.noUiSlider = {
+    on: (event, listener) => listeners.set(event, listener),
+    off: (event) => listeners.delete(event),
+  };
+  const values = () => places ?? [model.get()].flat();
   const [low, high] = [one.low[0], one.high[0]];
   const show = () => handles.forEach((handle, i) => { handle.style.left = `${((values()[i] - low) / (high - low)) * 100}%`; });
   const put = (i, value) => {
-    const next = values();
+    const next = [...values()];
     next[i] = one.odd ? 2 * Math.floor(value / 2) + 1 : one.integer ? Math.round(value) : value;
-    model.set(one.names.length > 1 ? next : next[0]);
+    return next;
   };
+  const set = (next) => model.set(one.names.length > 1 ? next : next[0]);
   target.addEventListener("pointerdown", (event) => {
     const box = target.getBoundingClientRect();
     const at = (later) => low + Math.min(1, Math.max(0, (later.clientX - box.left) / box.width)) * (high - low);
     const i = handles.indexOf(event.target) < 0 ? 0 : handles.indexOf(event.target);
     event.stopPropagation();
     target.setPointerCapture(event.pointerId);
-    const move = (later) => put(i, at(later));
+    const move = (later) => {
+      places = put(i, at(later));
+      show();
+      for (const listener of listeners.values()) listener(places.map(String), i, places);
+    };
+    const end = () => {
+      target.removeEventListener("pointermove", move);
+      const last = places;
+      places = null;
+      if (last) set(last);
+    };
     target.addEventListener("pointermove", move);
-    target.addEventListener("lostpointercapture", () => target.removeEventListener("pointermove", move), { once: true });
+    target.addEventListener("lostpointercapture", end, { once: true });
   });
   handles.forEach((handle, i) => handle.addEventListener("keydown", (event) => {
     const by = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
-    if (by) put(i, values()[i] + by * one.step[0]);
+    if (by) set(put(i, values()[i] + by * one.step[0]));
   }));
   model.on("change:value", show);
   show();
@@ -208,14 +226,23 @@ const answers = {
     await kernel.remember();
     await kernel.run();
   },
-  async set({ values, commit }) {
+  painted({ move }) {
+    if (move) answers.move(move);
+  },
+  async move({ values, places }) {
+    const slid = Object.entries(places).map(([model, place]) => {
+      const { names } = ROWS.find((row) => row.model === model);
+      return Object.fromEntries(names.map((name, i) => [name, [place].flat()[i]]));
+    });
+    setValues(Object.assign({}, values, ...slid));
+    await kernel.run();
+  },
+  async set({ values }) {
     const changed = Object.entries(values).map(([name, value]) => `${name} ${JSON.stringify(kernel.values[name])} -> ${JSON.stringify(value)}`);
     setValues(values);
-    if (commit) {
-      kernel.entries.forEach((entry) => { entry.current = false; });
-      kernel.entries.push({ number: kernel.entries.length, values, label: `#${kernel.entries.length}`, changed: changed.join(", "), current: true });
-      await kernel.remember();
-    }
+    kernel.entries.forEach((entry) => { entry.current = false; });
+    kernel.entries.push({ number: kernel.entries.length, values, label: `#${kernel.entries.length}`, changed: changed.join(", "), current: true });
+    await kernel.remember();
     await kernel.run();
   },
   async reset({ names }) {

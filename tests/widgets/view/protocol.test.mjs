@@ -1,6 +1,7 @@
 // Is the final picture always the final value's, whatever becomes of the messages?
 import assert from "node:assert/strict";
 import { test } from "node:test";
+import { modelValue } from "../../../widgets/epypes_widgets/view/slides.js";
 import { outbox } from "../../../widgets/epypes_widgets/view/outbox.js";
 import { arrivals, newestOnly, oneAtATime } from "../../../widgets/epypes_widgets/view/protocol.js";
 import { withBytes } from "../../../widgets/epypes_widgets/view/screen.js";
@@ -81,32 +82,65 @@ test("a lost answer is not waited for", () => {
 
 function recorded() {
   const sent = [];
-  const waiting = [];
+  let waiting = [];
   let now_ms = 0;
-  const out = outbox((content) => sent.push(content), (callback) => waiting.push(callback), () => now_ms);
-  return { out, sent, tick: () => waiting.splice(0).forEach((callback) => callback()), later: (ms) => { now_ms += ms; } };
+  const out = outbox((content) => sent.push(content), (callback, delay_ms) => waiting.push([now_ms + delay_ms, callback]), () => now_ms);
+  const later = (ms) => {
+    now_ms += ms;
+    const due = waiting.filter(([at_ms]) => at_ms <= now_ms);
+    waiting = waiting.filter(([at_ms]) => at_ms > now_ms);
+    due.forEach(([, callback]) => callback());
+  };
+  return { out, sent, later };
 }
-test("many moves between two paints are one message", () => {
-  const { out, sent, tick } = recorded();
+test("the first move goes at once, and those until its picture is there are one message with its acknowledgement", () => {
+  const { out, sent } = recorded();
   for (let x = 0; x < 50; x++) out.set({ x, y: 1 }, false);
-  assert.equal(sent.length, 0);
-  tick();
-  assert.deepEqual(sent, [{ kind: "set", values: { x: 49, y: 1 }, commit: false }]);
+  for (let place = 0; place < 9; place++) out.slide("m", place);
+  assert.deepEqual(sent, [{ kind: "move", values: { x: 0, y: 1 }, places: {} }]);
+  out.painted(7);
+  assert.deepEqual(sent.slice(1), [{ kind: "painted", seq: 7, move: { values: { x: 49, y: 1 }, places: { m: 8 } } }]);
+  out.painted(8);
+  assert.deepEqual(sent.slice(2), [{ kind: "painted", seq: 8 }]);
+});
+test("moves do not wait for the picture of a slow graph for ever", () => {
+  const { out, sent, later } = recorded();
+  for (let place = 0; place < 120; place++) {
+    out.slide("m", place);
+    later(16);
+  }
+  later(250);
+  assert.equal(sent.at(-1).places.m, 119);
+  assert.ok(sent.length <= 10, `${sent.length} messages in 2 s`);
+});
+test("when a slider is let go its last place is told before", () => {
+  const { out, sent } = recorded();
+  out.slide("m", 1);
+  out.slide("m", 2);
+  out.release(["x"]);
+  assert.deepEqual(sent.map(({ kind }) => kind), ["move", "move", "release"]);
+  assert.deepEqual(sent[1].places, { m: 2 });
 });
 test("a committed value goes at once and takes what waits along", () => {
-  const { out, sent, tick } = recorded();
+  const { out, sent, later } = recorded();
   out.set({ x: 1 }, false);
+  out.set({ x: 2 }, false);
   out.set({ y: 2 }, true);
-  tick();
-  assert.deepEqual(sent, [{ kind: "set", values: { x: 1, y: 2 }, commit: true }]);
+  later(1000);
+  assert.deepEqual(sent.slice(1), [{ kind: "set", values: { x: 2, y: 2 } }]);
 });
 test("what was moved by keys is committed once", () => {
-  const { out, sent, tick } = recorded();
+  const { out, sent } = recorded();
   out.set({ x: 1 }, false);
-  tick();
   out.commit();
   out.commit();
-  assert.deepEqual(sent.map(({ commit }) => commit), [false, true]);
+  assert.deepEqual(sent.map(({ kind }) => kind), ["move", "set"]);
+});
+test("a slider's place is a value of its model", () => {
+  const row = { names: ["x"], integer: true };
+  assert.equal(modelValue(row, [2.0000001]), 2);
+  assert.equal(modelValue({ names: ["x"], log: true }, [-1]), 0.1);
+  assert.deepEqual(modelValue({ names: ["lo", "hi"] }, [0.5, 1.5]), [0.5, 1.5]);
 });
 test("an older frame does not take back what the hand did", () => {
   const { out, later } = recorded();

@@ -11,6 +11,7 @@ from epypes.display.previews.short import short_repr
 from epypes_widgets.controls.control import Control
 from epypes_widgets.controls.kinds import is_same
 from epypes_widgets.controls.look import Look
+from epypes_widgets.controls.quiet import QuietFloatRange, QuietIntRange
 from epypes_widgets.controls.scale import Scale
 from epypes_widgets.controls.sliders import Snap
 
@@ -87,14 +88,14 @@ def pair(low: Scale, high: Scale, values: _Two, first: _Two, look: Look, tip: st
     scales = (low, high)
     names = (low.name, high.name)
     integer = low.integer and high.integer
-    kind = ipywidgets.IntRangeSlider if integer else ipywidgets.FloatRangeSlider
+    kind = QuietIntRange if integer else QuietFloatRange
     widget = kind(
         value=(low.place(values[0]), high.place(values[1])),
         min=min(low.low, high.low),
         max=max(low.high, high.high),
         step=min(low.step, high.step),
         readout=False,
-        continuous_update=True,
+        continuous_update=False,
         **look.words(names, low.param, tip, ipywidgets.widgets.widget_int.SliderStyle),
     )
     mechanism = _Pair(widget, scales, values)

@@ -9,6 +9,7 @@ import ipywidgets
 
 from epypes_widgets.controls.control import Control
 from epypes_widgets.controls.look import Look
+from epypes_widgets.controls.quiet import QuietFloatSlider, QuietIntSlider, QuietLogSlider
 from epypes_widgets.controls.scale import Scale, exponent
 
 
@@ -71,13 +72,13 @@ class _Single:
 def slider(scale: Scale, value: Any, first: Any, look: Look, tip: str) -> Control:
     """Return a slider of whole numbers, of floats, or of exponents."""
     words = look.words((scale.name,), scale.param, tip, ipywidgets.widgets.widget_int.SliderStyle)
-    common = {"step": scale.step, "readout": False, "continuous_update": True, **words}
+    common = {"step": scale.step, "readout": False, "continuous_update": False, **words}
     widget: Any
     if scale.param.log:
         low, high = exponent(min(scale.low, value)), exponent(max(scale.high, value))
-        widget = ipywidgets.FloatLogSlider(value=float(value), base=10, min=low, max=high, **common)
+        widget = QuietLogSlider(value=float(value), base=10, min=low, max=high, **common)
     else:
-        kind = ipywidgets.IntSlider if scale.integer else ipywidgets.FloatSlider
+        kind = QuietIntSlider if scale.integer else QuietFloatSlider
         widget = kind(value=scale.place(value), min=scale.low, max=scale.high, **common)
     mechanism = _Single(widget, scale, value)
     name = "log" if scale.param.log else "slider"

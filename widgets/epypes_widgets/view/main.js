@@ -32,6 +32,8 @@ function render({ model, el }) {
   const panel = {
     send,
     set: out.set,
+    slide: out.slide,
+    painted: out.painted,
     commit: out.commit,
     hold: out.hold,
     release: out.release,

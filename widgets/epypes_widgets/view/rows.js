@@ -2,6 +2,7 @@
 import { numberBox } from "./boxes.js";
 import { element, iconButton, note, say } from "./elements.js";
 import { inMs, same, shortly } from "./numbers.js";
+import { followSlides } from "./slides.js";
 
 const NUMERIC = ["slider", "range", "log"];
 const RETRY_MS = 100;
@@ -98,18 +99,19 @@ export function rowsPart(panel, figure) {
     if (!row.model || !NUMERIC.includes(row.kind)) return;
     const model = await panel.widgetModel(row.model);
     if (!model || closing.signal.aborted) return;
-    const moved = () => {
-      const value = model.get("value");
-      const parts = found.get(row);
-      const each = Array.isArray(value) ? value : [value];
-      parts?.boxes.forEach((box, index) => box.moved(each[index]));
-      markChanged(row);
-    };
-    if (bound.has(row)) return moved();
+    const told = () => moved(row, model.get("value"));
+    if (bound.has(row)) return told();
     bound.add(row);
-    model.on("change:value", moved);
-    closing.signal.addEventListener("abort", () => model.off("change:value", moved));
-    moved();
+    model.on("change:value", told);
+    closing.signal.addEventListener("abort", () => model.off("change:value", told));
+    told();
+  }
+
+  /** A slider has come to a place. */
+  function moved(row, value) {
+    const each = Array.isArray(value) ? value : [value];
+    found.get(row)?.boxes.forEach((box, index) => box.moved(each[index]));
+    markChanged(row);
   }
 
   function valueOf(row, index) {
@@ -194,14 +196,23 @@ export function rowsPart(panel, figure) {
     panel.tell(words.length && !matches ? `No hyperparameter matches "${asked}".` : "");
   }
 
-  const namesAt = (node) => rows.find((row) => found.get(row)?.node === node?.closest?.(".epypes-row"))?.names;
+  const rowAt = (node) => rows.find((row) => found.get(row)?.node === node?.closest?.(".epypes-row"));
 
   function onDown(event) {
-    const names = event.target.closest?.(".noUi-target") && namesAt(event.target);
-    if (!names || event.button !== 0) return;
+    const target = event.target.closest?.(".noUi-target");
+    const row = target && rowAt(target);
+    if (!row || event.button !== 0) return;
+    const { names } = row;
     panel.hold(names);
     const over = new AbortController();
-    const release = () => {
+    const slid = (value) => {
+      moved(row, value);
+      panel.slide(row.model, value);
+    };
+    followSlides(target, row, slid, over.signal);
+    const release = (event) => {
+      // The element that had the focus loses it at this very press, which the window hears of, too.
+      if (event.type === "blur" && event.target !== window) return;
       over.abort();
       panel.release(names);
     };
@@ -209,8 +220,8 @@ export function rowsPart(panel, figure) {
   }
 
   function onEnter(event) {
-    const names = event.key === "Enter" && event.target.closest?.(".noUi-handle") && namesAt(event.target);
-    if (names) panel.release(names);
+    const row = event.key === "Enter" && event.target.closest?.(".noUi-handle") && rowAt(event.target);
+    if (row) panel.release(row.names);
   }
 
   function clear() {

@@ -3,10 +3,6 @@ import { decoded } from "./blobs.js";
 import { written } from "./numbers.js";
 import { drawOverlay } from "./overlay.js";
 
-/** Resolves when the browser paints; at once in a hidden page, which never does. */
-const nextPaint = () =>
-  new Promise((resolve) => (document.hidden ? resolve(0) : requestAnimationFrame(() => resolve(0))));
-
 function alternative(frame) {
   const values = Object.entries(frame.values).map(([name, value]) => `${name} ${typeof value === "number" ? written(value) : value}`);
   return `${frame.token}${values.length ? ` with ${values.join(", ")}` : ""}`;
@@ -22,7 +18,7 @@ export function withBytes(pictures, buffers) {
 }
 
 /**
- * Shows frames: decodes off the screen, swaps, and says so when it is painted. What a frame says beside its picture
+ * Shows frames: decodes off the screen, swaps, and says so: the browser paints it next. What a frame says beside its picture
  * is written down afterwards, by `panel.later`.
  */
 export function screen(panel, stage, arrivals) {
@@ -65,7 +61,6 @@ export function screen(panel, stage, arrivals) {
     const compared = other ? panel.compare.take(other.picture, other.bytes, frame.seq) : undefined;
     if (main.picture.media_type === "text/plain") showText(frame, main.picture);
     else await showPicture(frame, main, compared);
-    await nextPaint();
     if (arrivals.isOvertaken(frame.seq)) return;
     arrivals.paint(frame);
     panel.later({ frame, main: main.picture, shown });
@@ -81,7 +76,7 @@ export function screen(panel, stage, arrivals) {
         arrivals.lose(frame.seq);
         panel.tell(`The picture of ${frame.token} can't be shown: ${error.message}.`, true);
       }
-      panel.send({ kind: "painted", seq: frame.seq });
+      panel.painted(frame.seq);
     },
   };
 }
