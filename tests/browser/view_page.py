@@ -86,9 +86,7 @@ class ViewPage:
     @property
     def moves(self) -> list[dict[str, Any]]:
         """What was moved and not committed, as it was sent: by itself, or with an acknowledgement."""
-        found: list[dict[str, Any]] = self.js(
-            "kernel.sent.map(message => message.kind === 'move' ? message : message.move).filter(Boolean)"
-        )
+        found: list[dict[str, Any]] = self.js("kernel.moves()")
         return found
 
     def click(self, selector: str) -> None:

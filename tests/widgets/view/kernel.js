@@ -194,6 +194,9 @@ const kernel = {
     kernel.deliver({ kind: "error", seq: kernel.seq, text, function: of, names });
   },
 };
+/** What was moved and not committed, as it was sent: by itself, or with an acknowledgement. */
+kernel.moves = () => kernel.sent.map((message) => (message.kind === "move" ? message : message.move)).filter(Boolean);
+kernel.rows = ROWS;
 window.kernel = kernel;
 
 function moved(one, value) {
