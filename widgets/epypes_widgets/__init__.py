@@ -7,13 +7,33 @@
     panel = tune(runner, canny_lo=(0, 255), blur_kernel=ep.Param(1, 31, odd=True))
     panel
 
-- ``ranges``: which values may each hyperparameter take
-- ``controls``: what moves it
-- ``worker``: when is it computed
+``panel`` is all of it, for a user. Between the hand and the screen:
+
+- ``messages``: what is done when the view says something
+- ``tuning``: what happens from a value that is set to a picture
+- ``worker``: when is it computed, and on which thread
+- ``hand``: where do the controls stand, and which are held
+- ``screen``: what is the view told
+- ``session``: what has been asked of the runner, and what has it computed
+- ``frames``, ``shown``: what goes to the screen, and what does the user want to see
+- ``picture``, ``sender``, ``latency``: how it gets there, when, and how fast
+- ``view``: what runs in the browser
+
+What is remembered:
+
+- ``history``, ``historyframe``: at which values did the hand stop
+- ``settings``: how values get into a file, and back
+- ``code``: which line of code does the same
+- ``promotion``: what becomes of a promotion
+- ``still``, ``static``, ``pictures``: what stays in a saved notebook
+
+What is looked at, and moved:
+
 - ``looking``: what can be looked at in a run
-- ``frames``: which picture goes to the screen, and when
-- ``picture``: what the screen shows
-- ``panel``: all of it, for a user
+- ``controls``: what moves a hyperparameter
+- ``tips``: what is said about it
+- ``ranges``, ``pairs``, ``guesses``, ``movable``: which values may it take
+- ``values``: when are two values the same, and how are they said
 """
 
 from __future__ import annotations
