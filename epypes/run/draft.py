@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from epypes.run.guard import is_plain_array, is_same_guarded_array
 from epypes.run.program import Program, Step
 from epypes.run.tokens import NOT_COMPUTED, Freshness, TokenManager, is_same_value
+
+if TYPE_CHECKING:
+    from epypes.run.hyperparameters import Hyperparameters
+    from epypes.run.record import Run
 
 
 class Draft:
@@ -81,6 +85,19 @@ class Draft:
     def tokens(self) -> TokenManager:
         """Return the tokens as they are now, for good."""
         return TokenManager(self.values, self.freshness())
+
+
+def draft_after(program: Program, last: Run | None, hparams: Hyperparameters) -> Draft:
+    """Return a run's tokens with these hyperparameters, to go on from; those of no run without one.
+
+    Both are given, so that what is read beside a rerun in another thread is decided from one state.
+    """
+    if last is None:
+        return Draft.of_sources(program, hparams.base.copy(), not hparams.free_slots)
+    draft = Draft.after(last.tokens)
+    for token, value in hparams.changes_since(last.record[2]).items():
+        draft.change(token, value)
+    return draft
 
 
 def is_unchanged(old: Any, new: Any, given: Sequence[Any], guard: bool) -> bool:

@@ -12,7 +12,7 @@ from epypes.graph import CompGraph
 from epypes.graph.redefined import redefined
 from epypes.run.attempt import AttemptsByKind, Outcome
 from epypes.run.call import StepFailed
-from epypes.run.draft import Draft
+from epypes.run.draft import draft_after
 from epypes.run.guard import lend
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.plan import Plan, plan
@@ -131,7 +131,9 @@ class CompGraphRunner:
             outcome = attempts.run_broken_off(values, failed, None, True, start_ns)
         else:
             times = (program, None, durations_ns, perf_counter_ns() - start_ns, False, -1)
-            run = self._last = Run((values, attempts.clean, hparams, times, None))
+            run = Run((values, attempts.clean, hparams, times, None))
+            with self._lock:
+                self._last = run
             self.reports.kept.append(times)
             if self._watchers:
                 self._watchers.tell()
@@ -166,7 +168,7 @@ class CompGraphRunner:
         if freshness.is_clean and not targets and hparams.follows == before.revision:
             compiled = attempts.short_way.of_changes(changed)
         if compiled is None:
-            outcome = attempts.stale(self._draft(last, hparams), targets, start_ns)
+            outcome = attempts.stale(draft_after(self._program, last, hparams), targets, start_ns)
         else:
             # The way of a slider: as short as can be.
             values = stored.copy()
@@ -176,7 +178,9 @@ class CompGraphRunner:
                 outcome = attempts.rerun_broken_off(values, failed, changed, start_ns)
             else:
                 times = (self._program, None, durations_ns, perf_counter_ns() - start_ns, False, -1)
-                run = self._last = Run((values, freshness, hparams, times, None))
+                run = Run((values, freshness, hparams, times, None))
+                with self._lock:
+                    self._last = run
                 self.reports.kept.append(times)
                 if self._watchers:
                     self._watchers.tell()
@@ -190,7 +194,9 @@ class CompGraphRunner:
 
         To be called where no exception is being handled, which would become the context of the user's.
         """
-        run = self._last = Run((*outcome[:2], hparams, *outcome[2:]))
+        run = Run((*outcome[:2], hparams, *outcome[2:]))
+        with self._lock:
+            self._last = run
         self.reports.add(run.record[3])
         self._watchers.tell()
         if run.failure is not None:
@@ -230,7 +236,7 @@ class CompGraphRunner:
         elif last is None:
             raise nothing_run(self.free_source_tokens)
         else:
-            outcome = attempts.stale(self._draft(last, hparams), targets, start_ns)
+            outcome = attempts.stale(draft_after(self._program, last, hparams), targets, start_ns)
         run = Run((*outcome[:2], hparams, *outcome[2:]))
         self._trials.add(run, before, last)
         return run
@@ -331,23 +337,11 @@ class CompGraphRunner:
         with self._lock:
             return self._hparams, self._last
 
-    def _draft(self, last: Run | None, hparams: Hyperparameters) -> Draft:
-        """Return a run's tokens with these hyperparameters, to go on from.
-
-        Both are given, so that what is read beside a rerun in another thread is decided from one state.
-        """
-        if last is None:
-            return Draft.of_sources(self._program, hparams.base.copy(), not hparams.free_slots)
-        draft = Draft.after(last.tokens)
-        for token, value in hparams.changes_since(last.record[2]).items():
-            draft.change(token, value)
-        return draft
-
     def _now(self, last: Run | None, hparams: Hyperparameters) -> TokenManager:
         """Return a run's tokens as they are to be read with these hyperparameters."""
         if last is not None and last.record[2] is hparams and not self._program.revised:
             return last.tokens
-        return self._draft(last, hparams).tokens()
+        return draft_after(self._program, last, hparams).tokens()
 
     def __getitem__(self, token: str) -> Any:
         hparams, last = self._state

@@ -11,7 +11,8 @@ import numpy as np
 from PIL import Image
 
 import epypes as ep
-from epypes_widgets.frames import make_frame, plain
+from epypes_widgets.frames import make_frame
+from epypes_widgets.plain import plain
 from epypes_widgets.shown import Comparison, Shown
 from tests.colours import red_image, red_runner
 

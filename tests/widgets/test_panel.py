@@ -137,13 +137,27 @@ def test_a_panel_made_again_goes_on_with_values_history_and_undo(panel: Panel, r
     for threshold in (60, 70):
         panel["threshold"] = threshold
         panel.wait(10)
+    panel.token = "image_bright"
+    panel.wait(10)
     again = tune(runner, gain=(1, 5), threshold=(0, 255))
-    assert again["threshold"] == 70
+    assert (again["threshold"], again.token) == (70, "image_bright")
     assert list(again.history["threshold"]) == [100, 60, 70]
     again.undo()
     again.wait(10)
     assert (again["threshold"], runner["threshold"]) == (60, 60)
     again.close(10)
+
+
+def test_a_panel_whose_view_is_gone_computes_nothing_for_cells(
+    panel: Panel, screen: FrontEnd, runner: ep.CompGraphRunner, calls: Any
+) -> None:
+    screen.tell("closed")
+    runner["threshold"] = 60
+    panel.wait(10)
+    assert (calls.counts, panel["threshold"]) == ({}, 60)
+    panel["threshold"] = 61
+    panel.wait(10)
+    assert calls.counts == {"above": 1}
 
 
 def test_several_values_are_set_all_or_none(panel: Panel) -> None:

@@ -309,3 +309,35 @@ def test_a_message_that_makes_no_sense_is_logged_and_harms_nothing(panel: Panel,
     front_end.wait_for_values(10, threshold=60)
     assert len(panel.log) == 7
     assert front_end.last("log")["lines"]
+
+
+def test_what_a_cell_sets_on_a_panel_waits_for_the_hand(
+    panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner
+) -> None:
+    front_end.tell("hold", names=["threshold"])
+    panel["threshold"] = 90
+    with pytest.raises(ValueError, match="can't be 300"):
+        panel["threshold"] = 300
+    panel.wait(10)
+    assert (panel["threshold"], runner["threshold"]) == (100, 100)
+    front_end.tell("move", values={"threshold": 95}, places={})
+    panel.wait(10)
+    assert (panel["threshold"], runner["threshold"]) == (95, 95)
+    panel["threshold"] = 90
+    front_end.tell("release", names=["threshold"])
+    panel.wait(10)
+    assert (panel["threshold"], runner["threshold"]) == (90, 90)
+
+
+def test_places_of_a_slider_that_is_dragged_come_with_acknowledgements(
+    panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner
+) -> None:
+    slider = panel._hand.control("threshold").widget
+    front_end.tell("hold", names=["threshold"])
+    front_end.tell("move", values={}, places={slider.model_id: 110})
+    panel.wait(10)
+    front_end.tell("painted", seq=0, move={"values": {}, "places": {slider.model_id: 120, "gone": 1}})
+    panel.wait(10)
+    front_end.wait_for_values(10, threshold=120)
+    assert (panel["threshold"], runner["threshold"], slider.value) == (120, 120, 120)
+    assert list(panel.history["threshold"]) == [100, 110, 120]

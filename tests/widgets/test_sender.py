@@ -41,6 +41,7 @@ def sent_by(steps: Sequence[tuple[str, int]]) -> tuple[list[int], FrameSender]:
         elif step == "painted":
             sender.painted(seq)
         else:
+            sender.mount()
             sender.ready()
     return sent, sender
 
@@ -90,6 +91,7 @@ def test_the_frame_offered_last_is_delivered_last_once_all_is_acknowledged(steps
             offered += 1
             sender.offer(frame(offered))
         elif step == "ready":
+            sender.mount()
             sender.ready()
         elif step == "painted in flight":
             sender.painted(sender.in_flight.seq if sender.in_flight else 0)
@@ -108,6 +110,7 @@ def test_a_front_end_on_another_thread_that_answers_wildly_still_gets_the_last_f
     complete = threading.Event()
     last = 2000
     sender = FrameSender(lambda frame: arrived.put(frame.seq), never)
+    sender.mount()
     sender.ready()
 
     def front_end() -> None:
@@ -136,6 +139,7 @@ def test_an_answer_from_within_sending_is_allowed() -> None:
         sender.painted(frame.seq)
 
     sender = FrameSender(send, never)
+    sender.mount()
     sender.ready()
     sender.offer(frame(1))
     sender.offer(frame(2))
@@ -146,6 +150,7 @@ def test_a_frame_or_an_answer_that_is_lost_is_made_good_with_the_newest() -> Non
     sent: list[int] = []
     clock = Clock()
     sender = FrameSender(lambda frame: sent.append(frame.seq), clock)
+    sender.mount()
     sender.ready()
     sender.offer(frame(1))
     clock.due()
@@ -162,6 +167,7 @@ def test_a_frame_or_an_answer_that_is_lost_is_made_good_with_the_newest() -> Non
 def test_a_screen_that_is_gone_is_asked_less_and_less_often() -> None:
     clock = Clock()
     sender = FrameSender(lambda frame: None, clock)
+    sender.mount()
     sender.ready()
     sender.offer(frame(1))
     delays = []
@@ -174,15 +180,34 @@ def test_a_screen_that_is_gone_is_asked_less_and_less_often() -> None:
     assert clock.delay_s == 2.0
 
 
+def test_of_two_views_one_may_be_removed() -> None:
+    sent: list[int] = []
+    sender = FrameSender(lambda frame: sent.append(frame.seq), never)
+    for _ in range(2):
+        sender.mount()
+        sender.ready()
+    sender.closed()
+    sender.offer(frame(1))
+    assert (sent, sender.mounted, sender.left) == ([1], True, False)
+    sender.closed()
+    sender.closed()
+    assert (sender.mounted, sender.left) == (False, True)
+    sender.mount()
+    sender.ready()
+    assert sent == [1, 1]
+
+
 def test_nothing_is_sent_to_a_view_that_was_removed() -> None:
     sent: list[int] = []
     clock = Clock()
     sender = FrameSender(lambda frame: sent.append(frame.seq), clock)
+    sender.mount()
     sender.ready()
     sender.offer(frame(1))
     sender.closed()
     clock.due()
     sender.offer(frame(2))
     assert (sent, sender.mounted) == ([1], False)
+    sender.mount()
     sender.ready()
     assert sent == [1, 2]

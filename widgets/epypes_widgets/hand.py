@@ -38,6 +38,12 @@ class Hand:
         return {name: value for control in self.controls for name, value in control.read().items()}
 
     @property
+    def movable(self) -> dict[str, Any]:
+        """The values of the controls that are not only shown, by token."""
+        movable = (control for control in self.controls if control.kind != "shown")
+        return {name: value for control in movable for name, value in control.read().items()}
+
+    @property
     def params(self) -> dict[str, Param | Roi | Text | None]:
         """What each hyperparameter may be, by token."""
         return {
@@ -50,8 +56,11 @@ class Hand:
             raise UnknownName("hyperparameter", name, self._by_name, "of this panel")
         return self._by_name[name]
 
-    def set(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Move controls because the user said so, all or none, and return the values as the hyperparameters take them.
+    def set(self, values: Mapping[str, Any], *, is_by_hand: bool = False) -> dict[str, Any]:
+        """Move controls to values that were set, all or none, and return them as the hyperparameters take them.
+
+        Those of controls that are held are not among them, unless it is the hand that sets them: they wait until the
+        control is let go.
 
         Raises
         ------
@@ -62,6 +71,10 @@ class Hand:
         """
         parts = self._parts(values)
         with self._lock:
+            held = [part for part in parts if not is_by_hand and self._held.intersection(part[0].names)]
+            for control, own in held:
+                control.mechanism.checked(own)
+            parts = [part for part in parts if part not in held]
             before = {control: control.read() for control, _ in parts}
             try:
                 for control, own in parts:
@@ -71,8 +84,8 @@ class Hand:
                     if differing(own, control.read()):
                         control.write(own)
                 raise
-            for name in values:
-                self._waiting.pop(name, None)
+            for _, own in held:
+                self._waiting.update(own)
             return {name: control.read()[name] for control, own in parts for name in own}
 
     def slide(self, places: Mapping[str, Any]) -> None:
@@ -113,12 +126,20 @@ class Hand:
         with self._lock:
             self._held.update(name for name in names if name in self._by_name)
 
-    def release(self) -> list[str]:
-        """Know that nothing is held any more, and move the controls that had to wait; sentences as from ``follow``."""
+    def release(self) -> tuple[dict[str, Any], list[str]]:
+        """Know that nothing is held any more, and move the controls that had to wait.
+
+        Returns
+        -------
+        dict
+            The values that they had to wait for, by token.
+        list of str
+            Sentences as from ``follow``.
+        """
         with self._lock:
             self._held.clear()
             waiting, self._waiting = self._waiting, {}
-            return self.follow(waiting)
+            return waiting, self.follow(waiting)
 
     def _parts(self, values: Mapping[str, Any]) -> list[tuple[Control, dict[str, Any]]]:
         """Return the values by control."""

@@ -70,8 +70,10 @@ class Messages:
             self._set(message["values"], commit=False)
 
     def _set(self, values: Mapping[str, Any], *, commit: bool = True) -> None:
+        # What the view sets is what the hand holds.
+        self._tuning.hand.moved(values)
         try:
-            self._tuning.want(values, commit=commit)
+            self._tuning.want(values, commit=commit, is_by_hand=True)
         except ValueError as error:
             self._tuning.screen.fail(str(error), names=tuple(values))
 

@@ -13,13 +13,13 @@ from epypes.hints import Param, Roi
 from epypes.run import CompGraphRunner, Run
 from epypes_widgets import code, settings
 from epypes_widgets.controls import column, controls
-from epypes_widgets.frames import plain_values
 from epypes_widgets.hand import Hand
 from epypes_widgets.history import history_of
 from epypes_widgets.latency import Latency, latency_of
 from epypes_widgets.looking.films import payloads
 from epypes_widgets.messages import Messages
 from epypes_widgets.picture import PictureView
+from epypes_widgets.plain import plain_values
 from epypes_widgets.promotion import proposal
 from epypes_widgets.screen import Screen
 from epypes_widgets.session import Session
@@ -236,9 +236,14 @@ class Panel:
         return self._tuning.go_to(self._history.redo)
 
     def save(self, path: str | Path) -> Path:
-        """Write the values to a TOML file, and return its path; SettingsError with every reason why not."""
-        values = {**self._runner.hyperparameters, **self.values}
-        return settings.save(path, values, self._runner.cg, self._hand.params)
+        """Write the values of all controls that can be moved to a TOML file, and return its path.
+
+        Raises
+        ------
+        SettingsError
+            With every reason why not.
+        """
+        return settings.save(path, self._hand.movable, self._runner.cg, self._hand.params)
 
     def load(self, path: str | Path) -> None:
         """Set the values that are in a TOML file, all or none.

@@ -1,7 +1,17 @@
 """How do a panel and its view in the browser talk?
 
-Pictures travel as one binary message per frame, never in a trait: traits are kept, compared and saved. What the
-messages are is written down in ``view/protocol.js`` too.
+Every message has a ``kind``; those of the kernel that replace one another a ``seq``, which rises. Any may come late,
+twice or in another order than they were sent.
+
+- To the view: ``setup`` (what there is: rows, folders, stages, images), ``frame`` (pictures, with their bytes),
+  ``reference`` (a picture to compare with), ``error``, ``latency``, ``history``, ``probe``, ``settings``, ``promoted``,
+  ``log``.
+- To the kernel: ``ready`` and ``closed`` (a view is mounted or removed), ``painted`` (a frame is on the screen; what
+  was moved meanwhile goes with it), ``move`` (what is under the hand at the moment), ``set`` (what it has stopped at),
+  ``hold`` and ``release`` (of a control), ``reset``, ``undo``, ``redo``, ``goto``, ``save``, ``load``, ``promote``,
+  ``stage``, ``pin``, ``compare``, ``histogram``, ``probe``, ``image``, ``live``, ``run``.
+
+Pictures travel as one binary message per frame, never in a trait: traits are kept, compared and saved.
 """
 
 from __future__ import annotations

@@ -11,12 +11,13 @@ from operator import is_
 from typing import Any, Final
 
 from epypes.run import Run
-from epypes_widgets.frames import make_frame, picture, plain_values
+from epypes_widgets.frames import make_frame, picture
 from epypes_widgets.history import Entry, History, changed
 from epypes_widgets.looking.stages import Stage, stages, states
 from epypes_widgets.picture import PictureView
+from epypes_widgets.plain import plain_values
 from epypes_widgets.session import Session
-from epypes_widgets.shown import Shown
+from epypes_widgets.shown import Shown, remember_shown, shown_before
 
 _MOST_ENTRIES: Final = 40
 _MOST_LINES: Final = 100
@@ -62,7 +63,8 @@ class Screen:
         code: Callable[[], str],
     ) -> None:
         self.view = view
-        self.shown = Shown(token=asked)
+        before = shown_before(session.runner)
+        self.shown = Shown(asked or before.token, before.pinned)
         self.stages: tuple[Stage, ...] = ()
         self.error = ""
         self.compute_ms: float | None = None
@@ -81,6 +83,7 @@ class Screen:
         """Replace parts of what is shown, and return it."""
         with self._lock:
             self.shown = replace(self.shown, **parts)
+            remember_shown(self._session.runner, self.shown)
             return self.shown
 
     def require_stage(self, token: object) -> str:

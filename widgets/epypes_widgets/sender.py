@@ -63,7 +63,8 @@ class FrameSender:
         self._newest: Frame | None = None
         self._in_flight: Frame | None = None
         self._waiting = False
-        self._mounted = False
+        self._views = 0
+        self._was_mounted = False
         self._timeout_s = FIRST_TIMEOUT_S
 
     @property
@@ -79,7 +80,12 @@ class FrameSender:
     @property
     def mounted(self) -> bool:
         """Whether there is a view."""
-        return self._mounted
+        return self._views > 0
+
+    @property
+    def left(self) -> bool:
+        """Whether there was a view, and there is none any more."""
+        return self._was_mounted and not self._views
 
     def offer(self, frame: Frame) -> None:
         """Send a frame now, or when the one in flight has been painted, unless a newer one comes until then."""
@@ -100,23 +106,27 @@ class FrameSender:
             return frame
 
     def mount(self) -> None:
-        """Know that there is a view, which is not to get frames yet."""
+        """Know that there is one more view, which is not to get frames yet."""
         with self._lock:
-            self._mounted = True
+            self._views += 1
+            self._was_mounted = True
             self._waiting, self._in_flight = False, None
 
     def ready(self) -> None:
-        """Start over with the newest frame: a view has been mounted, and what was in flight may be lost."""
+        """Start over with the newest frame: what was in flight may be lost to a view that has just been mounted."""
         with self._lock:
-            self._mounted = True
             self._timeout_s = FIRST_TIMEOUT_S
             self._start_over()
 
     def closed(self) -> None:
-        """Send nothing until there is a view again: the last one has been removed."""
+        """Know that there is one view less; without one nothing is sent.
+
+        A page that is loaded anew does not say that its views are gone; more of them are then counted than there are.
+        """
         with self._lock:
-            self._mounted = False
-            self._in_flight = None
+            self._views = max(0, self._views - 1)
+            if not self._views:
+                self._in_flight = None
 
     def _start_over(self) -> None:
         self._in_flight = None
@@ -124,7 +134,7 @@ class FrameSender:
         self._go_on()
 
     def _go_on(self) -> None:
-        if self._mounted and self._waiting and self._in_flight is None and self._newest is not None:
+        if self._views and self._waiting and self._in_flight is None and self._newest is not None:
             frame = self._in_flight = self._newest
             self._waiting = False
             # Asked for first: an answer within send() sends the next frame, whose time-out must replace this one.
@@ -134,6 +144,6 @@ class FrameSender:
     def _overdue(self, frame: Frame) -> None:
         """Take a frame, or its acknowledgement, for lost."""
         with self._lock:
-            if self._in_flight is frame and self._mounted:
+            if self._in_flight is frame and self._views:
                 self._timeout_s = min(2 * self._timeout_s, LAST_TIMEOUT_S)
                 self._start_over()

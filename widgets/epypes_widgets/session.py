@@ -53,6 +53,11 @@ class Session:
             return dict(self._wanted)
 
     @property
+    def is_wanting(self) -> bool:
+        """Whether anything is asked for that has not been computed."""
+        return bool(self._wanted) or self._image_wanted is not None
+
+    @property
     def image_wanted(self) -> int | None:
         """The index of the payload that is asked for; the present one if none is."""
         return self.image if self._image_wanted is None else self._image_wanted

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
-from epypes.run import Run
+from epypes.run import CompGraphRunner, Run
 from epypes_widgets.looking.stages import Stage, best_stage
 
 
@@ -76,3 +77,17 @@ class Shown:
         """Return this with a token pinned, or not."""
         others = tuple(name for name in self.pinned if name != token)
         return replace(self, pinned=(*others, token) if on else others)
+
+
+# A cell that is run again makes a new panel, in which the hand goes on where it was.
+_last: WeakKeyDictionary[CompGraphRunner, Shown] = WeakKeyDictionary()
+
+
+def remember_shown(runner: CompGraphRunner, shown: Shown) -> None:
+    """Keep what is shown of a runner for its next panel."""
+    _last[runner] = shown
+
+
+def shown_before(runner: CompGraphRunner) -> Shown:
+    """Return what the last panel of a runner has shown; nothing of one that had none."""
+    return _last.get(runner, Shown())

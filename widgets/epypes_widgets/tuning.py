@@ -79,10 +79,10 @@ class Tuning:
 
     # -- from any thread ----------------------------------------------------------------------------------------
 
-    def want(self, values: Mapping[str, Any], *, commit: bool = True) -> None:
+    def want(self, values: Mapping[str, Any], *, commit: bool = True, is_by_hand: bool = False) -> None:
         """Move controls to values and have them computed; ValueError, and nothing is done, if one is out of range."""
         with self._lock:  # of two threads the one whose value stands is wanted last
-            self.session.want(self.hand.set(values))
+            self.session.want(self.hand.set(values, is_by_hand=is_by_hand))
         if commit:
             self._commits = True
         else:
@@ -102,7 +102,11 @@ class Tuning:
 
     def release(self) -> None:
         """Commit what the hand has let go."""
-        self._log(self.hand.release())
+        waited, refused = self.hand.release()
+        self._log(refused)
+        if waited:
+            self.session.want(waited)
+            self.worker.ask()
         if self.is_live:
             self._commit_later(_AFTER_RELEASE_S)
 
@@ -166,6 +170,8 @@ class Tuning:
         is_forced, self._is_forced = self._is_forced, False
         if not (self.is_live or is_forced or self.session.result is None):
             return
+        if self.screen.view.frames.left and not (is_forced or self.session.is_wanting):
+            return  # the cell was run again, and another panel looks at this runner now
         try:
             run, is_settled = self.session.bring_up_to_date(self.screen.shown.targets)
         except Exception as error:  # what is wanted can't be run: a placeholder, a branch that is not there

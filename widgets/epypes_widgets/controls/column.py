@@ -15,7 +15,7 @@ from epypes.hints import Param
 from epypes_widgets.controls.control import Control
 from epypes_widgets.controls.kinds import is_number
 from epypes_widgets.controls.look import sendable
-from epypes_widgets.frames import plain
+from epypes_widgets.plain import plain
 from epypes_widgets.tips import tip
 
 

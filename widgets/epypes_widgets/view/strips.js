@@ -96,6 +96,8 @@ export function historyPart(panel) {
   const empty = element("span", "epypes-empty-strip", {}, "Nothing has been changed yet.");
   const root = element("div", "epypes-history", { role: "group", "aria-label": "History" }, list);
   let images = [];
+  /** The bytes of thumbnails by number of entry: the kernel sends each once. */
+  const known = new Map();
   moveAlong(root);
 
   function make(entry, bytes) {
@@ -123,7 +125,10 @@ export function historyPart(panel) {
       const focused = document.activeElement?.closest?.(".epypes-entry")?.dataset.number;
       const old = images;
       images = [];
-      const buttons = entries.map((entry, at) => make(entry, buffers[at]));
+      entries.forEach(({ number }, at) => buffers[at]?.byteLength && known.set(number, buffers[at]));
+      const listed = new Set(entries.map(({ number }) => number));
+      for (const number of known.keys()) if (!listed.has(number)) known.delete(number);
+      const buttons = entries.map((entry) => make(entry, known.get(entry.number)));
       panel.blobs.drop(old);
       list.replaceChildren(...(buttons.length ? buttons : [empty]));
       if (focused !== undefined) buttons.find((one) => one.dataset.number === focused)?.focus();
