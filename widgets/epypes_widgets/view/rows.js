@@ -70,6 +70,7 @@ export function rowsPart(panel, figure) {
     const reset = iconButton("reset", `Reset ${row.names.join(", ")} to ${row.default.map(shortly).join(", ")}`, () => onReset(row), "epypes-reset");
     const tail = element("span", "epypes-tail", { "data-lm-suppress-shortcuts": "true" });
     boxes.forEach((box, index) => tail.append(...(index ? ["–"] : []), box.input));
+    if (row.unit) tail.append(element("span", "epypes-unit", {}, row.unit));
     if (row.kind === "roi") tail.append(iconButton("roi", `Draw ${row.names[0]} on the picture`, () => panel.drawRoi(), "epypes-draw"));
     if (row.kind !== "shown") tail.append(reset);
     tail.append(sign);
@@ -201,7 +202,9 @@ export function rowsPart(panel, figure) {
     if (!names || event.button !== 0) return;
     panel.hold(names);
     const over = new AbortController();
-    const release = () => {
+    const release = (event) => {
+      // The window is told of every element that loses the focus, too.
+      if (event.type === "blur" && event.target !== window) return;
       over.abort();
       panel.release(names);
     };
