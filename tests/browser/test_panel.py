@@ -324,6 +324,8 @@ def test_running_the_cell_again_goes_on_from_its_values(notebook: Notebook, pane
 def test_a_thousand_frames_leave_neither_blobs_nor_bytes_behind(
     notebook: Notebook, panel: PanelOnScreen, lab: JupyterLab, theme: str
 ) -> None:
+    if theme != "light":
+        pytest.skip("What is left behind does not depend on the theme.")
     path = lab.root / "panel.ipynb"
     notebook.save()
     before, blobs = path.stat().st_size, panel.page.evaluate("() => window.blobs.size")

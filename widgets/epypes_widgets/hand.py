@@ -12,6 +12,7 @@ from typing import Any
 from epypes.errors import UnknownName
 from epypes.hints import Param, Roi, Text
 from epypes_widgets.controls import Control
+from epypes_widgets.route import Route
 from epypes_widgets.values import differing
 
 
@@ -22,10 +23,15 @@ class Hand:
     ----------
     controls
         In the order in which they are listed.
+
+    Attributes
+    ----------
+    route
+        By which the controls are moved.
     """
 
     def __init__(self, controls: Iterable[Control]) -> None:
-        self.controls = tuple(controls)
+        self.controls, self.route = tuple(controls), Route()
         self._by_name = {name: control for control in self.controls for name in control.names}
         self._lock = threading.RLock()
         self._held: set[str] = set()
@@ -64,11 +70,11 @@ class Hand:
             before = {control: control.read() for control, _ in parts}
             try:
                 for control, own in parts:
-                    control.write(own)
+                    self.route.call(control.write, own)
             except ValueError:
                 for control, own in before.items():
                     if differing(own, control.read()):
-                        control.write(own)
+                        self.route.call(control.write, own)
                 raise
             for name in values:
                 self._waiting.pop(name, None)
@@ -89,7 +95,7 @@ class Hand:
                     self._waiting.update(own)
                     continue
                 try:
-                    control.write(own)
+                    self.route.call(control.write, own)
                 except ValueError as error:
                     refused.append(f"The control stays where it was: {error}")
         return refused
