@@ -220,9 +220,18 @@ class Notebook:
     def start(self, code: str) -> None:
         """Begin to run code in the kernel outside of any cell, and return at once."""
         self.page.evaluate(
-            f"code => {{ {_KERNEL}.requestExecute({{ code, store_history: false }}); }}",
+            f"""code => {{
+                window.isRunning = true;
+                const future = {_KERNEL}.requestExecute({{ code, store_history: false }});
+                future.done.then(() => {{ window.isRunning = false; }});
+            }}""",
             code,
         )
+
+    @property
+    def is_running(self) -> bool:
+        """Whether what was started has not come to its end; the kernel's status tells of other threads, too."""
+        return bool(self.page.evaluate("() => window.isRunning"))
 
     def execute(self, code: str) -> str:
         """Run code in the kernel outside of any cell; return what it printed, or its traceback."""

@@ -20,7 +20,7 @@ class PanelOnScreen:
     """The panel of a notebook as a hand and an eye have it."""
 
     def __init__(self, notebook: Notebook) -> None:
-        self.page = notebook.page
+        self.notebook, self.page = notebook, notebook.page
         self.page.wait_for_function(
             "() => document.querySelector('img.epypes-picture')?.dataset.seq", timeout=TIMEOUT_MS
         )
@@ -96,6 +96,11 @@ class PanelOnScreen:
     def height(self) -> float:
         """Of the whole panel, in pixels."""
         return float(self.page.locator(".epypes-panel").bounding_box()["height"])
+
+    def settle(self) -> None:
+        """Return when everything is computed, committed and on the screen; the panel is called that in the kernel."""
+        seq = int(self.notebook.execute("panel.wait(10); print(panel._screen.view.frames.newest.seq)"))
+        self.wait("seq => document.querySelector('img.epypes-picture').dataset.seq >= seq", seq)
 
     def wait_for_status(self, text: str) -> None:
         """Return when the status line has this text in it; when it is empty, if the text is."""

@@ -39,6 +39,8 @@ def outlines(above):
 
 photograph = cv2.cvtColor(data.coffee(), cv2.COLOR_RGB2BGR)
 runner = ep.CompGraphRunner(ep.CompGraph.from_functions(cut, gray, above, outlines))
+"""
+SHOW = """
 panel = tune(runner, images=[photograph, photograph[:, ::-1].copy()], token="above")
 panel
 """
@@ -52,11 +54,11 @@ URL.revokeObjectURL = url => { window.blobs.delete(url); give(url); };
 THOUSAND_FRAMES = """
 frames, pause = panel._screen.view.frames, threading.Event()
 for count in range(1000):
-    panel["threshold"] = 60 + count % 100
-    panel.wait(10)
-    while frames.in_flight is not None:
-        pause.wait(0.001)
-print(len(panel.history))
+    seq = frames.newest.seq
+    panel._tuning.want({"threshold": 60 + count % 100}, commit=False)
+    while frames.newest.seq == seq or frames.in_flight is not None:
+        pause.wait(0.005)
+panel.wait(10)
 """
 
 
@@ -73,7 +75,7 @@ def written(folder: Path, name: str, *cells: str) -> Path:
 
 @pytest.fixture(scope="module")
 def notebook(browser: Any, lab: JupyterLab) -> Iterator[Notebook]:
-    written(lab.root, "panel.ipynb", SET_UP.strip())
+    written(lab.root, "panel.ipynb", SET_UP.strip(), SHOW.strip())
     notebook = Notebook(browser, lab, "panel.ipynb", script=COUNT_BLOBS)
     notebook.run_all()
     yield notebook
@@ -90,17 +92,18 @@ def panel(notebook: Notebook) -> PanelOnScreen:
     return panel
 
 
-def test_a_drag_is_followed_and_committed_once(notebook: Notebook, panel: PanelOnScreen) -> None:
+def test_a_drag_is_followed_and_committed_when_it_ends(notebook: Notebook, panel: PanelOnScreen) -> None:
     assert notebook.execute("before = len(panel.history)") == ""
     seq, height = panel.seq, panel.height
     x, y = panel.grab("threshold")
-    for step in range(1, 21):
+    for step in range(1, 41):
         panel.page.mouse.move(x + step, y)
         panel.page.evaluate("() => new Promise(done => requestAnimationFrame(done))")
     panel.wait("() => JSON.parse(document.querySelector('img.epypes-picture').dataset.values).threshold > 110")
     panel.page.mouse.up()
-    assert notebook.execute("panel.wait(10); print(len(panel.history) - before)").strip() == "1"
-    assert panel.seq > seq + 2
+    panel.settle()
+    # A hand that rests commits, and a machine that is busy lets it rest.
+    assert 1 <= int(notebook.execute("print(len(panel.history) - before)")) < (panel.seq - seq) / 2
     assert panel.height == height
     said = notebook.execute("print(runner['threshold'], panel['threshold'], panel.result.hyperparameters['threshold'])")
     assert set(said.split()) == {str(int(panel.number("threshold")))}
@@ -113,8 +116,8 @@ def test_a_cell_that_runs_for_ten_seconds_does_not_stop_the_panel(notebook: Note
     for step in range(1, 6):
         panel.press("ArrowRight", "threshold", 100 + step)
     panel.choose("gray")
-    assert panel.page.evaluate(f"() => {notebook.KERNEL}.status") == "busy"
-    notebook.wait_idle()
+    assert notebook.is_running
+    panel.wait("() => !window.isRunning")
 
 
 def test_a_cell_moves_the_control_but_never_under_the_hand(notebook: Notebook, panel: PanelOnScreen) -> None:
@@ -145,20 +148,30 @@ def test_typed_numbers_steps_and_reset(panel: PanelOnScreen) -> None:
     panel.wait_for("threshold", 100)
 
 
-def test_undo_and_redo_from_the_toolbar_and_history(notebook: Notebook, panel: PanelOnScreen) -> None:
+def test_undo_and_redo_from_the_toolbar(notebook: Notebook, panel: PanelOnScreen) -> None:
     for value in (110, 120):
         assert notebook.execute(f"panel['threshold'] = {value}; panel.wait(10)") == ""
     panel.page.locator(".epypes-undo").click()
     panel.wait_for("threshold", 110)
     panel.page.locator(".epypes-redo").click()
     panel.wait_for("threshold", 120)
-    panel.page.locator(".epypes-history [data-number]").first.click()
-    first = int(notebook.execute("print(panel.history['threshold'].iloc[0])"))
-    panel.wait_for("threshold", first)
+
+
+def test_every_entry_of_the_history_has_its_picture_and_goes_back_to_its_values(
+    notebook: Notebook, panel: PanelOnScreen
+) -> None:
+    for value in (110, 120, 130):
+        assert notebook.execute(f"panel['threshold'] = {value}; panel.wait(10)") == ""
+    panel.wait("() => document.querySelector('.epypes-entry[aria-current=true]').title.includes('120 -> 130')")
+    seen = "() => [...document.querySelectorAll('.epypes-entry img')].filter(img => img.naturalWidth > 10).length"
+    panel.wait(f"() => ({seen})() === document.querySelectorAll('.epypes-entry').length")
+    panel.page.locator(".epypes-entry").nth(-2).click()
+    panel.wait_for("threshold", 120)
+    panel.wait("() => document.querySelector('.epypes-code').textContent === 'runner.rerun(threshold=120)'")
 
 
 def test_a_threshold_is_dragged_on_the_histogram_of_what_it_cuts(panel: PanelOnScreen) -> None:
-    line = panel.page.locator(".epypes-cut[data-name=threshold]")
+    line = panel.page.locator(".epypes-cut[data-name=threshold] .epypes-cut-hit")
     line.scroll_into_view_if_needed()
     box = line.bounding_box()
     panel.page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
@@ -178,12 +191,22 @@ def test_a_region_is_drawn_on_the_picture_that_it_is_of(panel: PanelOnScreen, th
     panel.page.mouse.move(x + 90, y + 60, steps=10)
     panel.page.mouse.up()
     panel.wait("() => JSON.parse(document.querySelector('img.epypes-picture').dataset.values).region[0] > 50")
+    panel.settle()
     region = panel.values["region"]
     assert 0.8 < region[2] / region[3] / 1.5 < 1.25
     panel.page.locator(".epypes-panel").screenshot(path=SCREENSHOTS / f"panel-region-{theme}.png")
     panel.choose("gray")
     shape = panel.page.locator(".epypes-kind").inner_text()
     assert f"{region[3]} x {region[2]}" in shape
+
+
+def test_every_token_with_a_picture_has_a_tab(panel: PanelOnScreen) -> None:
+    tabs = panel.page.locator(".epypes-chip")
+    panel.choose("outlines")
+    assert [tab.get_attribute("data-token") for tab in tabs.all()] == ["image", "cut", "gray", "above", "outlines"]
+    panel.wait("() => document.querySelectorAll('.epypes-pin').length === 5")
+    panel.page.keyboard.press("ArrowLeft")
+    panel.wait("() => document.querySelector('img.epypes-picture').alt.startsWith('above ')")
 
 
 def test_stages_are_compared_probed_and_zoomed(panel: PanelOnScreen, theme: str) -> None:
@@ -200,9 +223,22 @@ def test_stages_are_compared_probed_and_zoomed(panel: PanelOnScreen, theme: str)
     panel.page.select_option(".epypes-compare", index=0)
 
 
+def test_zoom_and_place_stay_when_values_and_images_change(panel: PanelOnScreen) -> None:
+    panel.page.locator(".epypes-box").focus()
+    for key in ("+", "+", "ArrowRight", "ArrowDown"):
+        panel.page.keyboard.press(key)
+    place = panel.page.locator(".epypes-canvas").first.bounding_box()
+    panel.focus("threshold")
+    panel.press("ArrowRight", "threshold", 101)
+    panel.choose("gray")
+    panel.settle()
+    assert panel.page.locator(".epypes-canvas").first.bounding_box() == place
+    panel.page.locator(".epypes-fit").click()
+
+
 def test_test_images_are_switched_on_the_film(notebook: Notebook, panel: PanelOnScreen) -> None:
     digest = panel.digest
-    panel.page.locator(".epypes-filmstrip [data-index='1']").click()
+    panel.page.locator(".epypes-filmstrip button").nth(1).click()
     panel.wait("before => document.querySelector('img.epypes-picture').dataset.seq > before", panel.seq)
     assert notebook.execute("panel.wait(10); print(panel._session.image)").strip() == "1"
     assert panel.digest != digest
@@ -213,7 +249,7 @@ def test_what_fails_is_said_at_its_chip_and_control(notebook: Notebook, panel: P
     assert notebook.execute("panel['region'] = (0, 0, 0, 0); panel.wait(10)") == ""
     panel.wait_for_status("gray")
     assert panel.row("region").evaluate("row => row.classList.contains('epypes-failed')")
-    assert panel.page.locator(".epypes-chip[data-token=gray].epypes-failed").count() == 1
+    assert panel.page.locator("[data-state=failed] .epypes-chip[data-token=gray]").count() == 1
     assert (panel.values, panel.digest, panel.height) == (values, digest, height)
     assert notebook.execute("print(runner['region'])").strip() == "(0, 0, 600, 400)"
     panel.page.locator(".epypes-panel").screenshot(path=SCREENSHOTS / f"panel-error-{theme}.png")
@@ -221,7 +257,7 @@ def test_what_fails_is_said_at_its_chip_and_control(notebook: Notebook, panel: P
     assert unread == []
     assert notebook.execute("panel.reset(); panel.wait(10)") == ""
     panel.wait_for_status("")
-    assert panel.page.locator(".epypes-failed").count() == 0
+    assert panel.page.locator(".epypes-failed, [data-state=failed]").count() == 0
 
 
 def test_what_fails_in_the_panel_itself_is_in_its_log(notebook: Notebook, panel: PanelOnScreen) -> None:
@@ -232,7 +268,7 @@ def test_what_fails_in_the_panel_itself_is_in_its_log(notebook: Notebook, panel:
 
 def test_settings_are_saved_and_loaded(notebook: Notebook, panel: PanelOnScreen, lab: JupyterLab) -> None:
     assert notebook.execute("panel['threshold'] = 88; panel.wait(10)") == ""
-    panel.page.locator(".epypes-settings-name").fill("afternoon")
+    panel.page.locator(".epypes-setting").fill("afternoon")
     panel.page.locator(".epypes-save").click()
     panel.wait("() => document.querySelector('.epypes-foot').textContent.includes('Saved afternoon.toml')")
     assert "threshold = 88" in (lab.root / "afternoon.toml").read_text()
@@ -270,14 +306,31 @@ def test_at_600_px_everything_is_there_and_nothing_jumps(panel: PanelOnScreen, t
         panel.page.set_viewport_size(size)
 
 
+def test_running_the_cell_again_goes_on_from_its_values(notebook: Notebook, panel: PanelOnScreen) -> None:
+    assert notebook.execute("panel['threshold'] = 91; panel.wait(10); before = len(panel.history)") == ""
+    panel.wait_for("threshold", 91)
+    panel.page.evaluate("() => { document.querySelector('img.epypes-picture').dataset.isOld = 'yes'; }")
+    panel.page.evaluate(
+        "() => { jupyterapp.shell.currentWidget.content.activeCellIndex = 1;"
+        " return jupyterapp.commands.execute('notebook:run-cell'); }"
+    )
+    panel.wait("() => document.querySelector('img.epypes-picture')?.dataset.isOld === undefined")
+    panel.wait("() => document.querySelector('img.epypes-picture')?.dataset.seq > 0")
+    panel.wait_for("threshold", 91)
+    assert notebook.execute("print(panel['threshold'], len(panel.history) - before)").strip() == "91 0"
+    panel.wait("() => +document.querySelector('.epypes-changed input.epypes-number')?.value === 91")
+
+
 def test_a_thousand_frames_leave_neither_blobs_nor_bytes_behind(
     notebook: Notebook, panel: PanelOnScreen, lab: JupyterLab, theme: str
 ) -> None:
+    if theme != "light":
+        pytest.skip("What is left behind does not depend on the theme.")
     path = lab.root / "panel.ipynb"
     notebook.save()
     before, blobs = path.stat().st_size, panel.page.evaluate("() => window.blobs.size")
     seq = panel.seq
-    assert int(notebook.execute(THOUSAND_FRAMES)) > 3
+    assert notebook.execute(THOUSAND_FRAMES) == ""
     panel.wait("before => document.querySelector('img.epypes-picture').dataset.seq >= before + 1000", seq)
     # The films and the history, of which so many are listed, are pictures too.
     assert panel.page.evaluate("() => window.blobs.size") <= blobs + 45
@@ -304,4 +357,4 @@ def test_opened_again_without_its_kernel_the_last_picture_and_values_are_there(
         again.screenshot(SCREENSHOTS / f"panel-again-{theme}.png")
     finally:
         again.close()
-    assert json.loads((lab.root / "again.ipynb").read_text())["cells"][0]["outputs"][1]["output_type"] == "display_data"
+    assert json.loads((lab.root / "again.ipynb").read_text())["cells"][1]["outputs"][1]["output_type"] == "display_data"

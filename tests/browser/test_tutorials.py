@@ -1,4 +1,4 @@
-"""Do the other tutorials run in JupyterLab, and what do they look like?"""
+"""Do the other tutorials run in JupyterLab, are their panels painted, and what do they look like?"""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import pytest
 
 from tests.browser.conftest import SCREENSHOTS, TUTORIALS
 from tests.browser.jupyter import JupyterLab, Notebook
+from tests.browser.panel import PanelOnScreen
 
 pytestmark = pytest.mark.browser
 
@@ -18,7 +19,10 @@ def test_every_cell_runs_and_every_graph_is_drawn(browser: Any, lab: JupyterLab,
     notebook = Notebook(browser, lab, tutorial.name)
     try:
         notebook.run_all()
+        if "epypes_widgets import tune" in tutorial.read_text():
+            PanelOnScreen(notebook).settle()
         notebook.screenshot(SCREENSHOTS / f"{tutorial.stem}-{theme}.png")
+        assert notebook.page.locator(".epypes-log:not([hidden])").count() == 0
         figures = notebook.page.locator("figure.epypes-figure")
         assert figures.count() > 0
         assert notebook.page.locator("figure svg.epypes-graph").count() == figures.count(), "none is left an image"

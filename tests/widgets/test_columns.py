@@ -69,7 +69,7 @@ def test_rows_and_folders_are_found_by_their_classes(edges: ep.CompGraphRunner) 
     assert size._dom_classes == ("epypes-row", "epypes-row-0")
     assert size.children[0].model_id == found.rows[0]["model"]
     assert canny.children[1].children[0].description == "lo .. hi"
-    assert size.children[0].description == "ksize [px]"
+    assert size.children[0].description == "ksize"
 
 
 def test_names_with_markup_in_them_stay_names() -> None:

@@ -354,3 +354,36 @@ def test_a_value_that_is_set_is_asked_for_once(panel: Panel, monkeypatch: pytest
     panel["threshold"] = 60
     panel._hand.control("threshold").widget.value = 61
     assert asked == [{"threshold": 60}, {"threshold": 60}, {"threshold": 61}]
+
+
+def test_what_was_set_is_at_fault_for_a_failure_that_it_causes_further_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    cg = ep.CompGraph.from_functions(halved, checked)
+    runner = ep.CompGraphRunner(cg, {"start": 2, "other": 1})
+    runner.run(image=np.ones((4, 4)))
+    panel = tune(runner)
+    screen = FrontEnd(panel, monkeypatch)
+    panel.set(start=0)
+    panel.wait(10)
+    assert screen.last("error")["names"] == ["start"]
+    panel.close()
+
+
+@ep.outputs("half")
+def halved(image: Any, start: int) -> Any:
+    return image[start:]
+
+
+@ep.outputs("result")
+def checked(half: Any, other: int) -> Any:
+    if half.shape[0] == 4:
+        raise ValueError("nothing is cut off")
+    return half * other
+
+
+def test_a_panel_on_a_run_of_one_of_its_images_knows_which() -> None:
+    images = [np.zeros((4, 4)), np.ones((4, 4))]
+    runner = ep.CompGraphRunner(ep.CompGraph.from_functions(halved), {"start": 2})
+    runner.run(image=images[1])
+    panel = tune(runner, images=images)
+    assert panel._session.image == 1
+    panel.close()

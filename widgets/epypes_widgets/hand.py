@@ -13,6 +13,7 @@ from epypes.errors import UnknownName
 from epypes.hints import Param, Roi, Text
 from epypes_widgets.controls import Control
 from epypes_widgets.controls.quiet import slide
+from epypes_widgets.route import Route
 from epypes_widgets.values import differing
 
 
@@ -23,10 +24,15 @@ class Hand:
     ----------
     controls
         In the order in which they are listed.
+
+    Attributes
+    ----------
+    route
+        By which the controls are moved.
     """
 
     def __init__(self, controls: Iterable[Control]) -> None:
-        self.controls = tuple(controls)
+        self.controls, self.route = tuple(controls), Route()
         self._by_name = {name: control for control in self.controls for name in control.names}
         self._lock = threading.RLock()
         self._held: set[str] = set()
@@ -78,11 +84,11 @@ class Hand:
             before = {control: control.read() for control, _ in parts}
             try:
                 for control, own in parts:
-                    control.write(own)
+                    self.route.call(control.write, own)
             except ValueError:
                 for control, own in before.items():
                     if differing(own, control.read()):
-                        control.write(own)
+                        self.route.call(control.write, own)
                 raise
             for _, own in held:
                 self._waiting.update(own)
@@ -110,7 +116,7 @@ class Hand:
                     self._waiting.update(own)
                     continue
                 try:
-                    control.write(own)
+                    self.route.call(control.write, own)
                 except ValueError as error:
                     refused.append(f"The control stays where it was: {error}")
         return refused

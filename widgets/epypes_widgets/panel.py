@@ -120,7 +120,7 @@ class Panel:
         self._still = Still(self._static)
         self._tuning = tuning = Tuning(hand, session, self._history, self._still.update)
         self._messages = Messages(tuning, self.save, self.load)
-        view = PictureView(lambda: tuning.worker.idle, self._later, self._messages.handlers, tuning.report)
+        view = PictureView(lambda: tuning.worker.idle, self._later, self._messages.handlers, tuning.report, hand.route)
         self._screen = tuning.screen = Screen(view, session, self._history, token, self._setup, self.code)
         self._cuts = _cuts(hand)
         tuning.screen.change(cut=tuple(self._cuts), has_histogram=bool(self._cuts))

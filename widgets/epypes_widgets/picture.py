@@ -23,6 +23,7 @@ from typing import Any, Final
 
 import anywidget
 
+from epypes_widgets.route import Route
 from epypes_widgets.sender import Frame, FrameSender
 from epypes_widgets.view.script import joined
 
@@ -46,6 +47,8 @@ class PictureView(anywidget.AnyWidget):
         By kind of message, what is called with it on the thread that answers the front end.
     failed
         Is called with what a handler has raised.
+    route
+        By which messages go.
     """
 
     _esm = joined()
@@ -57,11 +60,12 @@ class PictureView(anywidget.AnyWidget):
         later: Later,
         handlers: Mapping[str, Callable[[Message], object]],
         failed: Callable[[BaseException], None],
+        route: Route,
     ) -> None:
         super().__init__()
         self.frames = FrameSender(self._send_frame, later)
         self.to_screen_ms: list[float] = []
-        self._idle, self._failed = idle, failed
+        self._idle, self._failed, self._route = idle, failed, route
         self._handlers: dict[str, Callable[[Message], object]] = {
             "painted": self._painted,
             "closed": lambda _: self.frames.closed(),
@@ -72,14 +76,16 @@ class PictureView(anywidget.AnyWidget):
     def tell(self, kind: str, content: Message, buffers: Sequence[bytes] = ()) -> None:
         """Send a message other than a frame, if there is a view."""
         if self.frames.mounted:
-            self.send({"kind": kind, **content}, list(buffers))
+            self._route.call(self.send, {"kind": kind, **content}, list(buffers))
 
     def _send_frame(self, frame: Frame) -> None:
         last = self.to_screen_ms[-1] if self.to_screen_ms else None
-        self.send({**frame.content, "to_screen_ms": last}, list(frame.buffers))
+        self._route.call(self.send, {**frame.content, "to_screen_ms": last}, list(frame.buffers))
 
     def _answer(self, _widget: object, content: Any, _buffers: object) -> None:
         try:
+            if content.get("kind") == "ready":
+                self._route.hear()
             handler = self._handlers.get(content.get("kind"))
             if handler is not None:
                 handler(content)

@@ -38,7 +38,7 @@ class Session:
     def __init__(self, runner: CompGraphRunner, payloads: Sequence[Payload] = ()) -> None:
         self.runner, self.payloads = runner, tuple(payloads)
         self.result: Run | None = None
-        self.image: int | None = None
+        self.image = self._image_of(runner.last)
         self._lock = threading.Lock()
         self._wanted: dict[str, Any] = {}
         self._image_wanted: int | None = None
@@ -122,6 +122,16 @@ class Session:
         """Return a run with these hyperparameters on the present payload; nothing is changed by it."""
         known = self.runner.hyperparameters
         return self.runner.trial({name: value for name, value in values.items() if name in known}, *targets)
+
+    def _image_of(self, run: Run | None) -> int | None:
+        """Return the index of the payload that a run was computed from, that is, of the very same values."""
+        if run is None:
+            return None
+        values, slots = run.tokens.values, run.tokens.program.slots
+        for index, payload in enumerate(self.payloads):
+            if all(values[slots[token]] is value for token, value in payload.values.items()):
+                return index
+        return None
 
     def _changes_nothing(self, run: Run, wanted: Mapping[str, Any], payload: object) -> bool:
         return not wanted and payload is None and not run.report.ran

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final
 
+from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner, Failure, Run
 from epypes_widgets.hand import Hand
 from epypes_widgets.history import Entry, History
@@ -190,12 +192,17 @@ class Tuning:
         self._compare()
 
     def _fail(self, run: Run, failure: Failure) -> None:
-        wanted, takes = self.session.wanted, self.runner.cg.func_inputs(failure.function)
-        names = [name for name in takes if name in wanted] or [name for name in takes if name in run.hyperparameters]
         good = self.session.result
         if good is not None:
             self.screen.show(good, 0, failed=run)
-        self.screen.fail(str(failure), failure.function, names)
+        self.screen.fail(str(failure), failure.function, self._at_fault(run, failure.function))
+
+    def _at_fault(self, run: Run, function: str) -> list[str]:
+        """Return what was set and goes into a function, or into what it is given; if nothing was, all that it takes."""
+        wanted, takes = self.session.wanted, self.runner.cg.func_inputs(function)
+        given = [name for name in takes if name in wanted]
+        behind = (name for name in _behind(self.runner.cg, function) if name in wanted)
+        return given or list(behind) or [name for name in takes if name in run.hyperparameters]
 
     def _commit(self) -> None:
         """Add the values that the runner has taken over to the history, unless they are there."""
@@ -231,3 +238,16 @@ class Tuning:
         if entry is None:
             raise LookupError(f"No entry {comparison.number} in the history.")
         return entry.values, f"history {entry.number}"
+
+
+def _behind(cg: CompGraph, function: str) -> Iterator[str]:
+    """Yield the tokens that a function takes, then those that they are made from."""
+    seen = dict.fromkeys(cg.func_inputs(function))
+    waiting = deque(seen)
+    while waiting:
+        token = waiting.popleft()
+        yield token
+        maker = cg.digraph.producer.get(token)
+        found = [] if maker is None else [name for name in cg.func_inputs(maker) if name not in seen]
+        seen.update(dict.fromkeys(found))
+        waiting.extend(found)

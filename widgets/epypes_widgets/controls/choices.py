@@ -69,12 +69,12 @@ def choice(name: str, value: Any, param: Param, first: Any, look: Look, tip: str
     if index is None:
         return None
     if all(map(is_truth, choices)) and sorted(choices) == [False, True]:
-        box = ipywidgets.Checkbox(value=bool(value), **look.words((name,), param, tip, CheckboxStyle))
+        box = ipywidgets.Checkbox(value=bool(value), **look.words((name,), tip, CheckboxStyle))
         mechanism = _Chosen(name, replace(param, choices=(False, True)), value, box, "value")
         return Control((name,), "check", (param,), box, mechanism, first=(first,))
     labels = param.labels or tuple(map(label, choices))
     # The style of sliders has all that a drop-down's has, so it can be shared.
-    words = look.words((name,), param, tip, SliderStyle)
+    words = look.words((name,), tip, SliderStyle)
     box = ipywidgets.Dropdown(options=[sendable(text) for text in labels], index=index, **words)
     return Control((name,), "choice", (param,), box, _Chosen(name, param, value, box, "index"), "index", (first,))
 

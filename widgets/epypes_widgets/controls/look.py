@@ -9,8 +9,6 @@ from typing import Any, Final
 
 import ipywidgets
 
-from epypes.hints import Param, Roi, Text
-
 _DESCRIPTION_WIDTH: Final = "112px"
 
 
@@ -27,11 +25,10 @@ class Look:
             self._styles[kind] = kind(description_width=_DESCRIPTION_WIDTH)
         return self._styles[kind]
 
-    def words(self, names: tuple[str, ...], param: Param | Roi | Text | None, tip: str, style: type) -> dict[str, Any]:
-        """Return what the constructor of any control is given: name and unit, tip, layout and style."""
-        unit = f" [{param.unit}]" if isinstance(param, Param) and param.unit else ""
+    def words(self, names: tuple[str, ...], tip: str, style: type) -> dict[str, Any]:
+        """Return what the constructor of any control is given: name, tip, layout and style."""
         return {
-            "description": f"{' .. '.join(names)}{unit}",
+            "description": " .. ".join(names),
             "tooltip": tip,
             "layout": self.layout,
             "style": self.style(style),

@@ -96,7 +96,7 @@ def pair(low: Scale, high: Scale, values: _Two, first: _Two, look: Look, tip: st
         step=min(low.step, high.step),
         readout=False,
         continuous_update=False,
-        **look.words(names, low.param, tip, ipywidgets.widgets.widget_int.SliderStyle),
+        **look.words(names, tip, ipywidgets.widgets.widget_int.SliderStyle),
     )
     mechanism = _Pair(widget, scales, values)
     return Control(

@@ -28,7 +28,7 @@ def roi(name: str, value: Any, param: Roi, first: Any, look: Look, tip: str) -> 
             raise ValueError(f"{name!r} can't be {short_repr(new)}: it is a rectangle. {way_out}")
         return kind(int(side) for side in sides)
 
-    line = line_of(in_words(value), look.words((name,), param, tip, HTMLStyle))
+    line = line_of(in_words(value), look.words((name,), tip, HTMLStyle))
     return Control((name,), "roi", (param,), line, Words(name, value, line, in_words, checked), first=(first,))
 
 

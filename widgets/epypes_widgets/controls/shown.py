@@ -61,7 +61,7 @@ def shown(name: str, value: Any, param: Param | Roi | Text | None, first: Any, l
             raise refused(name, new, param)
         return new
 
-    line = line_of(said(value), look.words((name,), param, tip, HTMLStyle))
+    line = line_of(said(value), look.words((name,), tip, HTMLStyle))
     return Control((name,), "shown", (param,), line, Words(name, value, line, said, checked), first=(first,))
 
 

@@ -71,7 +71,7 @@ class _Single:
 
 def slider(scale: Scale, value: Any, first: Any, look: Look, tip: str) -> Control:
     """Return a slider of whole numbers, of floats, or of exponents."""
-    words = look.words((scale.name,), scale.param, tip, ipywidgets.widgets.widget_int.SliderStyle)
+    words = look.words((scale.name,), tip, ipywidgets.widgets.widget_int.SliderStyle)
     common = {"step": scale.step, "readout": False, "continuous_update": False, **words}
     widget: Any
     if scale.param.log:

@@ -47,5 +47,5 @@ def text(name: str, value: Any, param: Text, first: Any, look: Look, tip: str) -
         return None
     # A box of one line drops the ends of lines as soon as somebody types into it.
     kind = ipywidgets.Textarea if "\n" in value else ipywidgets.Text
-    box = kind(value=sendable(value), continuous_update=False, **look.words((name,), param, tip, TextStyle))
+    box = kind(value=sendable(value), continuous_update=False, **look.words((name,), tip, TextStyle))
     return Control((name,), "text", (param,), box, _Typed(name, value, box), first=(first,))

@@ -46,14 +46,14 @@ def stages(run: Run, kept: Iterable[Stage] = (), asked: str | None = None) -> tu
     Returns
     -------
     tuple of Stage
-        Of a run that has neither pictures nor sink tokens with a value, all tokens that have one.
+        Of a run that has neither pictures nor sink tokens, all tokens that have a value.
     """
     known = {stage.token: stage.is_picture for stage in kept}
     sinks = run.cg.sink_tokens
     found: dict[str, bool] = {}
     for token in run.cg.tokens:
         is_picture = known.get(token, False) or _has_picture(run, token)
-        if is_picture or token == asked or token in known or (token in sinks and run.tokens.is_computed(token)):
+        if is_picture or token == asked or token in known or token in sinks:
             found[token] = is_picture
     found = found or dict.fromkeys(run, False)
     return tuple(Stage(token, is_picture) for token, is_picture in found.items())

@@ -103,6 +103,7 @@ export function barPart(panel, parts) {
   for (const end of ["pointerup", "pointercancel", "pointerleave", "keyup", "blur"]) flip.addEventListener(end, () => compare.flip(false));
   compare.watch(show);
   roi.watch(show);
+  histogram.watch(show);
   let scheduled = false;
   stage.watch(() => {
     if (scheduled) return;

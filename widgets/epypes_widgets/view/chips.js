@@ -12,10 +12,9 @@ export function chipsPart(panel) {
   let shown = "";
   let pinned = new Set();
 
-  function make({ token, is_picture }) {
+  function make(token) {
     const sign = element("span", "epypes-sign", { "aria-hidden": "true" });
     const chip = element("button", "epypes-chip", { type: "button", role: "tab", "data-token": token, tabindex: "-1", "aria-selected": "false" }, token, sign);
-    if (!is_picture) chip.classList.add("epypes-as-text");
     const pin = element("button", "epypes-pin", { type: "button", "aria-pressed": "false", tabindex: "-1" }, icon("pin"));
     chip.addEventListener("click", () => panel.chooseStage(token));
     pin.addEventListener("click", () => {
@@ -26,9 +25,24 @@ export function chipsPart(panel) {
       panel.send({ kind: "pin", token, on });
     });
     const both = element("span", "epypes-chip-box", { role: "presentation" }, chip);
-    if (is_picture) both.append(pin);
     root.append(both);
     return { chip, pin, sign, both, state: "" };
+  }
+
+  /** What is a picture may show only when it has been computed. */
+  function tellKind({ token, is_picture }) {
+    const { chip, pin, both } = chips.get(token);
+    chip.classList.toggle("epypes-as-text", !is_picture);
+    if (is_picture && !pin.isConnected) both.append(pin);
+  }
+
+  function rebuild(tokens) {
+    const focused = document.activeElement?.closest?.(".epypes-chip")?.dataset.token;
+    root.replaceChildren();
+    chips.clear();
+    for (const token of tokens) chips.set(token, make(token));
+    shown = "";
+    if (focused) chips.get(focused)?.chip.focus();
   }
 
   function select(token) {
@@ -83,12 +97,8 @@ export function chipsPart(panel) {
     element: root,
     setup(message) {
       const names = message.stages.map(({ token }) => token);
-      if (names.join("\n") !== [...chips.keys()].join("\n")) {
-        root.replaceChildren();
-        chips.clear();
-        for (const stage of message.stages) chips.set(stage.token, make(stage));
-        shown = "";
-      }
+      if (names.join("\n") !== [...chips.keys()].join("\n")) rebuild(names);
+      message.stages.forEach(tellKind);
       pinned = new Set(message.pinned ?? []);
       showPins();
       select(message.token);

@@ -15,6 +15,8 @@ export function histogramPart(panel) {
   let isLogarithmic = false;
   let dragged = "";
   let last = null;
+  let isSetUp = false;
+  const watchers = [];
 
   const namesOn = (token) => cuts.filter((cut) => cut.token === token).flatMap((cut) => cut.names);
 
@@ -140,17 +142,24 @@ export function histogramPart(panel) {
     for (const [token, histogram] of wanted) paint(token, histogram);
   }
 
+  function switchTo(on) {
+    isOn = on;
+    root.hidden = !on;
+    for (const watcher of watchers) watcher();
+  }
+
   return {
     element: root,
     setup(message) {
       cuts = message.cuts ?? [];
       for (const chart of charts.values()) lines(chart);
-      if (isOn) panel.send({ kind: "histogram", on: true });
+      if (!isSetUp) switchTo(Boolean(message.histogram));
+      else if (isOn && !message.histogram) panel.send({ kind: "histogram", on: true });
+      isSetUp = true;
     },
     frame: ({ frame }) => show(frame),
     toggle() {
-      isOn = !isOn;
-      root.hidden = !isOn;
+      switchTo(!isOn);
       panel.send({ kind: "histogram", on: isOn });
       if (last) show(last);
     },
@@ -160,6 +169,7 @@ export function histogramPart(panel) {
     },
     get isOn() { return isOn; },
     get isLogarithmic() { return isLogarithmic; },
+    watch: (watcher) => watchers.push(watcher),
     isHeld: (name) => dragged === name,
   };
 }

@@ -95,13 +95,12 @@ export function historyPart(panel) {
   const list = element("div", "epypes-strip epypes-entries");
   const empty = element("span", "epypes-empty-strip", {}, "Nothing has been changed yet.");
   const root = element("div", "epypes-history", { role: "group", "aria-label": "History" }, list);
-  let images = [];
-  /** The bytes of thumbnails by number of entry: the kernel sends each once. */
-  const known = new Map();
+  /** By number of its entry; the kernel sends a thumbnail once. */
+  const images = new Map();
   moveAlong(root);
 
   function make(entry, bytes) {
-    const img = thumbnail("");
+    const img = images.get(entry.number) ?? thumbnail("");
     const label = entry.label || `#${entry.number}`;
     const said = entry.changed || "start";
     const button = element(
@@ -112,10 +111,19 @@ export function historyPart(panel) {
       element("span", "epypes-caption", {}, element("b", "", {}, label), ` ${said}`),
     );
     button.addEventListener("click", () => panel.send({ kind: "goto", number: entry.number }));
-    images.push(img);
-    panel.blobs.fill(img, bytes);
-    if (!bytes?.byteLength) img.hidden = true;
+    images.set(entry.number, img);
+    if (bytes?.byteLength) panel.blobs.fill(img, bytes);
+    img.hidden = !img.src;
     return button;
+  }
+
+  function forget(entries) {
+    const numbers = new Set(entries.map(({ number }) => number));
+    for (const [number, img] of images) {
+      if (numbers.has(number)) continue;
+      panel.blobs.drop([img]);
+      images.delete(number);
+    }
   }
 
   return {
@@ -123,13 +131,8 @@ export function historyPart(panel) {
     history(message, buffers) {
       const { entries } = message;
       const focused = document.activeElement?.closest?.(".epypes-entry")?.dataset.number;
-      const old = images;
-      images = [];
-      entries.forEach(({ number }, at) => buffers[at]?.byteLength && known.set(number, buffers[at]));
-      const listed = new Set(entries.map(({ number }) => number));
-      for (const number of known.keys()) if (!listed.has(number)) known.delete(number);
-      const buttons = entries.map((entry) => make(entry, known.get(entry.number)));
-      panel.blobs.drop(old);
+      const buttons = entries.map((entry, at) => make(entry, buffers[at]));
+      forget(entries);
       list.replaceChildren(...(buttons.length ? buttons : [empty]));
       if (focused !== undefined) buttons.find((one) => one.dataset.number === focused)?.focus();
       // Only this strip is scrolled, never the page.
