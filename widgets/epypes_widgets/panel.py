@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import ipywidgets
 
 from epypes.errors import NotComputed, PayloadError, run_call
+from epypes.graph import CompGraph
 from epypes.hints import Param, Roi
 from epypes.run import CompGraphRunner, Run
 from epypes_widgets import code, settings
@@ -312,7 +313,11 @@ class Panel:
             "images": [{"index": index, "title": film.title} for index, film in enumerate(films)],
             "live": self._tuning.is_live,
             "cuts": [{"token": token, "names": names} for token, names in self._cuts.items()],
-            "rois": [{"name": name, "token": param.on} for name, param in params.items() if isinstance(param, Roi)],
+            "rois": [
+                {"name": name, "token": param.on, "cuts_out": _made_from(self._runner.cg, name)}
+                for name, param in params.items()
+                if isinstance(param, Roi)
+            ],
             "runner_name": code.name_of(self._runner),
             "promote_to": proposal(self.token),
             "settings": list(settings.names(Path.cwd())),
@@ -330,3 +335,12 @@ def _cuts(hand: Hand) -> dict[str, list[str]]:
         if isinstance(param, Param) and param.cuts:
             cuts.setdefault(param.cuts, []).append(name)
     return cuts
+
+
+def _made_from(cg: CompGraph, token: str) -> list[str]:
+    """Return all tokens that a token has to do with: on a picture that was cut out, a rectangle means something else."""
+    found = {token}
+    for function in cg.functions:
+        if found.intersection(cg.func_inputs(function)):
+            found.update(cg.func_outputs(function))
+    return sorted(found)

@@ -34,6 +34,7 @@ function render({ model, el }) {
     set: out.set,
     slide: out.slide,
     painted: out.painted,
+    took: out.took,
     commit: out.commit,
     hold: out.hold,
     release: out.release,

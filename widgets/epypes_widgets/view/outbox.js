@@ -24,6 +24,7 @@ export function outbox(send, later = setTimeout, now_ms = () => performance.now(
   /** Sent, and not yet seen in a frame: a frame that was computed before must not take the hand back. */
   const awaited = new Map();
   let sent_ms = -Infinity;
+  let shown_ms = 0;
   let isScheduled = false;
   let isClosed = false;
 
@@ -69,11 +70,15 @@ export function outbox(send, later = setTimeout, now_ms = () => performance.now(
       places = { ...places, [model]: place };
       goOn();
     },
-    /** A frame is on the screen. */
+    /** A frame has arrived, and the one before is on the screen. */
     painted(seq) {
       sent_ms = -Infinity;
       const moves = taken();
-      send(moves ? { kind: "painted", seq, move: moves } : { kind: "painted", seq });
+      send({ kind: "painted", seq, ...(moves ? { move: moves } : {}), ...(shown_ms ? { shown_ms } : {}) });
+    },
+    /** A frame took so long from its arrival to the screen. */
+    took(ms) {
+      shown_ms = ms;
     },
     /** Commit what was moved by keys. */
     commit() {

@@ -26,6 +26,7 @@ export function roiPart(panel, stage) {
     if (!panel.state.token || !stage.size.width || stage.canvas.hidden) return false;
     const size = sizes.get(entry.token);
     if (entry.token === panel.state.token) return true;
+    if (entry.cuts_out?.includes(panel.state.token)) return false;
     return Boolean(size && size.width === stage.size.width && size.height === stage.size.height);
   }
 

@@ -66,17 +66,33 @@ export function screen(panel, stage, arrivals) {
     panel.later({ frame, main: main.picture, shown });
   }
 
-  return {
-    async take(frame, buffers) {
-      const todo = arrivals.frame(frame.seq);
-      if (todo === "wait") return;
+  let isShowing = false;
+  let next = null;
+
+  /** Show a frame, and then the newest of those that came meanwhile. */
+  async function showAll(frame, buffers) {
+    isShowing = true;
+    for (let given = [frame, buffers]; given; [given, next] = [next, null]) {
+      const began_ms = performance.now();
+      panel.painted(given[0].seq);
       try {
-        if (todo === "show") await show(frame, buffers);
+        await show(...given);
       } catch (error) {
-        arrivals.lose(frame.seq);
-        panel.tell(`The picture of ${frame.token} can't be shown: ${error.message}.`, true);
+        arrivals.lose(given[0].seq);
+        panel.tell(`The picture of ${given[0].token} can't be shown: ${error.message}.`, true);
       }
-      panel.painted(frame.seq);
+      panel.took(performance.now() - began_ms);
+    }
+    isShowing = false;
+  }
+
+  return {
+    take(frame, buffers) {
+      const todo = arrivals.frame(frame.seq);
+      if (todo === "acknowledge") panel.painted(frame.seq);
+      else if (todo === "show" && isShowing) next = [frame, buffers];
+      else if (todo === "show") return showAll(frame, buffers);
+      return undefined;
     },
   };
 }
