@@ -55,6 +55,13 @@ class Hand:
             raise UnknownName("hyperparameter", name, self._by_name, "of this panel")
         return self._by_name[name]
 
+    def hear(self) -> None:
+        """Have what the front end says handled on this thread from now on, so that no cell that runs holds it up."""
+        self.route.hear()
+        for control in self.controls:
+            # Whatever is sent: the control's next message comes as an answer to it.
+            self.route.call(control.widget.send, {})
+
     def set(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Move controls because the user said so, all or none, and return the values as the hyperparameters take them.
 
