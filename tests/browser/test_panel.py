@@ -92,6 +92,18 @@ def panel(notebook: Notebook) -> PanelOnScreen:
     return panel
 
 
+def test_a_cell_that_runs_for_ten_seconds_does_not_stop_the_panel(notebook: Notebook, panel: PanelOnScreen) -> None:
+    # The first of all tests: whatever a control has sent before would be handled on a thread that is free.
+    notebook.start("busy = threading.Event(); busy.wait(10)")
+    panel.wait(f"() => {notebook.KERNEL}.status === 'busy'")
+    panel.focus("threshold")
+    for step in range(1, 6):
+        panel.press("ArrowRight", "threshold", 100 + step)
+    panel.choose("gray")
+    assert notebook.is_running
+    panel.wait("() => !window.isRunning")
+
+
 def test_a_drag_is_followed_and_committed_when_it_ends(notebook: Notebook, panel: PanelOnScreen) -> None:
     assert notebook.execute("before = len(panel.history)") == ""
     seq, height = panel.seq, panel.height
@@ -107,17 +119,6 @@ def test_a_drag_is_followed_and_committed_when_it_ends(notebook: Notebook, panel
     assert panel.height == height
     said = notebook.execute("print(runner['threshold'], panel['threshold'], panel.result.hyperparameters['threshold'])")
     assert set(said.split()) == {str(int(panel.number("threshold")))}
-
-
-def test_a_cell_that_runs_for_ten_seconds_does_not_stop_the_panel(notebook: Notebook, panel: PanelOnScreen) -> None:
-    notebook.start("busy = threading.Event(); busy.wait(10)")
-    panel.wait(f"() => {notebook.KERNEL}.status === 'busy'")
-    panel.focus("threshold")
-    for step in range(1, 6):
-        panel.press("ArrowRight", "threshold", 100 + step)
-    panel.choose("gray")
-    assert notebook.is_running
-    panel.wait("() => !window.isRunning")
 
 
 def test_a_cell_moves_the_control_but_never_under_the_hand(notebook: Notebook, panel: PanelOnScreen) -> None:
@@ -180,6 +181,7 @@ def test_a_threshold_is_dragged_on_the_histogram_of_what_it_cuts(panel: PanelOnS
     panel.page.mouse.up()
     panel.wait("() => JSON.parse(document.querySelector('img.epypes-picture').dataset.values).threshold > 105")
     panel.wait("() => +document.querySelector('.epypes-changed input.epypes-number').value > 105")
+    panel.settle()
 
 
 def test_a_region_is_drawn_on_the_picture_that_it_is_of(panel: PanelOnScreen, theme: str) -> None:

@@ -62,6 +62,13 @@ class Hand:
             raise UnknownName("hyperparameter", name, self._by_name, "of this panel")
         return self._by_name[name]
 
+    def hear(self) -> None:
+        """Have what the front end says handled on this thread from now on, so that no cell that runs holds it up."""
+        self.route.hear()
+        for control in self.controls:
+            # Whatever is sent: the control's next message comes as an answer to it.
+            self.route.call(control.widget.send, {})
+
     def set(self, values: Mapping[str, Any], *, is_by_hand: bool = False) -> dict[str, Any]:
         """Move controls to values that were set, all or none, and return them as the hyperparameters take them.
 

@@ -40,7 +40,7 @@ class Messages:
         """What is called with each kind of message."""
         tuning = self._tuning
         return {
-            "ready": lambda _: tuning.screen.ready(),
+            "ready": self._ready,
             "hold": lambda message: tuning.hand.hold(message["names"]),
             "release": lambda _: tuning.release(),
             "set": lambda message: self._set(message["values"]),
@@ -61,6 +61,10 @@ class Messages:
             "load": lambda message: self._file(self._loaded, message),
             "promote": self._promote,
         }
+
+    def _ready(self, _message: Message) -> None:
+        self._tuning.hand.hear()
+        self._tuning.screen.ready()
 
     # -- values -------------------------------------------------------------------------------------------------
 

@@ -84,8 +84,6 @@ class PictureView(anywidget.AnyWidget):
 
     def _answer(self, _widget: object, content: Any, _buffers: object) -> None:
         try:
-            if content.get("kind") == "ready":
-                self._route.hear()
             handler = self._handlers.get(content.get("kind"))
             if handler is not None:
                 handler(content)

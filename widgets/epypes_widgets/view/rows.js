@@ -71,7 +71,8 @@ export function rowsPart(panel, figure) {
     const reset = iconButton("reset", `Reset ${row.names.join(", ")} to ${row.default.map(shortly).join(", ")}`, () => onReset(row), "epypes-reset");
     const tail = element("span", "epypes-tail", { "data-lm-suppress-shortcuts": "true" });
     boxes.forEach((box, index) => tail.append(...(index ? ["–"] : []), box.input));
-    if (row.unit) tail.append(element("span", "epypes-unit", {}, row.unit));
+    // Without a unit, too: the boxes stand below each other.
+    if (boxes.length || row.unit) tail.append(element("span", "epypes-unit", {}, row.unit ?? ""));
     if (row.kind === "roi") tail.append(iconButton("roi", `Draw ${row.names[0]} on the picture`, () => panel.drawRoi(), "epypes-draw"));
     if (row.kind !== "shown") tail.append(reset);
     tail.append(sign);
