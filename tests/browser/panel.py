@@ -94,8 +94,9 @@ class PanelOnScreen:
 
     @property
     def height(self) -> float:
-        """Of the whole panel, in pixels."""
-        return float(self.page.locator(".epypes-panel").bounding_box()["height"])
+        """Of the panel down to its foot, in pixels; at the very end of that a log may appear."""
+        top, foot = (self.page.locator(css).bounding_box()["y"] for css in (".epypes-panel", ".epypes-foot"))
+        return float(foot - top)
 
     def settle(self) -> None:
         """Return when everything is computed, committed and on the screen; the panel is called that in the kernel."""
