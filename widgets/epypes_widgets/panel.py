@@ -121,7 +121,7 @@ class Panel:
         self._still = Still(self._static)
         self._tuning = tuning = Tuning(hand, session, self._history, self._still.update)
         self._messages = Messages(tuning, self.save, self.load)
-        view = PictureView(lambda: tuning.worker.idle, self._later, self._messages.handlers, tuning.report, hand.route)
+        view = PictureView(tuning.worker.later, self._messages.handlers, tuning.report, hand.route)
         self._screen = tuning.screen = Screen(view, session, self._history, token, self._setup, self.code)
         self._cuts = _cuts(hand)
         tuning.screen.change(cut=tuple(self._cuts), has_histogram=bool(self._cuts))
@@ -324,9 +324,6 @@ class Panel:
         }
         return content, [film.thumbnail for film in films]
 
-    def _later(self, delay_s: float, function: Any) -> None:
-        self._tuning.worker.later("lost frame", delay_s, function)
-
 
 def _cuts(hand: Hand) -> dict[str, list[str]]:
     """Return the hyperparameters that are thresholds, by the token that they cut."""
@@ -338,7 +335,7 @@ def _cuts(hand: Hand) -> dict[str, list[str]]:
 
 
 def _made_from(cg: CompGraph, token: str) -> list[str]:
-    """Return all tokens that a token has to do with: on a picture that was cut out, a rectangle means something else."""
+    """Return the tokens that a token has to do with: on a picture that it has cut out, it means something else."""
     found = {token}
     for function in cg.functions:
         if found.intersection(cg.func_inputs(function)):

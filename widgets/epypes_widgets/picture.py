@@ -6,10 +6,11 @@ twice or in another order than they were sent.
 - To the view: ``setup`` (what there is: rows, folders, stages, images), ``frame`` (pictures, with their bytes),
   ``reference`` (a picture to compare with), ``error``, ``latency``, ``history``, ``probe``, ``settings``, ``promoted``,
   ``log``.
-- To the kernel: ``ready`` and ``closed`` (a view is mounted or removed), ``painted`` (a frame is on the screen; what
-  was moved meanwhile goes with it), ``move`` (what is under the hand at the moment), ``set`` (what it has stopped at),
-  ``hold`` and ``release`` (of a control), ``reset``, ``undo``, ``redo``, ``goto``, ``save``, ``load``, ``promote``,
-  ``stage``, ``pin``, ``compare``, ``histogram``, ``probe``, ``image``, ``live``, ``run``.
+- To the kernel: ``ready`` and ``closed`` (a view is mounted or removed), ``painted`` (a frame has come, and the one
+  before is on the screen; what was moved meanwhile goes with it), ``move`` (what is under the hand at the moment),
+  ``set`` (what it has stopped at), ``hold`` and ``release`` (of a control), ``reset``, ``undo``, ``redo``, ``goto``,
+  ``save``, ``load``, ``promote``, ``stage``, ``pin``, ``compare``, ``histogram``, ``probe``, ``image``, ``live`` and
+  ``run``.
 
 Pictures travel as one binary message per frame, never in a trait: traits are kept, compared and saved.
 """
@@ -17,7 +18,7 @@ Pictures travel as one binary message per frame, never in a trait: traits are ke
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from functools import partial
 from time import perf_counter_ns
 from typing import Any, Final
 
@@ -25,11 +26,12 @@ import anywidget
 
 from epypes_widgets.route import Route
 from epypes_widgets.sender import Frame, FrameSender
-from epypes_widgets.view.script import joined
+from epypes_widgets.view.script import joined, styles
 
-_CSS: Final = Path(__file__).parent / "view" / "view.css"
+_MOST_TIMES: Final = 200
+_REST_S: Final = 0.3
 
-Later = Callable[[float, Callable[[], None]], None]
+Later = Callable[[str, float, Callable[[], None]], None]
 Message = Mapping[str, Any]
 
 
@@ -38,11 +40,9 @@ class PictureView(anywidget.AnyWidget):
 
     Parameters
     ----------
-    idle
-        Whether nothing is being computed. Only then the time to the screen is sent: a small message just before a
-        frame would hold that frame back, since the websocket of JupyterLab waits to fill its packets.
     later
-        Calls a function after a delay.
+        Is called with a word, a delay in seconds and a function, which is to be called once after it; a later call with
+        the same word replaces an earlier one.
     handlers
         By kind of message, what is called with it on the thread that answers the front end.
     failed
@@ -52,20 +52,19 @@ class PictureView(anywidget.AnyWidget):
     """
 
     _esm = joined()
-    _css = _CSS
+    _css = styles()
 
     def __init__(
         self,
-        idle: Callable[[], bool],
         later: Later,
         handlers: Mapping[str, Callable[[Message], object]],
         failed: Callable[[BaseException], None],
         route: Route,
     ) -> None:
         super().__init__()
-        self.frames = FrameSender(self._send_frame, later)
+        self.frames = FrameSender(self._send_frame, partial(later, "lost frame"))
         self.to_screen_ms: list[float] = []
-        self._idle, self._failed, self._route = idle, failed, route
+        self._later, self._failed, self._route = later, failed, route
         self._handlers: dict[str, Callable[[Message], object]] = {
             "painted": self._painted,
             "closed": lambda _: self.frames.closed(),
@@ -97,10 +96,10 @@ class PictureView(anywidget.AnyWidget):
         # The first frame of a panel shows values that nobody moved, so it has no time to the screen.
         if frame is None or not frame.changed_ns:
             return
-        self.to_screen_ms.append((perf_counter_ns() - frame.changed_ns) / 1e6)
+        # What a picture takes in the browser after it has come is known of the one before.
+        shown_ms = float(message.get("shown_ms", 0))
+        self.to_screen_ms.append((perf_counter_ns() - frame.changed_ns) / 1e6 + shown_ms)
         del self.to_screen_ms[:-_MOST_TIMES]
-        if self._idle() and self.frames.in_flight is None:
-            self.tell("latency", {"seq": frame.seq, "to_screen_ms": self.to_screen_ms[-1]})
-
-
-_MOST_TIMES: Final = 200
+        told = {"seq": frame.seq, "to_screen_ms": self.to_screen_ms[-1]}
+        # A small message right before a frame would hold that frame back, so it waits until the hand rests.
+        self._later("latency", _REST_S, lambda: self.tell("latency", told))
