@@ -250,6 +250,9 @@ def test_marks_are_vectors_whose_width_does_not_grow(view: ViewPage) -> None:
     line = ".epypes-mark-line:not(.epypes-dots)"
     assert "M1 1L50 1L50 40Z" in str(view.attribute(line, "d"))
     assert view.js(f"getComputedStyle(document.querySelector('{line}')).vectorEffect") == "non-scaling-stroke"
+    # The kernel measures from the corner of the first pixel, as the drawing does.
+    assert view.attribute(".epypes-overlay", "viewBox") == "0 0 512 384"
+    assert view.attribute(line, "transform") is None
     assert view.text(".epypes-marks") == "3 marks"
     view.focus()
     view.press("o")
@@ -282,7 +285,7 @@ def test_the_divider_of_a_wipe_follows_mouse_and_keys(view: ViewPage) -> None:
     view.focus(".epypes-divider")
     view.press("ArrowRight")
     assert int(view.attribute(".epypes-divider", "aria-valuenow") or 0) == before + 2
-    clip = view.js("document.querySelector('.epypes-other').style.clipPath")
+    clip = view.js("document.querySelector('.epypes-layer').style.clipPath")
     assert clip.startswith("inset(0px 0px 0px ")
     assert picture.evaluate("node => node.isConnected && node.matches('img.epypes-picture')")
 
@@ -301,6 +304,19 @@ def test_side_by_side_both_pictures_are_zoomed_and_panned_together(view: ViewPag
     assert one["width"] == two["width"]
     assert one["x"] - left["x"] == pytest.approx(two["x"] - right["x"], abs=2.5)
     assert one["y"] == two["y"]
+
+
+def test_the_second_picture_has_marks_of_its_own(view: ViewPage) -> None:
+    marks = "{ points: [], lines: [[1, 1, 50, 1, 50, 40]], closed: true, total: 1, what: 'contours' }"
+    view.page.select_option(".epypes-compare", '{"kind":"default"}')
+    view.until("document.querySelector('.epypes-other').src")
+    view.do(
+        f"const [frame, bytes] = await kernel.frame(); kernel.deliver({{ kind: 'reference', seq: frame.seq, label: 'default',"
+        f" picture: {{ ...frame.pictures[0], role: 'other', overlay: {marks} }} }}, bytes)"
+    )
+    view.until("document.querySelector('.epypes-layer .epypes-mark-line').getAttribute('d').startsWith('M1 1')")
+    assert view.js("document.querySelector('.epypes-overlay .epypes-mark-line').getAttribute('d')") == ""
+    assert view.shown(".epypes-layer")
 
 
 def test_a_stage_that_is_compared_with_follows_the_values(view: ViewPage) -> None:

@@ -2,8 +2,9 @@
 import { decoded } from "./blobs.js";
 import { element, follow, note, say } from "./elements.js";
 import { wiped } from "./geometry.js";
-import { newestOnly } from "./protocol.js";
 import { same, shortly } from "./numbers.js";
+import { drawOverlay } from "./overlay.js";
+import { newestOnly } from "./protocol.js";
 
 const KEY_SHARE = 0.02;
 
@@ -40,26 +41,26 @@ export function comparePart(panel, stage) {
 
   function clip() {
     if (mode !== "wipe" || isFlipped) {
-      stage.other.style.clipPath = "";
+      stage.layer.style.clipPath = "";
       return;
     }
     divider.style.left = `${share * stage.room.width}px`;
     note(divider, "aria-valuenow", String(Math.round(share * 100)));
-    stage.other.style.clipPath = `inset(0 0 0 ${wiped(share, stage.room, stage.place)}px)`;
+    stage.layer.style.clipPath = `inset(0 0 0 ${wiped(share, stage.room, stage.place)}px)`;
   }
 
   function arrange() {
     const isSide = isThere && mode === "side";
     const home = isSide ? stage.secondCanvas : stage.canvas;
-    if (stage.other.parentElement !== home) {
-      if (isSide) home.append(stage.other);
-      else stage.picture.after(stage.other);
+    if (stage.layer.parentElement !== home) {
+      if (isSide) home.append(stage.layer);
+      else stage.overlay.after(stage.layer);
     }
     stage.secondPane.hidden = !isSide;
     stage.box.classList.toggle("epypes-side", isSide);
     stage.box.classList.toggle("epypes-wiping", isThere && mode === "wipe");
     stage.box.classList.toggle("epypes-flipped", isThere && isFlipped);
-    stage.other.hidden = !isThere || (!isSide && mode !== "wipe" && !isFlipped);
+    stage.layer.hidden = !isThere || (!isSide && mode !== "wipe" && !isFlipped);
     divider.hidden = !isThere || mode !== "wipe";
     here.hidden = there.hidden = !isThere || (!mode && !isFlipped);
     say(here, isFlipped && !isSide ? `B  ${label}` : "A  now");
@@ -125,6 +126,7 @@ export function comparePart(panel, stage) {
       if (!ready || asked !== target || !isNewest(seq)) return panel.blobs.close(url);
       stage.other.src = url;
       panel.blobs.put(stage.other, url);
+      drawOverlay(stage.otherMarks, picture.overlay);
       stage.other.alt = `${picture.token}, compared with: ${said || label}`;
       stage.other.dataset.seq = String(seq);
       isThere = true;

@@ -28,11 +28,11 @@ const LAYERS = [
   ["epypes-mark-line epypes-dots", "dots"],
 ];
 
-/** Draw marks, or take away those of the frame before. Coordinates name pixels, whose middles are half a pixel on. */
+/** Draw marks, or take away those of the frame before. The first pixel of the picture reaches from 0 to 1. */
 export function drawOverlay(svg, overlay) {
   if (!svg.firstChild) {
     // Two strokes, dark under bright, can be seen on any picture.
-    for (const [name] of LAYERS) svg.append(shape("path", { class: name, transform: "translate(0.5 0.5)" }));
+    for (const [name] of LAYERS) svg.append(shape("path", { class: name }));
   }
   const points = overlay?.points ?? [];
   const lines = (overlay?.lines ?? []).map((line) => linePath(line, overlay.closed));

@@ -11,10 +11,13 @@ const CLICK_PX = 3;
 /** The box with the big picture, the one that it is compared with, and the drawings above them. */
 export function stagePart(panel) {
   const picture = element("img", "epypes-picture", { alt: "", hidden: "", draggable: "false" });
-  const other = element("img", "epypes-other", { alt: "", hidden: "", draggable: "false" });
+  const other = element("img", "epypes-other", { alt: "", draggable: "false" });
   const overlay = shape("svg", { class: "epypes-overlay", preserveAspectRatio: "none", "aria-hidden": "true" });
   const roi = shape("svg", { class: "epypes-roi", preserveAspectRatio: "none" });
-  const canvas = element("div", "epypes-canvas", {}, picture, other, overlay, roi);
+  const otherMarks = shape("svg", { class: "epypes-overlay", preserveAspectRatio: "none", "aria-hidden": "true" });
+  // Above the marks of the big picture: where it is seen, these are not.
+  const layer = element("div", "epypes-layer", { hidden: "" }, other, otherMarks);
+  const canvas = element("div", "epypes-canvas", {}, picture, overlay, layer, roi);
   const pane = element("div", "epypes-pane", {}, canvas);
   const secondCanvas = element("div", "epypes-canvas");
   const secondPane = element("div", "epypes-pane epypes-second", { hidden: "" }, secondCanvas);
@@ -72,7 +75,7 @@ export function stagePart(panel) {
   function resize(width, height) {
     if (width === size.width && height === size.height) return;
     size = { width, height };
-    for (const svg of [overlay, roi]) svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
+    for (const svg of [overlay, otherMarks, roi]) svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
     fit();
   }
 
@@ -135,7 +138,7 @@ export function stagePart(panel) {
   sizes.observe(pane);
 
   return {
-    element: box, box, pane, secondPane, canvas, secondCanvas, picture, other, overlay, roi, text,
+    element: box, box, pane, secondPane, canvas, secondCanvas, picture, layer, other, otherMarks, overlay, roi, text,
     fit, resize, pointOf,
     zoomBy: (factor) => zoomTo(place.scale * factor),
     zoomIn: () => zoomTo(place.scale * BUTTON_STEP),
