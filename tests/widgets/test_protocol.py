@@ -199,7 +199,11 @@ def test_with_live_off_values_wait_until_they_are_run(panel: Panel, front_end: F
     panel["threshold"] = 50
     panel["gain"] = 3
     panel.wait(10)
-    assert calls.counts == {}
+    front_end.tell("stage", token="image_bright")
+    panel.wait(10)
+    assert (calls.counts, front_end.frames[-1]["token"]) == ({}, "image_bright")
+    assert front_end.frames[-1]["values"] == {"gain": 2, "threshold": 100}
+    front_end.tell("stage", token="mask")
     front_end.tell("run")
     panel.wait(10)
     front_end.wait_for_values(10, threshold=50, gain=3)

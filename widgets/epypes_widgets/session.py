@@ -95,8 +95,15 @@ class Session:
 
     # -- on the worker's thread ---------------------------------------------------------------------------------
 
-    def bring_up_to_date(self, targets: Sequence[str]) -> tuple[Run, bool]:
+    def bring_up_to_date(self, targets: Sequence[str], *, is_wanted: bool = True) -> tuple[Run, bool]:
         """Compute what is wanted, as far as the targets need it.
+
+        Parameters
+        ----------
+        targets
+            Tokens; everything without.
+        is_wanted
+            Whether to compute what is wanted; if not, the targets are computed from what the runner has.
 
         Returns
         -------
@@ -108,7 +115,7 @@ class Session:
         """
         for _ in range(_MOST_ATTEMPTS):
             with self._lock:
-                wanted, image = dict(self._wanted), self._image_wanted
+                wanted, image = (dict(self._wanted), self._image_wanted) if is_wanted else ({}, None)
             payload = None if image is None else self.payloads[image].values
             run = self.runner.trial(wanted, *targets, payload=payload)
             if run.failure is not None:

@@ -57,7 +57,7 @@ class Tuning:
         self._settled = settled
         self._lock = threading.Lock()
         self._commits = False
-        self._is_forced = False
+        self._is_forced = self._has_looked = False
         self._forget = self.runner.watch(self._runner_changed)
         for control in hand.controls:
             control.on_change(self._moved)
@@ -98,8 +98,8 @@ class Tuning:
         self.worker.ask()
 
     def look(self) -> None:
-        """Have what is looked at computed, live or not."""
-        self._is_forced = True
+        """Have what is looked at computed, live or not; if not, from the values that the runner has."""
+        self._has_looked = True
         self.worker.ask()
 
     def release(self) -> None:
@@ -169,13 +169,15 @@ class Tuning:
         if foreign:
             self._log(self.hand.follow(foreign))
             self._commit_later(REST_S)
-        is_forced, self._is_forced = self._is_forced, False
-        if not (self.is_live or is_forced or self.session.result is None):
+        is_wanted = self.is_live or self._is_forced or self.session.result is None
+        is_asked = self._is_forced or self._has_looked
+        self._is_forced = self._has_looked = False
+        if not (is_wanted or is_asked):
             return
-        if self.screen.view.frames.left and not (is_forced or self.session.is_wanting):
+        if self.screen.view.frames.left and not (is_asked or self.session.is_wanting):
             return  # the cell was run again, and another panel looks at this runner now
         try:
-            run, is_settled = self.session.bring_up_to_date(self.screen.shown.targets)
+            run, is_settled = self.session.bring_up_to_date(self.screen.shown.targets, is_wanted=is_wanted)
         except Exception as error:  # what is wanted can't be run: a placeholder, a branch that is not there
             self.screen.fail(str(error))
             return
