@@ -13,6 +13,8 @@ import pytest
 from epypes.parameters import TABLE, Entry, entry_of, parameter_names
 from tests.parameters.calls import called, function_of, names_of
 
+pytestmark = pytest.mark.slow
+
 # Just outside of what is allowed, the library refuses these too.
 _REFUSED: Final[dict[str, dict[str, tuple[Any, ...]]]] = {
     "GaussianBlur": {"ksize": (2,)},

@@ -17,6 +17,8 @@ import epypes as ep
 from epypes_widgets.promotion import Outcome, Promotion, proposal
 from tests.bundle.test_slicer import notebook
 
+pytestmark = pytest.mark.slow
+
 TIMEOUT_S = 60.0
 
 _CELL = """\
