@@ -7,6 +7,7 @@ annotation: ``Annotated[int, Param(1, 31, odd=True)]``.
 from __future__ import annotations
 
 import enum
+import math
 import numbers
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -70,6 +71,7 @@ class Param:
     about: str = ""
 
     def __post_init__(self) -> None:
+        self._check_numbers()
         self._check_choices()
         self._check_soft()
         if self.low is not None and self.high is not None and self.low > self.high:
@@ -80,6 +82,17 @@ class Param:
             raise ValueError("A logarithmic range needs a positive low.")
         if self.odd and self.low is not None and self.low == self.high and self.low % 2 != 1:
             raise ValueError(f"There is no odd value between {self.low} and {self.high}.")
+
+    def _check_numbers(self) -> None:
+        for setting in ("low", "high", "step"):
+            value = getattr(self, setting)
+            if value is None or self.choices is not None:
+                continue
+            if not isinstance(value, numbers.Real) or not _is_end(value, is_step=setting == "step"):
+                raise ValueError(f"{setting} must be a number that a float can hold, not {value!r:.60}.")
+        for setting in ("unit", "below", "cuts", "about"):
+            if not isinstance(getattr(self, setting), str):
+                raise ValueError(f"{setting} is a text, not {getattr(self, setting)!r:.60}.")
 
     def _check_choices(self) -> None:
         if self.choices is None:
@@ -153,6 +166,15 @@ def _is_length(value: Any) -> bool:
     return isinstance(value, numbers.Integral) and not isinstance(value, bool) and int(value) >= 0
 
 
+def _is_end(value: numbers.Real, *, is_step: bool) -> bool:
+    """Whether a number can be an end of a range, which may be infinite, or a step, which may not."""
+    try:
+        number = float(value)
+    except OverflowError:  # a whole number that no slider has
+        return False
+    return math.isfinite(number) if is_step else not math.isnan(number)
+
+
 def as_param(hint: Any) -> Param | Roi | None:
     """Read a hint: a Param or Roi, a tuple as a range (low, high[, step]), a list as choices; None if it is neither.
 
@@ -165,7 +187,7 @@ def as_param(hint: Any) -> Param | Roi | None:
     """
     if isinstance(hint, Param | Roi):
         return hint
-    if isinstance(hint, tuple) and len(hint) in (2, 3) and all(isinstance(end, int | float) for end in hint):
+    if isinstance(hint, tuple) and len(hint) in (2, 3) and all(isinstance(end, numbers.Real) for end in hint):
         return Param(*hint)
     if isinstance(hint, list):
         return Param(choices=tuple(hint))

@@ -54,7 +54,7 @@ def lab_arguments(words: list[str], *, is_root: bool = False) -> tuple[str, ...]
         "jupyterlab",
         folder,
         # JupyterLab refuses an address that is given twice.
-        *(() if any(option.startswith(_ADDRESS) for option in options) else ("--ip=127.0.0.1",)),
+        *(() if any(option.partition("=")[0] in _ADDRESS for option in options) else ("--ip=127.0.0.1",)),
         *(("--allow-root",) if is_root else ()),
         f"--ServerApp.jpserver_extensions={_EXTENSION}=True",
         *options,

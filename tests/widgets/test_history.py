@@ -226,7 +226,7 @@ def test_a_change_of_everything_is_still_short() -> None:
     assert one is not None
     assert two is not None
     assert len(changed(one, two)) < 150
-    assert changed(one, two).endswith("image 0 -> 1")
+    assert changed(one, two).endswith("image 1 -> 2")
     few = history.commit({"a": 1, "b": 1, "c": 1, "d": 1, "e": 1})
     last = history.commit({"a": 2, "b": 2, "c": 2, "d": 2, "f": 2})
     assert few is not None

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from typing import Any
 
+import numpy as np
 import pytest
 
 import epypes as ep
-from epypes_widgets import Panel, sender
+from epypes.errors import StillRunning
+from epypes_widgets import Panel, sender, tune
 from tests.widgets.frontend import BadLine, FrontEnd
 
 
@@ -344,4 +347,141 @@ def test_places_of_a_slider_that_is_dragged_come_with_acknowledgements(
     panel.wait(10)
     front_end.wait_for_values(10, threshold=120)
     assert (panel["threshold"], runner["threshold"], slider.value) == (120, 120, 120)
-    assert list(panel.history["threshold"]) == [100, 110, 120]
+    front_end.tell("release", names=["threshold"])
+    panel.wait(10)
+    assert list(panel.history["threshold"]) == [100, 120]
+
+
+def slowed(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
+    """Have the next trial of a panel's runner wait: return when it has begun, and what lets it go on."""
+    begun, go_on = threading.Event(), threading.Event()
+    trial = panel._session.runner.trial
+
+    def slow(*arguments: Any, **payload: Any) -> Any:
+        run = trial(*arguments, **payload)
+        begun.set()
+        assert go_on.wait(10)
+        return run
+
+    monkeypatch.setattr(panel._session.runner, "trial", slow)
+    return begun, go_on
+
+
+def test_of_a_panel_and_a_cell_the_one_that_set_last_wins(
+    panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, go_on = slowed(panel, monkeypatch)
+    panel["gain"] = 3
+    assert begun.wait(10)
+    runner["gain"] = 5
+    go_on.set()
+    panel.wait(10)
+    assert (runner["gain"], panel["gain"]) == (5, 5)
+    begun.clear()
+    go_on.clear()
+    panel["threshold"] = 50
+    assert begun.wait(10)
+    runner["gain"] = 4
+    panel["gain"] = 2
+    go_on.set()
+    panel.wait(10)
+    assert (runner["gain"], panel["gain"], runner["threshold"]) == (2, 2, 50)
+
+
+def test_a_panel_that_was_closed_changes_the_runner_no_more(
+    panel: Panel, runner: ep.CompGraphRunner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, go_on = slowed(panel, monkeypatch)
+    panel["gain"] = 3
+    assert begun.wait(10)
+    with pytest.raises(StillRunning):
+        panel.close(0.01)
+    go_on.set()
+    panel.close(10)
+    assert runner["gain"] == 2
+
+
+def test_a_stream_of_runs_does_not_keep_values_from_counting(
+    panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner, image: Any
+) -> None:
+    done = threading.Event()
+
+    def stream() -> None:
+        while not done.is_set():
+            runner.run(image=image)
+
+    thread = threading.Thread(target=stream)
+    thread.start()
+    try:
+        panel["threshold"] = 50
+        front_end.wait_for_values(10, threshold=50)
+        panel._tuning.worker.later("probe", 0.0, lambda: None, is_work=True)
+    finally:
+        done.set()
+        thread.join(10)
+    panel.wait(10)
+    assert (runner["threshold"], panel["threshold"]) == (50, 50)
+
+
+def test_a_hyperparameter_that_is_one_no_more_blocks_nothing(panel: Panel, runner: ep.CompGraphRunner) -> None:
+    runner.unfreeze("gain")
+    panel["gain"] = 3
+    panel.wait(10)
+    runner.run(image=runner.last["image"], gain=2)
+    panel["threshold"] = 51
+    panel.wait(10)
+    assert (panel.error, runner["threshold"]) == ("", 51)
+
+
+def test_a_page_that_is_loaded_anew_holds_nothing(
+    panel: Panel, front_end: FrontEnd, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    front_end.tell("hold", names=["threshold"])
+    FrontEnd(panel, monkeypatch)
+    panel["threshold"] = 44
+    panel.wait(10)
+    assert panel["threshold"] == 44
+
+
+def test_a_payload_that_is_run_anew_is_compared_anew(
+    panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner, image: Any
+) -> None:
+    front_end.tell("compare", **{"with": {"kind": "default"}})
+    panel.wait(10)
+    image[:] = 255 - image
+    runner.run(image=image)
+    panel.wait(10)
+    assert len(front_end.of("reference")) == 2
+    front_end.tell("compare", **{"with": {"kind": "history", "number": 77}})
+    panel.wait(10)
+    for threshold in (50, 51, 52):
+        panel["threshold"] = threshold
+        panel.wait(10)
+    assert sum("No entry 77" in line for line in panel.log) == 1
+
+
+def test_the_last_values_that_failed_are_no_step_of_undo(panel: Panel, runner: ep.CompGraphRunner) -> None:
+    panel["threshold"] = 60
+    panel.wait(10)
+    panel["threshold"] = 13
+    panel.wait(10)
+    assert panel.undo()
+    panel.wait(10)
+    assert (runner["threshold"], list(panel.history["threshold"])) == (100, [100, 60])
+    assert panel.redo()
+    assert not panel.redo()
+
+
+def test_whatever_a_hyperparameter_is_a_frame_stays_small() -> None:
+    values = {"text": "x" * 5_000_000, "many": list(range(300_000)), "deep": [], "huge": 10**6000}
+    for _ in range(3000):
+        values["deep"] = [values["deep"]]
+    cg = ep.CompGraph({"f": lambda image, *_: image}, {"f": (("image", *values), "y")})
+    runner = ep.CompGraphRunner(cg, values)
+    runner.run(image=np.zeros((8, 8), np.uint8))
+    panel = tune(runner)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        front_end = FrontEnd(panel, monkeypatch)
+        assert len(json.dumps(front_end.messages)) < 60_000
+        assert front_end.painted
+    panel.close(10)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Container
+from functools import partial
 from typing import Any, Final
 
 from epypes.display import encode_image
@@ -22,7 +24,15 @@ _TEXT_LENGTH: Final = 400
 Picture = tuple[dict[str, Any], bytes]
 
 
-def make_frame(run: Run, token: str, seq: int, shown: Shown, changed_ns: int = 0, **content: Any) -> Frame:
+def make_frame(
+    run: Run,
+    token: str,
+    seq: int,
+    shown: Shown,
+    changed_ns: int = 0,
+    had_pictures: Container[str] = (),
+    **content: Any,
+) -> Frame:
     """Return what is shown of a run that has the tokens for it.
 
     Parameters
@@ -37,13 +47,16 @@ def make_frame(run: Run, token: str, seq: int, shown: Shown, changed_ns: int = 0
         What else is shown.
     changed_ns
         When the newest of its values was set.
+    had_pictures
+        The tokens that have had a picture: where nothing is found any more, the image without marks is left.
     content
         Is told to the front end as it is.
     """
-    pictures = [picture(run, token, "main")]
+    drawn = partial(picture, run, had_pictures=had_pictures)
+    pictures = [drawn(token, "main")]
     if shown.other:
-        pictures.append(picture(run, shown.other, "other"))
-    pictures += [picture(run, token, "pinned", PINNED_SIDE_PX) for token in shown.pinned]
+        pictures.append(drawn(shown.other, "other"))
+    pictures += [drawn(token, "pinned", max_side_px=PINNED_SIDE_PX) for token in shown.pinned]
     content = {
         "kind": "frame",
         "seq": seq,
@@ -58,9 +71,11 @@ def make_frame(run: Run, token: str, seq: int, shown: Shown, changed_ns: int = 0
     return Frame(seq, content, tuple(data for _, data in pictures if data), changed_ns)
 
 
-def picture(run: Run, token: str, role: str, max_side_px: int = MAX_SIDE_PX) -> Picture:
+def picture(
+    run: Run, token: str, role: str, max_side_px: int = MAX_SIDE_PX, had_pictures: Container[str] = ()
+) -> Picture:
     """Return a token as a picture: an image, marks over their image, or anything else as text."""
-    found = scene(run, token)
+    found = scene(run, token, had_marks=token in had_pictures)
     described: dict[str, Any] = {"token": token, "role": role, "overlay": None}
     if found is None:
         text = text_of(run[token]) if token in run else f"{token} has not been computed with these values."

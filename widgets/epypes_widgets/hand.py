@@ -56,6 +56,11 @@ class Hand:
             name: param for control in self.controls for name, param in zip(control.names, control.params, strict=True)
         }
 
+    @property
+    def is_holding(self) -> bool:
+        """Whether any control is held."""
+        return bool(self._held)
+
     def control(self, name: str) -> Control:
         """Return the control of a token; UnknownName if there is none."""
         if name not in self._by_name:

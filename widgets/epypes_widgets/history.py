@@ -13,6 +13,7 @@ from weakref import WeakKeyDictionary
 
 from epypes.display import Picture
 from epypes.run import CompGraphRunner
+from epypes_widgets.looking.films import is_alike
 from epypes_widgets.values import differing, said_change
 
 if TYPE_CHECKING:
@@ -88,6 +89,8 @@ class History:
         self._path: tuple[Entry, ...] = ()
         self._place = -1
         self._committed = 0
+        self._images: tuple[Any, ...] = ()
+        self._images_from = 1
 
     def commit(
         self,
@@ -144,6 +147,16 @@ class History:
                 self._path = (*self._path[: self._place + 1], entry)
             self._place = self._path.index(entry)
             return entry
+
+    def use_images(self, images: tuple[Any, ...]) -> None:
+        """Know which images the indices of entries mean from now on; earlier ones go on meaning these very images."""
+        with self._lock:
+            if len(images) != len(self._images) or not all(map(is_alike, images, self._images)):
+                self._images, self._images_from = images, self._committed + 1
+
+    def is_of_images(self, entry: Entry) -> bool:
+        """Whether the index of an entry's image means one of the present images."""
+        return entry.image is not None and entry.number >= self._images_from
 
     @property
     def current(self) -> Entry | None:
@@ -211,8 +224,14 @@ def changed(before: Entry | None, after: Entry) -> str:
     """Return what an entry has changed, as ``"canny_lo 70 -> 90, blur 3 -> 5"``; empty for the first."""
     if before is None:
         return ""
-    moved = f"image {before.image} -> {after.image}" if before.image != after.image else ""
+    one, other = (_numbered(entry.image) for entry in (before, after))
+    moved = f"image {one} -> {other}" if one != other else ""
     return ", ".join(filter(None, (said_change(before.values, after.values), moved)))
+
+
+def _numbered(image: int | None) -> str:
+    """Return an index as images are counted on the screen."""
+    return "-" if image is None else str(image + 1)
 
 
 def _is_at(current: Entry | None, values: Mapping[str, Any], image: int | None) -> bool:

@@ -63,6 +63,7 @@ class Messages:
         }
 
     def _ready(self, _message: Message) -> None:
+        self._tuning.release()  # a page that is loaded anew holds nothing
         self._tuning.hand.hear()
         self._tuning.screen.ready()
 
@@ -127,7 +128,7 @@ class Messages:
             said, is_done = act(str(message["name"]).strip()), True
         except (EpypesError, ValueError) as error:
             said, is_done = str(error), False
-        names = list(settings.names(Path.cwd()))
+        names = list(settings.names("."))
         self._tuning.screen.view.tell("settings", {"names": names, "said": said, "ok": is_done})
 
     def _saved(self, name: str) -> str:

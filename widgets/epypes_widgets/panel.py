@@ -62,6 +62,8 @@ def tune(
     ------
     PayloadError
         The runner has not been run and there are no images, or they don't fit its free source tokens.
+    Exception
+        Whatever a function raises on the first image, if the runner has not been run.
     UnknownName
         A hint is for no hyperparameter of the runner, or ``token`` is not in its graph.
     TypeError, ValueError
@@ -91,10 +93,9 @@ def tune(
         text = f"Nothing has been run yet, so there is nothing to tune on. Call {run_call(free)} first."
         raise PayloadError(free, text)
     hand = Hand(controls(runner, hints))
-    session = Session(runner, given)
     if runner.last is None:
-        session.want_image(0)
-    return Panel(hand, session, token)
+        runner.run(**given[0].values)
+    return Panel(hand, Session(runner, given), token)
 
 
 class Panel:
@@ -117,6 +118,8 @@ class Panel:
     def __init__(self, hand: Hand, session: Session, token: str | None) -> None:
         self._hand, self._session, self._runner = hand, session, session.runner
         self._history = history_of(self._runner)
+        if session.payloads:
+            self._history.use_images(tuple(value for film in session.payloads for value in film.values.values()))
         self._column = column(self._runner.cg, hand.controls)
         self._still = Still(self._static)
         self._tuning = tuning = Tuning(hand, session, self._history, self._still.update)
@@ -140,7 +143,8 @@ class Panel:
         return self._hand.control(name).read()[name]
 
     def __setitem__(self, name: str, value: Any) -> None:
-        self.set(**{name: value})
+        self._require_open()
+        self._tuning.want({name: value})
 
     def set(self, **values: Any) -> None:
         """Move controls, all or none, and have the values computed.
@@ -157,8 +161,11 @@ class Panel:
 
     def reset(self, *names: str) -> None:
         """Set hyperparameters to the values that the runner had them frozen with; all without names."""
+        self._require_open()
         first = self._runner.first_hyperparameters
-        self.set(**{name: first[name] for name in names or self._hand.values})
+        for name in names:
+            self._hand.control(name)
+        self._tuning.want({name: first[name] for name in names or self._hand.values if name in first})
 
     def code(self) -> str:
         """Return the line that leads from the runner's first hyperparameters to those of the panel."""
@@ -197,7 +204,10 @@ class Panel:
         return latency_of(self._screen.compute_ms, self._screen.view.to_screen_ms)
 
     def wait(self, timeout_s: float) -> None:
-        """Return when everything that was set has been computed and committed; TimeoutError if that takes longer."""
+        """Return when everything that was set has been computed and committed; TimeoutError if that takes longer.
+
+        What waits for a hand to let go, or with live off to be run, is not waited for.
+        """
         self._tuning.worker.wait(timeout_s)
 
     # -- looking ------------------------------------------------------------------------------------------------
@@ -320,7 +330,7 @@ class Panel:
             ],
             "runner_name": code.name_of(self._runner),
             "promote_to": proposal(self.token),
-            "settings": list(settings.names(Path.cwd())),
+            "settings": list(settings.names(".")),
         }
         return content, [film.thumbnail for film in films]
 

@@ -66,9 +66,9 @@ class PictureView(anywidget.AnyWidget):
         self.to_screen_ms: list[float] = []
         self._later, self._failed, self._route = later, failed, route
         self._handlers: dict[str, Callable[[Message], object]] = {
-            "painted": self._painted,
-            "closed": lambda _: self.frames.closed(),
             **handlers,
+            "painted": self._painted,
+            "closed": self._closed,
         }
         self.on_msg(self._answer)
 
@@ -88,6 +88,10 @@ class PictureView(anywidget.AnyWidget):
                 handler(content)
         except Exception as error:
             self._failed(error)
+
+    def _closed(self, message: Message) -> None:
+        self.frames.closed()
+        self._handlers["release"](message)
 
     def _painted(self, message: Message) -> None:
         frame = self.frames.painted(int(message.get("seq", 0)))

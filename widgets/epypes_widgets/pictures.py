@@ -13,7 +13,7 @@ _THUMBNAIL_BYTES: Final = 4_000
 
 def picture_of(run: Run, token: str, max_side_px: int, most_bytes: int) -> Picture | None:
     """Return a token as one picture, its marks drawn over their image; None if it is none, or not up to date."""
-    seen = scene_of(run, token)
+    seen = scene_of(run, token, had_marks=True)
     return None if seen is None else scene_picture(seen, max_side_px, most_bytes)
 
 

@@ -21,6 +21,8 @@ from epypes_widgets.shown import Shown, remember_shown, shown_before
 
 _MOST_ENTRIES: Final = 40
 _MOST_LINES: Final = 100
+_LINE_CHARACTERS: Final = 500
+_ERROR_CHARACTERS: Final = 2_000
 
 
 class Screen:
@@ -49,6 +51,8 @@ class Screen:
         The tokens that can be.
     error
         What failed with the last values; empty if nothing did.
+    told
+        The number of the newest entry of the history that the view was told of.
     compute_ms
         How long the run that is shown took; None before the first.
     """
@@ -75,6 +79,7 @@ class Screen:
         self._reference: tuple[dict[str, Any], tuple[bytes, ...]] | None = None
         self._referred: tuple[object, tuple[Any, ...]] = (None, ())
         self._told: set[int] = set()
+        self.told = 0
         self._log: list[dict[str, str]] = []
 
     # -- what is shown ------------------------------------------------------------------------------------------
@@ -85,6 +90,10 @@ class Screen:
             self.shown = replace(self.shown, **parts)
             remember_shown(self._session.runner, self.shown)
             return self.shown
+
+    @property
+    def _pictures(self) -> set[str]:
+        return {stage.token for stage in self.stages if stage.is_picture}
 
     def require_stage(self, token: object) -> str:
         """Return the token; LookupError if it is no stage."""
@@ -117,15 +126,16 @@ class Screen:
             self._seq(),
             shown,
             changed_ns,
+            self._pictures,
             stale=failed is not None,
-            image=self._session.image,
+            image=self._session.image_wanted,
             stages=states(failed or run, self.stages),
         )
         self.view.frames.offer(frame)
 
     def fail(self, text: str, function: str = "", names: Sequence[str] = ()) -> None:
         """Say what failed, and where; the picture stays."""
-        self.error = text
+        self.error = text = text[:_ERROR_CHARACTERS]
         self._failure = {"seq": self._seq(), "text": text, "function": function, "names": list(names)}
         self.view.tell("error", self._failure)
 
@@ -137,9 +147,13 @@ class Screen:
     def refer(self, key: object, payload: Sequence[Any], label: str, run: Run, token: str) -> None:
         """Show a token of another run to compare with."""
         self._referred = key, tuple(payload)
-        described, data = picture(run, token, "other")
+        described, data = picture(run, token, "other", had_pictures=self._pictures)
         self._reference = {"seq": self._seq(), "label": label, "picture": described}, (data,) if data else ()
         self.view.tell("reference", *self._reference)
+
+    def refer_anew(self) -> None:
+        """Have what the picture is compared with computed again: a cell has run it, or set what is default."""
+        self._referred = (None, ())
 
     def refer_to_nothing(self) -> None:
         """Compare with nothing, or with another stage, which comes with each frame."""
@@ -162,8 +176,11 @@ class Screen:
     def tell_history(self) -> None:
         """Tell the last entries; a thumbnail goes to a view once, and is empty from then on."""
         with self._lock:
-            entries, current = self._history.entries[-_MOST_ENTRIES - 1 :], self._history.current
-            pairs = list(zip([None, *entries[:-1]], entries, strict=True))[-_MOST_ENTRIES:]
+            entries, current = self._history.entries, self._history.current
+            pairs = list(zip([None, *entries[:-1]], entries, strict=True))
+            # The first one is where all came from.
+            pairs = pairs if len(pairs) <= _MOST_ENTRIES else [pairs[0], *pairs[1 - _MOST_ENTRIES :]]
+            self.told = len(entries) and entries[-1].number
             content = [_entry(before, entry, is_current=entry is current) for before, entry in pairs]
             buffers = [b"" if entry.number in self._told else _thumbnail(entry) for _, entry in pairs]
             if self.view.frames.mounted:
@@ -173,8 +190,9 @@ class Screen:
 
     def log(self, text: str) -> None:
         """Add a line to the log drawer."""
+        line = {"at": f"{datetime.now().astimezone():%H:%M:%S}", "text": text[:_LINE_CHARACTERS]}
         with self._lock:
-            self._log = [*self._log, {"at": f"{datetime.now().astimezone():%H:%M:%S}", "text": text}][-_MOST_LINES:]
+            self._log = [*self._log, line][-_MOST_LINES:]
         self.view.tell("log", {"lines": self._log})
 
     @property

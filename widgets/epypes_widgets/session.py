@@ -7,14 +7,12 @@ from them, in one step; so cells never see the one without the other. Values wit
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Callable, Mapping, Sequence
+from operator import is_, is_not
+from typing import Any
 
 from epypes.run import CompGraphRunner, Run
-from epypes_widgets.looking.films import Payload
-
-# A cell that changes the runner all the time must not keep the picture from being shown.
-_MOST_ATTEMPTS: Final = 3
+from epypes_widgets.looking.films import Payload, is_alike
 
 
 class Session:
@@ -32,17 +30,18 @@ class Session:
     result
         The last run that completed; None before the first.
     image
-        The index of the payload that it was computed from; None for the runner's own.
+        The index of the payload that it was computed from; None for one that is not among them.
     """
 
     def __init__(self, runner: CompGraphRunner, payloads: Sequence[Payload] = ()) -> None:
         self.runner, self.payloads = runner, tuple(payloads)
         self.result: Run | None = None
-        self.image = self._image_of(runner.last)
+        self.image = self._image_of(runner.last, is_alike)
         self._lock = threading.Lock()
         self._wanted: dict[str, Any] = {}
         self._image_wanted: int | None = None
         self._seen = dict(runner.hyperparameters)
+        self._is_closed = False
 
     # -- from any thread ----------------------------------------------------------------------------------------
 
@@ -69,9 +68,15 @@ class Session:
         return () if run is None else tuple(run.tokens.values[run.tokens.program.slots[token]] for token in free)
 
     def want(self, values: Mapping[str, Any]) -> None:
-        """Ask for values of hyperparameters."""
+        """Ask for values of hyperparameters; they are newer than what anybody has set on the runner until now."""
+        now = self.runner.hyperparameters
         with self._lock:
             self._wanted.update(values)
+            self._seen.update({name: now[name] for name in values if name in now})
+
+    def close(self) -> None:
+        """Change the runner no more."""
+        self._is_closed = True
 
     def want_image(self, index: int) -> None:
         """Ask for another payload; IndexError if there is none of this index."""
@@ -83,14 +88,14 @@ class Session:
     def changes_of_others(self) -> dict[str, Any]:
         """Return the hyperparameters that somebody else has changed since this was last asked, with their values.
 
-        They count from then on: what was asked for these tokens before is dropped.
+        They count from then on: what was asked for these tokens before is dropped, and so is what was asked for a token
+        that is no hyperparameter any more.
         """
         now = dict(self.runner.hyperparameters)
         with self._lock:
             changed = {name: value for name, value in now.items() if self._seen.get(name, self) is not value}
             self._seen = now
-            for name in changed:
-                self._wanted.pop(name, None)
+            self._wanted = {n: value for n, value in self._wanted.items() if n in now and n not in changed}
         return changed
 
     # -- on the worker's thread ---------------------------------------------------------------------------------
@@ -110,33 +115,38 @@ class Session:
         Run
             It may have failed; the runner and ``result`` are then what they were.
         bool
-            Whether everything that was wanted is settled. If not, somebody else has been changing the runner all the
-            time: the run can be shown, and is to be tried again.
+            Whether that is settled. If not, somebody else has changed the runner meanwhile: it is to be tried again.
         """
-        for _ in range(_MOST_ATTEMPTS):
-            with self._lock:
-                wanted, image = (dict(self._wanted), self._image_wanted) if is_wanted else ({}, None)
-            payload = None if image is None else self.payloads[image].values
-            run = self.runner.trial(wanted, *targets, payload=payload)
-            if run.failure is not None:
-                return run, True
-            if self._changes_nothing(run, wanted, payload) or self.runner.adopt(run):
-                self._settle(run, wanted, image)
-                return run, True
-        return run, False
+        with self._lock:
+            wanted, image = (dict(self._wanted), self._image_wanted) if is_wanted else ({}, None)
+        payload = None if image is None else self.payloads[image].values
+        run = self.runner.trial(wanted, *targets, payload=payload)
+        if run.failure is not None or self._is_closed:
+            return run, True
+        if not (self._changes_nothing(run, wanted, payload) or self.runner.adopt(run)):
+            return run, False
+        self._settle(run, wanted, image)
+        return run, True
+
+    def insist(self) -> None:
+        """Set what is wanted on a runner that is changed all the time; its next run has it."""
+        with self._lock:
+            wanted, self._wanted = self._wanted, {}
+        for name, value in wanted.items():
+            self.runner[name] = value
 
     def tried(self, values: Mapping[str, Any], targets: Sequence[str]) -> Run:
         """Return a run with these hyperparameters on the present payload; nothing is changed by it."""
         known = self.runner.hyperparameters
         return self.runner.trial({name: value for name, value in values.items() if name in known}, *targets)
 
-    def _image_of(self, run: Run | None) -> int | None:
-        """Return the index of the payload that a run was computed from, that is, of the very same values."""
+    def _image_of(self, run: Run | None, is_one: Callable[[Any, Any], bool] = is_) -> int | None:
+        """Return the index of the payload that a run was computed from."""
         if run is None:
             return None
         values, slots = run.tokens.values, run.tokens.program.slots
         for index, payload in enumerate(self.payloads):
-            if all(values[slots[token]] is value for token, value in payload.values.items()):
+            if all(is_one(values[slots[token]], value) for token, value in payload.values.items()):
                 return index
         return None
 
@@ -144,13 +154,15 @@ class Session:
         return not wanted and payload is None and not run.report.ran
 
     def _settle(self, run: Run, wanted: Mapping[str, Any], image: int | None) -> None:
+        before = self.payload
         with self._lock:
             self.result = run
+            is_another = len(before) != len(self.payload) or any(map(is_not, before, self.payload))
             for name, value in wanted.items():
                 if self._wanted.get(name, self) is value:
                     del self._wanted[name]
                 self._seen[name] = run.hyperparameters[name]
-            if image is not None:
-                self.image = image
-                if self._image_wanted == image:
-                    self._image_wanted = None
+            if is_another:
+                self.image = self._image_of(run)
+            if self._image_wanted == image:
+                self._image_wanted = None

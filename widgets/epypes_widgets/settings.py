@@ -6,6 +6,7 @@ import difflib
 import enum
 import os
 import secrets
+import stat
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -22,8 +23,10 @@ _SUFFIX: Final = ".toml"
 _SECTION: Final = "hyperparameters"
 _ABOUT: Final = "Values of hyperparameters, saved by a panel of EPypes. They may be edited; the rest may not."
 _COMMENT_CHARACTERS: Final = 80
-# A longer file is not one of ours; it is not even opened to see.
+# Ours say at the top what they are. A longer file, or more reasons, are nobody's settings.
+_BEGINNING_BYTES: Final = 1_000
 _MOST_BYTES: Final = 1_000_000
+_MOST_REASONS: Final = 20
 _MEMBER: Final = "enum"
 
 
@@ -54,6 +57,8 @@ def save(
         With every reason: values that TOML can't hold, or a place that can't be written to. Nothing is written then.
     """
     file = _with_suffix(path)
+    if _is_foreign(file):
+        raise SettingsError(file, [f"{file} exists and has no settings of a panel. Choose another name."])
     reasons = [reason for token, value in values.items() for reason in _unwritable(token, value)]
     if reasons:
         raise SettingsError(file, reasons)
@@ -95,7 +100,7 @@ def load(path: str | Path, present: Mapping[str, Any]) -> dict[str, Any]:
         except (UnknownName, ValueError) as error:
             reasons.append(str(error))
     if reasons:
-        raise SettingsError(file, reasons)
+        raise SettingsError(file, reasons[:_MOST_REASONS])
     return values
 
 
@@ -194,11 +199,19 @@ def _replace(file: Path, text: str) -> None:
 
 def _entries(file: Path) -> dict[str, Any]:
     try:
+        if (
+            file.exists()
+            and not file.is_dir()
+            and not (stat.S_ISREG(file.stat().st_mode) and file.stat().st_size <= _MOST_BYTES)
+        ):
+            raise SettingsError(file, [f"{file} is no plain file of at most {_MOST_BYTES / 1e6:g} MB."])
         document = tomllib.loads(file.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
         raise SettingsError(file, [_missing(file)]) from error
     except tomllib.TOMLDecodeError as error:
         raise SettingsError(file, [f"{file} is not TOML: {error}."]) from error
+    except RecursionError as error:
+        raise SettingsError(file, [f"{file} is nested too deeply."]) from error
     except (OSError, ValueError) as error:  # also bytes that are no text, and a zero byte in the name
         raise SettingsError(file, [f"{file} can't be read: {error}."]) from error
     entries = document.get(_SECTION)
@@ -220,13 +233,23 @@ def _missing(file: Path) -> str:
 
 
 def _is_ours(file: Path) -> bool:
+    """Whether a file begins as ours do; nothing but its beginning is read, and only of a plain file."""
     try:
-        if file.stat().st_size > _MOST_BYTES:
+        if not stat.S_ISREG(file.stat().st_mode) or file.stat().st_size > _MOST_BYTES:
             return False
-        _entries(file)
-    except (OSError, SettingsError):
+        with file.open("rb") as opened:
+            beginning = opened.read(_BEGINNING_BYTES).decode("utf-8", "replace")
+    except (OSError, ValueError):
         return False
-    return True
+    return f'format = "{FORMAT}"' in beginning
+
+
+def _is_foreign(file: Path) -> bool:
+    """Whether there is a file that is not ours to replace."""
+    try:
+        return file.is_file() and not _is_ours(file)
+    except (OSError, ValueError):  # a name that no file can have is refused when it is written
+        return False
 
 
 def _value(token: str, entry: Any) -> Any:

@@ -12,6 +12,8 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final
 
+from epypes.display import Picture
+from epypes.errors import StillRunning
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner, Failure, Run
 from epypes_widgets.hand import Hand
@@ -20,7 +22,6 @@ from epypes_widgets.pictures import thumbnail
 from epypes_widgets.screen import Screen
 from epypes_widgets.session import Session
 from epypes_widgets.shown import Comparison
-from epypes_widgets.values import differing
 from epypes_widgets.worker import Worker
 
 _LOG: Final = logging.getLogger(__name__)
@@ -29,6 +30,8 @@ REST_S: Final = 0.25
 # The last value of a drag may arrive after the word that the slider was let go.
 _AFTER_RELEASE_S: Final = 0.06
 _STILL_S: Final = 0.5
+# A cell that changes the runner all the time must not keep pictures from being shown, or values from counting.
+_MOST_ATTEMPTS: Final = 3
 
 
 class Tuning:
@@ -75,9 +78,13 @@ class Tuning:
             self.worker.ask()
 
     def close(self, timeout_s: float) -> None:
-        """Follow nothing any more."""
+        """Follow nothing any more; StillRunning names the functions that have not returned in time."""
         self._forget()
-        self.worker.close(timeout_s)
+        self.session.close()
+        try:
+            self.worker.close(timeout_s)
+        except StillRunning as error:
+            raise StillRunning(error.name, self.runner.running, timeout_s) from None
 
     # -- from any thread ----------------------------------------------------------------------------------------
 
@@ -119,10 +126,9 @@ class Tuning:
 
     def go_to(self, find: Callable[[], Entry | None]) -> bool:
         """Go to the entry of the history that is found after the present values were committed; False if none is."""
-        wanted = self.hand.values
-        current = self.history.current
-        if current is not None and differing(dict(current.values), {**current.values, **wanted}):
-            self.history.commit({**current.values, **wanted}, token=self.screen.shown.token, image=self.session.image)
+        run = self.session.result
+        if run is not None and not self.session.is_wanting:
+            self._add(run, None)
         entry = find()
         if entry is None:
             return False
@@ -130,7 +136,7 @@ class Tuning:
         with self._lock:
             self._log(self.hand.follow(values))
             self.session.want(values)
-        if entry.image is not None and entry.image != self.session.image_wanted:
+        if self.history.is_of_images(entry) and entry.image not in (None, self.session.image_wanted):
             self.session.want_image(entry.image)
         self._is_forced = True
         self.worker.ask()
@@ -152,6 +158,7 @@ class Tuning:
 
     def _runner_changed(self) -> None:
         if not self.worker.is_current:
+            self.screen.refer_anew()
             self.worker.ask()
 
     def _commit_later(self, delay_s: float) -> None:
@@ -165,10 +172,7 @@ class Tuning:
 
     def _compute(self, changed_ns: int) -> None:
         """Bring the screen up to date with all that is wanted."""
-        foreign = self.session.changes_of_others()
-        if foreign:
-            self._log(self.hand.follow(foreign))
-            self._commit_later(REST_S)
+        self._follow_others()
         is_wanted = self.is_live or self._is_forced or self.session.result is None
         is_asked = self._is_forced or self._has_looked
         self._is_forced = self._has_looked = False
@@ -177,7 +181,7 @@ class Tuning:
         if self.screen.view.frames.left and not (is_asked or self.session.is_wanting):
             return  # the cell was run again, and another panel looks at this runner now
         try:
-            run, is_settled = self.session.bring_up_to_date(self.screen.shown.targets, is_wanted=is_wanted)
+            run, is_settled = self._tried(is_wanted)
         except Exception as error:  # what is wanted can't be run: a placeholder, a branch that is not there
             self.screen.fail(str(error))
             return
@@ -187,11 +191,27 @@ class Tuning:
         self.screen.follow(run)
         self.screen.show(run, changed_ns)
         if not is_settled:
-            self.worker.ask()
+            self.session.insist()
+            self._commit_later(REST_S)
         elif self._commits:
             self._commits = False
-            self._commit()
+            self._commit(is_final=True)
         self._compare()
+
+    def _tried(self, is_wanted: bool) -> tuple[Run, bool]:
+        for _ in range(_MOST_ATTEMPTS):
+            run, is_settled = self.session.bring_up_to_date(self.screen.shown.targets, is_wanted=is_wanted)
+            if is_settled:
+                break
+            self._follow_others()
+        return run, is_settled
+
+    def _follow_others(self) -> None:
+        """Move the controls to what cells have set."""
+        changed = self.session.changes_of_others()
+        if changed:
+            self._log(self.hand.follow(changed))
+            self._commit_later(REST_S)
 
     def _fail(self, run: Run, failure: Failure) -> None:
         good = self.session.result
@@ -206,16 +226,23 @@ class Tuning:
         behind = (name for name in _behind(self.runner.cg, function) if name in wanted)
         return given or list(behind) or [name for name in takes if name in run.hyperparameters]
 
-    def _commit(self) -> None:
-        """Add the values that the runner has taken over to the history, unless they are there."""
+    def _commit(self, *, is_final: bool = False) -> None:
+        """Add the values that the runner has taken over to the history, unless they are there or under a hand."""
         run = self.session.result
-        if run is None or self.session.wanted:
+        if run is None or self.session.wanted or (self.hand.is_holding and not is_final):
             return
-        token, image, compute_ms = self.screen.shown.token, self.session.image, self.screen.compute_ms
-        seen = thumbnail(run, token)
-        if self.history.commit(run.hyperparameters, token=token, picture=seen, compute_ms=compute_ms, image=image):
+        self._add(run, thumbnail(run, self.screen.shown.token))
+        entries = self.history.entries
+        if entries and entries[-1].number != self.screen.told:  # another panel may have added some
             self.screen.tell_history()
         self.worker.later("still", _STILL_S, self._settled)
+
+    def _add(self, run: Run, seen: Picture | None) -> None:
+        current, image = self.history.current, self.session.image
+        if not self.session.payloads and current is not None:
+            image = current.image  # that of another panel on this runner
+        token, compute_ms = self.screen.shown.token, self.screen.compute_ms
+        self.history.commit(run.hyperparameters, token=token, picture=seen, compute_ms=compute_ms, image=image)
 
     def _compare(self) -> None:
         """Show what the picture is compared with, if that is not part of its own run."""
@@ -226,7 +253,12 @@ class Tuning:
         payload = self.session.payload
         if self.screen.refers_to((comparison, token), payload):
             return
-        values, label = self._compared(comparison)
+        try:
+            values, label = self._compared(comparison)
+        except LookupError as error:
+            self.screen.log(str(error))
+            self.screen.change(comparison=None)
+            return
         run = self.session.tried(values, (token,))
         if run.failure is not None:
             self.screen.log(f"Nothing to compare with: with these values {run.failure}.")
@@ -236,6 +268,8 @@ class Tuning:
     def _compared(self, comparison: Comparison) -> tuple[Mapping[str, Any], str]:
         if comparison.kind == "default":
             return self.runner.first_hyperparameters, "default"
+        if comparison.kind != "history":
+            raise LookupError(f"Nothing is called {comparison.kind!r:.40} that a picture could be compared with.")
         entry = next((entry for entry in self.history.entries if entry.number == comparison.number), None)
         if entry is None:
             raise LookupError(f"No entry {comparison.number} in the history.")

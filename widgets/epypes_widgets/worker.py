@@ -16,6 +16,7 @@ from typing import Final
 from epypes.errors import StillRunning
 
 _LOG: Final = logging.getLogger(__name__)
+_IDLE_S: Final = 60.0
 
 
 class Worker:
@@ -165,6 +166,9 @@ class Worker:
                     self._busy = True
                     return self._put_off.pop(key)[1]
                 self._wakes_s = due_s
-                self._condition.wait(None if key is None else wait_s)
+                is_told = self._condition.wait(min(wait_s, _IDLE_S))
                 self._wakes_s = 0.0
+                if key is None and not is_told and not self._is_asked and not self._put_off:
+                    break  # a panel that nobody uses keeps no thread; one is started when it is asked again
+            self._thread = None
             return None

@@ -2,7 +2,7 @@
 import { numberBox } from "./boxes.js";
 import { element, iconButton, note, say } from "./elements.js";
 import { inMs, same, shortly } from "./numbers.js";
-import { followSlides } from "./slides.js";
+import { followSlides, shownAt } from "./slides.js";
 
 const NUMERIC = ["slider", "range", "log"];
 const RETRY_MS = 100;
@@ -112,7 +112,7 @@ export function rowsPart(panel, figure) {
   /** A slider has come to a place. */
   function moved(row, value) {
     const each = Array.isArray(value) ? value : [value];
-    found.get(row)?.boxes.forEach((box, index) => box.moved(each[index]));
+    found.get(row)?.boxes.forEach((box, index) => box.moved(shownAt(row, each[index])));
     markChanged(row);
   }
 

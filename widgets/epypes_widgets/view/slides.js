@@ -2,9 +2,15 @@
 //
 // The slider itself tells the kernel when it is let go. What it passes on the way goes with the view's own messages.
 
+/** Return the number that a slider means at a place: whole where it is, and no finer than its steps can tell. */
+export function shownAt(row, place) {
+  if (row.integer) return Math.round(place);
+  return row.log ? Number(place.toPrecision(4)) : place;
+}
+
 /** Return the value of a slider's model at places of its handles. */
 export function modelValue(row, handles) {
-  const each = handles.map((place) => (row.log ? 10 ** place : row.integer ? Math.round(place) : place));
+  const each = handles.map((place) => shownAt(row, row.log ? 10 ** place : place));
   return row.names.length > 1 ? each : each[0];
 }
 
