@@ -46,7 +46,7 @@ class Worker:
         self._condition = threading.Condition()
         self._is_asked = False
         self._asked_ns = 0
-        self._busy = False
+        self._busy = self._is_computing = False
         self._closed = False
         self._put_off: dict[str, tuple[float, Callable[[], None], bool]] = {}
         self._wakes_s = 0.0
@@ -55,7 +55,7 @@ class Worker:
     @property
     def idle(self) -> bool:
         """Whether everything that was asked for has been computed."""
-        return not self._is_asked and not self._busy
+        return not self._is_asked and not self._is_computing
 
     @property
     def closed(self) -> bool:
@@ -128,7 +128,7 @@ class Worker:
             raise StillRunning(self._name, (), timeout_s)
 
     def _is_done(self) -> bool:
-        return self.idle and not any(is_work for _, _, is_work in self._put_off.values())
+        return self.idle and not self._busy and not any(is_work for _, _, is_work in self._put_off.values())
 
     def _wake(self) -> None:
         if self._thread is None:
@@ -152,12 +152,12 @@ class Worker:
     def _next(self) -> Callable[[], None] | None:
         """Wait for something to do, and return it; None when the worker is closed."""
         with self._condition:
-            self._busy = False
+            self._busy = self._is_computing = False
             self._condition.notify_all()
             while not self._closed:
                 if self._is_asked:
                     asked_ns = self._asked_ns
-                    self._is_asked, self._busy = False, True
+                    self._is_asked, self._busy, self._is_computing = False, True, True
                     return lambda: self._compute(asked_ns)
                 key = min(self._put_off, key=lambda key: self._put_off[key][0], default=None)
                 due_s = math.inf if key is None else self._put_off[key][0]
