@@ -387,3 +387,25 @@ def test_a_panel_on_a_run_of_one_of_its_images_knows_which() -> None:
     panel = tune(runner, images=images)
     assert panel._session.image == 1
     panel.close()
+
+
+def test_a_panel_on_what_has_been_run_computes_nothing(runner: ep.CompGraphRunner, image: Any, calls: Any) -> None:
+    panel = tune(runner, images=[255 - image, image.copy()])
+    assert "up to date" in repr(panel)
+    panel.wait(10)
+    assert (calls.counts, panel._session.image, list(panel.history["image"])) == ({}, 1, [1])
+    panel.close(10)
+
+
+def test_two_panels_on_one_runner_add_no_rows_for_each_other(image: Any) -> None:
+    cg = ep.CompGraph({"f": lambda image, k: image + np.uint8(k)}, {"f": (("image", "k"), "y")})
+    runner = ep.CompGraphRunner(cg, {"k": 1})
+    first, second = tune(runner, images=[image, 255 - image]), tune(runner)
+    for k in (2, 3):
+        first["k"] = k
+        first.wait(10)
+        second.wait(10)
+    assert list(second.history["k"]) == [1, 2, 3]
+    assert list(second.history["image"]) == [0, 0, 0]
+    first.close(10)
+    second.close(10)

@@ -68,7 +68,7 @@ class Tuning:
     def begin(self) -> None:
         """Show what the runner has, if that is up to date; else have it computed."""
         last = self.runner.last
-        if last is not None and last.failure is None and not self.runner.stale and self.session.image_wanted is None:
+        if last is not None and last.failure is None and not self.runner.stale:
             self.session.result = last
             self.screen.follow(last)
             self.screen.show(last, 0)
