@@ -138,6 +138,13 @@ class ViewPage:
     def settle(self) -> None:
         """Return when the last frame is on the screen and what it says is written down."""
         self.js("kernel.painted()")
+        # A frame is acknowledged before it is decoded, which takes some milliseconds; one that can't be shown, never ends.
+        self.js(
+            "new Promise(done => { const end = performance.now() + 400; const look = () => {"
+            " const shown = [...document.querySelectorAll('.epypes-picture, .epypes-text')].some("
+            "  node => node.dataset.seq === String(kernel.seq));"
+            " shown || performance.now() > end ? done() : setTimeout(look, 5); }; look(); })"
+        )
         self.js("new Promise(done => setTimeout(() => setTimeout(done)))")
 
     def close(self) -> None:
