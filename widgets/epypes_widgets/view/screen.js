@@ -66,33 +66,35 @@ export function screen(panel, stage, arrivals) {
     panel.later({ frame, main: main.picture, shown });
   }
 
-  let isShowing = false;
+  /** The number of the frame that is being decoded, which has been acknowledged; none if it is 0. */
+  let shown = 0;
+  /** What came meanwhile. */
   let next = null;
 
   /** Show a frame, and then the newest of those that came meanwhile. */
-  async function showAll(frame, buffers) {
-    isShowing = true;
-    for (let given = [frame, buffers]; given; [given, next] = [next, null]) {
+  async function showAll(...first) {
+    for (let given = first; given; [given, next] = [next, null]) {
+      const [frame, buffers] = given;
       const began_ms = performance.now();
-      panel.painted(given[0].seq);
+      shown = frame.seq;
+      panel.painted(frame.seq);
       try {
-        await show(...given);
+        await show(frame, buffers);
       } catch (error) {
-        arrivals.lose(given[0].seq);
-        panel.tell(`The picture of ${given[0].token} can't be shown: ${error.message}.`, true);
+        arrivals.lose(frame.seq);
+        panel.tell(`The picture of ${frame.token} can't be shown: ${error.message}.`, true);
       }
       panel.took(performance.now() - began_ms);
     }
-    isShowing = false;
+    shown = 0;
   }
 
   return {
     take(frame, buffers) {
       const todo = arrivals.frame(frame.seq);
-      if (todo === "acknowledge") panel.painted(frame.seq);
-      else if (todo === "show" && isShowing) next = [frame, buffers];
-      else if (todo === "show") return showAll(frame, buffers);
-      return undefined;
+      if (todo === "acknowledge" || frame.seq === shown) panel.painted(frame.seq);
+      else if (todo === "show" && shown) next = [frame, buffers];
+      else if (todo === "show") showAll(frame, buffers);
     },
   };
 }
