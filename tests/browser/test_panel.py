@@ -239,9 +239,9 @@ def test_zoom_and_place_stay_when_values_and_images_change(panel: PanelOnScreen)
 
 
 def test_test_images_are_switched_on_the_film(notebook: Notebook, panel: PanelOnScreen) -> None:
-    digest = panel.digest
+    seq, digest = panel.seq, panel.digest
     panel.page.locator(".epypes-filmstrip button").nth(1).click()
-    panel.wait("before => document.querySelector('img.epypes-picture').dataset.seq > before", panel.seq)
+    panel.wait("before => document.querySelector('img.epypes-picture').dataset.seq > before", seq)
     assert notebook.execute("panel.wait(10); print(panel._session.image)").strip() == "1"
     assert panel.digest != digest
 
