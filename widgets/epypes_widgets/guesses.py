@@ -11,7 +11,7 @@ from epypes.graph import CompGraph, annotated_params, as_switch
 from epypes.hints import Param, Roi, Text, param_from_value
 from epypes.parameters import entry_of, parameter_names, uses, usual
 from epypes.run import CompGraphRunner
-from epypes_widgets.movable import is_integer, is_number, plain
+from epypes_widgets.movable import is_integer, is_movable, plain
 
 _RECTANGLES: Final = frozenset(("roi", "rect", "rectangle", "crop", "box", "bbox", "window"))
 _THRESHOLDS: Final = frozenset(("thresh", "threshold", "level", "cutoff"))
@@ -105,7 +105,7 @@ def _selected(runner: CompGraphRunner, token: str, value: Any) -> Param | None:
 
 
 def _tabled(runner: CompGraphRunner, token: str, value: Any) -> Param | None:
-    if not is_number(value) and not isinstance(value, str | bool):
+    if not is_movable(value) and not isinstance(value, str | bool):
         return None
     found = _by_function(runner, token, value) or _by_name(runner, token, value)
     if found is None or found.choices is not None:
@@ -182,7 +182,7 @@ def _fits(param: Param, value: Any) -> bool:
     """Whether a range of the table holds a value of this type: 1 is not True, and only integers are odd."""
     if param.choices is not None:
         return isinstance(value, bool) == isinstance(param.choices[0], bool) and param.allows(value)
-    return is_number(value) and param.allows(value) and (is_integer(value) or not param.odd)
+    return is_movable(value) and param.allows(value) and (is_integer(value) or not param.odd)
 
 
 def _without_negative(param: Param, value: Any) -> Param:

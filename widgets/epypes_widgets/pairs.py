@@ -9,7 +9,7 @@ from typing import Any, Final, TypeVar
 from epypes.hints import Param
 from epypes.run import CompGraphRunner
 from epypes_widgets.guesses import takers, words
-from epypes_widgets.movable import is_integer, is_number
+from epypes_widgets.movable import is_integer, is_movable
 
 _UPPER: Final = {"lo": "hi", "low": "high", "min": "max", "lower": "upper", "minimum": "maximum"}
 _NUMBERED: Final = frozenset(("threshold", "thresh"))
@@ -59,7 +59,7 @@ def _check(
 def _is_pair(values: Mapping[str, Any], low: str, high: str, ranges: Mapping[str, Any]) -> bool:
     if not all(isinstance(ranges.get(token), Param) and ranges[token].choices is None for token in (low, high)):
         return False
-    if not is_number(values[low]) or not is_number(values[high]):
+    if not is_movable(values[low]) or not is_movable(values[high]):
         return False
     return is_integer(values[low]) == is_integer(values[high]) and bool(values[low] <= values[high])
 

@@ -14,7 +14,7 @@ from epypes.errors import UnknownName
 from epypes.hints import Param, Roi, Text, as_param, param_from_value
 from epypes.run import CompGraphRunner
 from epypes_widgets.guesses import guess
-from epypes_widgets.movable import is_number, plain
+from epypes_widgets.movable import is_movable, plain
 from epypes_widgets.pairs import paired
 
 Range = Param | Roi | Text | None
@@ -89,7 +89,7 @@ def closed(param: Range, value: Any) -> Range:
     """
     if not isinstance(param, Param) or param.choices is not None:
         return param
-    if not is_number(value):
+    if not is_movable(value):
         return None
     if param.soft is not None:
         low, high = param.soft

@@ -13,8 +13,8 @@ from ipywidgets.widgets.widget_string import HTMLStyle, TextStyle
 from epypes.graph import CompGraph
 from epypes.hints import Param
 from epypes_widgets.controls.control import Control
-from epypes_widgets.controls.kinds import is_number
 from epypes_widgets.controls.look import sendable
+from epypes_widgets.movable import is_number
 from epypes_widgets.plain import plain
 from epypes_widgets.tips import tip
 

@@ -44,25 +44,10 @@ def plain(number: Any) -> Any:
     return number.item() if kept_type(number) is not None else number
 
 
-def is_number(value: Any) -> bool:
-    """Whether a value is a real, finite number that a float can be near to; truth values are none."""
-    if not isinstance(value, numbers.Real) or isinstance(value, bool):
-        return False
-    try:
-        return math.isfinite(float(value))
-    except (OverflowError, ValueError, TypeError):  # 10**400, or a class of one's own
-        return False
-
-
 def is_truth(value: Any) -> bool:
     """Whether a value is True or False, of Python or of NumPy."""
     kind = kept_type(value)
     return isinstance(value, bool) or (kind is not None and kind.__name__ in ("bool", "bool_"))
-
-
-def is_integer(value: Any) -> bool:
-    """Whether a value is of a type of whole numbers: 1.0 is a float on purpose, and so is what it ranges over."""
-    return isinstance(value, numbers.Integral) and not isinstance(value, bool)
 
 
 def is_same(old: Any, new: Any) -> bool:

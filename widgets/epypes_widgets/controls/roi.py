@@ -9,9 +9,9 @@ from ipywidgets.widgets.widget_string import HTMLStyle
 from epypes.display.previews.short import short_repr
 from epypes.hints import Roi
 from epypes_widgets.controls.control import Control
-from epypes_widgets.controls.kinds import is_integer
 from epypes_widgets.controls.look import Look
 from epypes_widgets.controls.shown import Words, line_of, said
+from epypes_widgets.movable import is_integer
 from epypes_widgets.ranges import allows
 
 

@@ -8,7 +8,8 @@ from typing import Any, Final
 
 from epypes.display.previews.short import short_repr
 from epypes.hints import Param
-from epypes_widgets.controls.kinds import is_integer, is_number, like, limits, plain
+from epypes_widgets.controls.kinds import like, limits, plain
+from epypes_widgets.movable import is_integer, is_number
 from epypes_widgets.ranges import allows, described
 
 # A browser's numbers are floats: whole ones beyond this can't be told from their neighbours.
