@@ -28,6 +28,8 @@ from epypes.wire import Envelope
 from tests.bundle.test_slicer import notebook
 from tests.colours import red_image, red_runner
 
+pytestmark = pytest.mark.slow  # each proves a bundle in a process of its own
+
 promote_module = importlib.import_module("epypes.bundle.promote")
 
 # Functions of a test module are importable names of it, which a bundle can't have: OpenCV's own serve.
