@@ -33,6 +33,7 @@ class Hand:
 
     def __init__(self, controls: Iterable[Control]) -> None:
         self.controls, self.route = tuple(controls), Route()
+        self._sliders = {control.widget.model_id: control.widget for control in self.controls}
         self._by_name = {name: control for control in self.controls for name in control.names}
         self._lock = threading.RLock()
         self._held: set[str] = set()
@@ -108,10 +109,9 @@ class Hand:
 
     def slide(self, places: Mapping[str, Any]) -> None:
         """Take where sliders are that are being dragged, by the id of their model; they tell as if let go there."""
-        sliders = {control.widget.model_id: control.widget for control in self.controls}
         for model, place in places.items():
-            if model in sliders:
-                slide(sliders[model], place)
+            if model in self._sliders:
+                slide(self._sliders[model], place)
 
     def follow(self, values: Mapping[str, Any]) -> list[str]:
         """Move controls to what the runner has got from elsewhere; those that are held follow when they are let go.

@@ -328,7 +328,6 @@ class Panel:
                 for name, param in params.items()
                 if isinstance(param, Roi)
             ],
-            "runner_name": code.name_of(self._runner),
             "promote_to": proposal(self.token),
             "settings": list(settings.names(".")),
         }

@@ -223,7 +223,7 @@ const answers = {
     const images = [{ index: 0, title: "coffee" }, { index: 1, title: "coins" }];
     kernel.deliver({
       kind: "setup", rows: structuredClone(ROWS), folders: FOLDERS, stages: STAGES.map((token) => ({ token, is_picture: token !== "n_edges" })), images,
-      live: kernel.live, cuts: [{ token: "blurred", names: ["canny_lo", "canny_hi"] }], rois: [{ name: "crop", token: "image" }], runner_name: "runner",
+      live: kernel.live, cuts: [{ token: "blurred", names: ["canny_lo", "canny_hi"] }], rois: [{ name: "crop", token: "image" }],
       code: "runner.rerun()", promote_to: "services/edges", settings: ["good", "dark"], history: [], undo: false, redo: false, token: kernel.token, pinned: [],
     }, [await bytesOf("image", 96), await bytesOf("gray", 96)]);
     await kernel.remember();

@@ -100,8 +100,8 @@ def _row(cg: CompGraph, control: Control, css: str, function: str) -> dict[str, 
         "low": [_end(param.low) for param in ranges],
         "high": [_end(param.high) for param in ranges],
         "step": list(control.steps) or [None] * len(ranges),
-        "default": [_json(value) if is_plain else None for value in control.first],
-        "value": [_json(values[name]) if is_plain else None for name in control.names],
+        "default": [plain(value) if is_plain else None for value in control.first],
+        "value": [plain(values[name]) if is_plain else None for name in control.names],
         "unit": ranges[0].unit,
         "tip": "\n".join(tip(cg, name, param) for name, param in zip(control.names, control.params, strict=True)),
     }
@@ -109,11 +109,3 @@ def _row(cg: CompGraph, control: Control, css: str, function: str) -> dict[str, 
 
 def _end(end: Any) -> Any:
     return plain(end) if is_number(end) else None
-
-
-def _json(value: Any) -> Any:
-    """Return a value as frames write it, so that the page can compare the two; None if there is no such form."""
-    try:
-        return plain(value)
-    except Exception:  # a choice may be of any class
-        return None
