@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -92,16 +93,39 @@ def panel(notebook: Notebook) -> PanelOnScreen:
     return panel
 
 
-def test_a_cell_that_runs_for_ten_seconds_does_not_stop_the_panel(notebook: Notebook, panel: PanelOnScreen) -> None:
+def runs_until(pipe: Path) -> str:
+    """Code that runs until somebody opens a pipe for writing."""
+    os.mkfifo(pipe)
+    return f"open({str(pipe)!r}).close()"
+
+
+def test_a_cell_that_runs_does_not_stop_the_panel(notebook: Notebook, panel: PanelOnScreen, lab: JupyterLab) -> None:
     # The first of all tests: whatever a control has sent before would be handled on a thread that is free.
-    notebook.start("busy = threading.Event(); busy.wait(10)")
+    pipe = lab.state / "cell"
+    notebook.start(runs_until(pipe))
     panel.wait(f"() => {notebook.KERNEL}.status === 'busy'")
     panel.focus("threshold")
     for step in range(1, 6):
         panel.press("ArrowRight", "threshold", 100 + step)
     panel.choose("gray")
     assert notebook.is_running
+    pipe.open("w").close()
     panel.wait("() => !window.isRunning")
+
+
+def test_a_panel_can_be_used_while_the_cell_below_it_runs(browser: Any, lab: JupyterLab) -> None:
+    pipe = lab.state / "cell below"
+    written(lab.root, "below.ipynb", SET_UP.strip(), SHOW.strip(), runs_until(pipe) + "; print('ended')")
+    notebook = Notebook(browser, lab, "below.ipynb")
+    ran = "() => jupyterapp.commands.execute('notebook:run-all-cells').then(() => { window.hasRun = true; })"
+    notebook.page.evaluate(f"() => {{ ({ran})(); }}")
+    panel = PanelOnScreen(notebook)
+    panel.focus("threshold")
+    panel.press("ArrowRight", "threshold", 101)
+    assert not notebook.page.evaluate("() => window.hasRun")
+    pipe.open("w").close()
+    panel.wait("() => window.hasRun")
+    notebook.close()
 
 
 def test_a_drag_is_followed_and_committed_when_it_ends(notebook: Notebook, panel: PanelOnScreen) -> None:

@@ -13,7 +13,6 @@ from epypes.errors import UnknownName
 from epypes.hints import Param, Roi, Text
 from epypes_widgets.controls import Control
 from epypes_widgets.controls.quiet import slide
-from epypes_widgets.route import Route
 from epypes_widgets.values import differing
 
 
@@ -24,15 +23,10 @@ class Hand:
     ----------
     controls
         In the order in which they are listed.
-
-    Attributes
-    ----------
-    route
-        By which the controls are moved.
     """
 
     def __init__(self, controls: Iterable[Control]) -> None:
-        self.controls, self.route = tuple(controls), Route()
+        self.controls = tuple(controls)
         self._sliders = {control.widget.model_id: control.widget for control in self.controls}
         self._by_name = {name: control for control in self.controls for name in control.names}
         self._lock = threading.RLock()
@@ -68,13 +62,6 @@ class Hand:
             raise UnknownName("hyperparameter", name, self._by_name, "of this panel")
         return self._by_name[name]
 
-    def hear(self) -> None:
-        """Have what the front end says handled on this thread from now on, so that no cell that runs holds it up."""
-        self.route.hear()
-        for control in self.controls:
-            # Whatever is sent: the control's next message comes as an answer to it.
-            self.route.call(control.widget.send, {})
-
     def set(self, values: Mapping[str, Any], *, is_by_hand: bool = False) -> dict[str, Any]:
         """Move controls to values that were set, all or none, and return them as the hyperparameters take them.
 
@@ -97,11 +84,11 @@ class Hand:
             before = {control: control.read() for control, _ in parts}
             try:
                 for control, own in parts:
-                    self.route.call(control.write, own)
+                    control.write(own)
             except ValueError:
                 for control, own in before.items():
                     if differing(own, control.read()):
-                        self.route.call(control.write, own)
+                        control.write(own)
                 raise
             for _, own in held:
                 self._waiting.update(own)
@@ -128,7 +115,7 @@ class Hand:
                     self._waiting.update(own)
                     continue
                 try:
-                    self.route.call(control.write, own)
+                    control.write(own)
                 except ValueError as error:
                     refused.append(f"The control stays where it was: {error}")
         return refused

@@ -64,7 +64,6 @@ class Messages:
 
     def _ready(self, _message: Message) -> None:
         self._tuning.release()  # a page that is loaded anew holds nothing
-        self._tuning.hand.hear()
         self._tuning.screen.ready()
 
     # -- values -------------------------------------------------------------------------------------------------

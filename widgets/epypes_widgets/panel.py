@@ -22,6 +22,7 @@ from epypes_widgets.messages import Messages
 from epypes_widgets.picture import PictureView
 from epypes_widgets.plain import plain_values
 from epypes_widgets.promotion import proposal
+from epypes_widgets.route import listen_beside_cells
 from epypes_widgets.screen import Screen
 from epypes_widgets.session import Session
 from epypes_widgets.static import static_html
@@ -124,12 +125,13 @@ class Panel:
         self._still = Still(self._static)
         self._tuning = tuning = Tuning(hand, session, self._history, self._still.update)
         self._messages = Messages(tuning, self.save, self.load)
-        view = PictureView(tuning.worker.later, self._messages.handlers, tuning.report, hand.route)
+        view = PictureView(tuning.worker.later, self._messages.handlers, tuning.report)
         self._screen = tuning.screen = Screen(view, session, self._history, token, self._setup, self.code)
         self._cuts = _cuts(hand)
         tuning.screen.change(cut=tuple(self._cuts), has_histogram=bool(self._cuts))
         columns = ipywidgets.HBox([self._column.widget, view], _dom_classes=("epypes-columns",))
         self._widget = ipywidgets.VBox([columns], _dom_classes=("epypes-panel",))
+        listen_beside_cells(self._widget)
         tuning.begin()
 
     # -- values -------------------------------------------------------------------------------------------------

@@ -24,7 +24,6 @@ from typing import Any, Final
 
 import anywidget
 
-from epypes_widgets.route import Route
 from epypes_widgets.sender import Frame, FrameSender
 from epypes_widgets.view.script import joined, styles
 
@@ -47,8 +46,6 @@ class PictureView(anywidget.AnyWidget):
         By kind of message, what is called with it on the thread that answers the front end.
     failed
         Is called with what a handler has raised.
-    route
-        By which messages go.
     """
 
     _esm = joined()
@@ -59,12 +56,11 @@ class PictureView(anywidget.AnyWidget):
         later: Later,
         handlers: Mapping[str, Callable[[Message], object]],
         failed: Callable[[BaseException], None],
-        route: Route,
     ) -> None:
         super().__init__()
         self.frames = FrameSender(self._send_frame, partial(later, "lost frame"))
         self.to_screen_ms: list[float] = []
-        self._later, self._failed, self._route = later, failed, route
+        self._later, self._failed = later, failed
         self._handlers: dict[str, Callable[[Message], object]] = {
             **handlers,
             "painted": self._painted,
@@ -75,11 +71,11 @@ class PictureView(anywidget.AnyWidget):
     def tell(self, kind: str, content: Message, buffers: Sequence[bytes] = ()) -> None:
         """Send a message other than a frame, if there is a view."""
         if self.frames.mounted:
-            self._route.call(self.send, {"kind": kind, **content}, list(buffers))
+            self.send({"kind": kind, **content}, list(buffers))
 
     def _send_frame(self, frame: Frame) -> None:
         last = self.to_screen_ms[-1] if self.to_screen_ms else None
-        self._route.call(self.send, {**frame.content, "to_screen_ms": last}, list(frame.buffers))
+        self.send({**frame.content, "to_screen_ms": last}, list(frame.buffers))
 
     def _answer(self, _widget: object, content: Any, _buffers: object) -> None:
         try:

@@ -1,32 +1,26 @@
-"""On which thread of the kernel is the front end's answer to a message handled?
+"""On which thread of the kernel is what the front end says handled?
 
-Since ipykernel 7.4, on the one that handled the request during which the message was sent. A thread that a cell has
-started counts as that cell; so what the front end answers to it, or sends next, would wait until cells have ended.
+JupyterLab names one that no cell runs on (a subshell) in every message of a widget. Since ipykernel 7.4 a widget that
+has spoken overrules that: what the front end answers is handled where the widget last spoke, which for one that a cell
+has made is the thread of the cells, and so waits until they have ended.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextvars import Context, copy_context
 from typing import Any
 
+import ipywidgets
 
-class Route:
-    """Sends messages as answers to the front end, whichever thread sends them, so that no cell holds up what follows.
 
-    Before anything has been heard, messages are sent as they are.
-    """
+def listen_beside_cells(widget: ipywidgets.Widget) -> None:
+    """Have what is said to a widget, and to all inside it, handled on the thread that the front end names."""
+    comm = widget.comm
+    if comm is not None:
+        # Where an ipykernel does not know this name, it goes by what the front end says anyway.
+        comm._reply_subshell_for = _as_named
+    for child in getattr(widget, "children", ()):
+        listen_beside_cells(child)
 
-    def __init__(self) -> None:
-        self._context: Context | None = None
 
-    def hear(self) -> None:
-        """Know that the front end is being listened to here: on this thread, during this message."""
-        self._context = copy_context()
-
-    def call(self, send: Callable[..., Any], *arguments: Any) -> Any:
-        """Call a function that sends messages, and return what it returns."""
-        if self._context is None:
-            return send(*arguments)
-        # A context can be in use once at a time.
-        return self._context.copy().run(send, *arguments)
+def _as_named(_data: Any, named: str | None) -> str | None:
+    return named

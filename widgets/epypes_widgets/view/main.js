@@ -17,6 +17,10 @@ import { screen } from "./screen.js";
 import { stagePart } from "./stage.js";
 import { filmsPart, historyPart, pinnedPart } from "./strips.js";
 
+// Until JupyterLab has a thread for widgets beside that of the cells, a message waits for a cell that runs: then it is
+// said again, and the thread that is there by then hears it.
+const FIRST_ANSWER_MS = 500;
+const LAST_ANSWER_MS = 8000;
 const GIVES_VALUES = ["reset", "undo", "redo", "goto", "load"];
 
 /** @param {{model: any, el: HTMLElement}} context given by anywidget */
@@ -104,7 +108,14 @@ function render({ model, el }) {
     all("failure", failure);
   }
 
+  let knocking = 0;
+  function knock(answer_ms) {
+    send({ kind: "ready" });
+    knocking = setTimeout(() => knock(Math.min(2 * answer_ms, LAST_ANSWER_MS)), answer_ms);
+  }
+
   function setup(message, buffers) {
+    clearTimeout(knocking);
     panel.state.token = message.token ?? "";
     all("setup", message, buffers);
     const past = Array.isArray(message.history) ? { entries: message.history } : message.history;
@@ -128,8 +139,9 @@ function render({ model, el }) {
   const stopHiding = hideStatic(el);
 
   model.on("msg:custom", onMessage);
-  send({ kind: "ready" });
+  knock(FIRST_ANSWER_MS);
   return () => {
+    clearTimeout(knocking);
     send({ kind: "closed" });
     model.off("msg:custom", onMessage);
     stopKeys();
