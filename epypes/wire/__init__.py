@@ -9,7 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from epypes.wire.attribute_list import add_attribute, attributes, serialized
+    from epypes.wire.attribute_list import add_attribute, attributes, parsed, serialized
     from epypes.wire.envelope import Envelope, FailureRecord
     from epypes.wire.limits import Limits
     from epypes.wire.messages2019 import (
@@ -42,6 +42,7 @@ __all__ = [
     "decode",
     "encode",
     "load_sample",
+    "parsed",
     "save_sample",
     "serialized",
     "topic_frame",
@@ -56,6 +57,7 @@ _HOME = {
     "decode": "multipart",
     "encode": "multipart",
     "load_sample": "samples",
+    "parsed": "attribute_list",
     "save_sample": "samples",
     "serialized": "attribute_list",
     "topic_frame": "multipart",

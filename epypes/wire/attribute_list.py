@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numbers
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from epypes.errors import MessageError
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
+
+M = TypeVar("M", bound="Message")
 
 _INT32 = range(-(2**31), 2**31)
 
@@ -110,3 +112,19 @@ def serialized(message: Message) -> bytes:
     except (EncodeError, ValueError) as error:
         name = type(message).__name__
         raise MessageError("incomplete", f"This {name} can't be sent: {error}. Fill these fields.") from error
+
+
+def parsed(kind: type[M], data: bytes) -> M:
+    """Return the protobuf message of this class that was sent as these bytes.
+
+    Raises
+    ------
+    MessageError
+        Of reason ``"unreadable"`` if they are something else, or a required field is missing.
+    """
+    from google.protobuf.message import DecodeError
+
+    try:
+        return kind.FromString(data)
+    except (DecodeError, ValueError, TypeError) as error:
+        raise MessageError("unreadable", f"These bytes are no {kind.__name__}: {error}.") from error
