@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from epypes.wire.attribute_list import add_attribute, attributes, parsed, serialized
     from epypes.wire.envelope import Envelope, FailureRecord
+    from epypes.wire.failures import failure_event
     from epypes.wire.limits import Limits
     from epypes.wire.messages2019 import (
         Attribute,
@@ -41,6 +42,7 @@ __all__ = [
     "attributes",
     "decode",
     "encode",
+    "failure_event",
     "load_sample",
     "parsed",
     "save_sample",
@@ -56,6 +58,7 @@ _HOME = {
     "attributes": "attribute_list",
     "decode": "multipart",
     "encode": "multipart",
+    "failure_event": "failures",
     "load_sample": "samples",
     "parsed": "attribute_list",
     "save_sample": "samples",
