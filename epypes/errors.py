@@ -23,6 +23,7 @@ Everything an error's text mentions is an attribute of it::
     +-- BundleError             a bundle is not what it says; .path
     |   +-- PromotionRefused    a graph can't become a bundle; .reasons
     |   +-- ReplayDiffers       a bundle computes something else; .report
+    +-- ExperimentError         the paper's experiment can't begin or go on; .name
     +-- ServiceError            a service can't start or can't be called; .path
         +-- RemoteFailure       a function failed in the service; .function, .message
 
@@ -269,6 +270,17 @@ class ReplayDiffers(BundleError):
     def __init__(self, path: object, report: ReplayReport) -> None:
         self.report = report
         super().__init__(path, f"{path} does not compute what was recorded:\n{report}")
+
+
+class ExperimentError(EpypesError):
+    """The paper's experiment can't begin or go on; ``name`` is that of the node, the process or the option.
+
+    ``printed`` is what a process that ended had written to its standard error.
+    """
+
+    def __init__(self, name: str, text: str, printed: str = "") -> None:
+        self.name, self.printed = name, printed
+        super().__init__(text)
 
 
 class ServiceError(EpypesError):
