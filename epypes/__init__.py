@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from epypes import errors
+    from epypes.acquisition import ImageAcquisition, camera
     from epypes.bundle import load, load_pipeline, promote, to_source, verify
     from epypes.display import Preview, register_preview, reset_display_ranges, show
     from epypes.graph import CompGraph, Placeholder, extend, group, outputs, rename, subgraph, suffix, switch, union
@@ -58,6 +59,8 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "errors": "epypes",
+    "ImageAcquisition": "epypes.acquisition",
+    "camera": "epypes.acquisition",
     "show": "epypes.display",
     "CompGraph": "epypes.graph",
     "Placeholder": "epypes.graph",
@@ -115,6 +118,7 @@ __all__ = [
     "Failure",
     "FullPipeline",
     "Image",
+    "ImageAcquisition",
     "LogNormal",
     "Mailbox",
     "Node",
@@ -135,6 +139,7 @@ __all__ = [
     "TokenManager",
     "ZMQPublisher",
     "ZMQSubscriber",
+    "camera",
     "errors",
     "extend",
     "group",

@@ -17,6 +17,8 @@ Everything an error's text mentions is an attribute of it::
     +-- SourceRefused           a graph can't be written as one function; .reasons
     +-- LayoutUnavailable       no Graphviz engine answers; .tried
     +-- ImageFileError          an image file can't be read or written; .path
+    +-- CameraUnavailable       a camera gives no frame just now; .camera
+    +-- FrameUnavailable        no frame is near enough to a time; .requested_ns, .oldest_ns, .newest_ns
     +-- MessageError            a message can't be made or understood; .reason
     +-- AddressError            an address can't be bound or connected to; .address
     +-- SettingsError           settings of hyperparameters can't be written or read; .path, .reasons
@@ -220,6 +222,22 @@ class ImageFileError(EpypesError, OSError):
 
     def __init__(self, path: str, text: str) -> None:
         self.path = path
+        super().__init__(text)
+
+
+class CameraUnavailable(EpypesError, OSError):
+    """A camera that gives no frame just now; raised by its ``read``, it means: try again later."""
+
+    def __init__(self, camera: str, text: str) -> None:
+        self.camera = camera
+        super().__init__(text)
+
+
+class FrameUnavailable(EpypesError, LookupError):
+    """No frame is near enough to a time; Unix times in ns, those of frames None if there are none."""
+
+    def __init__(self, requested_ns: int, oldest_ns: int | None, newest_ns: int | None, text: str) -> None:
+        self.requested_ns, self.oldest_ns, self.newest_ns = requested_ns, oldest_ns, newest_ns
         super().__init__(text)
 
 
