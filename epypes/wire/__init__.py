@@ -9,7 +9,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from epypes.wire.attribute_list import add_attribute, attributes, serialized
+    from epypes.wire.attribute_list import add_attribute, attributes
+    from epypes.wire.complete import parsed, serialized
     from epypes.wire.envelope import Envelope, FailureRecord
     from epypes.wire.limits import Limits
     from epypes.wire.messages2019 import (
@@ -42,6 +43,7 @@ __all__ = [
     "decode",
     "encode",
     "load_sample",
+    "parsed",
     "save_sample",
     "serialized",
     "topic_frame",
@@ -56,8 +58,9 @@ _HOME = {
     "decode": "multipart",
     "encode": "multipart",
     "load_sample": "samples",
+    "parsed": "complete",
     "save_sample": "samples",
-    "serialized": "attribute_list",
+    "serialized": "complete",
     "topic_frame": "multipart",
 }
 
