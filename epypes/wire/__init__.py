@@ -9,7 +9,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from epypes.wire.attribute_list import add_attribute, attributes, serialized
+    from epypes.wire.attribute_list import add_attribute, attributes
+    from epypes.wire.complete import parsed, serialized
     from epypes.wire.envelope import Envelope, FailureRecord
     from epypes.wire.failures import failure_event
     from epypes.wire.limits import Limits
@@ -44,6 +45,7 @@ __all__ = [
     "encode",
     "failure_event",
     "load_sample",
+    "parsed",
     "save_sample",
     "serialized",
     "topic_frame",
@@ -59,8 +61,9 @@ _HOME = {
     "encode": "multipart",
     "failure_event": "failures",
     "load_sample": "samples",
+    "parsed": "complete",
     "save_sample": "samples",
-    "serialized": "attribute_list",
+    "serialized": "complete",
     "topic_frame": "multipart",
 }
 

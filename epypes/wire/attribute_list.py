@@ -83,30 +83,17 @@ def attributes(message: Message) -> dict[str, str | float]:
     Raises
     ------
     MessageError
-        Of reason ``"bad attribute"`` if an entry lacks the value that its type promises, ``"no attributes"``
-        for a message that has none.
+        Of reason ``"bad attribute"`` if an entry lacks the value that its type promises, ``"not utf-8"`` for text
+        that is none, ``"no attributes"`` for a message that has none.
     """
     result: dict[str, str | float] = {}
     for entry in _entries(message):
         field = {1: "str_val", 2: "double_val", 3: "int_val"}[entry.type]
         if not entry.HasField(field):
             raise MessageError("bad attribute", f"Attribute {entry.key!r} has no {field}, as its type says.")
-        result[entry.key] = getattr(entry, field)
+        key, value = entry.key, getattr(entry, field)
+        # Protobuf gives bytes for text that is not UTF-8.
+        if isinstance(key, bytes) or isinstance(value, bytes):
+            raise MessageError("not utf-8", f"An attribute is not UTF-8: {key!r}, {value!r}."[:200])
+        result[key] = value
     return result
-
-
-def serialized(message: Message) -> bytes:
-    """Return the bytes of a protobuf message.
-
-    Raises
-    ------
-    MessageError
-        Of reason ``"incomplete"`` if a required field is missing.
-    """
-    from google.protobuf.message import EncodeError
-
-    try:
-        return message.SerializeToString()
-    except (EncodeError, ValueError) as error:
-        name = type(message).__name__
-        raise MessageError("incomplete", f"This {name} can't be sent: {error}. Fill these fields.") from error
