@@ -57,6 +57,7 @@ class Mailbox:
         self.dropped: Counter[str] = Counter()
         self._items: deque[Any] = deque()
         self._changed = threading.Condition()
+        self._watchers: tuple[Callable[[], object], ...] = ()
 
     def put(self, item: Any, block: bool = True, timeout: float | None = None) -> None:
         """Put an item; never blocks unless the policy is ``"block"``.
@@ -75,6 +76,22 @@ class Mailbox:
         if self._on_drop is not None:
             for old in dropped:
                 self._on_drop(old)
+        for callback in self._watchers:
+            callback()
+
+    def watch(self, callback: Callable[[], object], /) -> Callable[[], None]:
+        """Call something without arguments after every put, on the thread that put; return what ends that.
+
+        So a taker need not wait in `get`: it takes from within the call, before ``put`` returns. A publisher does.
+        """
+
+        def end() -> None:
+            with self._changed:
+                self._watchers = tuple(each for each in self._watchers if each is not callback)
+
+        with self._changed:
+            self._watchers = (*self._watchers, callback)
+        return end
 
     def _make_room(self, block: bool, timeout: float | None) -> list[Any]:
         """Make room for one item; return what was dropped for it."""

@@ -1,8 +1,12 @@
-"""Who touches the sockets of this process? One I/O thread, and nobody else.
+"""Who touches the sockets of this process? One I/O thread, and nobody else without a socket's lock.
 
-ZeroMQ's sockets must not be shared between threads, and a thread per socket wakes up for nothing. So one daemon
-thread owns them all: it sleeps in a poller until a socket can be read or another thread hands it a command through
-a wake-up socket. It starts with the first command and ends when it has no socket left.
+ZeroMQ's sockets must not be used by two threads at once, and a thread per socket wakes up for nothing. So one daemon
+thread opens, reads and closes them all: it sleeps in a poller until a socket can be read, something is due, or
+another thread hands it a command through a wake-up socket. It starts with the first command and ends when it has no
+socket left.
+
+Sending alone is done where the message is, since to wake another thread for it takes longer than to send it (35 us
+of 60). A socket that is sent on has a lock, and whoever touches it holds that.
 """
 
 from __future__ import annotations
@@ -16,6 +20,9 @@ import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from time import monotonic
 from typing import Any, TypeVar
 
 import zmq
@@ -24,7 +31,8 @@ from epypes.transport.addresses import address_error, check_port
 
 T = TypeVar("T")
 Socket = zmq.Socket[bytes]
-Reader = Callable[[], None]
+# Reads some of what has arrived, and says whether there is more.
+Reader = Callable[[], bool]
 
 log = logging.getLogger("epypes.transport")
 
@@ -42,19 +50,47 @@ _OPTIONS: dict[int, int] = {
 }
 
 
+# As numbers: pyzmq looks an enum up at every call.
+_FD, _EVENTS, _POLLIN = int(zmq.FD), int(zmq.EVENTS), int(zmq.POLLIN)
+
+
+def has_arrived(owned: Socket) -> bool:
+    """Return whether a socket can be read. To be asked after whatever else was done with it: that may have used up
+    the signal by which its file descriptor wakes the I/O thread.
+    """
+    return bool(int(owned.get(_EVENTS)) & _POLLIN)
+
+
+@dataclass(slots=True, eq=False)
+class _Owned:
+    """What the I/O thread knows of a socket."""
+
+    descriptor: int
+    reader: Reader
+    lock: AbstractContextManager[Any]
+    endpoint: str
+    tick: Callable[[], None] | None = None
+    every_s: float = 0.0
+    due_s: float = float("inf")
+
+
 class IOThread:
     """The thread; its methods other than `submit` are for commands, which run on it."""
 
     def __init__(self) -> None:
         self._commands: deque[tuple[Callable[[IOThread], Any], Future[Any]]] = deque()
-        self._readers: dict[Socket, Reader] = {}
-        self._bound: dict[Socket, str] = {}
+        self._owned: dict[Socket, _Owned] = {}
+        # By file descriptor, and those among them that may have more than they were asked for.
+        self._readers: dict[int, Reader] = {}
+        self._unfinished: set[int] = set()
+        self._next_due_s = float("inf")
         self._context = zmq.Context(io_threads=1)
         self._poller = zmq.Poller()
         self._wake_in, self._wake_out = socket.socketpair()
         self._wake_in.setblocking(False)
         self._wake_out.setblocking(False)
         self._poller.register(self._wake_out.fileno(), zmq.POLLIN)
+        self._readers[self._wake_out.fileno()] = self._run_commands
         self.thread = threading.Thread(target=self._run, name="epypes-io", daemon=True)
 
     def submit(self, command: Callable[[IOThread], Any], future: Future[Any]) -> None:
@@ -65,9 +101,30 @@ class IOThread:
             self._wake_in.send(b"\0")
 
     def open(
-        self, kind: int, address: str, bind: bool, reader: Reader, options: Sequence[tuple[int, int | bytes]]
+        self,
+        kind: int,
+        address: str,
+        bind: bool,
+        reader: Reader,
+        options: Sequence[tuple[int, int | bytes]],
+        lock: AbstractContextManager[Any] | None = None,
     ) -> Socket:
         """Return a new socket, bound or connected, whose ``reader`` is called when it can be read.
+
+        Parameters
+        ----------
+        kind
+            ``zmq.XPUB`` or the like.
+        address
+            Where it is bound or connected.
+        bind
+            Whether it is bound.
+        reader
+            Reads a part of what has arrived; returns whether there is more.
+        options
+            Of ZeroMQ, by number, in this order.
+        lock
+            Is held by whoever else touches the socket.
 
         Raises
         ------
@@ -88,52 +145,97 @@ class IOThread:
             new.close(linger=0)
             number = getattr(error, "errno", None) or 0
             raise address_error(address, "bound" if bind else "connected", number, str(error)) from error
-        if bind:
-            self._bound[new] = new.getsockopt_string(zmq.LAST_ENDPOINT)
-        self._readers[new] = reader
-        self._poller.register(new, zmq.POLLIN)
+        endpoint = new.getsockopt_string(zmq.LAST_ENDPOINT) if bind else ""
+        descriptor = int(new.get(_FD))
+        self._owned[new] = _Owned(descriptor, reader, lock or nullcontext(), endpoint)
+        self._readers[descriptor] = reader
+        self._poller.register(descriptor, zmq.POLLIN)
+        self._unfinished.add(descriptor)
         return new
 
     def address_of(self, owned: Socket, address: str) -> str:
         """Return the endpoint that a socket is really bound to, or the address it was connected to."""
-        return self._bound.get(owned, address)
+        known = self._owned.get(owned)
+        return known.endpoint or address if known is not None else address
+
+    def read_again(self, owned: Socket) -> None:
+        """Have a socket read though it gives no signal, since something else has been done with it."""
+        known = self._owned.get(owned)
+        if known is not None:
+            self._unfinished.add(known.descriptor)
+
+    def every(self, interval_s: float, owned: Socket, tick: Callable[[], None]) -> None:
+        """Call something again and again while a socket is open; it may use the socket."""
+        known = self._owned[owned]
+        known.tick, known.every_s, known.due_s = tick, interval_s, monotonic() + interval_s
+        self._next_due_s = min(self._next_due_s, known.due_s)
 
     def close(self, owned: Socket) -> bool:
         """Close a socket, twice if you like; return whether it was the last one, so that the thread ends."""
-        if self._readers.pop(owned, None) is not None:
-            self._poller.unregister(owned)
-            _close(owned, self._bound.pop(owned, ""))
-        return not self._readers
+        known = self._owned.pop(owned, None)
+        if known is not None:
+            self._poller.unregister(known.descriptor)
+            self._readers.pop(known.descriptor, None)
+            self._unfinished.discard(known.descriptor)
+            with known.lock:
+                _close(owned, known.endpoint)
+        return not self._owned
 
     def close_all(self) -> bool:
         """Close every socket; the thread ends then."""
-        for owned in list(self._readers):
+        for owned in list(self._owned):
             self.close(owned)
         return True
 
     def _run(self) -> None:
         try:
             while not self._ended():
-                ready = {found for found, _ in self._poller.poll()}
-                self._run_commands()
-                for owned, reader in list(self._readers.items()):
-                    # A command or another reader may have closed it.
-                    if owned in ready and owned in self._readers:
-                        _read(reader)
+                ready = self._poller.poll(self._wait_ms())
+                if monotonic() >= self._next_due_s:
+                    self._tick()
+                self._read([*(found for found, _ in ready)])
         finally:
             self._context.term()
             self._wake_in.close()
             self._wake_out.close()
 
+    def _wait_ms(self) -> float | None:
+        if self._unfinished:
+            return 0
+        if self._next_due_s == float("inf"):
+            return None
+        # One more, since it is cut to whole milliseconds: otherwise it would wake up too early, and again at once.
+        return max(self._next_due_s - monotonic(), 0.0) * 1000 + 1
+
+    def _read(self, ready: list[Any]) -> None:
+        """Read a part of each socket that has something, so that none waits for another to be empty."""
+        unfinished, self._unfinished = self._unfinished, set()
+        for descriptor in {*ready, *unfinished} if unfinished else ready:
+            # A command or another reader may have closed it.
+            reader = self._readers.get(descriptor)
+            if reader is not None and _read(reader):
+                self._unfinished.add(descriptor)
+
+    def _tick(self) -> None:
+        now_s = monotonic()
+        for known in list(self._owned.values()):
+            if known.tick is not None and known.due_s <= now_s:
+                known.due_s = now_s + known.every_s
+                _read(known.tick)
+                self._unfinished.add(known.descriptor)
+        self._next_due_s = min((known.due_s for known in self._owned.values()), default=float("inf"))
+
     def _ended(self) -> bool:
+        if self._owned or self._commands:
+            return False
         with _state.lock:
-            if self._readers or self._commands:
+            if self._owned or self._commands:
                 return False
             if _state.current is self:
                 _state.current = None
             return True
 
-    def _run_commands(self) -> None:
+    def _run_commands(self) -> bool:
         with contextlib.suppress(BlockingIOError):
             self._wake_out.recv(4096)
         while self._commands:
@@ -143,6 +245,7 @@ class IOThread:
             except Exception as error:
                 # It belongs to the thread that asked, with its traceback.
                 future.set_exception(error)
+        return False
 
 
 def _close(owned: Socket, endpoint: str) -> None:
@@ -157,12 +260,13 @@ def _close(owned: Socket, endpoint: str) -> None:
     monitor.close(linger=0)
 
 
-def _read(reader: Reader) -> None:
+def _read(reader: Callable[[], bool | None]) -> bool:
     try:
-        reader()
+        return bool(reader())
     except Exception:
         # A reader counts what it can't read; this is a bug of ours, and must not stop the others.
         log.exception("a reader failed")
+        return False
 
 
 class _State:
@@ -253,11 +357,16 @@ def close(owned: Socket, timeout_s: float = 10.0) -> None:
         ending.join(min(timeout_s, LINGER_MS / 1000 + 0.5))
 
 
-def close_soon(owned: Socket) -> None:
-    """Have a socket closed without waiting; the garbage collector may call this in any thread, anywhere."""
+def soon(command: Callable[[IOThread], object]) -> None:
+    """Have a command run without waiting; the garbage collector may call this in any thread, anywhere."""
     current = _state.current
     if current is not None:
-        current.submit(lambda io: io.close(owned), Future())
+        current.submit(command, Future())
+
+
+def close_soon(owned: Socket) -> None:
+    """Have a socket closed without waiting; the garbage collector may call this in any thread, anywhere."""
+    soon(lambda io: io.close(owned))
 
 
 def _close_at_exit() -> None:

@@ -10,7 +10,8 @@ from types import TracebackType
 from typing import Any, Self
 
 from epypes.transport.addresses import check_bind
-from epypes.transport.bridge import Bridge, Counts, TakeQueue
+from epypes.transport.outlet import Counts, Outlet
+from epypes.transport.takers import Taker, TakeQueue, taker
 from epypes.wire import Limits, topic_frame
 
 HIGH_WATER_MARK = 1_000
@@ -72,14 +73,15 @@ class ZMQPublisher:
         self._high_water_mark = high_water_mark
         self._counts = Counts()
         self._lock = threading.Lock()
-        self._bridge: Bridge | None = None
+        self._outlet: Outlet | None = None
+        self._taker: Taker | None = None
         self._finalizer: weakref.finalize[Any, Any] | None = None
 
     @property
     def address(self) -> str:
         """The endpoint that is bound, once it is started; before that, the address that was given."""
-        bridge = self._bridge
-        return self._given if bridge is None else bridge.address
+        outlet = self._outlet
+        return self._given if outlet is None else outlet.address
 
     @property
     def sent(self) -> int:
@@ -102,15 +104,13 @@ class ZMQPublisher:
             If another thread's stop takes too long.
         """
         with self._lock:
-            if self._bridge is not None and not self._bridge.finish_if_stopping():
+            if self._taker is not None and not _is_over(self._taker):
                 return self
-            self._bridge = bridge = Bridge(self._queue, self._topic, self._limits, self._counts)
-            try:
-                bridge.start(self._given, self._bind, self._high_water_mark)
-            except BaseException:
-                self._bridge = None
-                raise
-            self._finalizer = weakref.finalize(self, _abandon, bridge, self._given)
+            outlet = Outlet(self._topic, self._limits, self._counts)
+            outlet.open(self._given, self._bind, self._high_water_mark)
+            self._outlet = outlet
+            self._taker = taker(self._queue, outlet)
+            self._finalizer = weakref.finalize(self, _abandon, self._taker, self._given)
         return self
 
     def stop(self, timeout_s: float = 5.0) -> None:
@@ -128,20 +128,20 @@ class ZMQPublisher:
         StillRunning
             If the queue's ``get`` does not return in time. The socket is closed all the same.
         """
-        bridge = self._bridge
-        if bridge is None:
+        running = self._taker
+        if running is None:
             return
         if self._finalizer is not None:
             self._finalizer.detach()
-        bridge.stop(timeout_s)
+        running.stop(timeout_s)
         with self._lock:
-            if self._bridge is bridge and not bridge.is_alive():
-                self._bridge = None
+            if self._taker is running and not running.is_alive():
+                self._taker = self._outlet = None
 
     def wait_for_subscriber(self, timeout_s: float = 5.0) -> bool:
         """Return whether a subscriber, of any topic, is there within ``timeout_s`` seconds."""
-        bridge = self._bridge
-        return bridge is not None and bridge.doorkeeper.wait(timeout_s)
+        outlet = self._outlet
+        return outlet is not None and outlet.doorkeeper.wait(timeout_s)
 
     def __enter__(self) -> Self:
         return self.start()
@@ -152,14 +152,22 @@ class ZMQPublisher:
         self.stop()
 
     def __repr__(self) -> str:
-        state = "stopped" if self._bridge is None else "running"
+        state = "stopped" if self._taker is None else "running"
         return f"<ZMQPublisher {self.address[:40]} {state}: {self.sent} sent>"
 
 
-def _abandon(bridge: Bridge, address: str) -> None:
+def _is_over(running: Taker) -> bool:
+    """Return whether a taker has ended, after waiting for it if it is about to."""
+    if running.is_alive() and not running.stopping:
+        return False
+    running.stop(5.0)
+    return True
+
+
+def _abandon(running: Taker, address: str) -> None:
     # By the garbage collector or at exit: so no waiting, no locks.
-    if bridge.is_alive():
-        bridge.stopping = True
+    if running.is_alive():
+        running.abandon()
         warnings.warn(
             f"ZMQPublisher {address} was left running. Call stop(), or use with.", ResourceWarning, stacklevel=2
         )

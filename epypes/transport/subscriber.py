@@ -28,6 +28,7 @@ _BATCH = 100
 # Sources whose sequence numbers are followed; a peer that invents sources must not fill the memory.
 _MAX_SOURCES = 1_024
 HIGH_WATER_MARK = 1_000
+_DONTWAIT = int(zmq.DONTWAIT)
 
 Source = tuple[str, int]
 
@@ -285,17 +286,21 @@ class _Opened:
         """Return whether this is a forked child, where there is neither thread nor socket."""
         return self._process != os.getpid()
 
-    def _read(self) -> None:
+    def _read(self) -> bool:
         socket = self._socket
         for _ in range(_BATCH):
             # The queue's put may have stopped this subscriber.
-            if socket is None or socket.closed:
-                return
-            try:
-                frames = socket.recv_multipart(zmq.DONTWAIT, copy=False)
-            except zmq.Again:
-                return
-            self._inbox.accept(frames, self.guest)
+            if socket is None or socket.closed or not io.has_arrived(socket):
+                return False
+            self._inbox.accept(_received(socket), self.guest)
+        return True
+
+
+def _received(socket: io.Socket) -> list[zmq.Frame]:
+    frames = [socket.recv(_DONTWAIT, copy=False)]
+    while frames[-1].more:
+        frames.append(socket.recv(_DONTWAIT, copy=False))
+    return frames
 
 
 def _abandon(opened: _Opened, address: str) -> None:

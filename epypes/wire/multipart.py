@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from epypes.errors import MessageError
 from epypes.wire.codecs import Payload, Reader, to_value
@@ -25,8 +25,19 @@ _PLAIN_FIELDS = (
     "bundle_digest",
 )
 _MAX_TOPIC_BYTES = 1024
+# What encode writes, and the greatest that decode reads. Fields may be added without raising it, since old receivers
+# pass over them; it rises when what is there already changes its meaning.
+VERSION = 1
 # What protobuf and numpy raise for values that they can't take; anything else is a bug of ours and must show.
 _REFUSALS = (ValueError, TypeError, OverflowError, MemoryError, RecursionError)
+
+
+class Stamp(NamedTuple):
+    """What a publisher knows better than who made the envelope; see there."""
+
+    epoch: int
+    sequence: int
+    published_ns: int
 
 
 def encode(
@@ -36,6 +47,7 @@ def encode(
     *,
     rgb: Collection[str] = (),
     limits: Limits = DEFAULT_LIMITS,
+    stamp: Stamp | None = None,
 ) -> list[bytes | memoryview]:
     """Return the frames of an envelope: topic, header, payloads.
 
@@ -51,6 +63,8 @@ def encode(
         Names of parts in RGB order, beside those that the envelope names itself.
     limits
         What the receiver will accept.
+    stamp
+        Epoch, sequence number and time of publishing, in place of the envelope's own.
 
     Returns
     -------
@@ -87,6 +101,8 @@ def encode(
     first = topic_frame(topic)
     try:
         _write_plain(header, envelope)
+        if stamp is not None:
+            header.epoch, header.sequence, header.published_ns = stamp
         add_values(header.parts, envelope.parts, "parts")
         add_values(header.attributes, envelope.attributes, "attributes")
         head: bytes = header.SerializeToString()
@@ -117,6 +133,7 @@ def topic_frame(topic: str) -> bytes:
 
 
 def _write_plain(header: Any, envelope: Envelope) -> None:
+    header.version = VERSION
     for name in _PLAIN_FIELDS:
         setattr(header, name, getattr(envelope, name))
     for function, duration_ns in envelope.timings.items():
@@ -158,6 +175,7 @@ def decode(frames: Sequence[bytes | bytearray | memoryview], limits: Limits = DE
     _check_sizes(views, limits)
     _check_topic(views[0])
     header = _parse(views[1])
+    _check_version(header.version)
     reader = Reader(views[2:], limits)
     rgb: set[str] = set()
 
@@ -223,6 +241,15 @@ def _parse(view: memoryview) -> Any:
         return message_class("epypes.v1.Envelope").FromString(bytes(view))
     except (DecodeError, *_REFUSALS) as error:
         raise MessageError("no envelope", f"The second frame is no Envelope: {error}.") from error
+
+
+def _check_version(version: int) -> None:
+    if version > VERSION:
+        raise MessageError(
+            "unknown version",
+            f"The Envelope is of version {version}, and this EPypes reads version {VERSION}. "
+            "Install a newer EPypes where it is received.",
+        )
 
 
 def _name(entry: Any) -> str:

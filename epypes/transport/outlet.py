@@ -1,0 +1,134 @@
+"""How does an item leave through the socket? Whoever has it sends it, one thread at a time."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import zmq
+
+from epypes.errors import MessageError
+from epypes.transport import io
+from epypes.transport.framing import Frames, Framing
+from epypes.transport.joining import Doorkeeper
+from epypes.wire import Limits
+from epypes.wire.arrays import is_settled
+
+log = logging.getLogger("epypes.transport")
+
+# A subscription is short; whoever sends more to a publisher is no subscriber.
+_MAX_SUBSCRIPTION_BYTES = 64 * 1024
+# Below this a copy takes less time than to keep account of a buffer that is lent.
+_LENT_FROM_BYTES = 64 * 1024
+_DONTWAIT, _MORE = int(zmq.DONTWAIT), int(zmq.DONTWAIT | zmq.SNDMORE)
+
+
+@dataclass(slots=True)
+class Counts:
+    """What a publisher has done since it was made."""
+
+    sent: int = 0
+    rejected: Counter[str] = field(default_factory=Counter)
+
+
+class Outlet:
+    """The socket of a publisher, from a start to its stop.
+
+    The I/O thread reads subscriptions from it, and whoever publishes sends on it; each holds its lock meanwhile.
+    """
+
+    def __init__(self, topic: str, limits: Limits, counts: Counts) -> None:
+        self._framing = Framing(topic, limits)
+        self._counts = counts
+        self._process = os.getpid()
+        # Re-entrant: a signal's handler may publish as well, while its thread is in here.
+        self._lock = threading.RLock()
+        self._socket: io.Socket | None = None
+        self.doorkeeper = Doorkeeper()
+        self.address = ""
+
+    def open(
+        self, address: str, bind: bool, high_water_mark: int, more_options: Sequence[tuple[int, int | bytes]] = ()
+    ) -> None:
+        """Open the socket; raise AddressError if the address is refused."""
+        options = [
+            (zmq.XPUB_MANUAL, 1),
+            (zmq.SNDHWM, high_water_mark),
+            (zmq.MAXMSGSIZE, _MAX_SUBSCRIPTION_BYTES),
+            *more_options,
+        ]
+
+        def open_socket(thread: io.IOThread) -> str:
+            self._socket = opened = thread.open(zmq.XPUB, address, bind, self._read, options, self._lock)
+            self.doorkeeper.attach(opened)
+            return thread.address_of(opened, address)
+
+        self.address = io.call(open_socket, start=True)
+
+    def is_gone(self) -> bool:
+        """Return whether this is a forked child, where there is neither thread nor socket."""
+        return self._process != os.getpid()
+
+    def close(self, timeout_s: float = 10.0) -> None:
+        """Close the socket; what was sent still leaves."""
+        if self._socket is not None and not self.is_gone():
+            io.close(self._socket, timeout_s)
+
+    def close_soon(self) -> None:
+        """Close the socket without waiting, as the garbage collector must."""
+        if self._socket is not None and not self.is_gone():
+            io.close_soon(self._socket)
+
+    def publish(self, item: object) -> None:
+        """Send an item; what can't be sent is counted and logged. Arrays that could be changed are copied first."""
+        try:
+            self._send(self._framing.frames(item))
+        except MessageError as error:
+            self.reject(error.reason, str(error))
+        except zmq.ZMQError as error:
+            self.reject("not sent", f"a message could not be sent: {error}")
+        except Exception as error:
+            # The item's own code, called to make bytes of it, may raise anything.
+            self.reject(type(error).__name__, f"a {type(item).__name__} could not be sent: {error!r}")
+
+    def reject(self, reason: str, text: str, log_once: bool = False) -> None:
+        """Count an item that can't be sent."""
+        self._counts.rejected[reason] += 1
+        if not log_once or self._counts.rejected[reason] == 1:
+            log.warning("%s rejected an item (%s): %s", self.address, reason, text)
+
+    def _send(self, frames: Frames) -> None:
+        with self._lock:
+            socket = self._socket
+            if socket is None:
+                raise zmq.ZMQError(zmq.ENOTSOCK)
+            # Counted before: whoever has received it must find it counted.
+            self._counts.sent += 1
+            try:
+                _send(socket, frames)
+            except zmq.ZMQError:
+                self._counts.sent -= 1
+                raise
+            if io.has_arrived(socket) and self.doorkeeper.read():
+                io.soon(lambda thread: thread.read_again(socket))
+
+    def _read(self) -> bool:
+        with self._lock:
+            return self.doorkeeper.read()
+
+
+def _send(socket: io.Socket, frames: Frames) -> None:
+    last = len(frames) - 1
+    for index, frame in enumerate(frames):
+        socket.send(frame, _DONTWAIT if index == last else _MORE, copy=not _can_be_lent(frame))
+
+
+def _can_be_lent(frame: bytes | memoryview) -> bool:
+    """Return whether ZeroMQ may read a frame later: if it is worth it, and nobody can change it meanwhile."""
+    if len(frame) < _LENT_FROM_BYTES:
+        return False
+    return isinstance(frame, bytes) or is_settled(frame)
