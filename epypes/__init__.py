@@ -11,7 +11,7 @@ The rooms, from the bottom up; imports point downwards only (checked by ``lint-i
 - ``pipeline``: the paper's ladder of nodes and pipelines; ``acquisition``: where images come from;
   ``display``: how a graph, a run and a value look; ``wire``: how a value travels
 - ``bundle``: from notebook to a folder of text; ``transport``: sockets
-- ``service``: a bundle as a running process
+- ``service``: a bundle as a running process; ``experiment``: the paper's own
 - ``cli``: the commands; ``epypes_widgets``: the notebook front end
 
 Names are loaded when they are first used, so ``import epypes`` costs little and imports no other package.
@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from epypes import errors
+    from epypes.acquisition import ImageAcquisition, camera
     from epypes.bundle import load, load_pipeline, promote, to_source, verify
     from epypes.display import Preview, register_preview, reset_display_ranges, show
     from epypes.graph import CompGraph, Placeholder, extend, group, outputs, rename, subgraph, suffix, switch, union
@@ -58,6 +59,8 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "errors": "epypes",
+    "ImageAcquisition": "epypes.acquisition",
+    "camera": "epypes.acquisition",
     "show": "epypes.display",
     "CompGraph": "epypes.graph",
     "Placeholder": "epypes.graph",
@@ -115,6 +118,7 @@ __all__ = [
     "Failure",
     "FullPipeline",
     "Image",
+    "ImageAcquisition",
     "LogNormal",
     "Mailbox",
     "Node",
@@ -135,6 +139,7 @@ __all__ = [
     "TokenManager",
     "ZMQPublisher",
     "ZMQSubscriber",
+    "camera",
     "errors",
     "extend",
     "group",

@@ -17,12 +17,15 @@ Everything an error's text mentions is an attribute of it::
     +-- SourceRefused           a graph can't be written as one function; .reasons
     +-- LayoutUnavailable       no Graphviz engine answers; .tried
     +-- ImageFileError          an image file can't be read or written; .path
+    +-- CameraUnavailable       a camera gives no frame just now; .camera
+    +-- FrameUnavailable        no frame is near enough to a time; .requested_ns, .oldest_ns, .newest_ns
     +-- MessageError            a message can't be made or understood; .reason
     +-- AddressError            an address can't be bound or connected to; .address
     +-- SettingsError           settings of hyperparameters can't be written or read; .path, .reasons
     +-- BundleError             a bundle is not what it says; .path
     |   +-- PromotionRefused    a graph can't become a bundle; .reasons
     |   +-- ReplayDiffers       a bundle computes something else; .report
+    +-- ExperimentError         the paper's experiment can't begin or go on; .name
     +-- ServiceError            a service can't start or can't be called; .path
         +-- RemoteFailure       a function failed in the service; .function, .message
 
@@ -222,6 +225,22 @@ class ImageFileError(EpypesError, OSError):
         super().__init__(text)
 
 
+class CameraUnavailable(EpypesError, OSError):
+    """A camera that gives no frame just now; raised by its ``read``, it means: try again later."""
+
+    def __init__(self, camera: str, text: str) -> None:
+        self.camera = camera
+        super().__init__(text)
+
+
+class FrameUnavailable(EpypesError, LookupError):
+    """No frame is near enough to a time; Unix times in ns, those of frames None if there are none."""
+
+    def __init__(self, requested_ns: int, oldest_ns: int | None, newest_ns: int | None, text: str) -> None:
+        self.requested_ns, self.oldest_ns, self.newest_ns = requested_ns, oldest_ns, newest_ns
+        super().__init__(text)
+
+
 class MessageError(EpypesError, ValueError):
     """A message that can't be made or can't be understood; ``reason`` is a short word to count by."""
 
@@ -269,6 +288,17 @@ class ReplayDiffers(BundleError):
     def __init__(self, path: object, report: ReplayReport) -> None:
         self.report = report
         super().__init__(path, f"{path} does not compute what was recorded:\n{report}")
+
+
+class ExperimentError(EpypesError):
+    """The paper's experiment can't begin or go on; ``name`` is that of the node, the process or the option.
+
+    ``printed`` is what a process that ended had written to its standard error.
+    """
+
+    def __init__(self, name: str, text: str, printed: str = "") -> None:
+        self.name, self.printed = name, printed
+        super().__init__(text)
 
 
 class ServiceError(EpypesError):

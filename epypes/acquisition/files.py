@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from epypes.acquisition.quiet import quiet
 from epypes.errors import ImageFileError
 from epypes.images import swapped
 
@@ -35,11 +36,8 @@ def read_image(path: str | Path, order: Order = "bgr") -> npt.NDArray[np.uint8 |
         text = f"Image {str(path)!r} can't be read: {error.strerror}. Check the path."
         raise ImageFileError(str(path), text) from error
     # Reading the bytes first tells a missing file from a broken one; what OpenCV would print of that is ours to say.
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
+    with quiet():
         image: Any = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-    finally:
-        cv2.utils.logging.setLogLevel(level)
     if image is None:
         text = f"{str(path)!r} is not an image that OpenCV can read. Use PNG, JPEG, TIFF, BMP or WebP."
         raise ImageFileError(str(path), text)

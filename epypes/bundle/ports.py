@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import MessageError
 from epypes.pipeline import EventView
-from epypes.run import Failure
 from epypes.run.guard import is_array
 
 if TYPE_CHECKING:
@@ -15,8 +14,6 @@ if TYPE_CHECKING:
 
 REQUEST: Final = "epypes.request"
 RESULT: Final = "epypes.result"
-FAILURE: Final = "epypes.failure"
-_MESSAGE_CHARACTERS: Final = 2_000
 
 
 def payload_of(inputs: Sequence[str], rgb: Collection[str] = ()) -> Callable[[Any], Mapping[str, Any]]:
@@ -83,11 +80,6 @@ def answer_with(
     return f_out
 
 
-def _sendable(text: str) -> str:
-    """Return text cut to what a report needs, without halves of surrogate pairs, which no message can hold."""
-    return text[:_MESSAGE_CHARACTERS].encode("utf-8", "replace").decode("utf-8")
-
-
 def detached(value: Any) -> Any:
     """Return a value whose arrays, also in tuples, lists and dicts, are copies."""
     if is_array(value):
@@ -97,26 +89,3 @@ def detached(value: Any) -> Any:
     if type(value) is dict:
         return {key: detached(item) for key, item in value.items()}
     return value
-
-
-def failure_event(failure: Failure, source: str, bundle_digest: str) -> Envelope:
-    """Return the Envelope that reports a failure."""
-    from epypes.wire import Envelope, FailureRecord
-
-    notes = getattr(failure.exception, "__notes__", None)
-    said = [failure.message, *(notes if isinstance(notes, list) else ())]
-    record = FailureRecord(
-        function=_sendable(failure.function),
-        tokens=tuple(map(_sendable, failure.tokens)),
-        exception=_sendable(type(failure.exception).__name__),
-        message=_sendable(" | ".join(text for text in said if isinstance(text, str))),
-        input_id=failure.event_id,
-        attempt=1,
-    )
-    return Envelope(
-        type=FAILURE,
-        source=source,
-        correlation_id=failure.event_id,
-        bundle_digest=bundle_digest,
-        failure=record,
-    )

@@ -6,6 +6,7 @@ import typer
 
 from epypes.cli.call import call
 from epypes.cli.demo import demo
+from epypes.cli.experiment import experiment
 from epypes.cli.lab import lab
 from epypes.cli.promote import promote
 from epypes.cli.serve import serve
@@ -19,5 +20,5 @@ app = typer.Typer(
     # A traceback's locals would print whole images.
     pretty_exceptions_enable=False,
 )
-for command in (promote, verify, serve, call, demo, lab):
+for command in (promote, verify, serve, call, experiment, demo, lab):
     app.command()(command)

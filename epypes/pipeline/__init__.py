@@ -7,6 +7,7 @@ from epypes.pipeline.node import Node
 from epypes.pipeline.pipeline import Pipeline
 from epypes.pipeline.reactive import FullPipeline, SinkPipeline, SourcePipeline
 from epypes.pipeline.stages import Stage, Stages
+from epypes.pipeline.stamps import Stamps
 from epypes.pipeline.view import EventView
 
 __all__ = [
@@ -21,4 +22,5 @@ __all__ = [
     "SourcePipeline",
     "Stage",
     "Stages",
+    "Stamps",
 ]

@@ -7,21 +7,26 @@ a FullPipeline does both.
 from __future__ import annotations
 
 import logging
+from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, Self
+from typing import Any, Final, Self
 
 from epypes.errors import EpypesError
 from epypes.graph import CompGraph
 from epypes.pipeline.loop import EventLoop
 from epypes.pipeline.pipeline import Pipeline
 from epypes.pipeline.stages import Stage, Stages, function_stage, loop_stage, queue_stage
+from epypes.pipeline.stamps import Stamps
 from epypes.pipeline.view import EventView
 from epypes.run import Failure, Run
 from epypes.run.underway import locals_under_way
 
 FIn = Callable[[Any], Mapping[str, Any]]
 FOut = Callable[[EventView], Any]
+
+# Ids of events that failed, for the count of attempts: some for every event that may be sent again.
+_MOST_REMEMBERED: Final = 1_000
 
 _log = logging.getLogger("epypes.pipeline")
 
@@ -52,9 +57,14 @@ class SourcePipeline(Pipeline):
 
     def run(self, /, **payload: Any) -> Run:
         """Run the graph on a payload and put the result on q_out."""
+        stamps = Stamps()
         run = super().run(**payload)
-        _emit(self, self.f_out, self.q_out, None, run)
+        _emit(self, None, run, stamps)
         return run
+
+    def put(self, answer: Any, view: EventView) -> None:
+        """Put an answer on q_out, when f_out has made it of the view; the hook for subclasses."""
+        self.q_out.put(answer)
 
     @property
     def stages(self) -> Stages:
@@ -99,12 +109,15 @@ class SinkPipeline(Pipeline):
         self.failed = 0
         self.working_on: Any = None
         self._stage = ""
+        self._stamps = Stamps()
+        self._attempts: OrderedDict[str, int] = OrderedDict()
         # Where the last event that failed did so, what was raised, and how many had been worked on.
         self._failed_last = ("", "", 0)
         self.loop = EventLoop(q_in, self.handle, lambda event: {"event": event}, name=name, busy=self._busy)
 
     def handle(self, event: Any) -> None:
         """Work on one event; every failure is reported, none is raised. The hook for subclasses."""
+        self._stamps = Stamps()
         self.working_on = event
         self._work_on(event)
         self.working_on = None
@@ -148,7 +161,10 @@ class SinkPipeline(Pipeline):
         """Do something with an event's run; a SinkPipeline does nothing. The hook for subclasses."""
 
     def _payload(self, event: Any) -> Mapping[str, Any]:
+        stamps = self._stamps
+        stamps.f_in_start_ns = stamps.now_ns()
         payload = self.f_in(event)
+        stamps.f_in_end_ns = stamps.now_ns()
         if not isinstance(payload, Mapping):
             text = f"f_in of {self.name!r} must return a mapping by free source token, not {type(payload).__name__}."
             raise TypeError(text)
@@ -165,7 +181,8 @@ class SinkPipeline(Pipeline):
         self.failed += 1
         # The text alone: the exception would keep the event and all its tokens.
         self._failed_last = failure.function, f"{type(failure.exception).__name__}: {failure.message}", self.run_count
-        failure = replace(failure, event_id=_event_id(event))
+        event_id = _event_id(event)
+        failure = replace(failure, event_id=event_id, attempt=self._attempt(event_id), source=self.name)
         if self.on_error is None:
             expected = isinstance(failure.exception, EpypesError)
             _log.error(
@@ -179,6 +196,15 @@ class SinkPipeline(Pipeline):
             self.on_error(failure)
         except BaseException:
             _log.exception("%s: on_error itself failed", self.name)
+
+    def _attempt(self, event_id: str) -> int:
+        """Return which try of an event this was that failed, as far as that is remembered."""
+        if not event_id:
+            return 1
+        self._attempts[event_id] = attempt = self._attempts.pop(event_id, 0) + 1
+        if len(self._attempts) > _MOST_REMEMBERED:
+            self._attempts.popitem(last=False)
+        return attempt
 
     def listen(self) -> None:
         """Start the event loop; does nothing while it runs."""
@@ -252,7 +278,11 @@ class FullPipeline(SinkPipeline):
 
     def emit(self, event: Any, run: Run) -> None:
         """Put what f_out makes of the event's run on q_out."""
-        _emit(self, self.f_out, self.q_out, event, run)
+        _emit(self, event, run, self._stamps)
+
+    def put(self, answer: Any, view: EventView) -> None:
+        """Put an answer on q_out, when f_out has made it of the view; the hook for subclasses."""
+        self.q_out.put(answer)
 
     @property
     def stages(self) -> Stages:
@@ -270,10 +300,12 @@ def _event_id(event: Any) -> str:
     return event_id if isinstance(event_id, str) else ""
 
 
-def _emit(pipeline: Pipeline, f_out: FOut, q_out: Any, event: Any, run: Run) -> None:
-    view = EventView(pipeline.name, event, run, pipeline.attributes)
-    answer = f_out(view)
-    q_out.put(answer)
+def _emit(pipeline: SourcePipeline | FullPipeline, event: Any, run: Run, stamps: Stamps) -> None:
+    view = EventView(pipeline.name, event, run, pipeline.attributes, stamps)
+    stamps.f_out_start_ns = stamps.now_ns()
+    answer = pipeline.f_out(view)
+    stamps.f_out_end_ns = stamps.now_ns()
+    pipeline.put(answer, view)
 
 
 def _stages_after(pipeline: Pipeline, f_out: FOut, q_out: Any, failure: str) -> tuple[Stage, Stage]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from epypes.pipeline.stamps import Stamps
 from epypes.run import Run, RunReport
 
 
@@ -21,10 +22,12 @@ class EventView(Mapping[str, Any]):
         The event's run.
     attributes
         A copy of the pipeline's attributes, this event's own.
+    stamps
+        When the event was taken, and when f_in and f_out worked on it.
     """
 
-    def __init__(self, name: str, event: Any, run: Run, attributes: Mapping[str, Any]) -> None:
-        self.name, self.event, self.run = name, event, run
+    def __init__(self, name: str, event: Any, run: Run, attributes: Mapping[str, Any], stamps: Stamps) -> None:
+        self.name, self.event, self.run, self.stamps = name, event, run, stamps
         self.attributes = dict(attributes)
 
     @property

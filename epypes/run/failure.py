@@ -33,6 +33,10 @@ class Failure:
         What it raised, unchanged.
     event_id
         The id of the event that was being worked on, if it has one.
+    attempt
+        Which try of the event with that id this was, from 1, as far as failures are remembered.
+    source
+        Name of the pipeline that worked on it; empty if it was none that answers events.
     """
 
     function: str
@@ -40,6 +44,8 @@ class Failure:
     inputs: Mapping[str, Any] = field(repr=False)
     exception: BaseException
     event_id: str = ""
+    attempt: int = 1
+    source: str = ""
 
     @property
     def message(self) -> str:

@@ -17,13 +17,13 @@ from types import FrameType
 from typing import Any, Self
 
 from epypes.bundle.load import pipeline_of, read_bundle
-from epypes.bundle.ports import failure_event
 from epypes.bundle.replay import replay
 from epypes.errors import MessageError, ReplayDiffers, StillRunning
 from epypes.pipeline import Mailbox
 from epypes.run import Failure
 from epypes.service.state import ServiceState, StateLock
 from epypes.transport import ZMQPublisher, ZMQSubscriber
+from epypes.wire.failures import failure_event
 
 # How many events wait while one is computed; the oldest is dropped, and counted, when another comes.
 MAILBOX_SIZE = 8

@@ -9,8 +9,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from epypes.wire.attribute_list import add_attribute, attributes, serialized
+    from epypes.wire.attribute_list import add_attribute, attributes, parsed, serialized
     from epypes.wire.envelope import Envelope, FailureRecord
+    from epypes.wire.failures import failure_event
     from epypes.wire.limits import Limits
     from epypes.wire.messages2019 import (
         Attribute,
@@ -41,7 +42,9 @@ __all__ = [
     "attributes",
     "decode",
     "encode",
+    "failure_event",
     "load_sample",
+    "parsed",
     "save_sample",
     "serialized",
     "topic_frame",
@@ -55,7 +58,9 @@ _HOME = {
     "attributes": "attribute_list",
     "decode": "multipart",
     "encode": "multipart",
+    "failure_event": "failures",
     "load_sample": "samples",
+    "parsed": "attribute_list",
     "save_sample": "samples",
     "serialized": "attribute_list",
     "topic_frame": "multipart",

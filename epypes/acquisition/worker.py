@@ -1,0 +1,184 @@
+"""What does one camera's thread do?"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from epypes.acquisition.frames import Frame, take_image
+from epypes.acquisition.pace import Camera
+from epypes.acquisition.ring import Ring
+from epypes.errors import CameraUnavailable
+
+State = Literal["stopped", "running", "ended", "failed"]
+
+# A camera that gives nothing is asked again after 10, 20, 40 ms ..., at last every second.
+_FIRST_RETRY_S: Final = 0.01
+_LAST_RETRY_S: Final = 1.0
+# One frame that is missed is nothing to talk about; this many in a row are.
+_MISSES_REPORTED: Final = 5
+# close() may come in the moment before a read begins, which opens the camera again; so it is repeated.
+_CLOSE_AGAIN_S: Final = 0.05
+
+_log = logging.getLogger("epypes.acquisition")
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """What has happened with one camera since it was given to an ImageAcquisition.
+
+    Attributes
+    ----------
+    frames
+        Frames that came.
+    missed
+        Reads that gave no frame, and were tried again.
+    failed
+        How often it ended with an exception.
+    """
+
+    frames: int
+    missed: int
+    failed: int
+
+
+class Worker:
+    """One camera, its ring, and the thread that never waits for anybody but the camera.
+
+    Parameters
+    ----------
+    index
+        Of the camera.
+    camera
+        Is read on the thread.
+    size
+        Of the ring.
+    on_error
+        Called on the thread with the index and the exception.
+    on_change
+        Called on the thread with the first frame and at the end.
+    """
+
+    def __init__(
+        self,
+        index: int,
+        camera: Camera,
+        size: int,
+        on_error: Callable[[int, BaseException], object] | None,
+        on_change: Callable[[], None],
+    ) -> None:
+        self.index, self.camera, self.name = index, camera, f"camera {index}"
+        self.ring = Ring(size, name=f"Camera {index}")
+        self.state: State = "stopped"
+        self.has_frame = False
+        self._on_error, self._on_change = on_error, on_change
+        self._frames = self._missed = self._failed = self._missed_in_a_row = 0
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @property
+    def counts(self) -> Counts:
+        """What has happened so far."""
+        return Counts(self._frames, self._missed, self._failed)
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the thread has not ended."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def start(self) -> None:
+        """Start the thread, of which there must be none."""
+        self._stop = threading.Event()
+        self.has_frame, self.state = False, "running"
+        self._thread = threading.Thread(target=self._run, args=(self._stop,), name=f"epypes {self.name}", daemon=True)
+        self._thread.start()
+
+    def ask_to_stop(self) -> None:
+        """Tell the thread to end after the read under way."""
+        self._stop.set()
+
+    def end_read(self, deadline_s: float) -> None:
+        """Close the camera until the thread has ended, on a thread of its own: close() might wait for a lock."""
+        if self.is_alive and self._thread is not threading.current_thread():
+            threading.Thread(
+                target=self._close_again, args=(self._thread, deadline_s), name=f"epypes close {self.name}", daemon=True
+            ).start()
+
+    def join(self, deadline_s: float) -> bool:
+        """Wait for the thread; return whether it has ended. On the thread itself, True."""
+        thread = self._thread
+        if thread is None or thread is threading.current_thread():
+            return True
+        thread.join(max(0.0, deadline_s - time.monotonic()))
+        return not thread.is_alive()
+
+    def _close_again(self, thread: threading.Thread, deadline_s: float) -> None:
+        while thread.is_alive() and time.monotonic() < deadline_s:
+            self._close()
+            thread.join(_CLOSE_AGAIN_S)
+
+    def _run(self, stop: threading.Event) -> None:
+        state: State = "stopped"
+        try:
+            if not self._capture_until(stop):
+                state = "ended"
+        except BaseException as exception:  # a generator's SystemExit must not end the thread in silence
+            # A read that was ended by close() may raise anything, and that is nobody's fault.
+            if not stop.is_set():
+                state = "failed"
+                self._failed += 1
+                self._report(exception)
+        self._close()
+        self.state = "stopped" if stop.is_set() else state
+        self._on_change()
+
+    def _capture_until(self, stop: threading.Event) -> bool:
+        """Read frames until told to stop; return False if the camera has no more."""
+        while not stop.is_set():
+            try:
+                given = [self.camera.read()]
+            except CameraUnavailable as error:
+                stop.wait(self._miss(error))
+                continue
+            captured_ns = time.time_ns()
+            if given[0] is None:
+                return stop.is_set()
+            self._keep(given, captured_ns)
+        return True
+
+    def _keep(self, given: list[object], captured_ns: int) -> None:
+        self._missed_in_a_row = 0
+        # The number is taken first: whoever has a frame must find it counted.
+        frame = Frame(take_image(given), captured_ns, self._frames + 1)
+        self._frames += 1
+        self.ring.append(frame)
+        if not self.has_frame:
+            self.has_frame = True
+            self._on_change()
+
+    def _miss(self, error: CameraUnavailable) -> float:
+        """Count a read that gave no frame; return after how many seconds to try again."""
+        self._missed += 1
+        self._missed_in_a_row += 1
+        if self._missed_in_a_row == _MISSES_REPORTED:
+            self._report(error)
+        return float(min(_LAST_RETRY_S, _FIRST_RETRY_S * 2 ** min(self._missed_in_a_row - 1, 10)))
+
+    def _close(self) -> None:
+        try:
+            self.camera.close()
+        except BaseException as exception:
+            self._report(exception)
+
+    def _report(self, exception: BaseException) -> None:
+        if self._on_error is None:
+            _log.error("%s: %s", self.name, exception, exc_info=exception)
+            return
+        try:
+            self._on_error(self.index, exception)
+        except BaseException:
+            _log.exception("%s: on_error itself failed", self.name)

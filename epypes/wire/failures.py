@@ -1,0 +1,46 @@
+"""How does a failure travel, so that others hear of it?"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from epypes.run import Failure
+from epypes.wire.envelope import Envelope, FailureRecord
+
+FAILURE: Final = "epypes.failure"
+_MESSAGE_CHARACTERS: Final = 2_000
+
+
+def failure_event(failure: Failure, source: str = "", bundle_digest: str = "") -> Envelope:
+    """Return the Envelope that reports a failure; it answers the event that failed, by its id.
+
+    Parameters
+    ----------
+    source
+        Who reports it; the failure's own source without.
+    bundle_digest
+        Digest of the bundle that was run, if it was one.
+    """
+    notes = getattr(failure.exception, "__notes__", None)
+    said = [failure.message, *(notes if isinstance(notes, list) else ())]
+    input_id = _sendable(failure.event_id)
+    record = FailureRecord(
+        function=_sendable(failure.function),
+        tokens=tuple(map(_sendable, failure.tokens)),
+        exception=_sendable(type(failure.exception).__name__),
+        message=_sendable(" | ".join(text for text in said if isinstance(text, str))),
+        input_id=input_id,
+        attempt=failure.attempt,
+    )
+    return Envelope(
+        type=FAILURE,
+        source=_sendable(source or failure.source),
+        correlation_id=input_id,
+        bundle_digest=bundle_digest,
+        failure=record,
+    )
+
+
+def _sendable(text: str) -> str:
+    """Return text cut to what a report needs, without halves of surrogate pairs, which no message can hold."""
+    return text[:_MESSAGE_CHARACTERS].encode("utf-8", "replace").decode("utf-8")
