@@ -1,0 +1,212 @@
+"""How are the times of the paper's experiment drawn as its Figures 14, 15 and 16?
+
+Semeniuta and Falkman 2019, PeerJ Computer Science 5:e176.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from epypes.experiment.drawing import BLUE, GREEN, INK, ORANGE, RED, blank, finished, in_style, told
+from epypes.experiment.fits import PAPER, LogNormal, answered, lognormal_fit
+from epypes.wording import counted
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+
+_MS, _US = 1e3, 1e6
+_SHOWN_REQUESTS: Final = 100
+_PARTS: Final = {
+    "acquisition.t_rp": ("acquisition", BLUE),
+    "vision.t_rp": ("vision", ORANGE),
+    "o_network": ("network", GREEN),
+}
+# Of a curve, by as many sigmas from mu as there is something to see: a narrow peak on a wide axis has them all.
+_POINTS: Final = 160
+_SIGMAS: Final = 5.0
+# What is beside the outermost mark, as a factor.
+_MARGIN: Final = 1.5
+# On more decades there is no room for numbers at 2 and 5.
+_FEW_DECADES: Final = 3.0
+
+
+@in_style()
+def figure_14(table: pd.DataFrame) -> Figure:
+    """Draw 100 requests as stacked bars: what acquisition, vision and the network took of each trip.
+
+    Parameters
+    ----------
+    table
+        A row per request, as ``Results.table``. The first 100 rows are drawn; ``table[table.experiment == 2]`` chooses
+        others.
+
+    Returns
+    -------
+    Figure
+        It has three containers of bars, in milliseconds. A request that failed is a cross without a bar.
+
+    Raises
+    ------
+    ValueError
+        It is no table of an experiment.
+    """
+    has_times = answered(table, *_PARTS)[:_SHOWN_REQUESTS]
+    figure, axes = blank("Figure 14: where the time of each request goes")
+    if not has_times.any():
+        return told(figure, axes, _why_nothing(has_times))
+    shown = table[:_SHOWN_REQUESTS]
+    negative = _stack(axes, np.flatnonzero(has_times), shown[has_times])
+    failed = np.flatnonzero(~has_times)
+    if len(failed):
+        axes.plot(failed, np.zeros(len(failed)), "x", color=INK, label="failed", clip_on=False, zorder=3)
+    axes.set(xlabel="request", ylabel="time, ms", xlim=(-1, len(shown)))
+    return finished(
+        figure,
+        axes,
+        _of_experiments(len(shown), "request", shown["experiment"].nunique()),
+        f"{counted(negative, 'negative time')} not drawn" * bool(negative),
+        _failures(has_times),
+        columns=4,
+    )
+
+
+@in_style()
+def figure_15(table: pd.DataFrame, *, side_by_side: bool = False) -> Figure:
+    """Draw how the graph overhead of the vision component is distributed, beside the paper's.
+
+    Parameters
+    ----------
+    table
+        A row per request, as ``Results.table``.
+    side_by_side
+        Whether functions ran side by side; graph overhead is then wall time less the critical path, and labelled so.
+
+    Returns
+    -------
+    Figure
+        Log-normal densities on a logarithmic axis of microseconds: a shape per experiment and a curve over all, a thin
+        line at its mode, thick lines at the measured range, and a dashed line at the mode in the paper. Values that
+        aren't positive are counted in the text, not fitted.
+
+    Raises
+    ------
+    ValueError
+        It is no table of an experiment.
+    """
+    less = "the critical path" if side_by_side else "the times of its functions"
+    return _densities(table, "vision.o_cg", "Figure 15: graph overhead", f"o_cg: pipeline time less {less}, µs")
+
+
+@in_style()
+def figure_16(table: pd.DataFrame) -> Figure:
+    """Draw how the overhead of the vision component's reactive pipeline is distributed, beside the paper's.
+
+    Parameters, what is returned and what is raised are those of ``figure_15``.
+    """
+    meaning = "o_epypes: from reaction to publishing, less the times of f_in, pipeline and f_out, µs"
+    return _densities(table, "vision.o_epypes", "Figure 16: overhead of the reactive pipeline", meaning)
+
+
+def _stack(axes: Axes, places: np.ndarray, rows: pd.DataFrame) -> int:
+    """Draw a stack of bars per request; return how many times were negative, which no bar can show."""
+    bottom, negative = np.zeros(len(rows)), 0
+    for column, (name, colour) in _PARTS.items():
+        times = rows[column].to_numpy(dtype=float)
+        heights = np.fmax(times, 0) * _MS
+        axes.bar(places, heights, width=0.84, bottom=bottom, color=colour, label=name)
+        bottom = bottom + heights
+        negative += int(np.sum(times < 0))
+    return negative
+
+
+def _densities(table: pd.DataFrame, column: str, title: str, meaning: str) -> Figure:
+    has_times = answered(table, column)
+    figure, axes = blank(title)
+    if not has_times.any():
+        return told(figure, axes, _why_nothing(has_times))
+    rows = table[has_times]
+    whole = lognormal_fit(rows[column])
+    if not whole.count:
+        return told(figure, axes, f"Of {counted(len(rows), 'value')} none is positive, so there is nothing to fit.")
+    experiments = [lognormal_fit(values) for _, values in rows.groupby("experiment")[column]]
+    _axis(axes, rows.loc[rows[column] > 0, column], whole, PAPER[column])
+    axes.set_xlabel(meaning)
+    _curves(axes, whole, experiments)
+    return finished(
+        figure,
+        axes,
+        _of_experiments(whole.count, "value", len(experiments)),
+        f"{counted(whole.left_out, 'value')} not positive, left out" * bool(whole.left_out),
+        _without_curve(whole, experiments),
+        _failures(has_times),
+    )
+
+
+def _axis(axes: Axes, times: pd.Series[float], whole: LogNormal, paper: float) -> None:
+    """Draw what stands on the axis: the measured range, the mode of all data, and the paper's."""
+    least, most, mode, paper = (_US * time for time in (times.min(), times.max(), whole.mode, paper))
+    measured = f"measured: {_number(least)} to {_number(most)} µs" if least < most else f"measured: {_number(least)} µs"
+    for time, label in ((least, measured), (most, None)):
+        axes.axvline(time, color=INK, linewidth=3, label=label, ymax=0.25)
+    axes.axvline(mode, color=INK, linewidth=0.9, label=f"mode: {_number(mode)} µs")
+    axes.axvline(paper, color=RED, linewidth=1.6, linestyle=(0, (4, 2)), label=f"the paper's mode: {_number(paper)} µs")
+    low, high = min(least, mode, paper) / _MARGIN, max(most, mode, paper) * _MARGIN
+    axes.set_xscale("log")
+    axes.set_xlim(low, high)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if np.log10(high / low) < _FEW_DECADES else (1,)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda time, _: _number(time)))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _curves(axes: Axes, whole: LogNormal, experiments: list[LogNormal]) -> None:
+    if not whole.has_curve:
+        axes.yaxis.set_visible(False)
+        return
+    low, high = axes.get_xlim()
+    label = "each experiment"
+    for fitted in experiments:
+        if fitted.has_curve:
+            axes.fill_between(*_density(fitted, low, high), color=BLUE, alpha=0.2, linewidth=0, label=label)
+            label = ""
+    axes.plot(*_density(whole, low, high), color=BLUE, linewidth=2.8, label="all data")
+    axes.set_ylabel("probability density, per µs")
+    axes.set_ylim(bottom=0)
+
+
+def _density(fitted: LogNormal, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return microseconds, and how dense a distribution is there, per microsecond."""
+    times = np.exp(fitted.mu + fitted.sigma * np.linspace(-_SIGMAS, _SIGMAS, _POINTS)) * _US
+    times = np.array([low, *times[(times > low) & (times < high)], high])
+    return times, fitted.pdf(times / _US) / _US
+
+
+def _why_nothing(has_times: np.ndarray) -> str:
+    requests = len(has_times)
+    if not requests:
+        return "There is no request."
+    return "The only request failed." if requests == 1 else f"All {requests} requests failed."
+
+
+def _of_experiments(count: int, noun: str, experiments: int) -> str:
+    return f"{count:,} {noun}{'s' * (count != 1)} of {counted(experiments, 'experiment')}"
+
+
+def _failures(has_times: np.ndarray) -> str:
+    failed = int(np.sum(~has_times))
+    return f"{counted(failed, 'request')} failed" * bool(failed)
+
+
+def _without_curve(whole: LogNormal, experiments: list[LogNormal]) -> str:
+    if not whole.has_curve:
+        return "no curve, since there are no values that differ"
+    flat = sum(not fitted.has_curve for fitted in experiments)
+    return f"{counted(flat, 'experiment')} without a curve" * bool(flat)
+
+
+def _number(time: float) -> str:
+    return f"{time:,.0f}" if time >= 100 else f"{time:.3g}"
