@@ -52,13 +52,11 @@ def play(
 
 
 def _print_info(file: Path, found: RecordingInfo) -> None:
-    about = found.about
-    source = f" from {about['address']}" if "address" in about else ""
-    begun = f", begun {datetime.fromtimestamp(found.first_ns / 1e9).astimezone():%Y-%m-%d %H:%M:%S %z}"
-    out.print(
-        f"{file}: {counted(found.messages, 'message')}{source} in {found.duration_s:.3f} s{begun if found.messages else ''}",
-        markup=False,
-    )
+    source = f" from {found.about['address']}" if "address" in found.about else ""
+    out.print(f"{file}: {counted(found.messages, 'message')}{source} in {found.duration_s:.3f} s", markup=False)
+    if found.messages:
+        begun = datetime.fromtimestamp(found.first_ns / 1e9).astimezone()
+        out.print(f"first message on {begun:%Y-%m-%d at %H:%M:%S %z}", markup=False)
     out.print(str(found.counts or "The recorder did not finish it: what it had not written is missing."), markup=False)
     for topic, count in sorted(found.topics.items()):
         out.print(f"  {topic or '(no topic)'}: {counted(count, 'message')}", markup=False)

@@ -6,7 +6,7 @@ import threading
 import time
 import weakref
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -80,22 +80,23 @@ class Recorder:
     ) -> None:
         self.path = Path(path)
 
-        def make() -> _Recording:
-            backlog = _Backlog(messages, backlog_bytes)
-            subscriber = ZMQSubscriber(address, backlog, topic, bind, undecoded=True, **options)
-            return _Recording(self.path, backlog, subscriber, force, on_end)
+        about = {"address": address, "topic": topic}
 
-        # One is made at once, since a bad address is the caller's of the constructor.
+        def make() -> tuple[ZMQSubscriber, _Recording]:
+            recording = _Recording(self.path, about, force, _Backlog(messages, backlog_bytes), on_end)
+            return ZMQSubscriber(address, recording.backlog, topic, bind, undecoded=True, **options), recording
+
         self._make = make
-        self._recording = make()
-        self._about = {"address": address, "topic": topic}
+        # At once, so that the constructor refuses what makes no sense. They are two, so that the recorder's thread does
+        # not keep the socket of a recorder that was forgotten.
+        self._subscriber, self._recording = make()
         self._lock = threading.Lock()
         self._finalizer: weakref.finalize[Any, Any] | None = None
 
     @property
     def address(self) -> str:
         """The endpoint that is bound, once it is started; otherwise the address that was given."""
-        return self._recording.subscriber.address
+        return self._subscriber.address
 
     @property
     def counts(self) -> Counts:
@@ -116,8 +117,14 @@ class Recorder:
             if self._recording.is_running():
                 return self
             if self._recording.was_started():
-                self._recording = self._make()
-            self._recording.start(self._about)
+                self._subscriber, self._recording = self._make()
+            # First the socket: an address that is refused must not cost the file that is to be replaced.
+            self._subscriber.start()
+            try:
+                self._recording.start()
+            except BaseException:
+                self._subscriber.stop()
+                raise
             self._finalizer = weakref.finalize(self, self._recording.backlog.close)
         return self
 
@@ -139,7 +146,8 @@ class Recorder:
         with self._lock:
             if self._finalizer is not None:
                 self._finalizer.detach()
-            recording = self._recording
+            subscriber, recording = self._subscriber, self._recording
+        subscriber.stop(timeout_s)
         recording.stop(timeout_s)
 
     def wait(self, timeout_s: float | None = None) -> bool:
@@ -148,7 +156,7 @@ class Recorder:
 
     def wait_joined(self, timeout_s: float = 5.0, publishers: int = 1) -> bool:
         """Return whether publishers have confirmed: what they send from then on is recorded. See `ZMQSubscriber`."""
-        return self._recording.subscriber.wait_joined(timeout_s, publishers)
+        return self._subscriber.wait_joined(timeout_s, publishers)
 
     def __enter__(self) -> Self:
         return self.start()
@@ -245,24 +253,18 @@ class _Recording:
     """From a start to its stop: one file and the thread that writes it."""
 
     def __init__(
-        self, path: Path, backlog: _Backlog, subscriber: ZMQSubscriber, force: bool, on_end: Callable[[], None]
+        self, path: Path, about: Mapping[str, str], force: bool, backlog: _Backlog, on_end: Callable[[], None]
     ) -> None:
-        self._path, self.backlog, self.subscriber = path, backlog, subscriber
-        self._force, self._on_end = force, on_end
+        self._path, self._about, self._force, self._on_end = path, about, force, on_end
         self._appended = 0
         self._deadline = float("inf")
         self._failure: RecordingError | None = None
-        self.ended = threading.Event()
         self._thread: threading.Thread | None = None
+        self.backlog = backlog
+        self.ended = threading.Event()
 
-    def start(self, about: dict[str, str]) -> None:
-        # First the socket: an address that is refused must not cost the file that is to be replaced.
-        self.subscriber.start()
-        try:
-            writer = RecordingWriter(self._path, about, self._force)
-        except BaseException:
-            self.subscriber.stop()
-            raise
+    def start(self) -> None:
+        writer = RecordingWriter(self._path, self._about, self._force)
         self._thread = threading.Thread(target=self._run, args=(writer,), name="epypes-recorder", daemon=True)
         self._thread.start()
 
@@ -275,7 +277,6 @@ class _Recording:
     def stop(self, timeout_s: float) -> None:
         if self._thread is None:
             return
-        self.subscriber.stop(timeout_s)
         self._deadline = time.monotonic() + timeout_s * _DRAIN_SHARE
         self.backlog.close()
         if self._thread is threading.current_thread():
