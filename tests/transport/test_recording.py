@@ -367,6 +367,7 @@ def test_a_full_disk_ends_the_recording_and_keeps_what_was_written(tmp_path):
     readable, text = read_until_error(path)
     assert [decode(frames).parts["n"] for frames in readable] == list(range(kept))
     assert "breaks off" in text
+    assert path.stat().st_size < 5_000_000, "what the disk took of the rest is cut off"
 
 
 class SlowDisk:
