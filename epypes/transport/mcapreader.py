@@ -141,7 +141,11 @@ def _records(path: Path) -> Iterator[tuple[str, Any]]:
         with path.open("rb") as file:
             source = _Whole(file)
             for record in StreamReader(source, validate_crcs=True).records:
-                yield type(record).__name__, record
+                kind = type(record).__name__
+                yield kind, record
+                # What follows is an index, for those who want to find a place quickly.
+                if kind == "DataEnd":
+                    return
     except RecordingError:
         raise
     except (InvalidMagic, _TooShort) as error:
