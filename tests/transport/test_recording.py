@@ -224,6 +224,20 @@ def test_it_plays_as_often_as_it_is_told(tmp_path):
         assert not player.wait(0.0)
 
 
+def test_another_subscriber_may_join_while_it_plays(tmp_path):
+    written(tmp_path / "a.mcap", [(1, [b"t/", bytes(1_000)]), (2, [b"x"])])
+    first, second = queue.SimpleQueue(), queue.SimpleQueue()
+    with (
+        Player(tmp_path / "a.mcap", speed=0, loop=0) as player,
+        ZMQSubscriber(player.address, first, undecoded=True),
+    ):
+        first.get(timeout=WAIT_S)
+        for _ in range(3):
+            with ZMQSubscriber(player.address, second, "t", undecoded=True) as other:
+                assert other.wait_joined(WAIT_S)
+                assert bytes(second.get(timeout=WAIT_S)[0]) == b"t/"
+
+
 def test_nothing_is_sent_before_somebody_listens_unless_it_is_told_so(tmp_path):
     written(tmp_path / "a.mcap", [(1, [b"x"])])
     with Player(tmp_path / "a.mcap") as player:
