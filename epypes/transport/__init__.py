@@ -7,16 +7,32 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from epypes.transport.addresses import check_bind, is_loopback
+    from epypes.transport.mcapreader import RecordingInfo, recording_info
+    from epypes.transport.playing import Player
     from epypes.transport.publisher import ZMQPublisher
+    from epypes.transport.recording import Recorder
     from epypes.transport.subscriber import ZMQSubscriber
 
-__all__ = ["ZMQPublisher", "ZMQSubscriber", "check_bind", "is_loopback"]
+__all__ = [
+    "Player",
+    "Recorder",
+    "RecordingInfo",
+    "ZMQPublisher",
+    "ZMQSubscriber",
+    "check_bind",
+    "is_loopback",
+    "recording_info",
+]
 
 _HOME = {
+    "Player": "playing",
+    "Recorder": "recording",
+    "RecordingInfo": "mcapreader",
     "ZMQPublisher": "publisher",
     "ZMQSubscriber": "subscriber",
     "check_bind": "addresses",
     "is_loopback": "addresses",
+    "recording_info": "mcapreader",
 }
 
 

@@ -61,6 +61,8 @@ class ZMQSubscriber:
         A peer that sends a larger frame is disconnected; a larger message is counted in `rejected`.
     high_water_mark
         Messages kept by ZeroMQ until the I/O thread has read them.
+    undecoded
+        True to put every message as the tuple of its frames, read-only memoryviews of what came.
 
     Raises
     ------
@@ -84,6 +86,7 @@ class ZMQSubscriber:
         insecure: bool = False,
         max_message_bytes: int = Limits().total_bytes,
         high_water_mark: int = HIGH_WATER_MARK,
+        undecoded: bool = False,
     ) -> None:
         if bind:
             check_bind(address, insecure)
@@ -91,7 +94,7 @@ class ZMQSubscriber:
         self._subscription = topic_frame(topic) if topic else b""
         self._limits = Limits(total_bytes=max_message_bytes)
         self._high_water_mark = high_water_mark
-        self._inbox = _Inbox(queue, self._limits)
+        self._inbox = _Inbox(queue, self._limits, undecoded)
         self._lock = threading.Lock()
         self._opened: _Opened | None = None
         self._finalizer: weakref.finalize[Any, Any] | None = None
@@ -201,8 +204,8 @@ class ZMQSubscriber:
 class _Inbox:
     """What happens to a message; all of it on the I/O thread."""
 
-    def __init__(self, queue: PutQueue, limits: Limits) -> None:
-        self._queue, self._limits = queue, limits
+    def __init__(self, queue: PutQueue, limits: Limits, undecoded: bool) -> None:
+        self._queue, self._limits, self._undecoded = queue, limits, undecoded
         self.received = 0
         self.rejected: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
@@ -210,10 +213,13 @@ class _Inbox:
         self._last: dict[Source, int] = {}
 
     def accept(self, frames: Sequence[zmq.Frame], guest: Guest) -> None:
+        if len(frames) == 2 and guest.saw(frames[0].bytes, frames[1].bytes):
+            return
+        if self._undecoded:
+            self._put(tuple(frame.buffer for frame in frames))
+            return
         if len(frames) == 1:
             self._put(frames[0].bytes)
-            return
-        if len(frames) == 2 and guest.saw(frames[0].bytes, frames[1].bytes):
             return
         try:
             envelope = decode([frame.buffer for frame in frames], self._limits)
