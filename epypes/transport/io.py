@@ -190,10 +190,10 @@ class IOThread:
     def _run(self) -> None:
         try:
             while not self._ended():
-                ready = self._poller.poll(self._wait_ms())
-                if monotonic() >= self._next_due_s:
-                    self._tick()
-                self._read([*(found for found, _ in ready)])
+                # What comes between the poller and a reader is paid for by every message.
+                for descriptor, _ in self._poller.poll(self._wait_ms()):
+                    self._read(descriptor)
+                self._catch_up()
         finally:
             self._context.term()
             self._wake_in.close()
@@ -207,21 +207,34 @@ class IOThread:
         # One more, since it is cut to whole milliseconds: otherwise it would wake up too early, and again at once.
         return max(self._next_due_s - monotonic(), 0.0) * 1000 + 1
 
-    def _read(self, ready: list[Any]) -> None:
-        """Read a part of each socket that has something, so that none waits for another to be empty."""
-        unfinished, self._unfinished = self._unfinished, set()
-        for descriptor in {*ready, *unfinished} if unfinished else ready:
-            # A command or another reader may have closed it.
-            reader = self._readers.get(descriptor)
-            if reader is not None and _read(reader):
+    def _read(self, descriptor: Any) -> None:
+        """Read a part of what a socket has, so that none waits for another to be empty."""
+        # A command or another reader may have closed it.
+        reader = self._readers.get(descriptor)
+        try:
+            if reader is not None and reader():
                 self._unfinished.add(descriptor)
+        except Exception:
+            # A reader counts what it can't read; this is a bug of ours, and must not stop the others.
+            log.exception("a reader failed")
+
+    def _catch_up(self) -> None:
+        if monotonic() >= self._next_due_s:
+            self._tick()
+        if self._unfinished:
+            unfinished, self._unfinished = self._unfinished, set()
+            for descriptor in unfinished:
+                self._read(descriptor)
 
     def _tick(self) -> None:
         now_s = monotonic()
         for known in list(self._owned.values()):
             if known.tick is not None and known.due_s <= now_s:
                 known.due_s = now_s + known.every_s
-                _read(known.tick)
+                try:
+                    known.tick()
+                except Exception:
+                    log.exception("what was due failed")
                 self._unfinished.add(known.descriptor)
         self._next_due_s = min((known.due_s for known in self._owned.values()), default=float("inf"))
 
@@ -258,15 +271,6 @@ def _close(owned: Socket, endpoint: str) -> None:
     owned.close()
     monitor.poll(_CLOSE_MS)
     monitor.close(linger=0)
-
-
-def _read(reader: Callable[[], bool | None]) -> bool:
-    try:
-        return bool(reader())
-    except Exception:
-        # A reader counts what it can't read; this is a bug of ours, and must not stop the others.
-        log.exception("a reader failed")
-        return False
 
 
 class _State:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import os
 import threading
-from collections import Counter
+import weakref
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -45,11 +46,14 @@ class Outlet:
         self._framing = Framing(topic, limits)
         self._counts = counts
         self._process = os.getpid()
-        # Re-entrant: a signal's handler may publish as well, while its thread is in here.
-        self._lock = threading.RLock()
+        # The turn is held while an item is made into frames, which runs its own code, the lock to touch the socket.
+        self._turn, self._lock = threading.Lock(), threading.Lock()
+        self._whose = 0
+        self._later: deque[object] = deque()
         self._socket: io.Socket | None = None
         self.doorkeeper = Doorkeeper()
         self.address = ""
+        _outlets.add(self)
 
     def open(
         self, address: str, bind: bool, high_water_mark: int, more_options: Sequence[tuple[int, int | bytes]] = ()
@@ -73,6 +77,11 @@ class Outlet:
         """Return whether this is a forked child, where there is neither thread nor socket."""
         return self._process != os.getpid()
 
+    def forget(self) -> None:
+        """Forget the socket, and the threads that held the locks, in a forked child."""
+        self._turn, self._lock = threading.Lock(), threading.Lock()
+        self._socket, self._whose = None, 0
+
     def close(self, timeout_s: float = 10.0) -> None:
         """Close the socket; what was sent still leaves."""
         if self._socket is not None and not self.is_gone():
@@ -84,7 +93,26 @@ class Outlet:
             io.close_soon(self._socket)
 
     def publish(self, item: object) -> None:
-        """Send an item; what can't be sent is counted and logged. Arrays that could be changed are copied first."""
+        """Send an item; what can't be sent is counted and logged. Arrays that could be changed are copied first.
+
+        From any thread, one after the other; an item that is published from within, by its own code or by a signal's
+        handler, follows.
+        """
+        if not self._turn.acquire(False):
+            if self._whose == threading.get_ident():
+                self._later.append(item)
+                return
+            self._turn.acquire()
+        try:
+            self._whose = threading.get_ident()
+            self._publish(item)
+        finally:
+            self._whose = 0
+            self._turn.release()
+        while self._later:
+            self.publish(self._later.popleft())
+
+    def _publish(self, item: object) -> None:
         try:
             self._send(self._framing.frames(item))
         except MessageError as error:
@@ -121,10 +149,22 @@ class Outlet:
             return self.doorkeeper.read()
 
 
+# Those of this process; their sockets must not be used in a forked child.
+_outlets: weakref.WeakSet[Outlet] = weakref.WeakSet()
+
+
+def _forget_outlets() -> None:
+    for outlet in list(_outlets):
+        outlet.forget()
+
+
+os.register_at_fork(after_in_child=_forget_outlets)
+
+
 def _send(socket: io.Socket, frames: Frames) -> None:
-    last = len(frames) - 1
-    for index, frame in enumerate(frames):
-        socket.send(frame, _DONTWAIT if index == last else _MORE, copy=not _can_be_lent(frame))
+    for frame in frames[:-1]:
+        socket.send(frame, _MORE, copy=not _can_be_lent(frame))
+    socket.send(frames[-1], _DONTWAIT, copy=not _can_be_lent(frames[-1]))
 
 
 def _can_be_lent(frame: bytes | memoryview) -> bool:

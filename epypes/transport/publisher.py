@@ -108,8 +108,12 @@ class ZMQPublisher:
                 return self
             outlet = Outlet(self._topic, self._limits, self._counts)
             outlet.open(self._given, self._bind, self._high_water_mark)
+            try:
+                self._taker = taker(self._queue, outlet)
+            except BaseException:
+                outlet.close()
+                raise
             self._outlet = outlet
-            self._taker = taker(self._queue, outlet)
             self._finalizer = weakref.finalize(self, _abandon, self._taker, self._given)
         return self
 

@@ -210,9 +210,6 @@ class _Inbox:
         self._last: dict[Source, int] = {}
 
     def accept(self, frames: Sequence[zmq.Frame], guest: Guest) -> None:
-        if len(frames) == 1:
-            self._put(frames[0].bytes)
-            return
         if len(frames) == 2 and guest.saw(frames[0].bytes, frames[1].bytes):
             return
         try:
@@ -222,9 +219,9 @@ class _Inbox:
             log.warning("rejected a message (%s): %s", error.reason, error)
             return
         self._follow(envelope)
-        self._put(envelope)
+        self.put(envelope)
 
-    def _put(self, item: object) -> None:
+    def put(self, item: object) -> None:
         # Counted before: whoever has the item must find it counted.
         self.received += 1
         try:
@@ -290,13 +287,20 @@ class _Opened:
         socket = self._socket
         for _ in range(_BATCH):
             # The queue's put may have stopped this subscriber.
-            if socket is None or socket.closed or not io.has_arrived(socket):
+            if socket is None or socket.closed:
                 return False
-            self._inbox.accept(_received(socket), self.guest)
+            try:
+                frame = socket.recv(_DONTWAIT, copy=False)
+            except zmq.Again:
+                return False
+            if frame.more:
+                self._inbox.accept([frame, *_rest(socket)], self.guest)
+            else:
+                self._inbox.put(frame.bytes)
         return True
 
 
-def _received(socket: io.Socket) -> list[zmq.Frame]:
+def _rest(socket: io.Socket) -> list[zmq.Frame]:
     frames = [socket.recv(_DONTWAIT, copy=False)]
     while frames[-1].more:
         frames.append(socket.recv(_DONTWAIT, copy=False))
