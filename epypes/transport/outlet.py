@@ -7,7 +7,6 @@ import os
 import threading
 import weakref
 from collections import Counter, deque
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import zmq
@@ -16,6 +15,7 @@ from epypes.errors import MessageError
 from epypes.transport import io
 from epypes.transport.framing import Frames, Framing
 from epypes.transport.joining import Doorkeeper
+from epypes.transport.security import Security
 from epypes.wire import Limits
 from epypes.wire.arrays import is_settled
 
@@ -55,19 +55,18 @@ class Outlet:
         self.address = ""
         _outlets.add(self)
 
-    def open(
-        self, address: str, bind: bool, high_water_mark: int, more_options: Sequence[tuple[int, int | bytes]] = ()
-    ) -> None:
+    def open(self, address: str, security: Security, high_water_mark: int) -> None:
         """Open the socket; raise AddressError if the address is refused."""
+        gate = security.gate()
         options = [
             (zmq.XPUB_MANUAL, 1),
             (zmq.SNDHWM, high_water_mark),
             (zmq.MAXMSGSIZE, _MAX_SUBSCRIPTION_BYTES),
-            *more_options,
+            *security.options(gate),
         ]
 
         def open_socket(thread: io.IOThread) -> str:
-            self._socket = opened = thread.open(zmq.XPUB, address, bind, self._read, options, self._lock)
+            self._socket = opened = thread.open(zmq.XPUB, address, security.bind, self._read, options, self._lock, gate)
             self.doorkeeper.attach(opened)
             return thread.address_of(opened, address)
 

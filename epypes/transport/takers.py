@@ -41,7 +41,7 @@ class Taker(Protocol):
 
 
 def taker(queue: TakeQueue, outlet: Outlet) -> Taker:
-    """Return what takes from a queue from now on: nobody, if the queue hands items over, as a Mailbox, else a Bridge."""
+    """Return what takes from a queue from now on: a Bridge, if the queue does not hand items over as a Mailbox does."""
     hand_to = getattr(queue, "hand_to", None)
     return HandOver(outlet, hand_to) if callable(hand_to) else Bridge(queue, outlet)
 
