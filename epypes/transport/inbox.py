@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import queue as queues
+import time
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any, Protocol
@@ -38,6 +39,8 @@ class Inbox:
         self.rejected: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.lost: dict[Source, int] = {}
+        self._opened_ns = 0
+        self._epochs: dict[str, int] = {}
         self._last: dict[Source, int] = {}
 
     def accept(self, frames: Sequence[zmq.Frame], guest: Guest) -> None:
@@ -52,6 +55,10 @@ class Inbox:
             return
         self._follow(envelope)
         self.put(envelope)
+
+    def begin(self) -> None:
+        """Take note that a socket is opened."""
+        self._opened_ns = time.time_ns()
 
     def put(self, item: object) -> None:
         """Put an item into the queue, or count it as dropped."""
@@ -72,8 +79,9 @@ class Inbox:
         if envelope.sequence == 0:
             return
         source = (envelope.source, envelope.epoch)
-        # What came before the first one that was received was sent before this subscriber had joined.
-        last = self._last.pop(source, envelope.sequence - 1)
+        last = self._last.pop(source, None)
+        if last is None:
+            last = 0 if self._has_restarted(envelope) else envelope.sequence - 1
         missing = envelope.sequence - last - 1
         if missing > 0:
             self.lost[source] = self.lost.get(source, 0) + missing
@@ -82,3 +90,13 @@ class Inbox:
             oldest = next(iter(self._last))
             del self._last[oldest]
             self.lost.pop(oldest, None)
+            self._epochs.pop(oldest[0], None)
+
+    def _has_restarted(self, envelope: Envelope) -> bool:
+        """Return whether a source that is known has begun anew while we listened.
+
+        Then what came before this envelope is lost; otherwise it was sent before this subscriber had joined.
+        """
+        known = self._epochs.get(envelope.source)
+        self._epochs[envelope.source] = max(envelope.epoch, known or 0)
+        return known is not None and envelope.epoch > max(known, self._opened_ns)

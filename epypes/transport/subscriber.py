@@ -242,6 +242,7 @@ class _Opened:
     def open(
         self, address: str, security: Security, options: Sequence[tuple[int, int | bytes]], heartbeat_s: float
     ) -> None:
+        self._inbox.begin()
         gate = security.gate()
         more = security.options(gate)
 

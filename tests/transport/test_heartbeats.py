@@ -27,26 +27,25 @@ class Changes:
 
 def test_a_stopped_publisher_is_reported_stale_within_three_heartbeats_and_recovers():
     changes, into, heartbeat_s = Changes(), queue.SimpleQueue(), 0.3
-    with process(PUBLISHER, LOCAL) as peer:
-        with ZMQSubscriber(line_of(peer), into, "t", heartbeat_s=heartbeat_s) as sub:
-            sub.on_stale = changes
-            assert sub.wait_joined(WAIT_S)
-            publish(peer, 1)
-            assert into.get(timeout=WAIT_S).parts["n"] == 1
-            assert not sub.is_stale
-            peer.send_signal(signal.SIGSTOP)
-            stopped = time.monotonic()
-            is_stale, when, _ = changes.told.get(timeout=WAIT_S)
-            assert is_stale
-            assert sub.is_stale
-            # A tenth for the scheduler.
-            assert when - stopped <= 3 * heartbeat_s + 0.1
-            peer.send_signal(signal.SIGCONT)
-            assert changes.told.get(timeout=WAIT_S)[0] is False
-            publish(peer, 1)
-            assert into.get(timeout=WAIT_S).parts["n"] == 2
-            assert not sub.is_stale
-            assert sub.lost == {}
+    with process(PUBLISHER, LOCAL) as peer, ZMQSubscriber(line_of(peer), into, "t", heartbeat_s=heartbeat_s) as sub:
+        sub.on_stale = changes
+        assert sub.wait_joined(WAIT_S)
+        publish(peer, 1)
+        assert into.get(timeout=WAIT_S).parts["n"] == 1
+        assert not sub.is_stale
+        peer.send_signal(signal.SIGSTOP)
+        stopped = time.monotonic()
+        is_stale, when, _ = changes.told.get(timeout=WAIT_S)
+        assert is_stale
+        assert sub.is_stale
+        # A tenth for the scheduler.
+        assert when - stopped <= 3 * heartbeat_s + 0.1
+        peer.send_signal(signal.SIGCONT)
+        assert changes.told.get(timeout=WAIT_S)[0] is False
+        publish(peer, 1)
+        assert into.get(timeout=WAIT_S).parts["n"] == 2
+        assert not sub.is_stale
+        assert sub.lost == {}
 
 
 def test_an_idle_publisher_is_not_stale():
