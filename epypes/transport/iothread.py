@@ -34,7 +34,8 @@ _OPTIONS: dict[int, int] = {
     zmq.HEARTBEAT_TIMEOUT: 15_000,
     zmq.HEARTBEAT_TTL: 30_000,
     zmq.RECONNECT_IVL: 50,
-    zmq.RECONNECT_IVL_MAX: 2_000,
+    # A peer that has come back is met soon: what it sends before that is lost.
+    zmq.RECONNECT_IVL_MAX: 200,
     zmq.IPV6: 0,
 }
 
