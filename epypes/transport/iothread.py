@@ -278,6 +278,8 @@ class IOThread:
             except Exception as error:
                 # It belongs to the thread that asked, with its traceback.
                 future.set_exception(error)
+        # A command that used a socket may have used up its signal as well.
+        self._unfinished.update(known.descriptor for known in self._owned.values())
         return False
 
 
