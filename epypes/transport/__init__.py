@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from epypes.transport.addresses import check_bind, is_loopback
+    from epypes.transport.keys import Keys, make_keys, read_keys
     from epypes.transport.mcapreader import RecordingInfo, recording_info
     from epypes.transport.playing import Player
     from epypes.transport.publisher import ZMQPublisher
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from epypes.transport.subscriber import ZMQSubscriber
 
 __all__ = [
+    "Keys",
     "Player",
     "Recorder",
     "RecordingInfo",
@@ -21,10 +23,13 @@ __all__ = [
     "ZMQSubscriber",
     "check_bind",
     "is_loopback",
+    "make_keys",
+    "read_keys",
     "recording_info",
 ]
 
 _HOME = {
+    "Keys": "keys",
     "Player": "playing",
     "Recorder": "recording",
     "RecordingInfo": "mcapreader",
@@ -32,6 +37,8 @@ _HOME = {
     "ZMQSubscriber": "subscriber",
     "check_bind": "addresses",
     "is_loopback": "addresses",
+    "make_keys": "keys",
+    "read_keys": "keys",
     "recording_info": "mcapreader",
 }
 

@@ -59,4 +59,3 @@ class Framing:
         # Counted when it can be sent: a rejected item is no loss on the way.
         self._sequences[envelope.source] = number
         return frames
-

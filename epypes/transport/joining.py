@@ -16,7 +16,7 @@ from collections import Counter
 
 import zmq
 
-from epypes.transport.io import Socket, has_arrived
+from epypes.transport.iothread import Socket, has_arrived
 
 JOIN_PREFIX = b"\xff\xffepypes/join/"
 _SUBSCRIBE, _UNSUBSCRIBE = 1, 0
@@ -33,7 +33,8 @@ class Doorkeeper:
 
     The socket is in manual mode, where every subscription of every peer is seen and is granted here, and the answer
     can be sent to the peer that asks and to nobody else: a peer of 2019 that subscribes to everything sees nothing
-    of it. (Where libzmq refuses that option, it would.) `read` is called by who holds the socket's lock, the rest by any.
+    of it. (Where libzmq refuses that option, it would.) Who calls `read` holds the socket's lock; the rest any thread
+    may call.
     """
 
     def __init__(self) -> None:
@@ -100,6 +101,11 @@ class Guest:
         self.topic = JOIN_PREFIX + uuid.uuid4().hex.encode()
         self._changed = threading.Condition()
         self._publishers: set[bytes] = set()
+
+    @property
+    def has_joined(self) -> bool:
+        """Whether a publisher has answered."""
+        return bool(self._publishers)
 
     def saw(self, topic: bytes, identity: bytes) -> bool:
         """Take note of a message that is an answer to a join; return whether it is one, of any subscriber's."""

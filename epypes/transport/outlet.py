@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import os
 import threading
-from collections import Counter
-from collections.abc import Sequence
+import weakref
+from collections import Counter, deque
 from dataclasses import dataclass, field
 
 import zmq
@@ -15,6 +15,7 @@ from epypes.errors import MessageError
 from epypes.transport import io
 from epypes.transport.framing import Frames, Framing
 from epypes.transport.joining import Doorkeeper
+from epypes.transport.security import Security
 from epypes.wire import Limits
 from epypes.wire.arrays import is_settled
 
@@ -45,25 +46,27 @@ class Outlet:
         self._framing = Framing(topic, limits)
         self._counts = counts
         self._process = os.getpid()
-        # Re-entrant: a signal's handler may publish as well, while its thread is in here.
-        self._lock = threading.RLock()
+        # The turn is held while an item is made into frames, which runs its own code, the lock to touch the socket.
+        self._turn, self._lock = threading.Lock(), threading.Lock()
+        self._whose = 0
+        self._later: deque[object] = deque()
         self._socket: io.Socket | None = None
         self.doorkeeper = Doorkeeper()
         self.address = ""
+        _outlets.add(self)
 
-    def open(
-        self, address: str, bind: bool, high_water_mark: int, more_options: Sequence[tuple[int, int | bytes]] = ()
-    ) -> None:
+    def open(self, address: str, security: Security, high_water_mark: int) -> None:
         """Open the socket; raise AddressError if the address is refused."""
+        gate = security.gate()
         options = [
             (zmq.XPUB_MANUAL, 1),
             (zmq.SNDHWM, high_water_mark),
             (zmq.MAXMSGSIZE, _MAX_SUBSCRIPTION_BYTES),
-            *more_options,
+            *security.options(gate),
         ]
 
         def open_socket(thread: io.IOThread) -> str:
-            self._socket = opened = thread.open(zmq.XPUB, address, bind, self._read, options, self._lock)
+            self._socket = opened = thread.open(zmq.XPUB, address, security.bind, self._read, options, self._lock, gate)
             self.doorkeeper.attach(opened)
             return thread.address_of(opened, address)
 
@@ -72,6 +75,11 @@ class Outlet:
     def is_gone(self) -> bool:
         """Return whether this is a forked child, where there is neither thread nor socket."""
         return self._process != os.getpid()
+
+    def forget(self) -> None:
+        """Forget the socket, and the threads that held the locks, in a forked child."""
+        self._turn, self._lock = threading.Lock(), threading.Lock()
+        self._socket, self._whose = None, 0
 
     def close(self, timeout_s: float = 10.0) -> None:
         """Close the socket; what was sent still leaves."""
@@ -84,7 +92,26 @@ class Outlet:
             io.close_soon(self._socket)
 
     def publish(self, item: object) -> None:
-        """Send an item; what can't be sent is counted and logged. Arrays that could be changed are copied first."""
+        """Send an item; what can't be sent is counted and logged. Arrays that could be changed are copied first.
+
+        From any thread, one after the other; an item that is published from within, by its own code or by a signal's
+        handler, follows.
+        """
+        if not self._turn.acquire(False):
+            if self._whose == threading.get_ident():
+                self._later.append(item)
+                return
+            self._turn.acquire()
+        try:
+            self._whose = threading.get_ident()
+            self._publish(item)
+        finally:
+            self._whose = 0
+            self._turn.release()
+        while self._later:
+            self.publish(self._later.popleft())
+
+    def _publish(self, item: object) -> None:
         try:
             self._send(self._framing.frames(item))
         except MessageError as error:
@@ -121,10 +148,22 @@ class Outlet:
             return self.doorkeeper.read()
 
 
+# Those of this process; their sockets must not be used in a forked child.
+_outlets: weakref.WeakSet[Outlet] = weakref.WeakSet()
+
+
+def _forget_outlets() -> None:
+    for outlet in list(_outlets):
+        outlet.forget()
+
+
+os.register_at_fork(after_in_child=_forget_outlets)
+
+
 def _send(socket: io.Socket, frames: Frames) -> None:
-    last = len(frames) - 1
-    for index, frame in enumerate(frames):
-        socket.send(frame, _DONTWAIT if index == last else _MORE, copy=not _can_be_lent(frame))
+    for frame in frames[:-1]:
+        socket.send(frame, _MORE, copy=not _can_be_lent(frame))
+    socket.send(frames[-1], _DONTWAIT, copy=not _can_be_lent(frames[-1]))
 
 
 def _can_be_lent(frame: bytes | memoryview) -> bool:

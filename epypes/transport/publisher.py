@@ -6,12 +6,15 @@ import threading
 import warnings
 import weakref
 from collections import Counter
+from collections.abc import Collection
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from epypes.transport.addresses import check_bind
+from epypes.transport.keys import Keys, PublicKey
 from epypes.transport.outlet import Counts, Outlet
-from epypes.transport.takers import Taker, TakeQueue, taker
+from epypes.transport.security import security
+from epypes.transport.takers import TakeQueue, Taker, taker
 from epypes.wire import Limits, topic_frame
 
 HIGH_WATER_MARK = 1_000
@@ -27,13 +30,21 @@ class ZMQPublisher:
     queue
         Any object with ``get(timeout=...)`` that raises queue.Empty. bytes, bytearray and memoryview go out as one
         frame, and so does a protobuf message (2019 mode: without a topic, for peers of the published system);
-        an Envelope goes out as topic, header and payload frames. Anything else is counted in `rejected`.
+        an Envelope goes out as topic, header and payload frames, a Failure as the Envelope that reports it. Anything
+        else is counted in `rejected`. From a Mailbox an item is sent within ``put``, on the thread that puts, whatever
+        its policy: buffers may be used again then. From other queues a thread takes it a little later, so leave
+        arrays alone, or make them read-only. Read-only arrays are sent without a copy.
     topic
         Topic of the envelopes. 2019 mode knows none.
     bind
         False to connect to a subscriber that binds.
     insecure
-        True to bind an address that other machines can reach.
+        True to bind an address that other machines can reach, without keys.
+    keys
+        Its own pair of CURVE keys, from `make_keys` or `read_keys`, or the path of its .key_secret file.
+    allow
+        With keys: the public keys of the peers that may connect, as text, .key files or a folder of these; where it
+        connects itself, the one of the peer that is bound there.
     max_message_bytes
         Larger messages are rejected here, since the receiver would drop the connection.
     high_water_mark
@@ -43,7 +54,9 @@ class ZMQPublisher:
     Raises
     ------
     AddressError
-        If ``bind`` is asked for an address that is not loopback, without ``insecure``.
+        If ``bind`` is asked for an address that is not loopback, with neither keys nor ``insecure``.
+    KeysError
+        If keys can't be read, or it is not said which are allowed.
     MessageError
         If ``topic`` can't be one.
 
@@ -61,14 +74,15 @@ class ZMQPublisher:
         bind: bool = True,
         *,
         insecure: bool = False,
+        keys: Keys | str | Path | None = None,
+        allow: PublicKey | Collection[PublicKey] | None = None,
         max_message_bytes: int = Limits().total_bytes,
         high_water_mark: int = HIGH_WATER_MARK,
     ) -> None:
-        if bind:
-            check_bind(address, insecure)
+        self._security = security(address, bind, insecure, keys, allow)
         topic_frame(topic)
         self._given = address
-        self._queue, self._topic, self._bind = queue, topic, bind
+        self._queue, self._topic = queue, topic
         self._limits = Limits(total_bytes=max_message_bytes)
         self._high_water_mark = high_water_mark
         self._counts = Counts()
@@ -93,6 +107,11 @@ class ZMQPublisher:
         """How many items could not be sent, by reason; a copy."""
         return Counter(self._counts.rejected)
 
+    @property
+    def refused(self) -> Counter[str]:
+        """How often peers were refused because their key is not allowed, by public key; a copy."""
+        return Counter(self._security.refused)
+
     def start(self) -> Self:
         """Open the socket and begin to publish; nothing happens if it runs already.
 
@@ -107,9 +126,13 @@ class ZMQPublisher:
             if self._taker is not None and not _is_over(self._taker):
                 return self
             outlet = Outlet(self._topic, self._limits, self._counts)
-            outlet.open(self._given, self._bind, self._high_water_mark)
+            outlet.open(self._given, self._security, self._high_water_mark)
+            try:
+                self._taker = taker(self._queue, outlet)
+            except BaseException:
+                outlet.close()
+                raise
             self._outlet = outlet
-            self._taker = taker(self._queue, outlet)
             self._finalizer = weakref.finalize(self, _abandon, self._taker, self._given)
         return self
 

@@ -41,98 +41,37 @@ class Taker(Protocol):
 
 
 def taker(queue: TakeQueue, outlet: Outlet) -> Taker:
-    """Return what takes from a queue from now on: a Pump if the queue can be watched, as a Mailbox, else a Bridge."""
-    watch = getattr(queue, "watch", None)
-    return Pump(queue, outlet, watch) if callable(watch) else Bridge(queue, outlet)
+    """Return what takes from a queue from now on: a Bridge, if the queue does not hand items over as a Mailbox does."""
+    hand_to = getattr(queue, "hand_to", None)
+    return HandOver(outlet, hand_to) if callable(hand_to) else Bridge(queue, outlet)
 
 
-class Pump:
-    """Takes from a queue that tells of every put, within the call of ``put``: no thread has to be woken up.
+class HandOver:
+    """Has a queue hand its items to the outlet within the call of ``put``: no thread has to be woken up.
 
-    When ``put`` returns, its item is on its way, and arrays that it could still change have been copied.
+    When ``put`` returns, its item has been sent, and arrays that it could still change have been copied.
     """
 
-    def __init__(
-        self, queue: TakeQueue, outlet: Outlet, watch: Callable[[Callable[[], object]], Callable[[], None]]
-    ) -> None:
-        self._queue, self._outlet = queue, outlet
-        self._turn = threading.Lock()
-        # The thread whose turn it is, and whether it was called again meanwhile, by itself.
-        self._whose, self._again = 0, False
-        self._is_closed = False
+    def __init__(self, outlet: Outlet, hand_to: Callable[[Callable[[Any], object]], Callable[[], None]]) -> None:
+        self._outlet = outlet
         self.stopping = False
-        self._end_watching = watch(self._run)
-        self._run()
+        self._end = hand_to(outlet.publish)
 
     def is_alive(self) -> bool:
         """Return whether it takes."""
-        return not self._is_closed and not self._outlet.is_gone()
+        return not self.stopping and not self._outlet.is_gone()
 
     def stop(self, timeout_s: float) -> None:
-        """Send what is queued and close the outlet."""
-        if self._outlet.is_gone():
-            return
-        deadline = time.monotonic() + timeout_s
+        """Close the outlet; what is put from now on stays in the queue."""
         self.stopping = True
-        self._end_watching()
-        if self._whose == threading.get_ident():
-            # Called by the queue's own get: the rest happens when that returns.
-            return
-        has_turn = self._turn.acquire(timeout=timeout_s)
-        try:
-            if has_turn:
-                self._take_all(deadline)
-        finally:
-            self._close(max(deadline - time.monotonic(), 0.1))
-            if has_turn:
-                self._turn.release()
-        if not has_turn:
-            raise StillRunning(f"ZMQPublisher {self._outlet.address}", ["get"], timeout_s)
+        self._end()
+        self._outlet.close(timeout_s)
 
     def abandon(self) -> None:
         """Stop without waiting."""
         self.stopping = True
+        self._end()
         self._outlet.close_soon()
-
-    def _run(self) -> None:
-        if self._outlet.is_gone():
-            return
-        me = threading.get_ident()
-        if self._whose == me:
-            # The queue's get puts into it, or a signal's handler does: the turn is not over, and sees to it.
-            self._again = True
-            return
-        while True:
-            with self._turn:
-                if self.stopping:
-                    return
-                self._whose, self._again = me, False
-                try:
-                    self._take_all()
-                finally:
-                    self._whose = 0
-                    if self.stopping:
-                        self._close()
-            if not self._again:
-                return
-
-    def _take_all(self, deadline_s: float = float("inf")) -> None:
-        # At a stop as many as there were: a producer that goes on must not keep it from ending.
-        left = _size(self._queue) if deadline_s != float("inf") else None
-        while left != 0 and (left is None or time.monotonic() < deadline_s):
-            try:
-                item = self._queue.get(timeout=0)
-            except queues.Empty:
-                return
-            except Exception as error:
-                self._outlet.reject("queue failed", f"the queue raised {error!r}", log_once=True)
-                return
-            self._outlet.publish(item)
-            left = None if left is None else left - 1
-
-    def _close(self, timeout_s: float = 10.0) -> None:
-        self._is_closed = True
-        self._outlet.close(timeout_s)
 
 
 class Bridge:

@@ -77,7 +77,7 @@ def flat_bytes(array: AnyArray) -> memoryview:
 
 
 def is_settled(view: memoryview) -> bool:
-    """Return whether nobody can change what a view of `flat_bytes` shows: all arrays down to its owner are read-only."""
+    """Return whether nobody can change what a view of `flat_bytes` shows: all arrays under it are read-only."""
     import numpy as np
 
     owner: object = view.obj
