@@ -85,7 +85,7 @@ def _is_settled(given: list[Any], np: Any) -> bool:
     if type(array) is not np.ndarray:
         return False
     owner = array if array.base is None else array.base
-    if type(owner) is bytes:
+    if type(getattr(owner, "base", owner)) is bytes or type(owner) is bytes:
         return True
     # Memory of anything else, such as a driver's buffer, is filled again as soon as the driver likes.
     if type(owner) is not np.ndarray or not owner.flags.owndata:
