@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from epypes.acquisition.frames import Frame, take_image
-from epypes.acquisition.pace import Camera
+from epypes.acquisition.pace import Alarm, Camera
 from epypes.acquisition.ring import Ring
 from epypes.errors import CameraUnavailable
 
@@ -96,7 +96,7 @@ class Worker:
         self._on_error, self._on_change = on_error, on_change
         self._image: Any = None
         self._frames = self._missed = self._failed = self._missed_in_a_row = 0
-        self._stop = threading.Event()
+        self._stop = Alarm()
         self._thread: threading.Thread | None = None
 
     @property
@@ -111,14 +111,14 @@ class Worker:
 
     def start(self) -> None:
         """Start the thread, of which there must be none."""
-        self._stop = threading.Event()
-        self.has_frame, self.state = False, "running"
+        self._stop = Alarm()
+        self.has_frame, self.state, self._missed_in_a_row = False, "running", 0
         self._thread = threading.Thread(target=self._run, args=(self._stop,), name=f"epypes {self.name}", daemon=True)
         self._thread.start()
 
     def ask_to_stop(self) -> None:
         """Tell the thread to end after the read under way."""
-        self._stop.set()
+        self._stop.ring()
 
     def end_read(self, deadline_s: float) -> Ending | None:
         """Close the camera until its thread has ended; return how to wait for that, unless it has ended already."""
@@ -139,24 +139,23 @@ class Worker:
             if time.monotonic() >= deadline_s:
                 return
 
-    def _run(self, stop: threading.Event) -> None:
-        state: State = "stopped"
+    def _run(self, stop: Alarm) -> None:
         try:
-            if not self._capture_until(stop):
-                state = "ended"
+            self._capture(stop)
+            self._end("stopped" if stop.has_rung else "ended")
         except BaseException as exception:  # a generator's SystemExit must not end the thread in silence
             # A read that was ended by close() may raise anything, and that is nobody's fault.
-            if not stop.is_set():
-                state = "failed"
+            if stop.has_rung:
+                self._end("stopped")
+            else:
                 self._failed += 1
+                self._end("failed")
                 self._report(exception)
         self._close()
-        self.state = "stopped" if stop.is_set() else state
-        self._on_change()
 
-    def _capture_until(self, stop: threading.Event) -> bool:
-        """Read frames until told to stop; return False if the camera has no more."""
-        while not stop.is_set():
+    def _capture(self, stop: Alarm) -> None:
+        """Read frames until told to stop, or until there are no more."""
+        while not stop.has_rung:
             try:
                 given = [self.camera.read()]
             except CameraUnavailable as error:
@@ -164,9 +163,12 @@ class Worker:
                 continue
             captured_ns = time.time_ns()
             if given[0] is None:
-                return stop.is_set()
+                return
             self._keep(given, captured_ns)
-        return True
+
+    def _end(self, state: State) -> None:
+        self.state = state
+        self._on_change()
 
     def _keep(self, given: list[Any], captured_ns: int) -> None:
         self._missed_in_a_row = 0

@@ -181,6 +181,17 @@ def test_a_buffer_that_is_filled_again_and_again_is_copied():
             assert int(frame.image[0, 0]) == (frame.number - 1) % 256
 
 
+def test_a_buffer_that_its_camera_locks_and_unlocks_is_copied_too():
+    buffer = gray(1)
+    buffer.setflags(write=False)
+    with ep.ImageAcquisition(Fed(buffer)) as acquisition:
+        assert acquisition.wait_for_frames(5)
+        (frame,) = acquisition.nearest(time.time_ns())
+        buffer.setflags(write=True)
+        buffer[:] = 9
+        assert np.unique(frame.image).tolist() == [1]
+
+
 @pytest.mark.parametrize(
     "part", [lambda buffer: buffer[:, ::2], lambda buffer: buffer.T, lambda buffer: np.frombuffer(buffer.data, np.uint8).reshape(6, 8)]
 )  # fmt: skip
@@ -279,7 +290,7 @@ def test_a_generator_that_raises_is_reported_with_its_index_and_the_others_go_on
     cameras = (ep.camera(gray(0), fps=200), generator_that_raises(error))
     with ep.ImageAcquisition(*cameras, on_error=lambda *error: errors.put(error)) as acquisition:
         assert errors.get(timeout=10) == (1, error)
-        until(lambda: acquisition.states == ("running", "failed"))
+        assert acquisition.states == ("running", "failed")
         assert acquisition.counts[1] == Counts(frames=1, missed=0, failed=1)
         seen = frames(acquisition)[0]
         until(lambda: frames(acquisition)[0] > seen + 3)

@@ -205,6 +205,21 @@ def test_a_stream_that_breaks_off_is_tried_again_and_then_opened_anew(video):
     camera.close()
 
 
+def test_a_device_that_is_unplugged_and_plugged_in_again_goes_on(video):
+    camera = ep.camera(f"file://{video}")
+    assert places(camera, 5) == [0, 1, 2, 3, 4]
+    unplugged = video.rename(video.with_suffix(".gone"))
+    texts = []
+    for _ in range(6):
+        with pytest.raises(CameraUnavailable) as info:
+            camera.read()
+        texts.append(str(info.value))
+    assert [f"Camera file://{video} {end}" in text for text, end in zip(texts, ["gave no frame"] * 3 + ["can't be opened"] * 3, strict=True)] == [True] * 6  # fmt: skip
+    unplugged.rename(video)
+    assert places(camera, 2) == [0, 1]
+    camera.close()
+
+
 def test_frames_of_a_device_that_are_not_due_are_thrown_away(video):
     camera = ep.camera(f"file://{video}", fps=1 / 3600)
     assert places(camera, 1) == [0]
