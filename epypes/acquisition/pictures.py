@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from epypes.acquisition.files import read_image
-from epypes.acquisition.frames import locked_copy
+from epypes.acquisition.frames import lasting_copy
 from epypes.acquisition.quiet import quiet
 from epypes.errors import ImageFileError
 
@@ -32,7 +32,7 @@ class Still:
     """
 
     def __init__(self, image: Any, loop: bool = True) -> None:
-        self._image = locked_copy(image)
+        self._image = lasting_copy(image)
         self._loop, self._was_given = loop, False
 
     def read(self) -> Any:
@@ -56,34 +56,32 @@ class Sequence:
     Parameters
     ----------
     start
-        Returns an iterator; called when the first frame is wanted, and for each further round.
+        Returns an iterable; called when the first frame is wanted, and for each further round.
     loop
         Whether there is another round.
-    rewinds
-        Whether `close` ends a round. What others have made goes on where it was.
     """
 
-    def __init__(self, start: Callable[[], Iterable[Any]], loop: bool = True, *, rewinds: bool = True) -> None:
-        self._start, self._loop, self._rewinds = start, loop, rewinds
+    def __init__(self, start: Callable[[], Iterable[Any]], loop: bool = True) -> None:
+        self._start, self._loop = start, loop
         self._items: Iterator[Any] | None = None
 
     def read(self) -> Any:
         """Return the next item; None if there are no more."""
-        if self._items is not None:
-            for item in self._items:
+        items = self._items
+        if items is not None:
+            for item in items:
                 return _required(item)
             if not self._loop:
                 return None
-        self._items = iter(self._start())
+        self._items = items = iter(self._start())
         # A round without any item would be followed by others for ever.
-        for item in self._items:
+        for item in items:
             return _required(item)
         return None
 
     def close(self) -> None:
-        """Begin anew with the next `read`, if that can be."""
-        if self._rewinds:
-            self._items = None
+        """Begin anew with the next `read`; an iterator, which can't, goes on where it was."""
+        self._items = None
 
     def __repr__(self) -> str:
         return f"<Sequence of {getattr(self._start, '__qualname__', 'frames'):.60}>"
