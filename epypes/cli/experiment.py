@@ -77,7 +77,7 @@ def _make_folder(folder: Path) -> None:
 @contextmanager
 def _shown_progress(description: str) -> Iterator[Callable[[int, int], None]]:
     """Show a progress display while the block runs; yield what tells it how many requests are done."""
-    with progress(auto_refresh=False) as shown:
+    with progress(auto_refresh=False, disable=not err.is_terminal) as shown:
         task = shown.add_task(f"{description}: starting", total=None)
         shown.refresh()
         last_s = 0.0

@@ -116,7 +116,7 @@ def _patient(robot: Robot) -> Callable[[], Any]:
 
 
 def _check(layout: str, **counts: int) -> None:
-    if layout not in LAYOUTS:
+    if layout not in list(LAYOUTS):
         raise ExperimentError("layout", f"There is no layout {layout!r}. There are: {', '.join(LAYOUTS)}.")
     for name, count in counts.items():
         if type(count) is not int or count < 1:
