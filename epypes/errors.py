@@ -21,6 +21,7 @@ Everything an error's text mentions is an attribute of it::
     +-- FrameUnavailable        no frame is near enough to a time; .requested_ns, .oldest_ns, .newest_ns
     +-- MessageError            a message can't be made or understood; .reason
     +-- AddressError            an address can't be bound or connected to; .address
+    +-- KeysError               keys can't be made, read or used; .path
     +-- SettingsError           settings of hyperparameters can't be written or read; .path, .reasons
     +-- BundleError             a bundle is not what it says; .path
     |   +-- PromotionRefused    a graph can't become a bundle; .reasons
@@ -254,6 +255,14 @@ class AddressError(EpypesError, OSError):
 
     def __init__(self, address: str, text: str) -> None:
         self.address = address
+        super().__init__(text)
+
+
+class KeysError(EpypesError, ValueError):
+    """Keys can't be made, read or used."""
+
+    def __init__(self, path: object, text: str) -> None:
+        self.path = str(path)
         super().__init__(text)
 
 

@@ -57,6 +57,7 @@ class Mailbox:
         self.dropped: Counter[str] = Counter()
         self._items: deque[Any] = deque()
         self._changed = threading.Condition()
+        self._take: Callable[[Any], object] | None = None
 
     def put(self, item: Any, block: bool = True, timeout: float | None = None) -> None:
         """Put an item; never blocks unless the policy is ``"block"``.
@@ -68,13 +69,49 @@ class Mailbox:
         MailboxOverflow
             The policy is ``"fault"`` and there was no room.
         """
+        take = self._take or self._keep(item, block, timeout)
+        if take is not None:
+            take(item)
+
+    def hand_to(self, take: Callable[[Any], object], /) -> Callable[[], None]:
+        """Have each item handed over within `put`, on the thread that puts, instead of kept; return what ends that.
+
+        So nobody has to wait in `get`, and no thread has to be woken up: what a ZMQPublisher takes has been sent when
+        ``put`` returns. What is kept already is handed over first. ``take`` must not raise, and must let several
+        threads call it at once.
+
+        Raises
+        ------
+        ValueError
+            Its items are handed to somebody else already.
+        """
+        with self._changed:
+            if self._take is not None:
+                raise ValueError("The items of this mailbox are handed to somebody else. Give each publisher its own.")
+            while self._items:
+                take(self._items.popleft())
+            self._take = take
+            self._changed.notify_all()
+
+        def end() -> None:
+            # Without the lock, since the garbage collector calls this as well.
+            if self._take is take:
+                self._take = None
+
+        return end
+
+    def _keep(self, item: Any, block: bool, timeout: float | None) -> Callable[[Any], object] | None:
+        """Keep an item until somebody gets it, or return whom it must be handed to, since this has begun meanwhile."""
         with self._changed:
             dropped = self._make_room(block, timeout) if len(self._items) >= self.size else []
+            if self._take is not None:
+                return self._take
             self._items.append(item)
             self._changed.notify_all()
         if self._on_drop is not None:
             for old in dropped:
                 self._on_drop(old)
+        return None
 
     def _make_room(self, block: bool, timeout: float | None) -> list[Any]:
         """Make room for one item; return what was dropped for it."""

@@ -7,16 +7,20 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from epypes.transport.addresses import check_bind, is_loopback
+    from epypes.transport.keys import Keys, make_keys, read_keys
     from epypes.transport.publisher import ZMQPublisher
     from epypes.transport.subscriber import ZMQSubscriber
 
-__all__ = ["ZMQPublisher", "ZMQSubscriber", "check_bind", "is_loopback"]
+__all__ = ["Keys", "ZMQPublisher", "ZMQSubscriber", "check_bind", "is_loopback", "make_keys", "read_keys"]
 
 _HOME = {
+    "Keys": "keys",
     "ZMQPublisher": "publisher",
     "ZMQSubscriber": "subscriber",
     "check_bind": "addresses",
     "is_loopback": "addresses",
+    "make_keys": "keys",
+    "read_keys": "keys",
 }
 
 

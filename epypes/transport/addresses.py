@@ -55,7 +55,7 @@ def check_bind(address: str, insecure: bool = False) -> None:
         raise AddressError(
             address,
             f"{address} can be reached from other machines, which could then read and write without keys. "
-            "Bind 127.0.0.1, or say insecure=True.",
+            "Bind 127.0.0.1, give keys= and allow= (epypes.transport.make_keys makes keys), or say insecure=True.",
         )
 
 

@@ -1,168 +1,31 @@
-"""Who touches the sockets of this process? One I/O thread, and nobody else.
+"""Who touches the sockets of this process? One I/O thread, and nobody else without a socket's lock.
 
-ZeroMQ's sockets must not be shared between threads, and a thread per socket wakes up for nothing. So one daemon
-thread owns them all: it sleeps in a poller until a socket can be read or another thread hands it a command through
-a wake-up socket. It starts with the first command and ends when it has no socket left.
+ZeroMQ's sockets must not be used by two threads at once, and a thread per socket wakes up for nothing. So one daemon
+thread opens, reads and closes them all: it sleeps in a poller until a socket can be read, something is due, or
+another thread hands it a command through a wake-up socket. It starts with the first command and ends when it has no
+socket left.
+
+Sending alone is done where the message is, since to wake another thread for it takes longer than to send it (35 us
+of 60). A socket that is sent on has a lock, and whoever touches it holds that.
 """
 
 from __future__ import annotations
 
 import atexit
 import contextlib
-import logging
 import os
-import socket
 import threading
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import zmq
 
-from epypes.transport.addresses import address_error, check_port
+from epypes.transport.iothread import LINGER_MS, IOThread, Socket, has_arrived
+
+__all__ = ["IOThread", "Socket", "call", "close", "close_soon", "has_arrived", "on_io_thread", "soon"]
 
 T = TypeVar("T")
-Socket = zmq.Socket[bytes]
-Reader = Callable[[], None]
-
-log = logging.getLogger("epypes.transport")
-
-# How long a socket that was closed, or the end of the process, may wait for a peer that does not read.
-LINGER_MS = 1_000
-_CLOSE_MS = 500
-# A silent peer is dropped after 15 s; seldom enough that an idle process stays idle.
-_OPTIONS: dict[int, int] = {
-    zmq.HEARTBEAT_IVL: 5_000,
-    zmq.HEARTBEAT_TIMEOUT: 15_000,
-    zmq.HEARTBEAT_TTL: 30_000,
-    zmq.RECONNECT_IVL: 50,
-    zmq.RECONNECT_IVL_MAX: 2_000,
-    zmq.IPV6: 0,
-}
-
-
-class IOThread:
-    """The thread; its methods other than `submit` are for commands, which run on it."""
-
-    def __init__(self) -> None:
-        self._commands: deque[tuple[Callable[[IOThread], Any], Future[Any]]] = deque()
-        self._readers: dict[Socket, Reader] = {}
-        self._bound: dict[Socket, str] = {}
-        self._context = zmq.Context(io_threads=1)
-        self._poller = zmq.Poller()
-        self._wake_in, self._wake_out = socket.socketpair()
-        self._wake_in.setblocking(False)
-        self._wake_out.setblocking(False)
-        self._poller.register(self._wake_out.fileno(), zmq.POLLIN)
-        self.thread = threading.Thread(target=self._run, name="epypes-io", daemon=True)
-
-    def submit(self, command: Callable[[IOThread], Any], future: Future[Any]) -> None:
-        """Hand over a command; callable from any thread, under the module's lock."""
-        self._commands.append((command, future))
-        # Blocking would mean that the pipe is full of wake-ups already.
-        with contextlib.suppress(BlockingIOError):
-            self._wake_in.send(b"\0")
-
-    def open(
-        self, kind: int, address: str, bind: bool, reader: Reader, options: Sequence[tuple[int, int | bytes]]
-    ) -> Socket:
-        """Return a new socket, bound or connected, whose ``reader`` is called when it can be read.
-
-        Raises
-        ------
-        AddressError
-            If ZeroMQ refuses the address.
-        """
-        check_port(address)
-        new: Socket = self._context.socket(kind)
-        try:
-            # Options count only for what is bound or connected after them.
-            for option, value in [*_OPTIONS.items(), (zmq.LINGER, LINGER_MS), *options]:
-                new.setsockopt(option, value)
-            if bind:
-                new.bind(address)
-            else:
-                new.connect(address)
-        except (zmq.ZMQError, UnicodeError, ValueError, TypeError) as error:
-            new.close(linger=0)
-            number = getattr(error, "errno", None) or 0
-            raise address_error(address, "bound" if bind else "connected", number, str(error)) from error
-        if bind:
-            self._bound[new] = new.getsockopt_string(zmq.LAST_ENDPOINT)
-        self._readers[new] = reader
-        self._poller.register(new, zmq.POLLIN)
-        return new
-
-    def address_of(self, owned: Socket, address: str) -> str:
-        """Return the endpoint that a socket is really bound to, or the address it was connected to."""
-        return self._bound.get(owned, address)
-
-    def close(self, owned: Socket) -> bool:
-        """Close a socket, twice if you like; return whether it was the last one, so that the thread ends."""
-        if self._readers.pop(owned, None) is not None:
-            self._poller.unregister(owned)
-            _close(owned, self._bound.pop(owned, ""))
-        return not self._readers
-
-    def close_all(self) -> bool:
-        """Close every socket; the thread ends then."""
-        for owned in list(self._readers):
-            self.close(owned)
-        return True
-
-    def _run(self) -> None:
-        try:
-            while not self._ended():
-                ready = {found for found, _ in self._poller.poll()}
-                self._run_commands()
-                for owned, reader in list(self._readers.items()):
-                    # A command or another reader may have closed it.
-                    if owned in ready and owned in self._readers:
-                        _read(reader)
-        finally:
-            self._context.term()
-            self._wake_in.close()
-            self._wake_out.close()
-
-    def _ended(self) -> bool:
-        with _state.lock:
-            if self._readers or self._commands:
-                return False
-            if _state.current is self:
-                _state.current = None
-            return True
-
-    def _run_commands(self) -> None:
-        with contextlib.suppress(BlockingIOError):
-            self._wake_out.recv(4096)
-        while self._commands:
-            command, future = self._commands.popleft()
-            try:
-                future.set_result(command(self))
-            except Exception as error:
-                # It belongs to the thread that asked, with its traceback.
-                future.set_exception(error)
-
-
-def _close(owned: Socket, endpoint: str) -> None:
-    if not endpoint.startswith(("tcp:", "ipc:")):
-        owned.close()
-        return
-    # Sockets close in the background: without this wait the same port could not be bound again at once. Not unbind(),
-    # which would throw away what is still to be sent (measured: 32 of 50 messages arrived).
-    monitor = owned.get_monitor_socket(zmq.EVENT_CLOSED | zmq.EVENT_CLOSE_FAILED)
-    owned.close()
-    monitor.poll(_CLOSE_MS)
-    monitor.close(linger=0)
-
-
-def _read(reader: Reader) -> None:
-    try:
-        reader()
-    except Exception:
-        # A reader counts what it can't read; this is a bug of ours, and must not stop the others.
-        log.exception("a reader failed")
 
 
 class _State:
@@ -225,9 +88,19 @@ def on_io_thread() -> bool:
 def _started(start: bool) -> IOThread:
     if not start:
         raise zmq.ZMQError(zmq.ENOTSOCK)
-    new = _state.current = IOThread()
+    new = IOThread(lambda: _retire(new))
+    _state.current = new
     new.thread.start()
     return new
+
+
+def _retire(thread: IOThread) -> None:
+    """Have a thread end, unless it has just got something to do."""
+    with _state.lock:
+        if thread.is_idle():
+            thread.has_retired = True
+            if _state.current is thread:
+                _state.current = None
 
 
 def close(owned: Socket, timeout_s: float = 10.0) -> None:
@@ -253,11 +126,16 @@ def close(owned: Socket, timeout_s: float = 10.0) -> None:
         ending.join(min(timeout_s, LINGER_MS / 1000 + 0.5))
 
 
-def close_soon(owned: Socket) -> None:
-    """Have a socket closed without waiting; the garbage collector may call this in any thread, anywhere."""
+def soon(command: Callable[[IOThread], object]) -> None:
+    """Have a command run without waiting; the garbage collector may call this in any thread, anywhere."""
     current = _state.current
     if current is not None:
-        current.submit(lambda io: io.close(owned), Future())
+        current.submit(command, Future())
+
+
+def close_soon(owned: Socket) -> None:
+    """Have a socket closed without waiting; the garbage collector may call this in any thread, anywhere."""
+    soon(lambda io: io.close(owned))
 
 
 def _close_at_exit() -> None:

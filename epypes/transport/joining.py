@@ -13,12 +13,10 @@ import logging
 import threading
 import uuid
 from collections import Counter
-from typing import TYPE_CHECKING
 
 import zmq
 
-if TYPE_CHECKING:
-    from epypes.transport.io import Socket
+from epypes.transport.iothread import Socket, has_arrived
 
 JOIN_PREFIX = b"\xff\xffepypes/join/"
 _SUBSCRIBE, _UNSUBSCRIBE = 1, 0
@@ -35,7 +33,8 @@ class Doorkeeper:
 
     The socket is in manual mode, where every subscription of every peer is seen and is granted here, and the answer
     can be sent to the peer that asks and to nobody else: a peer of 2019 that subscribes to everything sees nothing
-    of it. (Where libzmq refuses that option, it would.) `read` runs on the I/O thread, the rest on any.
+    of it. (Where libzmq refuses that option, it would.) Who calls `read` holds the socket's lock; the rest any thread
+    may call.
     """
 
     def __init__(self) -> None:
@@ -48,18 +47,16 @@ class Doorkeeper:
         """Take the socket whose subscriptions `read` will read."""
         self._socket = socket
 
-    def read(self) -> None:
-        """Grant the subscriptions that have arrived, some at a time."""
+    def read(self) -> bool:
+        """Grant some of the subscriptions that have arrived; return whether there may be more."""
         socket = self._socket
-        if socket is None:
-            return
         for _ in range(_BATCH):
-            try:
-                message = socket.recv(zmq.DONTWAIT)
-            except zmq.Again:
-                return
+            if socket is None or socket.closed or not has_arrived(socket):
+                return False
+            message = socket.recv(zmq.DONTWAIT)
             if message[:1] in {b"\0", b"\1"}:
                 self._grant(socket, message[0], message[1:])
+        return True
 
     def wait(self, timeout_s: float) -> bool:
         """Return whether there is a subscriber, of any topic, within ``timeout_s`` seconds."""
@@ -104,6 +101,11 @@ class Guest:
         self.topic = JOIN_PREFIX + uuid.uuid4().hex.encode()
         self._changed = threading.Condition()
         self._publishers: set[bytes] = set()
+
+    @property
+    def has_joined(self) -> bool:
+        """Whether a publisher has answered."""
+        return bool(self._publishers)
 
     def saw(self, topic: bytes, identity: bytes) -> bool:
         """Take note of a message that is an answer to a join; return whether it is one, of any subscriber's."""

@@ -4,39 +4,34 @@ from __future__ import annotations
 
 import logging
 import os
-import queue as queues
 import threading
 import warnings
 import weakref
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import zmq
 
-from epypes.errors import MessageError, StillRunning
+from epypes.errors import StillRunning
 from epypes.transport import io
-from epypes.transport.addresses import check_bind
+from epypes.transport.heartbeat import Pulse
+from epypes.transport.inbox import Inbox, PutQueue, Source
 from epypes.transport.joining import Guest
-from epypes.wire import Envelope, Limits, decode, topic_frame
+from epypes.transport.keys import Keys, PublicKey
+from epypes.transport.security import Security, security
+from epypes.wire import Limits, topic_frame
 
 log = logging.getLogger("epypes.transport")
 
 # Messages read before the I/O thread looks at other sockets again.
 _BATCH = 100
-# Sources whose sequence numbers are followed; a peer that invents sources must not fill the memory.
-_MAX_SOURCES = 1_024
 HIGH_WATER_MARK = 1_000
-
-Source = tuple[str, int]
-
-
-class PutQueue(Protocol):
-    """What a subscriber puts into: queue.Queue, queue.SimpleQueue, ep.Mailbox."""
-
-    def put(self, item: Any, *, block: bool) -> object:
-        """Take an item, or raise queue.Full; called with ``block=False`` on the I/O thread."""
+# Two small messages in this time cost no CPU to speak of.
+HEARTBEAT_S = 1.0
+_DONTWAIT = int(zmq.DONTWAIT)
 
 
 class ZMQSubscriber:
@@ -55,16 +50,32 @@ class ZMQSubscriber:
     bind
         True to bind, for publishers that connect.
     insecure
-        True to bind an address that other machines can reach.
+        True to bind an address that other machines can reach, without keys.
+    keys
+        Its own pair of CURVE keys, from `make_keys` or `read_keys`, or the path of its .key_secret file.
+    allow
+        With keys: the public keys of the peers that may connect, as text, .key files or a folder of these; where it
+        connects itself, the one of the peer that is bound there.
     max_message_bytes
         A peer that sends a larger frame is disconnected; a larger message is counted in `rejected`.
     high_water_mark
         Messages kept by ZeroMQ until the I/O thread has read them.
+    heartbeat_s
+        After so many seconds of silence publishers of EPypes 1.0 are asked whether they live; after three times as
+        many without an answer the input is stale.
+
+    Attributes
+    ----------
+    on_stale
+        None, or called with True when the input becomes stale and with False when something is heard again. It is
+        called on the I/O thread, and must be quick.
 
     Raises
     ------
     AddressError
-        If ``bind`` is asked for an address that is not loopback, without ``insecure``.
+        If ``bind`` is asked for an address that is not loopback, with neither keys nor ``insecure``.
+    KeysError
+        If keys can't be read, or it is not said which are allowed.
     MessageError
         If ``topic`` can't be one.
 
@@ -81,16 +92,20 @@ class ZMQSubscriber:
         bind: bool = False,
         *,
         insecure: bool = False,
+        keys: Keys | str | Path | None = None,
+        allow: PublicKey | Collection[PublicKey] | None = None,
         max_message_bytes: int = Limits().total_bytes,
         high_water_mark: int = HIGH_WATER_MARK,
+        heartbeat_s: float = HEARTBEAT_S,
     ) -> None:
-        if bind:
-            check_bind(address, insecure)
-        self._given, self._bind = address, bind
+        self._security = security(address, bind, insecure, keys, allow)
+        self._given = address
         self._subscription = topic_frame(topic) if topic else b""
         self._limits = Limits(total_bytes=max_message_bytes)
         self._high_water_mark = high_water_mark
-        self._inbox = _Inbox(queue, self._limits)
+        self._inbox = Inbox(queue, self._limits)
+        self._heartbeat_s = heartbeat_s
+        self.on_stale: Callable[[bool], None] | None = None
         self._lock = threading.Lock()
         self._opened: _Opened | None = None
         self._finalizer: weakref.finalize[Any, Any] | None = None
@@ -121,6 +136,23 @@ class ZMQSubscriber:
         """How many envelopes never arrived, by (source, epoch): gaps in their sequence numbers; a copy."""
         return dict(self._inbox.lost)
 
+    @property
+    def refused(self) -> Counter[str]:
+        """How often peers were refused because their key is not allowed, by public key; a copy."""
+        return Counter(self._security.refused)
+
+    @property
+    def is_stale(self) -> bool:
+        """Whether a publisher that had joined is silent: it does not even answer. One that is idle does."""
+        opened = self._opened
+        return opened is not None and opened.pulse.is_stale
+
+    @property
+    def last_heard_s(self) -> float | None:
+        """How many seconds ago anything came from a publisher; None before that, and when it is stopped."""
+        opened = self._opened
+        return None if opened is None else opened.pulse.last_heard_s
+
     def start(self) -> Self:
         """Open the socket and begin to receive; nothing happens if it runs already.
 
@@ -131,9 +163,9 @@ class ZMQSubscriber:
         """
         with self._lock:
             if self._opened is None or self._opened.is_gone():
-                self._opened = opened = _Opened(self._inbox)
+                self._opened = opened = _Opened(self._inbox, Pulse(self._heartbeat_s, _reporter(self)))
                 try:
-                    opened.open(self._given, self._bind, self._options(opened.guest))
+                    opened.open(self._given, self._security, self._options(opened.guest), self._heartbeat_s)
                 except BaseException:
                     self._opened = None
                     raise
@@ -197,75 +229,28 @@ class ZMQSubscriber:
         return f"<ZMQSubscriber {self.address[:40]} {state}: {self.received} received>"
 
 
-class _Inbox:
-    """What happens to a message; all of it on the I/O thread."""
-
-    def __init__(self, queue: PutQueue, limits: Limits) -> None:
-        self._queue, self._limits = queue, limits
-        self.received = 0
-        self.rejected: Counter[str] = Counter()
-        self.dropped: Counter[str] = Counter()
-        self.lost: dict[Source, int] = {}
-        self._last: dict[Source, int] = {}
-
-    def accept(self, frames: Sequence[zmq.Frame], guest: Guest) -> None:
-        if len(frames) == 1:
-            self._put(frames[0].bytes)
-            return
-        if len(frames) == 2 and guest.saw(frames[0].bytes, frames[1].bytes):
-            return
-        try:
-            envelope = decode([frame.buffer for frame in frames], self._limits)
-        except MessageError as error:
-            self.rejected[error.reason] += 1
-            log.warning("rejected a message (%s): %s", error.reason, error)
-            return
-        self._follow(envelope)
-        self._put(envelope)
-
-    def _put(self, item: object) -> None:
-        # Counted before: whoever has the item must find it counted.
-        self.received += 1
-        try:
-            self._queue.put(item, block=False)
-        except queues.Full:
-            self.received -= 1
-            self.dropped["queue full"] += 1
-        except Exception as error:
-            # The user's queue may raise anything, a Mailbox of policy "fault" does; the others' sockets go on.
-            self.received -= 1
-            self.dropped[type(error).__name__] += 1
-            log.warning("the queue refused a message: %r", error)
-
-    def _follow(self, envelope: Envelope) -> None:
-        if envelope.sequence == 0:
-            return
-        source = (envelope.source, envelope.epoch)
-        # What came before the first one that was received was sent before this subscriber had joined.
-        last = self._last.pop(source, envelope.sequence - 1)
-        missing = envelope.sequence - last - 1
-        if missing > 0:
-            self.lost[source] = self.lost.get(source, 0) + missing
-        self._last[source] = max(last, envelope.sequence)
-        if len(self._last) > _MAX_SOURCES:
-            oldest = next(iter(self._last))
-            del self._last[oldest]
-            self.lost.pop(oldest, None)
-
-
 class _Opened:
     """From a start to its stop: the socket, and who has confirmed its subscription."""
 
-    def __init__(self, inbox: _Inbox) -> None:
-        self._inbox = inbox
+    def __init__(self, inbox: Inbox, pulse: Pulse) -> None:
+        self._inbox, self.pulse = inbox, pulse
         self._process = os.getpid()
         self._socket: io.Socket | None = None
         self.guest = Guest()
         self.address = ""
 
-    def open(self, address: str, bind: bool, options: Sequence[tuple[int, int | bytes]]) -> None:
+    def open(
+        self, address: str, security: Security, options: Sequence[tuple[int, int | bytes]], heartbeat_s: float
+    ) -> None:
+        self._inbox.begin()
+        gate = security.gate()
+        more = security.options(gate)
+
         def open_socket(thread: io.IOThread) -> str:
-            self._socket = thread.open(zmq.SUB, address, bind, self._read, options)
+            self._socket = opened = thread.open(
+                zmq.SUB, address, security.bind, self._read, [*options, *more], gate=gate
+            )
+            thread.every(heartbeat_s, opened, self._look)
             return thread.address_of(self._socket, address)
 
         self.address = io.call(open_socket, start=True)
@@ -285,17 +270,46 @@ class _Opened:
         """Return whether this is a forked child, where there is neither thread nor socket."""
         return self._process != os.getpid()
 
-    def _read(self) -> None:
+    def _look(self) -> None:
+        if self.pulse.look(self.guest.has_joined) and self._socket is not None:
+            self._socket.setsockopt(zmq.UNSUBSCRIBE, self.guest.topic)
+            self._socket.setsockopt(zmq.SUBSCRIBE, self.guest.topic)
+
+    def _read(self) -> bool:
         socket = self._socket
         for _ in range(_BATCH):
             # The queue's put may have stopped this subscriber.
             if socket is None or socket.closed:
-                return
+                return False
             try:
-                frames = socket.recv_multipart(zmq.DONTWAIT, copy=False)
+                frame = socket.recv(_DONTWAIT, copy=False)
             except zmq.Again:
-                return
-            self._inbox.accept(frames, self.guest)
+                return False
+            if frame.more:
+                self._inbox.accept([frame, *_rest(socket)], self.guest)
+            else:
+                self._inbox.put(frame.bytes)
+            self.pulse.heard()
+        return True
+
+
+def _reporter(subscriber: ZMQSubscriber) -> Callable[[bool], None]:
+    """Return what calls a subscriber's on_stale, and does not keep the subscriber alive."""
+    known = weakref.ref(subscriber)
+
+    def report(is_stale: bool) -> None:
+        found = known()
+        if found is not None and found.on_stale is not None:
+            found.on_stale(is_stale)
+
+    return report
+
+
+def _rest(socket: io.Socket) -> list[zmq.Frame]:
+    frames = [socket.recv(_DONTWAIT, copy=False)]
+    while frames[-1].more:
+        frames.append(socket.recv(_DONTWAIT, copy=False))
+    return frames
 
 
 def _abandon(opened: _Opened, address: str) -> None:

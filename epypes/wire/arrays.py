@@ -68,8 +68,24 @@ def flat_bytes(array: AnyArray) -> memoryview:
 
     if array.nbytes == 0:
         return memoryview(b"")
+    contiguous = np.ascontiguousarray(array)
+    if contiguous is not array:
+        # Nobody else knows this copy; now it can be seen that it does not change.
+        contiguous.flags.writeable = False
     # memoryview.cast knows only native formats; the view as bytes knows all of them.
-    return np.ascontiguousarray(array).reshape(-1).view(np.uint8).data.toreadonly()
+    return contiguous.reshape(-1).view(np.uint8).data.toreadonly()
+
+
+def is_settled(view: memoryview) -> bool:
+    """Return whether nobody can change what a view of `flat_bytes` shows: all arrays under it are read-only."""
+    import numpy as np
+
+    owner: object = view.obj
+    while isinstance(owner, np.ndarray):
+        if owner.flags.writeable:
+            return False
+        owner = owner.base
+    return owner is None or isinstance(owner, bytes)
 
 
 def read_dtype(text: str, where: str) -> np.dtype[Any]:

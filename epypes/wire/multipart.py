@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from epypes.errors import MessageError
 from epypes.wire.codecs import Payload, Reader, to_value
@@ -32,6 +32,14 @@ VERSION = 1
 _REFUSALS = (ValueError, TypeError, OverflowError, MemoryError, RecursionError)
 
 
+class Stamp(NamedTuple):
+    """What a publisher knows better than who made the envelope; see there."""
+
+    epoch: int
+    sequence: int
+    published_ns: int
+
+
 def encode(
     envelope: Envelope,
     topic: str = "",
@@ -39,6 +47,7 @@ def encode(
     *,
     rgb: Collection[str] = (),
     limits: Limits = DEFAULT_LIMITS,
+    stamp: Stamp | None = None,
 ) -> list[bytes | memoryview]:
     """Return the frames of an envelope: topic, header, payloads.
 
@@ -54,6 +63,8 @@ def encode(
         Names of parts in RGB order, beside those that the envelope names itself.
     limits
         What the receiver will accept.
+    stamp
+        Epoch, sequence number and time of publishing, in place of the envelope's own.
 
     Returns
     -------
@@ -90,6 +101,8 @@ def encode(
     first = topic_frame(topic)
     try:
         _write_plain(header, envelope)
+        if stamp is not None:
+            header.epoch, header.sequence, header.published_ns = stamp
         add_values(header.parts, envelope.parts, "parts")
         add_values(header.attributes, envelope.attributes, "attributes")
         head: bytes = header.SerializeToString()

@@ -1,0 +1,61 @@
+"""Which frames does an item become?"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+
+from epypes.errors import MessageError
+from epypes.run import Failure
+from epypes.wire import Envelope, Limits, encode, failure_event, serialized
+from epypes.wire.multipart import Stamp
+
+Frames = Sequence[bytes | memoryview]
+
+
+class Framing:
+    """Makes frames of items, and numbers the envelopes among them; one from a publisher's start to its stop."""
+
+    def __init__(self, topic: str, limits: Limits) -> None:
+        self._topic, self._limits = topic, limits
+        self._sequences: Counter[str] = Counter()
+        self._epoch = time.time_ns()
+
+    def frames(self, item: object) -> Frames:
+        """Return the frames of an item.
+
+        Raises
+        ------
+        MessageError
+            If it can't be sent. What code of the item itself raises comes as it is.
+        """
+        if isinstance(item, Envelope):
+            return self._envelope_frames(item)
+        if isinstance(item, bytes):
+            data = item
+        elif callable(getattr(item, "SerializeToString", None)):
+            data = serialized(item)  # type: ignore[arg-type]  # google is imported in wire alone
+        elif isinstance(item, Failure):
+            return self._envelope_frames(failure_event(item))
+        elif isinstance(item, bytearray | memoryview):
+            data = bytes(item)
+        else:
+            raise MessageError(
+                "no codec",
+                f"A publisher sends bytes, protobuf messages, Envelopes and Failures, not {type(item).__name__}. "
+                "Let f_out return one of these.",
+            )
+        if len(data) > self._limits.total_bytes:
+            raise MessageError(
+                "too large", f"A message of {len(data):,} bytes; the limit is {self._limits.total_bytes:,}."
+            )
+        return (data,)
+
+    def _envelope_frames(self, envelope: Envelope) -> Frames:
+        number = self._sequences[envelope.source] + 1
+        stamp = Stamp(self._epoch, number, time.time_ns())
+        frames = encode(envelope, self._topic, limits=self._limits, stamp=stamp)
+        # Counted when it can be sent: a rejected item is no loss on the way.
+        self._sequences[envelope.source] = number
+        return frames

@@ -1,0 +1,102 @@
+"""What happens to a message that has arrived? It is checked, counted and put into the user's queue."""
+
+from __future__ import annotations
+
+import logging
+import queue as queues
+import time
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import zmq
+
+from epypes.errors import MessageError
+from epypes.transport.joining import Guest
+from epypes.wire import Envelope, Limits, decode
+
+log = logging.getLogger("epypes.transport")
+
+# Sources whose sequence numbers are followed; a peer that invents sources must not fill the memory.
+_MAX_SOURCES = 1_024
+
+Source = tuple[str, int]
+
+
+class PutQueue(Protocol):
+    """What a subscriber puts into: queue.Queue, queue.SimpleQueue, ep.Mailbox."""
+
+    def put(self, item: Any, *, block: bool) -> object:
+        """Take an item, or raise queue.Full; called with ``block=False`` on the I/O thread."""
+
+
+class Inbox:
+    """What happens to a message; all of it on the I/O thread."""
+
+    def __init__(self, queue: PutQueue, limits: Limits) -> None:
+        self._queue, self._limits = queue, limits
+        self.received = 0
+        self.rejected: Counter[str] = Counter()
+        self.dropped: Counter[str] = Counter()
+        self.lost: dict[Source, int] = {}
+        self._opened_ns = 0
+        self._epochs: dict[str, int] = {}
+        self._last: dict[Source, int] = {}
+
+    def accept(self, frames: Sequence[zmq.Frame], guest: Guest) -> None:
+        """Take a message of several frames: the answer to a join, or an envelope."""
+        if len(frames) == 2 and guest.saw(frames[0].bytes, frames[1].bytes):
+            return
+        try:
+            envelope = decode([frame.buffer for frame in frames], self._limits)
+        except MessageError as error:
+            self.rejected[error.reason] += 1
+            log.warning("rejected a message (%s): %s", error.reason, error)
+            return
+        self._follow(envelope)
+        self.put(envelope)
+
+    def begin(self) -> None:
+        """Take note that a socket is opened."""
+        self._opened_ns = time.time_ns()
+
+    def put(self, item: object) -> None:
+        """Put an item into the queue, or count it as dropped."""
+        # Counted before: whoever has the item must find it counted.
+        self.received += 1
+        try:
+            self._queue.put(item, block=False)
+        except queues.Full:
+            self.received -= 1
+            self.dropped["queue full"] += 1
+        except Exception as error:
+            # The user's queue may raise anything, a Mailbox of policy "fault" does; the others' sockets go on.
+            self.received -= 1
+            self.dropped[type(error).__name__] += 1
+            log.warning("the queue refused a message: %r", error)
+
+    def _follow(self, envelope: Envelope) -> None:
+        if envelope.sequence == 0:
+            return
+        source = (envelope.source, envelope.epoch)
+        last = self._last.pop(source, None)
+        if last is None:
+            last = 0 if self._has_restarted(envelope) else envelope.sequence - 1
+        missing = envelope.sequence - last - 1
+        if missing > 0:
+            self.lost[source] = self.lost.get(source, 0) + missing
+        self._last[source] = max(last, envelope.sequence)
+        if len(self._last) > _MAX_SOURCES:
+            oldest = next(iter(self._last))
+            del self._last[oldest]
+            self.lost.pop(oldest, None)
+            self._epochs.pop(oldest[0], None)
+
+    def _has_restarted(self, envelope: Envelope) -> bool:
+        """Return whether a source that is known has begun anew while we listened.
+
+        Then what came before this envelope is lost; otherwise it was sent before this subscriber had joined.
+        """
+        known = self._epochs.get(envelope.source)
+        self._epochs[envelope.source] = max(envelope.epoch, known or 0)
+        return known is not None and envelope.epoch > max(known, self._opened_ns)

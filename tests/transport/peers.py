@@ -1,0 +1,61 @@
+"""Other processes for these tests: publishers that can be stopped, continued and killed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+LOCAL = "tcp://127.0.0.1:*"
+WAIT_S = 5.0
+
+
+def wait_until(condition: Callable[[], object], timeout_s: float = WAIT_S) -> None:
+    """Wait on an event that nobody sets, a little at a time, until a counter of another thread is right."""
+    never = threading.Event()
+    for _ in range(int(timeout_s / 0.005)):
+        if condition():
+            return
+        never.wait(0.005)
+    raise AssertionError("the condition did not come true in time")
+
+
+@contextmanager
+def process(script: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """Run a script in a process of its own, which is killed at the end."""
+    command = [sys.executable, "-W", "ignore::ResourceWarning", "-c", script, *arguments]
+    started = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        yield started
+    finally:
+        started.kill()
+        started.communicate()
+
+
+def line_of(started: subprocess.Popen[str]) -> str:
+    """Return the next line that a process prints."""
+    return started.stdout.readline().strip()
+
+
+# Prints its address; for every line "N" on its input it publishes N envelopes, numbered on.
+PUBLISHER = """
+import queue, sys
+from epypes.transport import ZMQPublisher
+from epypes.wire import Envelope
+out = queue.SimpleQueue()
+with ZMQPublisher(sys.argv[1], out, "t") as pub:
+    print(pub.address, flush=True)
+    number = 0
+    for line in sys.stdin:
+        for _ in range(int(line)):
+            number += 1
+            out.put(Envelope("x", {"n": number}, source="peer"))
+"""
+
+
+def publish(started: subprocess.Popen[str], count: int) -> None:
+    """Have a PUBLISHER send some."""
+    started.stdin.write(f"{count}\n")
+    started.stdin.flush()

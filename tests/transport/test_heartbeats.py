@@ -1,0 +1,132 @@
+"""Is a publisher that has stopped told from one that has nothing to say?"""
+
+from __future__ import annotations
+
+import queue
+import signal
+import threading
+import time
+
+import pytest
+import zmq
+
+from epypes.transport import ZMQPublisher, ZMQSubscriber
+from epypes.wire import Envelope
+from tests.transport.peers import LOCAL, PUBLISHER, WAIT_S, line_of, process, publish, wait_until
+
+
+class Changes:
+    """What on_stale was told, and when."""
+
+    def __init__(self) -> None:
+        self.told: queue.SimpleQueue = queue.SimpleQueue()
+
+    def __call__(self, is_stale: bool) -> None:
+        self.told.put((is_stale, time.monotonic(), threading.current_thread().name))
+
+
+def test_a_stopped_publisher_is_reported_stale_within_three_heartbeats_and_recovers():
+    changes, into, heartbeat_s = Changes(), queue.SimpleQueue(), 0.3
+    with process(PUBLISHER, LOCAL) as peer, ZMQSubscriber(line_of(peer), into, "t", heartbeat_s=heartbeat_s) as sub:
+        sub.on_stale = changes
+        assert sub.wait_joined(WAIT_S)
+        publish(peer, 1)
+        assert into.get(timeout=WAIT_S).parts["n"] == 1
+        assert not sub.is_stale
+        peer.send_signal(signal.SIGSTOP)
+        stopped = time.monotonic()
+        is_stale, when, _ = changes.told.get(timeout=WAIT_S)
+        assert is_stale
+        assert sub.is_stale
+        # A tenth for the scheduler.
+        assert when - stopped <= 3 * heartbeat_s + 0.1
+        peer.send_signal(signal.SIGCONT)
+        assert changes.told.get(timeout=WAIT_S)[0] is False
+        publish(peer, 1)
+        assert into.get(timeout=WAIT_S).parts["n"] == 2
+        assert not sub.is_stale
+        assert sub.lost == {}
+
+
+def test_an_idle_publisher_is_not_stale():
+    changes = Changes()
+    with ZMQPublisher(LOCAL, queue.SimpleQueue()) as pub:
+        with ZMQSubscriber(pub.address, queue.SimpleQueue(), heartbeat_s=0.05) as sub:
+            sub.on_stale = changes
+            assert sub.wait_joined(WAIT_S)
+            with pytest.raises(queue.Empty):
+                changes.told.get(timeout=1.0)
+            assert sub.last_heard_s < 0.5
+        assert sub.last_heard_s is None
+
+
+def test_a_publisher_that_has_ended_is_stale_until_another_comes():
+    changes = Changes()
+    out = queue.SimpleQueue()
+    with ZMQPublisher(LOCAL, out) as pub:
+        address = pub.address
+        sub = ZMQSubscriber(address, queue.SimpleQueue(), heartbeat_s=0.05).start()
+        sub.on_stale = changes
+        assert sub.wait_joined(WAIT_S)
+    with sub:
+        assert changes.told.get(timeout=WAIT_S)[0] is True
+        with ZMQPublisher(address, out):
+            assert changes.told.get(timeout=WAIT_S)[0] is False
+
+
+def test_a_subscriber_that_never_met_a_publisher_waits_and_is_not_stale():
+    changes = Changes()
+    with ZMQSubscriber(LOCAL, queue.SimpleQueue(), bind=True, heartbeat_s=0.02) as sub:
+        sub.on_stale = changes
+        with pytest.raises(queue.Empty):
+            changes.told.get(timeout=0.3)
+        assert sub.last_heard_s is None
+
+
+def test_an_on_stale_that_raises_is_logged_and_the_input_goes_on(caplog):
+    out, into = queue.SimpleQueue(), queue.SimpleQueue()
+    with ZMQPublisher(LOCAL, out) as pub:
+        address = pub.address
+        sub = ZMQSubscriber(address, into, heartbeat_s=0.05).start()
+        sub.on_stale = lambda is_stale: 1 / 0
+        assert sub.wait_joined(WAIT_S)
+    with sub:
+        wait_until(lambda: sub.is_stale)
+        with ZMQPublisher(address, out) as pub:
+            wait_until(lambda: not sub.is_stale)
+            out.put(b"x")
+            assert into.get(timeout=WAIT_S) == b"x"
+    assert "on_stale itself failed" in caplog.text
+
+
+def test_a_peer_of_2019_sees_nothing_of_heartbeats():
+    context = zmq.Context()
+    out = queue.SimpleQueue()
+    try:
+        with ZMQPublisher(LOCAL, out) as pub:
+            plain = context.socket(zmq.SUB)
+            plain.subscribe(b"")
+            plain.connect(pub.address)
+            assert pub.wait_for_subscriber(WAIT_S)
+            with ZMQSubscriber(pub.address, queue.SimpleQueue(), heartbeat_s=0.02) as sub:
+                assert sub.wait_joined(WAIT_S)
+                assert not plain.poll(400)
+                out.put(b"x")
+                assert plain.recv_multipart() == [b"x"]
+    finally:
+        context.destroy(linger=0)
+
+
+def test_nothing_is_lost_while_heartbeats_are_asked_for():
+    out, into = queue.SimpleQueue(), queue.SimpleQueue()
+    with (
+        ZMQPublisher(LOCAL, out, "t") as pub,
+        ZMQSubscriber(pub.address, into, "t", heartbeat_s=0.002) as sub,
+    ):
+        assert sub.wait_joined(WAIT_S)
+        for number in range(300):
+            out.put(Envelope("x", {"n": number}))
+            assert into.get(timeout=WAIT_S).parts["n"] == number
+            # Silence between, long enough to be asked about now and then.
+            threading.Event().wait(0.003 if number % 10 == 0 else 0)
+        assert sub.lost == {}

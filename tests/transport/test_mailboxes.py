@@ -1,0 +1,158 @@
+"""Is what is put into a Mailbox sent within put, whoever puts, and however it ends?"""
+
+from __future__ import annotations
+
+import os
+import queue
+import threading
+
+import numpy as np
+import pytest
+
+from epypes.pipeline import Mailbox
+from epypes.run import Failure
+from epypes.transport import ZMQPublisher, ZMQSubscriber
+from epypes.wire import Envelope
+from tests.transport.peers import LOCAL, WAIT_S
+
+
+@pytest.mark.parametrize("policy", ["latest", "drop_oldest", "block", "fault"])
+def test_nothing_is_dropped_since_nothing_waits(policy):
+    out, into = Mailbox(policy), queue.SimpleQueue()
+    with ZMQPublisher(LOCAL, out) as pub, ZMQSubscriber(pub.address, into) as sub:
+        assert sub.wait_joined(WAIT_S)
+        for number in range(200):
+            out.put(b"%d" % number)
+            assert pub.sent == number + 1
+        assert [int(into.get(timeout=WAIT_S)) for _ in range(200)] == list(range(200))
+    assert out.dropped == {}
+
+
+def test_it_is_sent_on_the_thread_that_puts_and_no_thread_waits_in_the_mailbox():
+    threads = []
+
+    class Item:
+        def SerializeToString(self):
+            threads.append(threading.current_thread())
+            return b"x"
+
+    out = Mailbox()
+    with ZMQPublisher(LOCAL, out):
+        out.put(Item())
+        assert threads == [threading.current_thread()]
+        assert not [thread for thread in threading.enumerate() if thread.name == "epypes-publisher"]
+
+
+def test_what_was_put_before_the_start_comes_first_and_after_the_stop_it_is_kept():
+    out, into = Mailbox("drop_oldest", 10), queue.SimpleQueue()
+    with ZMQSubscriber(LOCAL, into, bind=True) as sub:
+        pub = ZMQPublisher(sub.address, out, bind=False).start()
+        assert sub.wait_joined(WAIT_S)
+        out.put(b"1")
+        pub.stop()
+        out.put(b"2")
+        assert out.get(timeout=0) == b"2"
+        assert into.get(timeout=WAIT_S) == b"1"
+        assert pub.sent == 1
+    out.put(b"3")
+    with ZMQPublisher(LOCAL, out) as pub:
+        assert pub.sent == 2
+
+
+def test_many_threads_put_and_every_message_arrives_whole_and_in_the_order_of_its_thread():
+    out, into = Mailbox("block", 1), queue.SimpleQueue()
+    with ZMQPublisher(LOCAL, out, high_water_mark=10_000) as pub, ZMQSubscriber(pub.address, into) as sub:
+        assert sub.wait_joined(WAIT_S)
+
+        def put_all(name: str) -> None:
+            for number in range(250):
+                out.put(Envelope("x", {"who": name, "n": number, "data": np.full(3_000, number % 251, np.int32)}))
+
+        threads = [threading.Thread(target=put_all, args=(name,)) for name in "abcd"]
+        for thread in threads:
+            thread.start()
+        received = [into.get(timeout=WAIT_S) for _ in range(1_000)]
+        for thread in threads:
+            thread.join(WAIT_S)
+    assert [event.sequence for event in received] == list(range(1, 1_001))
+    for name in "abcd":
+        assert [event.parts["n"] for event in received if event.parts["who"] == name] == list(range(250))
+    assert all((event.parts["data"] == event.parts["n"] % 251).all() for event in received)
+
+
+def test_an_item_whose_own_code_puts_another_is_sent_first():
+    out, into = Mailbox(), queue.SimpleQueue()
+
+    class Item:
+        def SerializeToString(self):
+            out.put(b"second")
+            return b"first"
+
+    with ZMQPublisher(LOCAL, out) as pub, ZMQSubscriber(pub.address, into) as sub:
+        assert sub.wait_joined(WAIT_S)
+        out.put(Item())
+        assert [into.get(timeout=WAIT_S) for _ in range(2)] == [b"first", b"second"]
+
+
+def test_two_publishers_can_not_share_a_mailbox_and_the_second_leaves_no_socket():
+    out = Mailbox()
+    with ZMQPublisher(LOCAL, out):
+        second = ZMQPublisher(LOCAL, out)
+        with pytest.raises(ValueError, match="Give each publisher its own"):
+            second.start()
+        assert "stopped" in repr(second)
+    with second:
+        out.put(b"x")
+        assert second.sent == 1
+
+
+def test_a_stop_from_within_put_ends_it():
+    out = Mailbox()
+
+    class Item:
+        def SerializeToString(self):
+            pub.stop()
+            return b"x"
+
+    pub = ZMQPublisher(LOCAL, out).start()
+    out.put(Item())
+    assert "stopped" in repr(pub)
+    assert pub.rejected == {"not sent": 1}
+
+
+def test_a_taker_that_waits_in_get_is_woken_up_when_items_are_handed_over():
+    mailbox, taken = Mailbox("block", 1), []
+    mailbox.put(1)
+    putter = threading.Thread(target=mailbox.put, args=(2,))
+    putter.start()
+    end = mailbox.hand_to(taken.append)
+    putter.join(WAIT_S)
+    mailbox.put(3)
+    end()
+    mailbox.put(4)
+    assert taken == [1, 2, 3]
+    assert mailbox.get(timeout=0) == 4
+
+
+def test_a_forked_child_neither_uses_its_parents_socket_nor_hangs():
+    out, into = Mailbox(), queue.SimpleQueue()
+    with ZMQPublisher(LOCAL, out) as pub, ZMQSubscriber(pub.address, into) as sub:
+        assert sub.wait_joined(WAIT_S)
+        child = os.fork()
+        if child == 0:
+            out.put(b"of the child")
+            os._exit(0 if pub.rejected == {"not sent": 1} else 1)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        out.put(b"of the parent")
+        assert into.get(timeout=WAIT_S) == b"of the parent"
+
+
+@pytest.mark.parametrize("make", [Mailbox, queue.SimpleQueue])
+def test_a_failure_is_published_as_its_event(make):
+    out, into = make(), queue.SimpleQueue()
+    with ZMQPublisher(LOCAL, out, "failures") as pub, ZMQSubscriber(pub.address, into, "failures") as sub:
+        assert sub.wait_joined(WAIT_S)
+        out.put(Failure("detect", ("image", "keypoints"), {}, ValueError("no corners"), "7", 2, "vision"))
+        event = into.get(timeout=WAIT_S)
+    assert (event.type, event.source, event.correlation_id, event.sequence) == ("epypes.failure", "vision", "7", 1)
+    assert (event.failure.function, event.failure.message, event.failure.attempt) == ("detect", "no corners", 2)

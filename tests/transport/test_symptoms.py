@@ -1,0 +1,289 @@
+"""Does what breaks elsewhere hold here? Each test bears a symptom that users of other systems have reported."""
+
+from __future__ import annotations
+
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+import zlib
+
+import numpy as np
+import pytest
+import zmq
+
+import epypes as ep
+from epypes.pipeline import Mailbox
+from epypes.run import Failure
+from epypes.transport import ZMQPublisher, ZMQSubscriber
+from epypes.wire import Envelope
+from tests.transport.peers import LOCAL, PUBLISHER, WAIT_S, line_of, process, publish, wait_until
+
+# Answers what it hears, on a socket of its own.
+ECHO = """
+import queue, sys
+from epypes.transport import ZMQPublisher, ZMQSubscriber
+asked = queue.SimpleQueue()
+with ZMQSubscriber(sys.argv[1], asked, bind=True) as sub, ZMQPublisher(sys.argv[2], asked) as pub:
+    print(sub.address, pub.address, flush=True)
+    sys.stdin.read()
+"""
+
+# Sends a lot to a subscriber that does not read, and is then told to end.
+STUFFED = """
+import queue, signal, sys
+from epypes.transport import ZMQPublisher
+def end(number, frame):
+    raise SystemExit
+signal.signal(signal.SIGTERM, end)
+out = queue.SimpleQueue()
+with ZMQPublisher("tcp://127.0.0.1:*", out) as pub:
+    print(pub.address, flush=True)
+    assert pub.wait_for_subscriber(10)
+    for _ in range(300):
+        out.put(bytes(1_000_000))
+    print("stuffed", flush=True)
+    while True:
+        signal.pause()
+"""
+
+SUBSCRIBER = """
+import queue, sys
+from epypes.transport import ZMQSubscriber
+into = queue.SimpleQueue()
+with ZMQSubscriber(sys.argv[1], into) as sub:
+    assert sub.wait_joined(10)
+    print("joined", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.slow
+def test_a_subscriber_that_computes_is_not_deaf_after_the_publisher_restarts():
+    into, received = queue.SimpleQueue(), []
+    with process(PUBLISHER, LOCAL) as first:
+        address = line_of(first)
+        sub = ZMQSubscriber(address, into, "t").start()
+        assert sub.wait_joined(WAIT_S)
+        publish(first, 30)
+        wait_until(lambda: sub.received == 30)
+    with sub, process(PUBLISHER, address) as second:
+        assert line_of(second) == address
+        for _ in range(70):
+            publish(second, 1)
+            # The consumer computes all the while: this thread is the only one that takes from its queue.
+            busy_until = time.perf_counter() + 0.02
+            while time.perf_counter() < busy_until:
+                np.linalg.norm(np.ones((50, 50)))
+        publish(second, 1)
+        wait_until(lambda: sub.received + sum(sub.lost.values()) == 101)
+        while not into.empty():
+            received.append(into.get().parts["n"])
+        assert len(received) == sub.received >= 95
+        assert received[-1] == 71
+
+
+@pytest.mark.slow
+def test_idle_publisher_subscriber_and_loop_take_under_half_a_percent_of_a_core():
+    script = """
+import queue, sys, threading, time
+import epypes as ep
+cg = ep.CompGraph({"double": lambda x: 2 * x}, {"double": ("x", "y")})
+asked, out = queue.SimpleQueue(), queue.SimpleQueue()
+pipe = ep.FullPipeline("p", cg, asked, out, lambda event: {"x": 1}, lambda view: b"y")
+with ep.ZMQPublisher("tcp://127.0.0.1:*", out) as pub, ep.ZMQSubscriber(pub.address, asked) as sub, pipe:
+    assert sub.wait_joined(5)
+    cpu, wall = time.process_time(), time.perf_counter()
+    threading.Event().wait(5.0)
+    cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+sys.exit(0 if cpu / wall < 0.005 else f"{cpu / wall:.2%}")
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_a_caller_does_not_wait_for_ever_for_a_server_that_was_killed_and_is_served_after_its_restart():
+    out, answers = queue.SimpleQueue(), queue.SimpleQueue()
+    with process(ECHO, LOCAL, LOCAL) as server:
+        addresses = line_of(server).split()
+        pub, sub = ZMQPublisher(addresses[0], out, bind=False).start(), ZMQSubscriber(addresses[1], answers).start()
+        assert sub.wait_joined(WAIT_S)
+        assert pub.wait_for_subscriber(WAIT_S)
+        out.put(b"1")
+        assert answers.get(timeout=WAIT_S) == b"1"
+        server.kill()
+        server.wait()
+        wait_until(lambda: not pub.wait_for_subscriber(0))
+        out.put(b"2")
+        with pytest.raises(queue.Empty):
+            answers.get(timeout=0.2)
+    with process(ECHO, *addresses) as server, pub, sub:
+        assert line_of(server).split() == addresses
+        assert pub.wait_for_subscriber(WAIT_S)
+        wait_until(lambda: sub.last_heard_s < 0.5)
+        out.put(b"3")
+        assert answers.get(timeout=WAIT_S) == b"3"
+
+
+def test_an_output_buffer_that_is_used_again_at_once_does_not_tear_a_thousand_frames():
+    buffer, out, into = np.zeros((300, 400), np.uint8), Mailbox(), queue.SimpleQueue()
+    with (
+        ZMQPublisher(LOCAL, out, high_water_mark=2_000) as pub,
+        ZMQSubscriber(pub.address, into, high_water_mark=2_000) as sub,
+    ):
+        assert sub.wait_joined(WAIT_S)
+        for number in range(1_000):
+            buffer[:] = number % 251
+            buffer[0, :8] = np.frombuffer(number.to_bytes(8, "little"), np.uint8)
+            checksum = zlib.crc32(buffer)
+            out.put(Envelope("x", {"image": buffer, "crc": checksum}))
+            buffer[:] = 255
+        for _ in range(1_000):
+            event = into.get(timeout=WAIT_S)
+            assert zlib.crc32(event.parts["image"]) == event.parts["crc"]
+        assert sub.lost == {}
+
+
+def test_a_function_that_returns_the_same_buffer_again_does_not_tear_frames_on_their_way():
+    buffer = np.zeros((300, 400), np.uint8)
+
+    def draw(number):
+        buffer[:] = number % 251
+        return buffer
+
+    cg = ep.CompGraph({"draw": draw}, {"draw": ("number", "image")})
+    asked, out, into = queue.SimpleQueue(), Mailbox(), queue.SimpleQueue()
+    pipe = ep.FullPipeline(
+        "p", cg, asked, out, lambda number: {"number": number}, lambda view: Envelope("x", {"image": view["image"]})
+    )
+    with ZMQPublisher(LOCAL, out) as pub, ZMQSubscriber(pub.address, into) as sub, pipe:
+        assert sub.wait_joined(WAIT_S)
+        for number in range(200):
+            asked.put(number)
+        for number in range(200):
+            assert (into.get(timeout=WAIT_S).parts["image"] == number % 251).all()
+
+
+def test_an_array_that_nobody_can_change_is_sent_without_a_copy_and_whole():
+    image, out, into = np.arange(1_000_000, dtype=np.int32), Mailbox(), queue.SimpleQueue()
+    image.flags.writeable = False
+    with ZMQPublisher(LOCAL, out) as pub, ZMQSubscriber(pub.address, into) as sub:
+        assert sub.wait_joined(WAIT_S)
+        out.put(Envelope("x", {"image": image[100:]}))
+        assert np.array_equal(into.get(timeout=WAIT_S).parts["image"], image[100:])
+
+
+@pytest.mark.slow
+def test_five_hundred_starts_and_stops_crash_nothing():
+    out = Mailbox()
+    for number in range(500):
+        with ZMQPublisher(LOCAL, out) as pub, ZMQSubscriber(pub.address, queue.SimpleQueue()):
+            out.put(b"%d" % number)
+    assert out.empty()
+
+
+def test_no_socket_is_ever_used_by_two_threads_at_once(monkeypatch):
+    inside: dict[int, int] = {}
+    shared, strangers = [], []
+
+    def spied(name: str):
+        real = getattr(zmq.Socket, name)
+
+        def spy(self, *args, **kwargs):
+            me = threading.get_ident()
+            if inside.setdefault(id(self), me) != me:
+                shared.append(name)
+            if name in {"recv", "bind", "connect", "close"} and threading.current_thread().name == "MainThread":
+                strangers.append(name)
+            try:
+                return real(self, *args, **kwargs)
+            finally:
+                inside.pop(id(self), None)
+
+        monkeypatch.setattr(zmq.Socket, name, spy)
+
+    for name in ("send", "recv", "get", "setsockopt", "bind", "connect", "close"):
+        spied(name)
+    out, into = Mailbox(), queue.SimpleQueue()
+    with ZMQPublisher(LOCAL, out) as pub, ZMQSubscriber(pub.address, into, heartbeat_s=0.002) as sub:
+        assert sub.wait_joined(WAIT_S)
+        threads = [threading.Thread(target=lambda: [out.put(b"x") for _ in range(300)]) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        # Subscriptions come and go on the same socket meanwhile.
+        for _ in range(10):
+            with ZMQSubscriber(pub.address, queue.SimpleQueue()) as other:
+                assert other.wait_joined(WAIT_S)
+        for _ in range(1_200):
+            into.get(timeout=WAIT_S)
+        for thread in threads:
+            thread.join(WAIT_S)
+    assert shared == []
+    assert strangers == []
+
+
+@pytest.mark.slow
+def test_a_process_with_a_peer_that_does_not_read_exits_within_the_drain_time_and_a_second():
+    with process(STUFFED) as stuffed, process(SUBSCRIBER, line_of(stuffed)) as peer:
+        assert line_of(peer) == "joined"
+        peer.send_signal(signal.SIGSTOP)
+        assert line_of(stuffed) == "stuffed"
+        stuffed.send_signal(signal.SIGTERM)
+        before = time.monotonic()
+        assert stuffed.wait(timeout=20) == 0
+        # Draining the queue into the socket takes 5 s at most, closing the socket 1 s.
+        assert time.monotonic() - before < 5.0 + 1.0 + 1.0
+
+
+@pytest.mark.slow
+def test_a_subscriber_that_is_stopped_or_killed_does_not_block_the_others():
+    out, into = queue.SimpleQueue(), queue.SimpleQueue()
+    with ZMQPublisher(LOCAL, out, high_water_mark=10) as pub, ZMQSubscriber(pub.address, into) as sub:
+        assert sub.wait_joined(WAIT_S)
+        with process(SUBSCRIBER, pub.address) as dead, process(SUBSCRIBER, pub.address) as killed:
+            assert [line_of(dead), line_of(killed)] == ["joined"] * 2
+            dead.send_signal(signal.SIGSTOP)
+            killed.kill()
+            slowest_s = 0.0
+            for number in range(200):
+                before = time.monotonic()
+                out.put(Envelope("x", {"n": number, "image": np.zeros(500_000, np.uint8)}))
+                assert into.get(timeout=WAIT_S).parts["n"] == number
+                slowest_s = max(slowest_s, time.monotonic() - before)
+            assert slowest_s < 1.0
+        assert sub.lost == {}
+
+
+def test_failures_are_not_starved_by_images():
+    data, events = queue.SimpleQueue(), queue.SimpleQueue()
+    images, failures = Mailbox("latest"), queue.SimpleQueue()
+    ended = threading.Event()
+
+    def overload() -> None:
+        while not ended.is_set():
+            data.put(Envelope("frame", {"image": np.zeros(1_000_000, np.uint8)}))
+            # Ahead of the socket, but not of the memory.
+            while data.qsize() > 20 and not ended.is_set():
+                ended.wait(0.0005)
+
+    with (
+        ZMQPublisher(LOCAL, data, "data", high_water_mark=20) as pub,
+        ZMQPublisher(LOCAL, events, "failures") as event_pub,
+        ZMQSubscriber(pub.address, images, "data", high_water_mark=20) as sub,
+        ZMQSubscriber(event_pub.address, failures, "failures") as event_sub,
+    ):
+        assert sub.wait_joined(WAIT_S)
+        assert event_sub.wait_joined(WAIT_S)
+        source = threading.Thread(target=overload, daemon=True)
+        source.start()
+        wait_until(lambda: sub.received > 20)
+        for number in range(200):
+            events.put(Failure("detect", (), {}, ValueError("bad"), str(number)))
+        arrived = [failures.get(timeout=20).correlation_id for _ in range(200)]
+        ended.set()
+        source.join(WAIT_S)
+        assert arrived == [str(number) for number in range(200)]
+        assert event_sub.lost == {}
