@@ -14,7 +14,8 @@ from typing import Any, Self
 
 from epypes.acquisition.cameras import camera, has_twins
 from epypes.acquisition.frames import Frame
-from epypes.acquisition.worker import Counts, State, Worker
+from epypes.acquisition.ring import Ring
+from epypes.acquisition.worker import Counts, Ending, State, Worker
 from epypes.errors import StillRunning
 
 _AT_EXIT_S = 0.5
@@ -97,6 +98,11 @@ class ImageAcquisition:
         return self._finalizer is not None
 
     @property
+    def rings(self) -> tuple[Ring, ...]:
+        """The recent frames, by camera."""
+        return tuple(worker.ring for worker in self._workers)
+
+    @property
     def counts(self) -> tuple[Counts, ...]:
         """Frames, missed frames and failures, by camera."""
         return tuple(worker.counts for worker in self._workers)
@@ -116,11 +122,11 @@ class ImageAcquisition:
         """
         with self._lock:
             if self._finalizer is None:
-                _require_ended([worker for worker in self._workers if worker.is_alive], 0.0)
+                _require_ended([worker.name for worker in self._workers if worker.is_alive], 0.0)
                 for worker in self._workers:
                     worker.start()
                     _started.add(worker)
-                self._finalizer = weakref.finalize(self, _abandon, self._workers, repr(self))
+                self._finalizer = weakref.finalize(self, _abandon, self._workers)
         return self
 
     def stop(self, timeout_s: float = 5.0) -> None:
@@ -138,10 +144,8 @@ class ImageAcquisition:
             if self._finalizer is not None:
                 self._finalizer.detach()
                 self._finalizer = None
-            for worker in self._workers:
-                worker.ask_to_stop()
-                worker.end_read(deadline_s)
-        _require_ended([worker for worker in self._workers if not worker.join(deadline_s)], timeout_s)
+            endings = _end(self._workers, deadline_s)
+        _require_ended([ending.name for ending in endings if not ending.join(deadline_s)], timeout_s)
 
     def nearest(self, time_ns: int) -> tuple[Frame, ...]:
         """Return each camera's frame nearest to a time; never waits.
@@ -185,30 +189,31 @@ def _is_settled(worker: Worker) -> bool:
     return worker.has_frame or worker.state in ("ended", "failed")
 
 
-def _require_ended(busy: Sequence[Worker], timeout_s: float) -> None:
+def _require_ended(busy: Sequence[str], timeout_s: float) -> None:
     if busy:
-        raise StillRunning("ImageAcquisition", [worker.name for worker in busy], timeout_s)
+        raise StillRunning("ImageAcquisition", busy, timeout_s)
 
 
-def _abandon(workers: Sequence[Worker], name: str) -> None:
+def _end(workers: Sequence[Worker], deadline_s: float) -> list[Ending]:
+    for worker in workers:
+        worker.ask_to_stop()
+    return [ending for worker in workers if (ending := worker.end_read(deadline_s)) is not None]
+
+
+def _abandon(workers: Sequence[Worker]) -> None:
     # By the garbage collector or at exit: so no waiting, no locks.
     for worker in workers:
         worker.ask_to_stop()
-    warnings.warn(
-        f"{name} was left running. Call stop(), or use it in a with statement.", ResourceWarning, stacklevel=2
-    )
+    text = f"An ImageAcquisition of {len(workers)} was left running. Call stop(), or use it in a with statement."
+    warnings.warn(text, ResourceWarning, stacklevel=2)
 
 
 @atexit.register
 def _end_threads() -> None:
-    # A thread that comes back from OpenCV while the interpreter goes down aborts the process. A camera that waits for
-    # nothing but its time comes back at once.
+    # A thread that comes back from OpenCV while the interpreter goes down aborts the process: its destructors may not
+    # be left by Python's way of ending threads. Cameras that wait for the next frame's time come back at once.
     deadline_s = time.monotonic() + _AT_EXIT_S
-    workers = [worker for worker in list(_started) if worker.is_alive]
-    for worker in workers:
-        worker.ask_to_stop()
-        # Some interpreters start no thread any more by now.
-        with contextlib.suppress(RuntimeError):
-            worker.end_read(deadline_s)
-    for worker in workers:
-        worker.join(deadline_s)
+    # Some interpreters start no thread any more by now.
+    with contextlib.suppress(RuntimeError):
+        for ending in _end(list(_started), deadline_s):
+            ending.join(deadline_s)

@@ -55,8 +55,8 @@ def take_image(given: list[Any]) -> Array:
     return image
 
 
-def locked_copy(image: Array) -> Array:
-    """Return a read-only copy of an image, which `take_image` will not copy again.
+def lasting_copy(image: Array) -> Array:
+    """Return a copy of an image that nobody can ever write to, so that `take_image` will not copy it.
 
     Raises
     ------
@@ -66,9 +66,8 @@ def locked_copy(image: Array) -> Array:
     import numpy as np
 
     _require_image(image, np)
-    copy = np.array(image, order="K")
-    copy.setflags(write=False)
-    return copy
+    # A lock could be opened again by whoever has the array; bytes have none.
+    return np.frombuffer(image.tobytes(), image.dtype).reshape(image.shape)
 
 
 def _require_image(given: Any, np: Any) -> None:
@@ -85,13 +84,11 @@ def _is_settled(given: list[Any], np: Any) -> bool:
     if type(array) is not np.ndarray:
         return False
     owner = array if array.base is None else array.base
-    if type(owner) is bytes:
+    if bytes in (type(owner), type(getattr(owner, "base", None))):
         return True
     # Memory of anything else, such as a driver's buffer, is filled again as soon as the driver likes.
     if type(owner) is not np.ndarray or not owner.flags.owndata:
         return False
-    if not owner.flags.writeable:
-        return True
     del array, owner
     return _references(given) <= _ALONE and _is_owned_alone(given[0])
 

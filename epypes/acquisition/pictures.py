@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from epypes.acquisition.files import read_image
-from epypes.acquisition.frames import locked_copy
+from epypes.acquisition.frames import lasting_copy
 from epypes.acquisition.quiet import quiet
 from epypes.errors import ImageFileError
 
@@ -32,7 +32,7 @@ class Still:
     """
 
     def __init__(self, image: Any, loop: bool = True) -> None:
-        self._image = locked_copy(image)
+        self._image = lasting_copy(image)
         self._loop, self._was_given = loop, False
 
     def read(self) -> Any:
@@ -69,14 +69,15 @@ class Sequence:
 
     def read(self) -> Any:
         """Return the next item; None if there are no more."""
-        if self._items is not None:
-            for item in self._items:
+        items = self._items
+        if items is not None:
+            for item in items:
                 return _required(item)
             if not self._loop:
                 return None
-        self._items = iter(self._start())
+        self._items = items = iter(self._start())
         # A round without any item would be followed by others for ever.
-        for item in self._items:
+        for item in items:
             return _required(item)
         return None
 

@@ -7,10 +7,10 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from epypes.acquisition.frames import Frame, take_image
-from epypes.acquisition.pace import Camera
+from epypes.acquisition.pace import Alarm, Camera
 from epypes.acquisition.ring import Ring
 from epypes.errors import CameraUnavailable
 
@@ -46,6 +46,24 @@ class Counts:
     failed: int
 
 
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """The threads of one camera that was asked to stop."""
+
+    name: str
+    reading: threading.Thread
+    closing: threading.Thread
+
+    def join(self, deadline_s: float) -> bool:
+        """Wait for the threads; return whether the camera has ended, or it is its own thread that asks."""
+        threads = (self.reading, self.closing)
+        if threading.current_thread() in threads:
+            return True
+        for thread in threads:
+            thread.join(max(0.0, deadline_s - time.monotonic()))
+        return not self.reading.is_alive()
+
+
 class Worker:
     """One camera, its ring, and the thread that never waits for anybody but the camera.
 
@@ -76,8 +94,9 @@ class Worker:
         self.state: State = "stopped"
         self.has_frame = False
         self._on_error, self._on_change = on_error, on_change
+        self._image: Any = None
         self._frames = self._missed = self._failed = self._missed_in_a_row = 0
-        self._stop = threading.Event()
+        self._stop = Alarm()
         self._thread: threading.Thread | None = None
 
     @property
@@ -92,53 +111,51 @@ class Worker:
 
     def start(self) -> None:
         """Start the thread, of which there must be none."""
-        self._stop = threading.Event()
-        self.has_frame, self.state = False, "running"
+        self._stop = Alarm()
+        self.has_frame, self.state, self._missed_in_a_row = False, "running", 0
         self._thread = threading.Thread(target=self._run, args=(self._stop,), name=f"epypes {self.name}", daemon=True)
         self._thread.start()
 
     def ask_to_stop(self) -> None:
         """Tell the thread to end after the read under way."""
-        self._stop.set()
+        self._stop.ring()
 
-    def end_read(self, deadline_s: float) -> None:
-        """Close the camera until the thread has ended, on a thread of its own: close() might wait for a lock."""
-        if self.is_alive and self._thread is not threading.current_thread():
-            threading.Thread(
-                target=self._close_again, args=(self._thread, deadline_s), name=f"epypes close {self.name}", daemon=True
-            ).start()
-
-    def join(self, deadline_s: float) -> bool:
-        """Wait for the thread; return whether it has ended. On the thread itself, True."""
+    def end_read(self, deadline_s: float) -> Ending | None:
+        """Close the camera until its thread has ended; return how to wait for that, unless it has ended already."""
         thread = self._thread
-        if thread is None or thread is threading.current_thread():
-            return True
-        thread.join(max(0.0, deadline_s - time.monotonic()))
-        return not thread.is_alive()
+        if thread is None or not thread.is_alive():
+            return None
+        # On a thread of its own, since a user's close() might wait for a lock that the read holds.
+        closing = threading.Thread(
+            target=self._close_again, args=(thread, deadline_s), name=f"epypes close {self.name}", daemon=True
+        )
+        closing.start()
+        return Ending(self.name, thread, closing)
 
     def _close_again(self, thread: threading.Thread, deadline_s: float) -> None:
-        while thread.is_alive() and time.monotonic() < deadline_s:
+        while thread.is_alive():
             self._close()
             thread.join(_CLOSE_AGAIN_S)
+            if time.monotonic() >= deadline_s:
+                return
 
-    def _run(self, stop: threading.Event) -> None:
-        state: State = "stopped"
+    def _run(self, stop: Alarm) -> None:
         try:
-            if not self._capture_until(stop):
-                state = "ended"
+            self._capture(stop)
+            self._end("stopped" if stop.has_rung else "ended")
         except BaseException as exception:  # a generator's SystemExit must not end the thread in silence
             # A read that was ended by close() may raise anything, and that is nobody's fault.
-            if not stop.is_set():
-                state = "failed"
+            if stop.has_rung:
+                self._end("stopped")
+            else:
                 self._failed += 1
+                self._end("failed")
                 self._report(exception)
         self._close()
-        self.state = "stopped" if stop.is_set() else state
-        self._on_change()
 
-    def _capture_until(self, stop: threading.Event) -> bool:
-        """Read frames until told to stop; return False if the camera has no more."""
-        while not stop.is_set():
+    def _capture(self, stop: Alarm) -> None:
+        """Read frames until told to stop, or until there are no more."""
+        while not stop.has_rung:
             try:
                 given = [self.camera.read()]
             except CameraUnavailable as error:
@@ -146,14 +163,21 @@ class Worker:
                 continue
             captured_ns = time.time_ns()
             if given[0] is None:
-                return stop.is_set()
+                return
             self._keep(given, captured_ns)
-        return True
 
-    def _keep(self, given: list[object], captured_ns: int) -> None:
+    def _end(self, state: State) -> None:
+        self.state = state
+        self._on_change()
+
+    def _keep(self, given: list[Any], captured_ns: int) -> None:
         self._missed_in_a_row = 0
-        # The number is taken first: whoever has a frame must find it counted.
-        frame = Frame(take_image(given), captured_ns, self._frames + 1)
+        # An image that lies still was looked at when it came first.
+        is_known = given[0] is self._image and not self._image.flags.writeable
+        image = self._image if is_known else take_image(given)
+        self._image = image
+        frame = Frame(image, captured_ns, self._frames + 1)
+        # Counted before: whoever has a frame must find it counted.
         self._frames += 1
         self.ring.append(frame)
         if not self.has_frame:

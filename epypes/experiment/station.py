@@ -16,7 +16,6 @@ from epypes.errors import ExperimentError
 from epypes.experiment.components import NODES, Component, Settings
 from epypes.experiment.messages import Request, envelope_of, pair_of
 from epypes.transport import ZMQPublisher, ZMQSubscriber
-from epypes.wire.failures import failure_event
 
 START_TIMEOUT_S: Final = 30.0
 
@@ -62,7 +61,7 @@ class Station:
         ]
         self._entrance = Adapted(self._q_in, _FROM_SOCKET[names[0]])
         for node in self.nodes:
-            node.on_error = Adapted(self._q_failures, failure_event).put
+            node.on_error = self._q_failures.put
 
     def start(self, source: str) -> dict[str, str]:
         """Start everything, and take events from an address; return the addresses of answers and of failures.
