@@ -21,12 +21,12 @@ err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 @contextmanager
-def progress(*, auto_refresh: bool = True) -> Iterator[Progress]:
+def progress(*, auto_refresh: bool = True, disable: bool = False) -> Iterator[Progress]:
     """Show a progress display while the block runs; without ``auto_refresh`` it is drawn when it is told to."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, TimeElapsedColumn(), console=err, auto_refresh=auto_refresh) as shown:
+    with Progress(*columns, TimeElapsedColumn(), console=err, auto_refresh=auto_refresh, disable=disable) as shown:
         yield shown
 
 

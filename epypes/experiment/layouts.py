@@ -16,7 +16,8 @@ from typing import Any, Final
 from epypes.errors import ExperimentError
 from epypes.experiment.components import Settings
 from epypes.experiment.process import ChildStation
-from epypes.experiment.station import START_TIMEOUT_S, Station, address_for
+from epypes.experiment.station import KEPT, START_TIMEOUT_S, Station, address_for
+from epypes.pipeline import Mailbox
 from epypes.transport import ZMQPublisher, ZMQSubscriber
 
 
@@ -83,7 +84,7 @@ def running(layout: Layout, settings: Settings) -> Iterator[System]:
     ExperimentError
         A process or a node does not start.
     """
-    requests: Any = queue.SimpleQueue()
+    requests = Mailbox("drop_oldest", KEPT)
     inbox: Any = queue.SimpleQueue()
     with ExitStack() as stack:
         publisher = stack.enter_context(ZMQPublisher(address_for(layout.scheme), requests))

@@ -15,10 +15,12 @@ from typing import Any, Final
 from epypes.errors import ExperimentError
 from epypes.experiment.components import NODES, Component, Settings
 from epypes.experiment.messages import Request, envelope_of, pair_of
+from epypes.pipeline import Mailbox
 from epypes.transport import ZMQPublisher, ZMQSubscriber
-from epypes.wire.failures import failure_event
 
 START_TIMEOUT_S: Final = 30.0
+# What waits to be sent while a publisher is not there: more than ever does, since the robot asks one thing at a time.
+KEPT: Final = 64
 
 # What the first node of a process takes from its subscriber, and what the last gives to its publisher.
 _FROM_SOCKET: Final[Mapping[str, Callable[[Any], Any]]] = {"acquisition": Request, "vision": pair_of}
@@ -53,8 +55,8 @@ class Station:
         self._scheme = scheme
         self._running = ExitStack()
         self._q_in: Any = queue.SimpleQueue()
-        self._q_out: Any = queue.SimpleQueue()
-        self._q_failures: Any = queue.SimpleQueue()
+        # Mailboxes, whose items are sent by the thread that puts them: no other one has to wake up for that.
+        self._q_out, self._q_failures = Mailbox("drop_oldest", KEPT), Mailbox("drop_oldest", KEPT)
         joints = [self._q_in, *(queue.SimpleQueue() for _ in names[1:]), Adapted(self._q_out, _TO_SOCKET[names[-1]])]
         self.nodes = [
             NODES[name](before, after, settings)
@@ -62,7 +64,7 @@ class Station:
         ]
         self._entrance = Adapted(self._q_in, _FROM_SOCKET[names[0]])
         for node in self.nodes:
-            node.on_error = Adapted(self._q_failures, failure_event).put
+            node.on_error = self._q_failures.put
 
     def start(self, source: str) -> dict[str, str]:
         """Start everything, and take events from an address; return the addresses of answers and of failures.

@@ -5,13 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from time import perf_counter_ns
-from typing import Any
 
 import cv2
 import numpy as np
-from skimage import data
 
 import epypes as ep
+from epypes.experiment.graph import (
+    OPTIONS,
+    detect_and_describe_features,
+    gather_keypoints,
+    match,
+    orb_graph,
+    orb_hyperparameters,
+    stereo_pair,
+)
 from tests.benchmarks.functions import STRAIGHT, TIMED
 from tests.benchmarks.row import OURS, Goal, Row, row
 from tests.benchmarks.timing import Effort, Times
@@ -19,46 +26,12 @@ from tests.benchmarks.timing import Effort, Times
 THREADS = "hand, 2 threads"
 PARALLEL = "EPypes, workers=2"
 _ROUNDS = 60
-_OPTIONS = ("nfeatures", "scaleFactor", "nlevels", "edgeThreshold", "WTA_K", "scoreType", "patchSize", "fastThreshold")
-_ORB = dict(zip(_OPTIONS, (500, 1.2, 8, 31, 2, cv2.ORB_HARRIS_SCORE, 31, 20), strict=True))
-_HPARAMS = {**_ORB, "mask_1": None, "mask_2": None, "normType": cv2.NORM_HAMMING, "crossCheck": True}
-
-
-def detect_and_describe_features(image: np.ndarray, mask: np.ndarray | None, *options: Any) -> tuple[Any, np.ndarray]:
-    orb = cv2.ORB_create(**dict(zip(_OPTIONS, options, strict=True)))
-    return orb.detectAndCompute(image, mask)
-
-
-def match(descriptors_1: np.ndarray, descriptors_2: np.ndarray, norm_type: int, cross_check: bool) -> list[Any]:
-    matches = cv2.BFMatcher(norm_type, cross_check).match(descriptors_1, descriptors_2)
-    return sorted(matches, key=lambda found: found.distance)
-
-
-def gather_keypoints(keypoints_1: Any, keypoints_2: Any, matches: list[Any]) -> np.ndarray:
-    pairs = [(*keypoints_1[found.queryIdx].pt, *keypoints_2[found.trainIdx].pt) for found in matches]
-    return np.array(pairs, np.float32).reshape(-1, 4)
-
-
-def orb_graph() -> ep.CompGraph:
-    return ep.CompGraph(
-        {
-            "detect_and_describe_features_1": detect_and_describe_features,
-            "detect_and_describe_features_2": detect_and_describe_features,
-            "match": match,
-            "gather_keypoints": gather_keypoints,
-        },
-        {
-            "detect_and_describe_features_1": (("image_1", "mask_1", *_OPTIONS), ("keypoints_1", "descriptors_1")),
-            "detect_and_describe_features_2": (("image_2", "mask_2", *_OPTIONS), ("keypoints_2", "descriptors_2")),
-            "match": (("descriptors_1", "descriptors_2", "normType", "crossCheck"), "matches"),
-            "gather_keypoints": (("keypoints_1", "keypoints_2", "matches"), "keypoints_paired"),
-        },
-    )
+_HPARAMS = orb_hyperparameters()
+_ORB = {name: _HPARAMS[name] for name in OPTIONS}
 
 
 def rows(effort: Effort) -> list[Row]:
-    left, right, _ = data.stereo_motorcycle()
-    pair = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right)]
+    pair = stereo_pair()
     runner, graph_ns, hand_ns = ep.CompGraphRunner(orb_graph(), _HPARAMS), [], []
 
     def graph() -> np.ndarray:
@@ -85,7 +58,7 @@ def _of_rounds(overheads_ns: list[int], times: Times, name: str) -> dict[int, fl
     return dict(zip(taken, overheads_ns[-len(taken) :], strict=True))
 
 
-def _parallel(pair: list[np.ndarray]) -> Callable[[], np.ndarray]:
+def _parallel(pair: tuple[np.ndarray, np.ndarray]) -> Callable[[], np.ndarray]:
     runner = ep.CompGraphRunner(orb_graph(), _HPARAMS, workers=2)
     return lambda: runner.run(image_1=pair[0], image_2=pair[1])["keypoints_paired"]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 import pandas as pd
 import pytest
@@ -42,3 +43,21 @@ def fail() -> Callable[..., pd.DataFrame]:
         return spoilt
 
     return failed
+
+
+@pytest.fixture(scope="session")
+def pictures() -> tuple[np.ndarray, np.ndarray]:
+    """Two equal small images with corners, gray."""
+    lot = np.random.default_rng(13)
+    picture = cv2.resize(lot.integers(0, 256, (16, 20), np.uint8), (160, 128), interpolation=cv2.INTER_NEAREST)
+    return picture, picture.copy()
+
+
+@pytest.fixture(scope="session")
+def images(pictures, tmp_path_factory) -> tuple[str, str]:
+    """The files of both."""
+    folder = tmp_path_factory.mktemp("images")
+    files = (str(folder / "left.png"), str(folder / "right.png"))
+    for file, picture in zip(files, pictures, strict=True):
+        assert cv2.imwrite(file, picture)
+    return files

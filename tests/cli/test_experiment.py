@@ -1,0 +1,118 @@
+"""Is the paper's experiment one command?"""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+
+import cv2
+import numpy as np
+import pandas as pd
+import psutil
+import pytest
+
+from epypes.cli import main
+
+TIMEOUT_S = 30.0
+
+
+@pytest.fixture
+def epypes(capsys):
+    """Run a command in this process, as far as its exit."""
+
+    def run(*arguments):
+        with pytest.raises(SystemExit) as stop:
+            main(["experiment", *map(str, arguments)])
+        return stop.value.code, capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def cameras(tmp_path_factory):
+    """Options for two cameras, whose image is small."""
+    lot = np.random.default_rng(13)
+    picture = cv2.resize(lot.integers(0, 256, (16, 20), np.uint8), (160, 128), interpolation=cv2.INTER_NEAREST)
+    file = tmp_path_factory.mktemp("images") / "picture.png"
+    assert cv2.imwrite(str(file), picture)
+    return "--camera", file, "--camera", file, "--fps", 50
+
+
+def test_one_command_runs_the_experiment_prints_its_times_and_leaves_figures(epypes, cameras, tmp_path):
+    folder = tmp_path / "new" / "folder"
+    code, said = epypes("--layout", "one", "--requests", 4, "--experiments", 2, *cameras, "--out", folder)
+    assert code == 0
+    for words in ("Layout one, in milliseconds", "paper's mode", "t_trip", "o_network", "vision.o_epypes"):
+        assert words in said.out
+    assert len(pd.read_csv(folder / "requests.csv")) == 8
+    assert {path.name for path in folder.iterdir()} == {
+        "requests.csv",
+        "figure_14.svg",
+        "figure_15.svg",
+        "figure_16.svg",
+    }
+    assert all("<svg" in path.read_text() for path in folder.glob("*.svg"))
+    assert "Left in" in said.out
+    assert said.err == "", "progress is for terminals"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (("--layout", "four"), "There is no layout 'four'. There are: paper, one, three."),
+        (("--requests", 0), "requests must be a whole number from 1, not 0."),
+        (("--experiments", 0), "experiments must be a whole number from 1, not 0."),
+        (("--workers", 0), "workers must be a whole number from 1, not 0."),
+        (("--fps", "nan"), "fps must be a number above 0, not nan."),
+        (("--timeout", 0), "timeout_s must be a number above 0, not 0.0."),
+        (("--camera", "left.png"), "cameras must be two"),
+    ],
+)
+def test_what_makes_no_sense_is_one_line_and_exit_status_1(epypes, wrong, says):
+    code, said = epypes(*wrong)
+    assert code.startswith(f"epypes: {says}"), "which the interpreter prints, and exits with 1"
+    assert "\n" not in code
+    assert said.err == ""
+
+
+def test_a_folder_that_cannot_be_made_is_told_before_anything_runs(epypes, tmp_path):
+    (tmp_path / "file").write_text("")
+    code, _ = epypes("--out", tmp_path / "file" / "folder")
+    assert code.startswith("epypes: ")
+    assert "can't be made" in code
+
+
+def test_requests_that_failed_are_counted_with_their_reason(epypes, tmp_path):
+    deep = tmp_path / "deep.png"
+    assert cv2.imwrite(str(deep), np.full((99, 99), 9_999, np.uint16)), "16 bit, which ORB does not take"
+    cameras = ("--camera", deep, "--camera", deep)
+    code, said = epypes("--layout", "one", "--requests", 2, "--experiments", 1, *cameras, "--out", tmp_path)
+    assert code == 0
+    assert "2 of 2 requests failed: vision, detect_and_describe_features_1: error:" in said.err
+    assert len(said.err.splitlines()) == 1
+    assert len(pd.read_csv(tmp_path / "requests.csv")) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", ["paper", "one", "three"])
+def test_ctrl_c_ends_everything_without_a_traceback(layout):
+    command = [sys.executable, "-m", "epypes.cli", "experiment", "--layout", layout, "--requests", "100000"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        watchdog = threading.Timer(TIMEOUT_S, process.kill)
+        watchdog.start()
+        mine = psutil.Process(process.pid)
+        wanted = {"paper": 1, "one": 0, "three": 2}[layout]
+        # Its sockets are there when it has threads; before that, Ctrl+C is Python's own.
+        while len(mine.children()) < wanted or mine.num_threads() < 4:
+            assert process.poll() is None
+            threading.Event().wait(0.05)
+        children = mine.children()
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate()
+        watchdog.cancel()
+    assert process.returncode not in (0, -signal.SIGKILL)
+    assert "Traceback" not in out + err
+    _, alive = psutil.wait_procs(children, timeout=TIMEOUT_S)
+    assert not alive

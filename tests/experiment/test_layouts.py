@@ -1,0 +1,174 @@
+"""Do layouts differ in their wiring alone, and does everything end?"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import psutil
+import pytest
+
+from epypes.errors import ExperimentError, ImageFileError
+from epypes.experiment.components import NODES, Settings
+from epypes.experiment.layouts import LAYOUTS, running
+from epypes.experiment.process import ChildStation
+from epypes.experiment.robot import Robot
+from epypes.experiment.station import described
+from epypes.pipeline import FullPipeline
+
+TIMEOUT_S = 20.0
+IN_CHILDREN = pytest.mark.slow
+
+
+def settings_of(images) -> Settings:
+    return Settings(images, fps=50.0)
+
+
+def robot_of(system, timeout_s=TIMEOUT_S) -> Robot:
+    return Robot(system.requests, system.inbox, timeout_s=timeout_s)
+
+
+def children() -> list[psutil.Process]:
+    return psutil.Process().children(recursive=True)
+
+
+def test_the_layouts_are_those_of_the_paper_and_the_two_beside_it():
+    assert {name: layout.processes for name, layout in LAYOUTS.items()} == {
+        "paper": (("acquisition", "vision"),),
+        "one": (("acquisition", "vision"),),
+        "three": (("acquisition",), ("vision",)),
+    }
+    assert [name for name, layout in LAYOUTS.items() if not layout.in_children] == ["one"]
+
+
+def test_a_layout_says_nothing_but_which_process_a_node_is_in():
+    assert set(LAYOUTS["paper"].__slots__) == {"processes", "in_children"}
+    assert all(name in NODES for layout in LAYOUTS.values() for names in layout.processes for name in names)
+
+
+def test_in_one_process_a_request_is_answered(images):
+    with running(LAYOUTS["one"], settings_of(images)) as system:
+        answers = [robot_of(system).ask() for _ in range(3)]
+        assert all(isinstance(node, FullPipeline) for node in system.stations[0].nodes)
+    assert [answer.failure for answer in answers] == [""] * 3
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("epypes")]
+
+
+@IN_CHILDREN
+def test_nodes_functions_graphs_and_answers_are_the_same_in_every_layout(images):
+    said, contents = {}, {}
+    for name, layout in LAYOUTS.items():
+        with running(layout, settings_of(images)) as system:
+            said[name] = system.described()
+            answer = robot_of(system).ask()
+            assert answer.failure == ""
+            contents[name] = answer.contents
+    assert said["paper"] == said["one"] == said["three"]
+    assert contents["paper"] == contents["one"] == contents["three"]
+    assert len(contents["paper"]) > 400
+    here = {name: described(build(None, None, settings_of(images))) for name, build in NODES.items()}
+    assert said["three"] == here
+    assert (
+        list(said["three"]["vision"]["functions"].values())[:2]
+        == ["epypes.experiment.graph.detect_and_describe_features"] * 2
+    )
+
+
+@IN_CHILDREN
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_request_for_a_time_long_ago_is_a_failure_and_the_next_one_is_answered(layout, images):
+    with running(LAYOUTS[layout], settings_of(images)) as system:
+        robot = robot_of(system)
+        assert "acquisition, nearest: FrameUnavailable" in robot.ask(at=time.time() - 3600).failure
+        assert robot.ask().failure == ""
+        assert not robot.counts
+
+
+@IN_CHILDREN
+@pytest.mark.parametrize("layout", ["paper", "three"])
+def test_a_vision_process_that_is_killed_ends_the_wait_with_an_error_that_names_it(layout, images):
+    with running(LAYOUTS[layout], settings_of(images)) as system:
+        robot = robot_of(system)
+        robot.ask()
+        victim = system.stations[-1]
+        os.kill(victim.pid, signal.SIGKILL)
+        start = time.monotonic()
+        with pytest.raises(ExperimentError, match=rf"The process of .*vision \({victim.pid}\) was ended by SIGKILL"):
+            # The first one may still be answered.
+            [robot.ask() for _ in range(10)]
+        assert time.monotonic() - start < TIMEOUT_S
+    assert not children()
+
+
+@IN_CHILDREN
+def test_a_vision_process_that_is_stopped_is_a_request_without_answer(images):
+    with running(LAYOUTS["three"], settings_of(images)) as system:
+        robot = robot_of(system, timeout_s=1.0)
+        robot.ask()
+        os.kill(system.stations[-1].pid, signal.SIGSTOP)
+        answers = [robot.ask() for _ in range(2)]
+        os.kill(system.stations[-1].pid, signal.SIGCONT)
+        robot.timeout_s = TIMEOUT_S
+        assert answers[-1].is_missing
+        assert robot.ask().failure == ""
+        assert robot.counts["late answer"] >= 1
+
+
+@IN_CHILDREN
+def test_no_process_outlives_its_parent_however_that_ends(images):
+    code = (
+        "import sys; from epypes.experiment.layouts import LAYOUTS, running\n"
+        "from epypes.experiment.components import Settings\n"
+        f"with running(LAYOUTS['three'], Settings({images!r}, 50.0)) as system:\n"
+        "    print(*(station.pid for station in system.stations), flush=True); sys.stdin.read()"
+    )
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", code], **pipes) as parent:
+        orphans = [psutil.Process(int(pid)) for pid in parent.stdout.readline().split()]
+        assert len(orphans) == 2
+        parent.kill()
+    _, alive = psutil.wait_procs(orphans, timeout=TIMEOUT_S)
+    assert not alive
+
+
+@IN_CHILDREN
+def test_a_process_that_cannot_start_says_why_in_the_error(tmp_path):
+    missing = str(tmp_path / "nothing.png")
+    with (
+        pytest.raises(ExperimentError, match=r"ended with exit status 1: ImageFileError: .*nothing\.png") as error,
+        running(LAYOUTS["three"], Settings((missing, missing))),
+    ):
+        pass
+    assert error.value.name == "acquisition"
+    assert "nothing.png" in error.value.printed
+    assert not children()
+
+
+def test_a_camera_that_cannot_be_opened_is_told_at_once_in_one_process(tmp_path):
+    with pytest.raises(ImageFileError), running(LAYOUTS["one"], Settings((str(tmp_path / "nothing.png"),) * 2)):
+        pass
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("epypes")]
+
+
+@IN_CHILDREN
+def test_a_process_ends_before_it_was_started_and_twice(images):
+    ended = []
+    station = ChildStation(["vision"], settings_of(images), ended.append)
+    station.stop()
+    station.stop()
+    assert not children()
+    assert not ended, "it was asked to"
+
+
+@IN_CHILDREN
+def test_a_process_that_does_not_end_by_itself_is_killed(images):
+    station = ChildStation(["vision"], settings_of(images), lambda error: None)
+    os.kill(station.pid, signal.SIGSTOP)
+    start = time.monotonic()
+    station.stop(timeout_s=0.2)
+    assert time.monotonic() - start < TIMEOUT_S
+    assert not children()
