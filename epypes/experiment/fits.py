@@ -138,10 +138,10 @@ def summary(table: pd.DataFrame) -> pd.DataFrame:
     import pandas as pd
 
     rows = table[answered(table)]
-    times = [time for time in rows.select_dtypes("number") if time not in _PLACES]
+    times = [str(time) for time in rows.select_dtypes("number") if time not in _PLACES]
     described = [_described(time, rows[time].dropna()) for time in times]
     columns = ["requests", "not_positive", "median_ms", "mode_ms", "least_ms", "most_ms", "paper_mode_ms"]
-    return pd.DataFrame(described, index=pd.Index(times, name="time"), columns=columns)
+    return pd.DataFrame(described, index=times, columns=columns)
 
 
 def _described(time: str, values: pd.Series[Any]) -> list[float]:
