@@ -49,7 +49,7 @@ def detect_and_describe_features(
     """
     import cv2
 
-    orb = cv2.ORB_create(
+    orb = cv2.ORB.create(
         nfeatures=nfeatures,
         scaleFactor=scaleFactor,
         nlevels=nlevels,

@@ -10,7 +10,7 @@ import functools
 import io
 import pickle
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from epypes.errors import MessageError
 from epypes.wire import Envelope, Event, attributes, parsed
@@ -46,7 +46,7 @@ class StereoPair(tuple[Any, ...]):
     id: str
     attributes: dict[str, float]
 
-    def __new__(cls, images: Iterable[Any], request_id: str, attributes: Mapping[str, float]) -> StereoPair:
+    def __new__(cls, images: Iterable[Any], request_id: str, attributes: Mapping[str, float]) -> Self:
         """Make a pair of two images.
 
         Raises
@@ -78,12 +78,9 @@ def pair_of(envelope: Any) -> StereoPair:
     MessageError
         Of reason ``"no pair"`` if it is something else.
     """
-    if (
-        not isinstance(envelope, Envelope)
-        or envelope.type != PAIR
-        or any(name not in envelope.parts for name in _IMAGES)
-    ):
-        what = repr(envelope) if isinstance(envelope, Envelope) else f"a {type(envelope).__name__}"
+    is_envelope = isinstance(envelope, Envelope)
+    if not is_envelope or envelope.type != PAIR or any(name not in envelope.parts for name in _IMAGES):
+        what = repr(envelope) if is_envelope else f"a {type(envelope).__name__}"
         raise MessageError("no pair", f"Vision takes pairs of images, not {what}.")
     return StereoPair((envelope.parts[name] for name in _IMAGES), envelope.id, envelope.attributes)
 

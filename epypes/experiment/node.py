@@ -1,4 +1,6 @@
-"""How does a process of the experiment begin and end? ``python -m epypes.experiment.node``
+"""How does a process of the experiment begin and end?
+
+``python -m epypes.experiment.node`` is started by a ChildStation.
 
 It reads one line of JSON from its standard input: which nodes it has, how they are made, where their events come from.
 It writes one line of JSON to its standard output: the addresses of its answers and failures. It ends when its standard

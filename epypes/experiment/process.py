@@ -52,7 +52,7 @@ class ChildStation:
         self._lines: queue.SimpleQueue[str] = queue.SimpleQueue()
         # A file takes any amount without anybody reading, as a pipe does not.
         self._printed = tempfile.TemporaryFile()  # noqa: SIM115 - closed by stop()
-        self._process = subprocess.Popen(  # noqa: S603 - our own command
+        self._process = subprocess.Popen(
             [sys.executable, "-m", "epypes.experiment.node"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

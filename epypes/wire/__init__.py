@@ -9,7 +9,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from epypes.wire.attribute_list import add_attribute, attributes, parsed, serialized
+    from epypes.wire.attribute_list import add_attribute, attributes
+    from epypes.wire.complete import parsed, serialized
     from epypes.wire.envelope import Envelope, FailureRecord
     from epypes.wire.failures import failure_event
     from epypes.wire.limits import Limits
@@ -60,9 +61,9 @@ _HOME = {
     "encode": "multipart",
     "failure_event": "failures",
     "load_sample": "samples",
-    "parsed": "attribute_list",
+    "parsed": "complete",
     "save_sample": "samples",
-    "serialized": "attribute_list",
+    "serialized": "complete",
     "topic_frame": "multipart",
 }
 

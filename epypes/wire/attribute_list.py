@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numbers
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from epypes.errors import MessageError
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
-
-M = TypeVar("M", bound="Message")
 
 _INT32 = range(-(2**31), 2**31)
 
@@ -94,46 +92,17 @@ def attributes(message: Message) -> dict[str, str | float]:
     Raises
     ------
     MessageError
-        Of reason ``"bad attribute"`` if an entry lacks the value that its type promises, ``"no attributes"``
-        for a message that has none.
+        Of reason ``"bad attribute"`` if an entry lacks the value that its type promises, ``"not utf-8"`` for text
+        that is none, ``"no attributes"`` for a message that has none.
     """
     result: dict[str, str | float] = {}
     for entry in _entries(message):
         field = _VALUE_FIELDS[entry.type]
         if not entry.HasField(field):
             raise MessageError("bad attribute", f"Attribute {entry.key!r} has no {field}, as its type says.")
-        result[entry.key] = getattr(entry, field)
+        key, value = entry.key, getattr(entry, field)
+        # Protobuf gives bytes for text that is not UTF-8.
+        if isinstance(key, bytes) or isinstance(value, bytes):
+            raise MessageError("not utf-8", f"An attribute is not UTF-8: {key!r}, {value!r}."[:200])
+        result[key] = value
     return result
-
-
-def serialized(message: Message) -> bytes:
-    """Return the bytes of a protobuf message.
-
-    Raises
-    ------
-    MessageError
-        Of reason ``"incomplete"`` if a required field is missing.
-    """
-    from google.protobuf.message import EncodeError
-
-    try:
-        return message.SerializeToString()
-    except (EncodeError, ValueError) as error:
-        name = type(message).__name__
-        raise MessageError("incomplete", f"This {name} can't be sent: {error}. Fill these fields.") from error
-
-
-def parsed(kind: type[M], data: bytes) -> M:
-    """Return the protobuf message of this class that was sent as these bytes.
-
-    Raises
-    ------
-    MessageError
-        Of reason ``"unreadable"`` if they are something else, or a required field is missing.
-    """
-    from google.protobuf.message import DecodeError
-
-    try:
-        return kind.FromString(data)
-    except (DecodeError, ValueError, TypeError) as error:
-        raise MessageError("unreadable", f"These bytes are no {kind.__name__}: {error}.") from error

@@ -25,6 +25,9 @@ _PLAIN_FIELDS = (
     "bundle_digest",
 )
 _MAX_TOPIC_BYTES = 1024
+# What encode writes, and the greatest that decode reads. Fields may be added without raising it, since old receivers
+# pass over them; it rises when what is there already changes its meaning.
+VERSION = 1
 # What protobuf and numpy raise for values that they can't take; anything else is a bug of ours and must show.
 _REFUSALS = (ValueError, TypeError, OverflowError, MemoryError, RecursionError)
 
@@ -117,6 +120,7 @@ def topic_frame(topic: str) -> bytes:
 
 
 def _write_plain(header: Any, envelope: Envelope) -> None:
+    header.version = VERSION
     for name in _PLAIN_FIELDS:
         setattr(header, name, getattr(envelope, name))
     for function, duration_ns in envelope.timings.items():
@@ -158,6 +162,7 @@ def decode(frames: Sequence[bytes | bytearray | memoryview], limits: Limits = DE
     _check_sizes(views, limits)
     _check_topic(views[0])
     header = _parse(views[1])
+    _check_version(header.version)
     reader = Reader(views[2:], limits)
     rgb: set[str] = set()
 
@@ -223,6 +228,15 @@ def _parse(view: memoryview) -> Any:
         return message_class("epypes.v1.Envelope").FromString(bytes(view))
     except (DecodeError, *_REFUSALS) as error:
         raise MessageError("no envelope", f"The second frame is no Envelope: {error}.") from error
+
+
+def _check_version(version: int) -> None:
+    if version > VERSION:
+        raise MessageError(
+            "unknown version",
+            f"The Envelope is of version {version}, and this EPypes reads version {VERSION}. "
+            "Install a newer EPypes where it is received.",
+        )
 
 
 def _name(entry: Any) -> str:

@@ -10,6 +10,7 @@ import pytest
 
 from epypes.errors import MessageError
 from epypes.wire import (
+    Attribute,
     AttributeList,
     Event,
     Image,
@@ -19,6 +20,7 @@ from epypes.wire import (
     TimeStampList,
     add_attribute,
     attributes,
+    parsed,
     serialized,
 )
 from epypes.wire.compile import PROTO_FILES, SCHEMA_PATH, compiled
@@ -69,10 +71,142 @@ def test_hand_made_bytes_are_the_message_and_the_message_is_these_bytes(message_
     assert message_class(**fields).SerializeToString() == data
 
 
-@pytest.mark.parametrize(("message_class", "number"), [(Event, 3), (JustBytes, 3), (Image, 4)])
-def test_attributes_ride_in_the_published_field(message_class, number):
-    message = message_class.FromString(field(1, b"x") + field(number, ATTRIBUTES))
+def test_an_int_is_a_varint_of_ten_bytes_when_it_is_negative():
+    message = AttributeList()
+    add_attribute(message, "n", -2)
+    by_hand = field(1, 3) + field(2, b"n") + bytes([5 << 3, 0xFE, *[0xFF] * 8, 0x01])
+    assert message.SerializeToString() == field(1, by_hand)
+    assert attributes(AttributeList.FromString(field(1, by_hand))) == {"n": -2}
+
+
+ONE_IMAGE = field(1, b"x")
+# What must be there, without which nothing else is read.
+REQUIRED = {
+    Attribute: field(1, 1) + field(2, b"key"),
+    Event: field(1, b"x"),
+    JustBytes: field(1, b"x"),
+    Image: ONE_IMAGE,
+    ImagePair: field(1, ONE_IMAGE) + field(2, ONE_IMAGE),
+    TimeStamp: field(1, b"start") + field(2, 1.5),
+}
+
+
+@pytest.mark.parametrize(("kind", "number"), [(Event, 3), (JustBytes, 3), (Image, 4), (ImagePair, 4)])
+def test_attributes_ride_in_the_published_field(kind, number):
+    by_hand = REQUIRED[kind] + field(number, ATTRIBUTES)
+    message = parsed(kind, by_hand)
     assert attributes(message) == WANTED
+    assert serialized(message) == by_hand
+
+
+# The field table of the published system, as DESIGN.md has it: number, name, type, and whether it must be there.
+TABLE = {
+    Attribute: "1 type enum!, 2 key string!, 3 str_val string, 4 double_val double, 5 int_val int32",
+    AttributeList: "1 entries Attribute*",
+    Event: "1 type string!, 2 id string, 3 attributes AttributeList",
+    JustBytes: "1 contents bytes!, 2 id string, 3 attributes AttributeList",
+    Image: "1 bytes bytes!, 2 id string, 3 format string, 4 attributes AttributeList",
+    ImagePair: "1 image1 Image!, 2 image2 Image!, 3 id string, 4 attributes AttributeList",
+    TimeStamp: "1 description string!, 2 unixtime double!",
+    TimeStampList: "1 entries TimeStamp*",
+}
+
+
+def written_out(kind) -> str:
+    from google.protobuf.descriptor_pb2 import DescriptorProto
+
+    found = DescriptorProto()
+    kind.DESCRIPTOR.CopyToProto(found)
+    types = {1: "double", 5: "int32", 9: "string", 12: "bytes", 14: "enum"}
+    marks = {1: "", 2: "!", 3: "*"}
+    return ", ".join(
+        f"{f.number} {f.name} {types.get(f.type) or f.type_name.removeprefix('.')}{marks[f.label]}" for f in found.field
+    )
+
+
+@pytest.mark.parametrize("kind", TABLE, ids=lambda kind: kind.__name__)
+def test_the_messages_have_the_published_fields_and_no_others(kind):
+    assert written_out(kind) == TABLE[kind]
+    assert kind.DESCRIPTOR.full_name == kind.__name__, "no package, as published"
+
+
+def test_the_types_of_attributes_have_the_published_numbers():
+    assert (Attribute.STRING, Attribute.DOUBLE, Attribute.INT) == (1, 2, 3)
+
+
+INCOMPLETE = [
+    *((kind, b"", words) for kind, words in [(Event, "type"), (JustBytes, "contents"), (Image, "bytes")]),
+    (Attribute, field(1, 1), "key"),
+    (Attribute, field(2, b"key"), "type"),
+    (Attribute, field(1, 9) + field(2, b"key"), "type"),
+    (AttributeList, field(1, field(2, b"key")), r"entries\[0\].type"),
+    (ImagePair, field(1, ONE_IMAGE), "image2"),
+    (ImagePair, field(2, ONE_IMAGE), "image1"),
+    (ImagePair, field(1, b"") + field(2, ONE_IMAGE), "image1.bytes"),
+    (TimeStamp, field(1, b"start"), "unixtime"),
+    (TimeStamp, field(2, 1.5), "description"),
+    (TimeStampList, field(1, b""), r"entries\[0\].description"),
+]
+
+
+@pytest.mark.parametrize(("kind", "data", "lacks"), INCOMPLETE)
+def test_a_message_without_what_it_must_have_is_refused_by_the_receiver(kind, data, lacks):
+    with pytest.raises(MessageError, match=f"{kind.__name__}: it lacks .*{lacks}") as caught:
+        parsed(kind, data)
+    assert caught.value.reason == "incomplete"
+
+
+@pytest.mark.parametrize(
+    ("kind", "data"),
+    [
+        (Event, field(1, b"\xff")),
+        (Event, field(1, b"x") + field(3, field(1, field(1, 1) + field(2, b"k") + field(3, b"\xff")))),
+        (ImagePair, field(1, ONE_IMAGE + field(3, b"\xff")) + field(2, ONE_IMAGE)),
+    ],
+)
+def test_text_that_is_none_is_refused_by_the_receiver(kind, data):
+    with pytest.raises(MessageError) as caught:
+        parsed(kind, data)
+    assert caught.value.reason == "not utf-8"
+
+
+@pytest.mark.parametrize("entry", [field(2, b"\xff") + field(3, b"x"), field(2, b"k") + field(3, b"\xff")])
+def test_attributes_that_are_no_text_are_refused(entry):
+    with pytest.raises(MessageError) as caught:
+        attributes(AttributeList.FromString(field(1, field(1, 1) + entry)))
+    assert caught.value.reason == "not utf-8"
+
+
+@pytest.mark.parametrize(("data", "reason"), [(b"\xff\xff", "no message"), ("text", "not bytes"), (None, "not bytes")])
+def test_what_is_no_message_is_refused_by_the_receiver(data, reason):
+    with pytest.raises(MessageError) as caught:
+        parsed(Event, data)
+    assert caught.value.reason == reason
+
+
+def test_an_event_that_lacks_a_field_is_counted_and_the_next_one_is_handled():
+    import queue
+
+    import epypes as ep
+
+    cg = ep.CompGraph({"length": len}, {"length": ("contents", "n")})
+    events, answers = queue.SimpleQueue(), queue.SimpleQueue()
+    pipe = ep.FullPipeline(
+        "sizes",
+        cg,
+        events,
+        answers,
+        lambda event: {"contents": parsed(JustBytes, event).contents},
+        lambda view: view["n"],
+    )
+    failures = queue.SimpleQueue()
+    pipe.on_error = failures.put
+    with pipe:
+        for event in (b"", field(2, b"7"), field(1, b"good")):
+            events.put(event)
+        assert answers.get(timeout=5) == 4
+    assert pipe.failed == 2
+    assert {failures.get(timeout=5).exception.reason for _ in range(2)} == {"incomplete"}
 
 
 def test_an_image_pair_holds_two_images():
