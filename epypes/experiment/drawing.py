@@ -78,7 +78,7 @@ class Drawing(Figure):
 
 def blank(title: str) -> tuple[Drawing, Axes]:
     """Return a figure with a title and nothing in it, and its axes."""
-    figure = Drawing(figsize=(8, 4.2), dpi=100, layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.12))
+    figure = Drawing(figsize=(8, 4.2), dpi=100, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.06))
     figure.suptitle(title, x=0.015, ha="left", fontsize=11, fontweight="bold")
     return figure, figure.add_subplot()
 
