@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import Any
 
 from epypes.graph import CompGraph, with_functions
-from epypes.pipeline.node import Node
+from epypes.pipeline.node import Node, under_way
 
 
 class NodeBasedCompGraph:
@@ -41,7 +41,8 @@ class NodeBasedCompGraph:
     @property
     def running(self) -> tuple[str, ...]:
         """The functions that were called and have not returned."""
-        return tuple(name for name, node in self.nodes.items() if node.is_running)
+        running = {id(node) for node in under_way()}
+        return tuple(name for name, node in self.nodes.items() if id(node) in running)
 
     def __repr__(self) -> str:
         return f"<NodeBasedCompGraph: {len(self.nodes)} nodes>"

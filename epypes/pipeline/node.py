@@ -6,7 +6,26 @@ import functools
 import itertools
 from collections.abc import Callable
 from time import perf_counter_ns
-from typing import Any
+from types import CodeType, FunctionType
+from typing import Any, Final, TypeVar
+
+from epypes.run.underway import functions_under_way, locals_under_way
+
+M = TypeVar("M", bound=Callable[..., Any])
+
+_CALLS: Final[set[CodeType]] = set()
+
+
+def is_a_call(method: M) -> M:
+    """Mark a method of nodes: as long as it has not returned, its node is running."""
+    assert isinstance(method, FunctionType)
+    _CALLS.add(method.__code__)
+    return method
+
+
+def under_way() -> list[object]:
+    """Return the nodes that have been called and have not returned, in any thread, and the functions of graphs."""
+    return [*functions_under_way(), *(found["self"] for found in locals_under_way(_CALLS))]
 
 
 class Node:
@@ -46,34 +65,42 @@ class Node:
         self.func = func
         self.time = 0.0
         self.run_count = 0
+        # Whole in every thread, which counting up is not.
         self._counter = itertools.count(1)
-        # A list, since adding to it and taking from it are whole in every thread, and counting up is not.
-        self._calls_under_way: list[None] = []
         # Gives the node its function's signature, so that a graph of nodes is checked like one of functions.
         functools.update_wrapper(self, func, updated=())
         # Marks go along; whatever else a callable object or another node keeps must not take the place of our own.
         marks = {key: mark for key, mark in getattr(func, "__dict__", {}).items() if not hasattr(self, key)}
         self.__dict__.update(marks)
 
+    @is_a_call
     def __call__(self, *args: Any) -> Any:
         """Compute, and measure the time."""
-        self._calls_under_way.append(None)
         start_ns = perf_counter_ns()
         try:
             return self.compute(*args)
         finally:
-            self.time = (perf_counter_ns() - start_ns) / 1e9
-            self.run_count = next(self._counter)
-            self._calls_under_way.pop()
+            self.__epypes_called__(perf_counter_ns() - start_ns)
 
     def compute(self, *args: Any) -> Any:
         """Compute the node's value from its inputs; the hook for subclasses."""
         return self.func(*args)
 
+    def __epypes_called__(self, duration_ns: int) -> None:
+        """Take a call into account that took so long."""
+        self.time = duration_ns / 1e9
+        self.run_count = next(self._counter)
+
+    @property
+    def __epypes_is_its_func__(self) -> bool:
+        """Whether it comes to the same to call ``func``, and to tell ``__epypes_called__`` how long that took."""
+        kind = type(self)
+        return kind.__call__ is Node.__call__ and kind.compute is Node.compute and "compute" not in vars(self)
+
     @property
     def is_running(self) -> bool:
         """Whether a call has not returned yet."""
-        return bool(self._calls_under_way)
+        return any(node is self for node in under_way())
 
     def traverse_time(self) -> tuple[Any, ...]:
         """Return ``(name, seconds of the last call)``; a pipeline adds its nodes' tuples as a third item."""
@@ -81,3 +108,4 @@ class Node:
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__:.30} {self.name!r:.40}: {self.run_count} calls>"
+

@@ -5,12 +5,13 @@ from __future__ import annotations
 import inspect
 import keyword
 from collections.abc import Collection, Mapping
+from time import perf_counter_ns
 from typing import Any
 
 from epypes.errors import PayloadError
 from epypes.graph import CompGraph
 from epypes.pipeline.network import NodeBasedCompGraph
-from epypes.pipeline.node import Node
+from epypes.pipeline.node import Node, is_a_call
 from epypes.pipeline.stages import Stages
 from epypes.run import CompGraphRunner, Run
 from epypes.wording import counted
@@ -81,10 +82,19 @@ class Pipeline(Node):
         """What an event passes before and after the graph, as it is at this moment; the hook for subclasses."""
         return Stages()
 
+    @is_a_call
     def run(self, /, **payload: Any) -> Run:
         """Run the graph on a payload; see ``CompGraphRunner.run``. It counts as a call of the node."""
-        run: Run = Node.__call__(self, payload)
-        return run
+        # To free the tokens of the run before takes its time, which is not this run's.
+        before = self.runner.last
+        start_ns = perf_counter_ns()
+        try:
+            run: Run = self.compute(payload)
+            return run
+        finally:
+            self.__epypes_called__(perf_counter_ns() - start_ns)
+            # Not at the end of this frame, which a failure keeps.
+            del before
 
     def __call__(self, *args: Any) -> Any:
         """Run the graph on the free source tokens, in order; return its sink token or tokens."""
@@ -95,7 +105,7 @@ class Pipeline(Node):
     def compute(self, *args: Any) -> Any:
         """Run the graph on one payload, a mapping by token; the hook for subclasses."""
         (payload,) = args
-        return self.runner.run(**payload)
+        return self.runner.run_on(payload)
 
     def _by_name(self, args: tuple[Any, ...]) -> dict[str, Any]:
         free = self.runner.free_source_tokens

@@ -143,7 +143,7 @@ class SinkPipeline(Pipeline):
     @property
     def stages(self) -> Stages:
         """q_in, the event loop and f_in, as they are at this moment."""
-        is_in_f_in = any(found["self"] is self for found in locals_under_way(SinkPipeline._payload.__code__))
+        is_in_f_in = any(found["self"] is self for found in locals_under_way({SinkPipeline._payload.__code__}))
         return Stages(
             before=(
                 queue_stage("q_in", self.q_in),
@@ -309,7 +309,7 @@ def _emit(pipeline: SourcePipeline | FullPipeline, event: Any, run: Run, stamps:
 
 
 def _stages_after(pipeline: Pipeline, f_out: FOut, q_out: Any, failure: str) -> tuple[Stage, Stage]:
-    calls = [found for found in locals_under_way(_emit.__code__) if found["pipeline"] is pipeline]
+    calls = [found for found in locals_under_way({_emit.__code__}) if found["pipeline"] is pipeline]
     return (
         function_stage("f_out", f_out, is_under_way=any("answer" not in found for found in calls), failure=failure),
         queue_stage("q_out", q_out, is_waited_for=any("answer" in found for found in calls)),

@@ -17,7 +17,7 @@ from typing import Any, Final, NoReturn
 from epypes.run.call import StepFailed, call, unpack
 from epypes.run.draft import is_unchanged
 from epypes.run.guard import ARRAYLESS, FRESH, FRESH_HERE, HARMLESS, LONG, array_type, keep, lend
-from epypes.run.program import Program, Step
+from epypes.run.program import CALLED, Program, Step, is_its_func
 
 # Runs its steps on values by slot, and gives nanoseconds by step; -1, or none, for those that did not run. A rerun is
 # given the new values of the source tokens too.
@@ -34,12 +34,15 @@ _MOST_KEPT: Final = 64
 _MOST_COUNTED: Final = 1_000
 
 
-def _failed(error: BaseException, duration_ns: int, found: Mapping[str, Any]) -> NoReturn:
+def _failed(program: Program, error: BaseException, duration_ns: int, found: Mapping[str, Any]) -> NoReturn:
     """Raise StepFailed for the step that was under way.
 
     ``found`` are the local variables: ``d3`` is how long step 3 took, and missing or -1 if it has not ended; ``c3``
-    whether slot 3 has got a new value; ``at`` is the step under way.
+    whether slot 3 has got a new value; ``at`` is the step under way, ``start`` when it called its function, or 0.
     """
+    function = program.steps[found["at"]].function
+    if duration_ns and is_its_func(function):
+        getattr(function, CALLED)(duration_ns)
     failed = error if isinstance(error, StepFailed) else StepFailed(found["at"], error, duration_ns)
     numbered = [(name[0], int(name[1:]), value) for name, value in found.items() if name[1:].isdigit()]
     failed.done_ns = {number: spent for letter, number, spent in numbered if letter == "d"}
@@ -164,7 +167,7 @@ def compile_run(program: Program, steps: list[Step], plain: Collection[int], cha
         "        try:",
         *(f"            {line}" for line in _body(program, steps, plain, set(changed))),
         "        except BaseException as error:",
-        "            failed(error, start and clock() - start, locals())",
+        "            failed(program, error, start and clock() - start, locals())",
         "    return run",
     ]
     names: dict[str, Any] = {"program": program}
@@ -181,11 +184,13 @@ def _body(program: Program, steps: list[Step], plain: Collection[int], changed: 
         is_certain = not changed or not changed.isdisjoint(step.inputs)
         new = [] if is_certain else [slot for slot in step.inputs if slot in known]
         checked = [slot for slot in step.outputs if changed and slot in read]
-        lines = [f"at = {step.place}", *_call(program, step, plain, locked)]
+        lines = [f"at = {step.place}", "start = 0", *_call(program, step, plain, locked)]
         for place, slot in enumerate(step.outputs):
             given = _given(step, changed, known) if slot in checked else None
             lines += _store(slot, "made" if step.single else f"made[{place}]", given)
         lines.append(f"d{step.place} = spent")
+        if _is_direct(step):
+            lines.append(f"f{step.place}.{CALLED}(spent)")
         if step.switch is None:
             locked.update(step.outputs)
         if new:
@@ -203,7 +208,7 @@ def _body(program: Program, steps: list[Step], plain: Collection[int], changed: 
 
 def _call(program: Program, step: Step, plain: Collection[int], locked: Collection[int]) -> Iterator[str]:
     """Write out the call of a step; the slots in ``locked`` hold what ``keep`` gave."""
-    if step.switch is not None or step.unguarded or step.contracts is not None:
+    if not _is_written_out(step):
         yield f"made, spent = call(program, steps[{step.place}], v)"
         if step.single:
             yield "made = made[0]"
@@ -217,12 +222,22 @@ def _call(program: Program, step: Step, plain: Collection[int], locked: Collecti
         yield f"a{place} = v[{slot}]"
         yield from _lend(f"a{place}", is_locked=slot in locked)
     yield "start = clock()"
-    yield f"made = f{step.place}({', '.join(args)})"
+    function = f"f{step.place}.func" if _is_direct(step) else f"f{step.place}"
+    yield f"made = {function}({', '.join(args)})"
     yield "spent = clock() - start"
     if step.single and program.guard:
         yield from _keep("made", is_read=bool(program.consumers[step.outputs[0]]))
     elif not step.single:
         yield from _unpack(program, step)
+
+
+def _is_written_out(step: Step) -> bool:
+    return step.switch is None and not step.unguarded and step.contracts is None
+
+
+def _is_direct(step: Step) -> bool:
+    """Whether what a node stands for is called in its place."""
+    return _is_written_out(step) and is_its_func(step.function)
 
 
 def _unpack(program: Program, step: Step) -> Iterator[str]:

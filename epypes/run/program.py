@@ -16,6 +16,10 @@ from epypes.run.guard import is_unguarded
 
 # What a function has that keeps hyperparameters of its own: a value that is another one whenever they have changed.
 REVISION: Final = "__epypes_revision__"
+# What a function has that keeps account of its calls: it is told the nanoseconds of each call of its ``func`` in its
+# place, which may be called so where IS_ITS_FUNC is true.
+CALLED: Final = "__epypes_called__"
+IS_ITS_FUNC: Final = "__epypes_is_its_func__"
 
 
 class Step(NamedTuple):
@@ -175,3 +179,8 @@ def longest_path_ns(program: Program, durations_ns: Mapping[int, int]) -> int:
         makers = {program.makers[slot] for slot in program.steps[place].inputs}
         ends_ns[place] = durations_ns[place] + max((ends_ns.get(maker, 0) for maker in makers), default=0)
     return max(ends_ns.values(), default=0)
+
+
+def is_its_func(function: object) -> bool:
+    """Whether a function keeps account of its calls, and its ``func`` may be called in its place."""
+    return hasattr(type(function), CALLED) and bool(getattr(function, IS_ITS_FUNC))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from time import perf_counter_ns
 from typing import Any
 
@@ -115,6 +115,10 @@ class CompGraphRunner:
         Exception
             Whatever a function raises, unchanged, with a note; ``last`` is then the failed run.
         """
+        return self.run_on(payload, targets)
+
+    def run_on(self, payload: Mapping[str, Any], targets: Sequence[str] = ()) -> Run:
+        """Do what ``run`` does, with the payload as a mapping by free source token."""
         start_ns = perf_counter_ns()
         if targets:
             require_targets(self.cg, targets, self.free_source_tokens)
@@ -135,7 +139,7 @@ class CompGraphRunner:
             with self._lock:
                 self._last = run
             self.reports.kept.append(times)
-            if self._watchers:
+            if self._watchers.callbacks:
                 self._watchers.tell()
             return run
         return self._ended(outcome, hparams)
@@ -182,7 +186,7 @@ class CompGraphRunner:
                 with self._lock:
                     self._last = run
                 self.reports.kept.append(times)
-                if self._watchers:
+                if self._watchers.callbacks:
                     self._watchers.tell()
                 return run
         # A failure keeps this frame, with all that is named in it: the Run before, which may have failed too ...

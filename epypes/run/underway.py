@@ -7,7 +7,7 @@ when somebody asks.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from types import CodeType, FrameType
 from typing import Any, Final
 
@@ -20,41 +20,37 @@ _CALL: Final = call.__code__
 
 def running_functions(program: Program) -> tuple[str, ...]:
     """Return the functions of a program that were called and have not returned, in run order."""
-    # The dictionary of frames gets no name: it holds the frame of this call, and would be a cycle with it.
-    found = {
-        step.place: step.name
-        for frame in sys._current_frames().values()
-        for caller in _callers(frame)
-        for step in _steps(caller, program)
-    }
+    found = {step.place: step.name for its_program, step in _steps_under_way() if its_program is program}
     return tuple(found[place] for place in sorted(found))
 
 
-def locals_under_way(code: CodeType) -> list[dict[str, Any]]:
-    """Return, for each call of the function with this code that has not returned, its local variables by name."""
-    return [
-        dict(caller.f_locals)
-        for frame in sys._current_frames().values()
-        for caller in _callers(frame)
-        if caller.f_code is code
-    ]
+def functions_under_way() -> list[object]:
+    """Return the functions of graphs that were called and have not returned."""
+    return [step.function for _, step in _steps_under_way()]
 
 
-def _callers(frame: FrameType) -> Iterator[FrameType]:
-    caller: FrameType | None = frame
-    while caller is not None:
-        yield caller
-        caller = caller.f_back
+def locals_under_way(codes: Collection[CodeType]) -> list[dict[str, Any]]:
+    """Return, for each call of a function with such a code that has not returned, its local variables by name."""
+    return [dict(frame.f_locals) for frame in _frames() if frame.f_code in codes]
 
 
-def _steps(frame: FrameType, program: Program) -> Iterator[Step]:
-    """Give the step that a frame of an engine is at, if it runs this program."""
-    code = frame.f_code
-    if code is _CALL:
-        found = frame.f_locals
-        if found.get("program") is program:
-            yield found["step"]
-    elif code.co_filename == FILE_NAME and frame.f_globals.get("program") is program:
-        place = frame.f_locals.get("at")
-        if place is not None:
-            yield program.steps[place]
+def _frames() -> Iterator[FrameType]:
+    """Give the frames of all threads, the innermost of each first."""
+    # The dictionary of frames gets no name: it holds the frame of this call, and would be a cycle with it.
+    for innermost in sys._current_frames().values():
+        frame: FrameType | None = innermost
+        while frame is not None:
+            yield frame
+            frame = frame.f_back
+
+
+def _steps_under_way() -> Iterator[tuple[Program, Step]]:
+    """Give the steps that the frames of engines are at, with their programs."""
+    for frame in _frames():
+        code = frame.f_code
+        if code is _CALL:
+            yield frame.f_locals["program"], frame.f_locals["step"]
+        elif code.co_filename == FILE_NAME:
+            program, place = frame.f_globals["program"], frame.f_locals.get("at")
+            if place is not None:
+                yield program, program.steps[place]

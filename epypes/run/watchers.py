@@ -19,27 +19,24 @@ class Watchers:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         # Replaced as a whole, so that telling needs no lock.
-        self._callbacks: tuple[Callable[[], object], ...] = ()
-
-    def __bool__(self) -> bool:
-        return bool(self._callbacks)
+        self.callbacks: tuple[Callable[[], object], ...] = ()
 
     def add(self, callback: Callable[[], object]) -> Callable[[], None]:
         """Tell from now on; return what ends that, and may be called twice."""
         # A callable of its own for each call, so that one callback may be added twice and taken out once.
         entry = lambda: callback()  # noqa: E731
         with self._lock:
-            self._callbacks = (*self._callbacks, entry)
+            self.callbacks = (*self.callbacks, entry)
 
         def remove() -> None:
             with self._lock:
-                self._callbacks = tuple(other for other in self._callbacks if other is not entry)
+                self.callbacks = tuple(other for other in self.callbacks if other is not entry)
 
         return remove
 
     def tell(self) -> None:
         """Call them all."""
-        for callback in self._callbacks:
+        for callback in self.callbacks:
             try:
                 callback()
             except Exception:

@@ -17,6 +17,8 @@ from tests.conftest import EDGE_HPARAMS, EDGE_IO
 from tests.properties.test_straight_line import ruff_says
 from tests.seeds import printed
 
+pytestmark = pytest.mark.slow  # what is written is run beside what it was written from
+
 EDGE_CELL = """
 # Weighs the channels as people see them.
 def grayscale(im):

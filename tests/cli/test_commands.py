@@ -18,6 +18,8 @@ from epypes.service import Service
 from epypes.service.state import StateLock
 from tests.colours import red_image, red_runner
 
+pytestmark = pytest.mark.slow  # each promotes or serves a bundle
+
 ANY = "tcp://127.0.0.1:*"
 
 

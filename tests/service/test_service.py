@@ -25,6 +25,8 @@ from epypes.wire import Envelope, encode
 from tests.colours import red_image, red_runner
 from tests.service.processes import run_cli, running
 
+pytestmark = pytest.mark.slow  # each proves and serves a bundle
+
 TIMEOUT_S = 20.0
 ANY = "tcp://127.0.0.1:*"
 
