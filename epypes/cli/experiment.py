@@ -88,7 +88,12 @@ def _shown_progress(description: str) -> Iterator[Callable[[int, int], None]]:
                 last_s = monotonic()
                 shown.update(task, completed=done, total=total, description=description, refresh=True)
 
-        yield on_request
+        try:
+            yield on_request
+        except BaseException:
+            # What went wrong is said alone.
+            shown.live.transient = True
+            raise
 
 
 def _print_table(results: Results) -> None:
@@ -115,8 +120,8 @@ def _print_problems(results: Results) -> None:
     failures = results.table["failure"]
     for text, count in failures[failures != ""].value_counts().items():
         err.print(f"{count} of {len(failures)} requests failed: {text}", markup=False)
-    if results.late or results.unreadable:
-        err.print(f"{results.late} answers came too late, {results.unreadable} messages were no answers.")
+    for text, count in results.counts.items():
+        err.print(f"{count} x {text}", markup=False)
 
 
 def _write(results: Results, folder: Path, *, side_by_side: bool) -> list[Path]:

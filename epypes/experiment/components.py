@@ -15,10 +15,14 @@ from epypes.experiment.messages import T_VREQ, StereoPair, contents_of, read_req
 from epypes.graph import CompGraph
 from epypes.pipeline import EventView, FullPipeline
 from epypes.pipeline.reactive import FIn
+from epypes.run import Failure
 from epypes.wire import JustBytes, add_attribute
 
 ROWS: Final = 20
 _NS: Final = 1_000_000_000
+# An older frame than this is no answer, unless a camera is as slow: so many of its frames may be missing.
+_MAX_AGE_S: Final = 1.0
+_MOST_MISSED: Final = 3
 # What a component writes into its answers; the last two when f_out has returned.
 _TIMES: Final = ("t_react", "t_fin_start", "t_fin_end", "t_p", "o_cg", "t_fout_start", "t_fout_end", "t_pub")
 
@@ -114,7 +118,12 @@ class Acquisition(Component):
 
     def __init__(self, q_in: Any, q_out: Any, settings: Settings) -> None:
         sources = settings.cameras or stereo_pair()
-        self.cameras = ImageAcquisition(*(camera(source, fps=settings.fps) for source in sources))
+        self.cameras = ImageAcquisition(
+            *(camera(source, fps=settings.fps) for source in sources),
+            # Of slow cameras the newest frame is older.
+            max_age_s=max(_MAX_AGE_S, _MOST_MISSED / settings.fps),
+            on_error=self._report_camera,
+        )
         cg = acquisition_graph(self.cameras)
         super().__init__("acquisition", cg, q_in, q_out, payload_of_request, pack_pair, add_to_pair)
 
@@ -129,6 +138,10 @@ class Acquisition(Component):
             super().stop(timeout_s)
         finally:
             self.cameras.stop(timeout_s)
+
+    def _report_camera(self, index: int, exception: BaseException) -> None:
+        if self.on_error is not None:
+            self.on_error(Failure(f"camera {index + 1}", (), {}, exception, source=self.name))
 
     def wait_until_ready(self, timeout_s: float) -> bool:
         """Return whether every camera has given a frame within ``timeout_s`` seconds."""

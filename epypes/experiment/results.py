@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -35,16 +35,13 @@ class Results:
         How its nodes were spread over processes.
     table
         A row per request; durations are in seconds, and nan where ``failure`` says what failed.
-    late
-        How many answers came after the time-out of their request.
-    unreadable
-        How many messages came that were no answers.
+    counts
+        What else came to the robot: late answers, failures of no request, messages that are no answers.
     """
 
     layout: str
     table: pd.DataFrame
-    late: int = 0
-    unreadable: int = 0
+    counts: Mapping[str, int] = field(default_factory=dict)
 
     def to_csv(self, path: str | Path) -> None:
         """Write the table to a file, with every digit of the durations."""

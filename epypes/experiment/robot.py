@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import time
 import uuid
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -64,15 +65,14 @@ class Robot:
 
     Attributes
     ----------
-    late
-        How many answers and failures of earlier requests came when they were waited for no more.
-    unreadable
-        How many messages were no answers.
+    counts
+        What came besides the answers that were waited for: late ones of earlier requests, messages that are no
+        answers, failures of no request. They are ignored, but counted.
     """
 
     def __init__(self, requests: Any, inbox: Any, *, timeout_s: float = 5.0, unsafe_pickle: bool = False) -> None:
         self.requests, self.inbox, self.timeout_s, self.unsafe_pickle = requests, inbox, timeout_s, unsafe_pickle
-        self.late = self.unreadable = 0
+        self.counts: Counter[str] = Counter()
 
     def ask(self, at: float | None = None) -> Answer:
         """Announce a request, and return what comes of it within the time-out.
@@ -108,16 +108,21 @@ class Robot:
         if isinstance(item, ExperimentError):
             raise item
         try:
-            message = item if isinstance(item, Envelope) else parsed(JustBytes, item)
-            if (message.correlation_id if isinstance(message, Envelope) else message.id) != request_id:
-                self.late += 1
-                return None
-            if isinstance(message, Envelope):
-                return Answer(request_id, failure=failure_text(message))
-            return self._answer(message, t_trip)
-        except MessageError:
-            self.unreadable += 1
-            return None
+            if isinstance(item, Envelope):
+                return self._failure(item, request_id)
+            message = parsed(JustBytes, item)
+            if message.id == request_id:
+                return self._answer(message, t_trip)
+            self.counts["late answer"] += 1
+        except MessageError as error:
+            self.counts[f"message that is no answer ({error.reason})"] += 1
+        return None
+
+    def _failure(self, event: Envelope, request_id: str) -> Answer | None:
+        if event.correlation_id == request_id:
+            return Answer(request_id, failure=failure_text(event))
+        self.counts["late failure" if event.correlation_id else failure_text(event)] += 1
+        return None
 
     def _answer(self, message: JustBytes, t_trip: float) -> Answer:
         try:

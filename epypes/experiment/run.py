@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -79,7 +80,7 @@ def run_experiment(
     _check_numbers(fps=fps, timeout_s=timeout_s)
     settings = Settings(_checked_cameras(cameras), float(fps), workers, bool(unsafe_pickle))
     rows: list[dict[str, Any]] = []
-    late = unreadable = 0
+    counts: Counter[str] = Counter()
 
     def on_request() -> None:
         if progress is not None:
@@ -94,8 +95,8 @@ def run_experiment(
             for request in range(requests):
                 rows.append(row_of(ask(), experiment, request))
                 on_request()
-        late, unreadable = late + robot.late, unreadable + robot.unreadable
-    return Results(layout, table_of(rows), late, unreadable)
+        counts += robot.counts
+    return Results(layout, table_of(rows), counts)
 
 
 def _patient(robot: Robot) -> Callable[[], Any]:
