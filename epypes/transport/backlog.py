@@ -9,6 +9,8 @@ from collections import Counter, deque
 from epypes.transport.mcapformat import Counts, Frames
 
 _SLOW, _FAILED = "disk too slow", "disk failed"
+# What a message takes beside its bytes: without it, millions of tiny ones would fill the memory.
+_BESIDE_BYTES = 1_024
 
 
 class Backlog:
@@ -35,7 +37,7 @@ class Backlog:
     def put(self, item: Frames, *, block: bool) -> None:
         """Take the frames of a message, or count them as dropped."""
         now_ns = self._offset_ns + time.perf_counter_ns()
-        size = sum(map(len, item))
+        size = sum(map(len, item)) + _BESIDE_BYTES
         with self._changed:
             if self._closed and not self._failed:
                 return

@@ -60,8 +60,8 @@ class Recorder:
 
     Notes
     -----
-    Start it, or use ``with``. Nothing is decoded. A time is the Unix time of the start plus what a monotonic clock has
-    counted since, so that a clock that is set meanwhile does no harm.
+    Start it, or use ``with``. Nothing is decoded. Times are Unix times, read once and counted on by a monotonic clock,
+    so that a clock that is set meanwhile does no harm.
     """
 
     def __init__(
