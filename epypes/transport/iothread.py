@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import select
 import socket
 import threading
 from collections import deque
@@ -44,6 +45,10 @@ _OPTIONS: dict[int, int] = {
 _FD, _EVENTS, _POLLIN = int(zmq.FD), int(zmq.EVENTS), int(zmq.POLLIN)
 
 
+# ZeroMQ's own, where the system has none, wraps it in a call more.
+_Poller: type[Any] = getattr(select, "poll", zmq.Poller)
+
+
 def has_arrived(owned: Socket) -> bool:
     """Return whether a socket can be read.
 
@@ -81,7 +86,7 @@ class IOThread:
         self._next_due_s = float("inf")
         self._gatekeeper: Gatekeeper | None = None
         self._context = zmq.Context(io_threads=1)
-        self._poller = zmq.Poller()
+        self._poller = _Poller()
         self._wake_in, self._wake_out = socket.socketpair()
         self._wake_in.setblocking(False)
         self._wake_out.setblocking(False)
@@ -215,10 +220,10 @@ class IOThread:
     def _run(self) -> None:
         try:
             while not self._ended():
-                # What comes between the poller and a reader is paid for by every message.
                 for descriptor, _ in self._poller.poll(self._wait_ms()):
                     self._read(descriptor)
-                self._catch_up()
+                if self._unfinished or self._next_due_s <= monotonic():
+                    self._catch_up()
         finally:
             self._context.term()
             self._wake_in.close()

@@ -289,6 +289,7 @@ class _Opened:
             except zmq.Again:
                 return False
             self._inbox.accept([frame, *_rest(socket)] if frame.more else [frame], self.guest)
+            # After it, since the thread that waits for the message is woken up by now.
             self.pulse.heard()
         return True
 
