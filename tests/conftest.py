@@ -1,6 +1,8 @@
-"""Which graphs and images do many tests share?"""
+"""Which graphs and images do many tests share, and what are kernels told that tests start?"""
 
 from __future__ import annotations
+
+import os
 
 import cv2
 import numpy as np
@@ -8,6 +10,9 @@ import pytest
 from skimage import data
 
 import epypes as ep
+
+# They inherit it: the tutorial on the experiment asks so often where a reader asks 500 times.
+os.environ.setdefault("EPYPES_REQUESTS", "20")
 
 
 def grayscale(im):

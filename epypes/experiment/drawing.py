@@ -16,6 +16,7 @@ from typing import Any, Final
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 BLUE: Final = "#0072b2"
 ORANGE: Final = "#e69f00"
@@ -77,8 +78,8 @@ class Drawing(Figure):
 
 def blank(title: str) -> tuple[Drawing, Axes]:
     """Return a figure with a title and nothing in it, and its axes."""
-    figure = Drawing(figsize=(8, 4.2), dpi=100, layout="constrained")
-    figure.suptitle(title, x=0.01, ha="left", fontsize=11, fontweight="bold")
+    figure = Drawing(figsize=(8, 4.2), dpi=100, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.06))
+    figure.suptitle(title, x=0.015, ha="left", fontsize=11, fontweight="bold")
     return figure, figure.add_subplot()
 
 

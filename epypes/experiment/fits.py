@@ -18,17 +18,8 @@ if TYPE_CHECKING:
 # Seconds, by column of the table: where the curves over all data of figures 15 and 16 are highest.
 PAPER: Final[Mapping[str, float]] = MappingProxyType({"vision.o_cg": 0.3e-3, "vision.o_epypes": 0.02e-3})
 
-TIMES: Final = (
-    "t_trip",
-    "acquisition.t_rp",
-    "vision.t_rp",
-    "o_network",
-    *(
-        f"{part}.{time}"
-        for part in ("vision", "acquisition")
-        for time in ("t_p", "o_cg", "t_fin", "t_fout", "o_epypes")
-    ),
-)
+# The columns of numbers that are no times.
+_PLACES: Final = ("experiment", "request")
 _MS: Final = 1e3
 
 
@@ -147,10 +138,10 @@ def summary(table: pd.DataFrame) -> pd.DataFrame:
     import pandas as pd
 
     rows = table[answered(table)]
-    times = [time for time in TIMES if time in rows]
+    times = [str(time) for time in rows.select_dtypes("number") if time not in _PLACES]
     described = [_described(time, rows[time].dropna()) for time in times]
     columns = ["requests", "not_positive", "median_ms", "mode_ms", "least_ms", "most_ms", "paper_mode_ms"]
-    return pd.DataFrame(described, index=pd.Index(times, name="time"), columns=columns)
+    return pd.DataFrame(described, index=times, columns=columns)
 
 
 def _described(time: str, values: pd.Series[Any]) -> list[float]:
