@@ -22,6 +22,7 @@ Everything an error's text mentions is an attribute of it::
     +-- MessageError            a message can't be made or understood; .reason
     +-- AddressError            an address can't be bound or connected to; .address
     +-- KeysError               keys can't be made, read or used; .path
+    +-- RecordingError          a recording of messages can't be written or read; .path
     +-- SettingsError           settings of hyperparameters can't be written or read; .path, .reasons
     +-- BundleError             a bundle is not what it says; .path
     |   +-- PromotionRefused    a graph can't become a bundle; .reasons
@@ -260,6 +261,14 @@ class AddressError(EpypesError, OSError):
 
 class KeysError(EpypesError, ValueError):
     """Keys can't be made, read or used."""
+
+    def __init__(self, path: object, text: str) -> None:
+        self.path = str(path)
+        super().__init__(text)
+
+
+class RecordingError(EpypesError, OSError):
+    """A file of recorded messages that can't be written, or is not what it should be."""
 
     def __init__(self, path: object, text: str) -> None:
         self.path = str(path)

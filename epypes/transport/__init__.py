@@ -8,19 +8,38 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from epypes.transport.addresses import check_bind, is_loopback
     from epypes.transport.keys import Keys, make_keys, read_keys
+    from epypes.transport.mcapreader import RecordingInfo, recording_info
+    from epypes.transport.playing import Player
     from epypes.transport.publisher import ZMQPublisher
+    from epypes.transport.recording import Recorder
     from epypes.transport.subscriber import ZMQSubscriber
 
-__all__ = ["Keys", "ZMQPublisher", "ZMQSubscriber", "check_bind", "is_loopback", "make_keys", "read_keys"]
+__all__ = [
+    "Keys",
+    "Player",
+    "Recorder",
+    "RecordingInfo",
+    "ZMQPublisher",
+    "ZMQSubscriber",
+    "check_bind",
+    "is_loopback",
+    "make_keys",
+    "read_keys",
+    "recording_info",
+]
 
 _HOME = {
     "Keys": "keys",
+    "Player": "playing",
+    "Recorder": "recording",
+    "RecordingInfo": "mcapreader",
     "ZMQPublisher": "publisher",
     "ZMQSubscriber": "subscriber",
     "check_bind": "addresses",
     "is_loopback": "addresses",
     "make_keys": "keys",
     "read_keys": "keys",
+    "recording_info": "mcapreader",
 }
 
 

@@ -34,7 +34,8 @@ _OPTIONS: dict[int, int] = {
     zmq.HEARTBEAT_TIMEOUT: 15_000,
     zmq.HEARTBEAT_TTL: 30_000,
     zmq.RECONNECT_IVL: 50,
-    zmq.RECONNECT_IVL_MAX: 2_000,
+    # A peer that has come back is met soon: what it sends before that is lost.
+    zmq.RECONNECT_IVL_MAX: 200,
     zmq.IPV6: 0,
 }
 
@@ -277,6 +278,8 @@ class IOThread:
             except Exception as error:
                 # It belongs to the thread that asked, with its traceback.
                 future.set_exception(error)
+        # A command that used a socket may have used up its signal as well.
+        self._unfinished.update(known.descriptor for known in self._owned.values())
         return False
 
 

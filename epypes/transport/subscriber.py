@@ -60,6 +60,8 @@ class ZMQSubscriber:
         A peer that sends a larger frame is disconnected; a larger message is counted in `rejected`.
     high_water_mark
         Messages kept by ZeroMQ until the I/O thread has read them.
+    undecoded
+        True to put every message as the tuple of its frames, read-only memoryviews of what came.
     heartbeat_s
         After so many seconds of silence publishers of EPypes 1.0 are asked whether they live; after three times as
         many without an answer the input is stale.
@@ -96,6 +98,7 @@ class ZMQSubscriber:
         allow: PublicKey | Collection[PublicKey] | None = None,
         max_message_bytes: int = Limits().total_bytes,
         high_water_mark: int = HIGH_WATER_MARK,
+        undecoded: bool = False,
         heartbeat_s: float = HEARTBEAT_S,
     ) -> None:
         self._security = security(address, bind, insecure, keys, allow)
@@ -103,7 +106,7 @@ class ZMQSubscriber:
         self._subscription = topic_frame(topic) if topic else b""
         self._limits = Limits(total_bytes=max_message_bytes)
         self._high_water_mark = high_water_mark
-        self._inbox = Inbox(queue, self._limits)
+        self._inbox = Inbox(queue, self._limits, undecoded)
         self._heartbeat_s = heartbeat_s
         self.on_stale: Callable[[bool], None] | None = None
         self._lock = threading.Lock()
@@ -285,10 +288,7 @@ class _Opened:
                 frame = socket.recv(_DONTWAIT, copy=False)
             except zmq.Again:
                 return False
-            if frame.more:
-                self._inbox.accept([frame, *_rest(socket)], self.guest)
-            else:
-                self._inbox.put(frame.bytes)
+            self._inbox.accept([frame, *_rest(socket)] if frame.more else [frame], self.guest)
             self.pulse.heard()
         return True
 

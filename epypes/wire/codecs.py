@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from epypes.errors import MessageError
 from epypes.images import Order, swapped
+from epypes.wire.arrays import frozen, image_encoding, read_dtype, read_image, read_tensor
 from epypes.wire.limits import DEFAULT_LIMITS, Limits
 from epypes.wire.schema import message_class
 
@@ -77,24 +78,30 @@ def to_value(
     MessageError
         Of reason ``"no codec"`` for another type, ``"too deep"``, ``"too many values"`` or ``"not utf-8"``.
     """
-    writer = _Writer(inline_below, order, first_frame, limits)
-    return writer.write(value, (name,)), writer.payloads
+    writer = Writer(inline_below, limits, first_frame)
+    message = message_class("epypes.v1.Value")()
+    writer.write(message, value, name, order)
+    return message, writer.payloads
 
 
-class _Writer:
-    """Writes Value messages and collects what travels beside them."""
+class Writer:
+    """Writes Value messages and collects what travels beside them.
 
-    def __init__(self, inline_below: int, order: str, first_frame: int, limits: Limits) -> None:
-        self._inline_below, self._order, self._limits = inline_below, order, limits
-        self._first_frame = first_frame
-        self._count = 0
-        self._value_class = message_class("epypes.v1.Value")
+    Attributes
+    ----------
+    payloads
+        What travels beside the messages written so far, in the order of its frames.
+    """
+
+    def __init__(self, inline_below: int, limits: Limits, first_frame: int = 0) -> None:
+        self._inline_below, self._limits, self._first_frame = inline_below, limits, first_frame
+        self._order, self._count = "bgr", 0
         self.payloads: list[Payload] = []
 
-    def write(self, value: object, path: Path) -> Any:
-        message = self._value_class()
-        self._fill(message, value, path)
-        return message
+    def write(self, message: Any, value: object, name: str, order: str) -> None:
+        """Write a named value into a Value message; see `to_value`."""
+        self._order, self._count = order, 0
+        self._fill(message, value, (name,))
 
     def _fill(self, message: Any, value: object, path: Path) -> None:
         self._count += 1
@@ -182,8 +189,6 @@ class _Writer:
             tensor.dtype = f"|S{len(raw)}" if value.dtype.kind == "S" else f"<U{len(raw) // 4}"
 
     def _array(self, message: Any, array: AnyArray, path: Path) -> None:
-        from epypes.wire.arrays import image_encoding
-
         encoding = image_encoding(array, self._order)
         if encoding is None:
             holder = message.tensor
@@ -205,16 +210,16 @@ class _Writer:
             holder.inline = data.tobytes()
 
 
-_PLAIN: dict[type, Callable[[_Writer, Any, Any, Path], None]] = {
-    type(None): _Writer._none,
-    bool: _Writer._boolean,
-    int: _Writer._integer,
-    float: _Writer._number,
-    str: _Writer._text,
-    bytes: _Writer._bytes,
-    list: _Writer._list,
-    tuple: _Writer._list,
-    dict: _Writer._map,
+_PLAIN: dict[type, Callable[[Writer, Any, Any, Path], None]] = {
+    type(None): Writer._none,
+    bool: Writer._boolean,
+    int: Writer._integer,
+    float: Writer._number,
+    str: Writer._text,
+    bytes: Writer._bytes,
+    list: Writer._list,
+    tuple: Writer._list,
+    dict: Writer._map,
 }
 
 
@@ -305,8 +310,6 @@ class Reader:
         return result
 
     def _image(self, content: Any, path: Path) -> AnyArray:
-        from epypes.wire.arrays import frozen, read_image
-
         data = self._data(content, path)
         image = read_image(content.width, content.height, content.encoding, content.step, data, spoken(path))
         if image.ndim == 2:
@@ -316,8 +319,6 @@ class Reader:
         return image if order == self.order else frozen(swapped(image))
 
     def _tensor(self, content: Any, path: Path) -> Any:
-        from epypes.wire.arrays import read_dtype, read_tensor
-
         where = spoken(path)
         data = self._data(content, path)
         if content.scalar and content.dtype[1:2] in _TEXT_KINDS:

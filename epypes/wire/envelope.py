@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import uuid
+import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -37,8 +37,11 @@ class FailureRecord:
     attempt: int = 0
 
 
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
 def _new_id() -> str:
-    return uuid.uuid4().hex
+    return os.urandom(16).hex()
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -93,9 +96,11 @@ class Envelope:
     rgb: Collection[str] = frozenset()
 
     def __post_init__(self) -> None:
-        for name in ("parts", "attributes", "timings"):
-            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
-        object.__setattr__(self, "rgb", frozenset((self.rgb,) if isinstance(self.rgb, str) else self.rgb))
+        put = object.__setattr__
+        put(self, "parts", MappingProxyType(dict(self.parts)))
+        put(self, "attributes", MappingProxyType(dict(self.attributes)) if self.attributes else _NOTHING)
+        put(self, "timings", MappingProxyType(dict(self.timings)) if self.timings else _NOTHING)
+        put(self, "rgb", frozenset((self.rgb,) if isinstance(self.rgb, str) else self.rgb))
 
     def __repr__(self) -> str:
         number = f" #{self.sequence}" if self.sequence else ""

@@ -6,7 +6,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from epypes.errors import MessageError
-from epypes.wire.codecs import Payload, Reader, to_value
+from epypes.wire.arrays import flat_bytes
+from epypes.wire.codecs import Payload, Reader, Writer
 from epypes.wire.envelope import Envelope, FailureRecord
 from epypes.wire.limits import DEFAULT_LIMITS, Limits
 from epypes.wire.schema import message_class
@@ -24,6 +25,7 @@ _PLAIN_FIELDS = (
     "revision",
     "bundle_digest",
 )
+_UNSET = ("", 0)
 _MAX_TOPIC_BYTES = 1024
 # What encode writes, and the greatest that decode reads. Fields may be added without raising it, since old receivers
 # pass over them; it rises when what is there already changes its meaning.
@@ -78,41 +80,38 @@ def encode(
         Of reason ``"no codec"``, ``"too deep"``, ``"too large"``, ``"not utf-8"``, ``"bad field"``, ...
     """
     header = message_class("epypes.v1.Envelope")()
-    payloads: list[Payload] = []
-    marked = {*rgb, *envelope.rgb}
-
-    def add_values(entries: Any, values: Mapping[str, Any], what: str) -> None:
-        if len(values) > limits.parts:
-            raise MessageError(f"too many {what}", f"{len(values)} {what}, but the limit is {limits.parts}.")
-        for name, value in values.items():
-            order = "rgb" if what == "parts" and name in marked else "bgr"
-            message, more = to_value(
-                value,
-                str(name),
-                inline_below=inline_below,
-                order=order,
-                first_frame=len(payloads),
-                limits=limits,
-            )
-            entry = entries.add(name=name)
-            entry.value.CopyFrom(message)
-            payloads.extend(more)
-
+    writer = Writer(inline_below, limits)
     first = topic_frame(topic)
     try:
         _write_plain(header, envelope)
         if stamp is not None:
             header.epoch, header.sequence, header.published_ns = stamp
-        add_values(header.parts, envelope.parts, "parts")
-        add_values(header.attributes, envelope.attributes, "attributes")
+        _write_values(writer, header.parts, envelope.parts, "parts", limits, {*rgb, *envelope.rgb})
+        if envelope.attributes:
+            _write_values(writer, header.attributes, envelope.attributes, "attributes", limits)
         head: bytes = header.SerializeToString()
     except MessageError:
         raise
     except _REFUSALS as error:
         raise MessageError("bad field", f"{envelope!r} has a field that can't be sent: {error}") from error
-    frames: list[bytes | memoryview] = [first, head, *map(_payload_frame, payloads)]
-    _check_sizes([memoryview(frame) for frame in frames], limits)
+    frames: list[bytes | memoryview] = [first, head, *map(_payload_frame, writer.payloads)]
+    # The frames are flat, so the length of each is its size in bytes.
+    _check_sizes([len(frame) for frame in frames], limits)
     return frames
+
+
+def _write_values(
+    writer: Writer,
+    entries: Any,
+    values: Mapping[str, Any],
+    what: str,
+    limits: Limits,
+    marked: Collection[str] = (),
+) -> None:
+    if len(values) > limits.parts:
+        raise MessageError(f"too many {what}", f"{len(values)} {what}, but the limit is {limits.parts}.")
+    for name, value in values.items():
+        writer.write(entries.add(name=name).value, value, str(name), "rgb" if name in marked else "bgr")
 
 
 def topic_frame(topic: str) -> bytes:
@@ -135,7 +134,10 @@ def topic_frame(topic: str) -> bytes:
 def _write_plain(header: Any, envelope: Envelope) -> None:
     header.version = VERSION
     for name in _PLAIN_FIELDS:
-        setattr(header, name, getattr(envelope, name))
+        value = getattr(envelope, name)
+        # What is not set reads as 0 or as an empty text.
+        if value not in _UNSET:
+            setattr(header, name, value)
     for function, duration_ns in envelope.timings.items():
         header.timings.add(function=function, duration_ns=duration_ns)
     failure = envelope.failure
@@ -149,8 +151,6 @@ def _write_plain(header: Any, envelope: Envelope) -> None:
 def _payload_frame(payload: Payload) -> bytes | memoryview:
     if isinstance(payload.data, bytes):
         return payload.data
-    from epypes.wire.arrays import flat_bytes
-
     return flat_bytes(payload.data)
 
 
@@ -172,7 +172,7 @@ def decode(frames: Sequence[bytes | bytearray | memoryview], limits: Limits = DE
         short word to count by.
     """
     views = [_view(frame) for frame in frames]
-    _check_sizes(views, limits)
+    _check_sizes([view.nbytes for view in views], limits)
     _check_topic(views[0])
     header = _parse(views[1])
     _check_version(header.version)
@@ -209,18 +209,18 @@ def _view(frame: bytes | bytearray | memoryview) -> memoryview:
         raise MessageError("bad frame", f"A frame must be contiguous bytes: {error}") from error
 
 
-def _check_sizes(views: Sequence[memoryview], limits: Limits) -> None:
-    if len(views) < 2:
-        raise MessageError("too few frames", f"{len(views)} frames; a v1 message has a topic and an Envelope.")
-    if len(views) - 2 > limits.frames:
-        raise MessageError("too many frames", f"{len(views) - 2} payload frames, but the limit is {limits.frames}.")
-    total = sum(view.nbytes for view in views)
+def _check_sizes(sizes: Sequence[int], limits: Limits) -> None:
+    if len(sizes) < 2:
+        raise MessageError("too few frames", f"{len(sizes)} frames; a v1 message has a topic and an Envelope.")
+    if len(sizes) - 2 > limits.frames:
+        raise MessageError("too many frames", f"{len(sizes) - 2} payload frames, but the limit is {limits.frames}.")
+    total = sum(sizes)
     if total > limits.total_bytes:
         raise MessageError("too large", f"The message has {total:,} bytes; the limit is {limits.total_bytes:,}.")
-    if views[1].nbytes > limits.header_bytes:
+    if sizes[1] > limits.header_bytes:
         raise MessageError(
             "too large",
-            f"The Envelope has {views[1].nbytes:,} bytes; the limit is {limits.header_bytes:,}. "
+            f"The Envelope has {sizes[1]:,} bytes; the limit is {limits.header_bytes:,}. "
             "Send long lists as numpy arrays.",
         )
 
@@ -235,11 +235,14 @@ def _check_topic(view: memoryview) -> None:
 
 
 def _parse(view: memoryview) -> Any:
-    from google.protobuf.message import DecodeError
-
     try:
         return message_class("epypes.v1.Envelope").FromString(bytes(view))
-    except (DecodeError, *_REFUSALS) as error:
+    except Exception as error:
+        # Looked up here, since an import takes as long as parsing.
+        from google.protobuf.message import DecodeError
+
+        if not isinstance(error, (DecodeError, *_REFUSALS)):
+            raise
         raise MessageError("no envelope", f"The second frame is no Envelope: {error}.") from error
 
 

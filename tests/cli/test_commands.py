@@ -124,7 +124,7 @@ def test_wrong_usage_exits_with_2(epypes):
 def test_help_names_every_command(epypes):
     done = epypes("--help")
     assert done.returncode == 0
-    for command in ("promote", "verify", "serve", "call", "demo"):
+    for command in ("promote", "verify", "serve", "call", "record", "play", "demo"):
         assert command in done.stdout
 
 

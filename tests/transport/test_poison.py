@@ -1,0 +1,94 @@
+"""Can a peer that sends nonsense stop a subscriber, or hide in its counts?"""
+
+from __future__ import annotations
+
+import queue
+import random
+from collections import Counter
+
+import numpy as np
+import pytest
+import zmq
+
+from epypes.errors import MessageError
+from epypes.transport import ZMQSubscriber
+from epypes.wire import Envelope, decode, encode
+from tests.wire.mutants import mutate_description, mutate_frames
+
+WAIT_S = 30.0
+# Fewer than what a socket keeps, so that none is lost on the way.
+BATCH = 500
+
+
+@pytest.fixture
+def poisoner():
+    """A socket of a peer that sends what it likes to a subscriber, and the way to connect it."""
+    context = zmq.Context()
+    socket = context.socket(zmq.XPUB)
+    socket.rcvtimeo = int(WAIT_S * 1000)
+
+    def connect(address: str) -> zmq.Socket:
+        socket.connect(address)
+        assert socket.recv() == b"\x01"
+        return socket
+
+    yield connect
+    socket.close(linger=0)
+    context.term()
+
+
+def sample() -> list[bytes]:
+    parts = {
+        "image": np.arange(60 * 80 * 3, dtype=np.uint8).reshape(60, 80, 3),
+        "depth": np.ones((30, 40), "<u2"),
+        "mask": np.eye(20, dtype=bool),
+        "names": np.array(["left", "right"]),
+        "points": [(1.5, 2), {"size": np.float32(3)}, None],
+        "jpeg": b"\xff\xd8" + bytes(500),
+    }
+    envelope = Envelope("edges", parts, source="cam1", epoch=1, attributes={"exposure": 0.5}, timings={"blur": 100})
+    return [bytes(frame) for frame in encode(envelope, "cam1", inline_below=64)]
+
+
+def expected_of(frames: list[bytes]) -> str | type:
+    """What the decoder makes of frames: a reason, or the type of what is put."""
+    if len(frames) == 1:
+        return bytes
+    try:
+        decode(frames)
+    except MessageError as error:
+        return error.reason
+    return Envelope
+
+
+def until_good(into):
+    """Yield what arrives before the envelope that ends a batch."""
+    while not (isinstance(item := into.get(timeout=WAIT_S), Envelope) and item.type == "good"):
+        yield item
+
+
+@pytest.mark.slow
+def test_of_10000_broken_messages_through_a_socket_each_is_counted_and_the_next_good_one_arrives(poisoner, caplog):
+    rng, good = random.Random(35), sample()
+    expected: Counter[str | type] = Counter()
+    arrived: Counter[str | type] = Counter()
+    into = queue.SimpleQueue()
+    caplog.set_level("ERROR", "epypes.transport")
+    with ZMQSubscriber("tcp://127.0.0.1:*", into, bind=True) as sub:
+        socket = poisoner(sub.address)
+        for start in range(0, 10_000, BATCH):
+            for number in range(start, start + BATCH):
+                mutation = mutate_description if number % 3 == 0 else mutate_frames
+                # ZeroMQ knows no message without frames.
+                frames = mutation(good, rng) or [b""]
+                expected[expected_of(frames)] += 1
+                socket.send_multipart(frames)
+            socket.send_multipart(encode(Envelope("good")))
+            arrived.update(map(type, until_good(into)))
+        assert sub.received == sum(arrived.values()) + 10_000 // BATCH
+        assert sub.rejected == {reason: n for reason, n in expected.items() if isinstance(reason, str)}
+        assert arrived == {kind: n for kind, n in expected.items() if isinstance(kind, type)}
+        assert sum(sub.rejected.values()) + sum(arrived.values()) == 10_000
+        assert not sub.dropped
+    assert len(sub.rejected) >= 12, "many kinds of broken messages were tried"
+    assert not caplog.records, "no reader failed"

@@ -1,0 +1,56 @@
+"""How is a message broken: in its frames, its bytes, or what it says of itself?"""
+
+from __future__ import annotations
+
+import random
+
+from epypes.wire.schema import message_class
+
+
+def mutate_bytes(data: bytes, rng: random.Random) -> bytes:
+    changed = bytearray(data)
+    for _ in range(rng.randint(1, 4)):
+        if changed:
+            changed[rng.randrange(len(changed))] = rng.choice([0, 1, 0x7F, 0x80, 0xFF, rng.randrange(256)])
+    what = rng.randrange(5)
+    if what == 0:
+        del changed[rng.randrange(len(changed) + 1) :]
+    elif what == 1:
+        place = rng.randrange(len(changed) + 1)
+        changed[place:place] = rng.randbytes(rng.randint(1, 12))
+    return bytes(changed)
+
+
+def mutate_frames(frames: list[bytes], rng: random.Random) -> list[bytes]:
+    frames = list(frames)
+    what = rng.randrange(8)
+    place = rng.randrange(len(frames))
+    if what == 0:
+        del frames[place]
+    elif what == 1:
+        frames.insert(place, frames[rng.randrange(len(frames))])
+    elif what == 2:
+        frames[place] = frames[place][: rng.randrange(len(frames[place]) + 1)]
+    elif what == 3:
+        rng.shuffle(frames)
+    else:
+        # Most of the meaning is in the header.
+        place = 1 if what > 4 else place
+        frames[place] = mutate_bytes(frames[place], rng)
+    return frames
+
+
+def mutate_description(frames: list[bytes], rng: random.Random) -> list[bytes]:
+    message = message_class("epypes.v1.Envelope").FromString(frames[1])
+    value = rng.choice(message.parts).value
+    numbers = [0, 1, 2, 3, 17, 2**16, 2**31, 2**32 - 1]
+    if value.HasField("image"):
+        setattr(value.image, rng.choice(["width", "height", "step", "frame"]), rng.choice(numbers))
+        value.image.encoding = rng.choice(["mono8", "bgr8", "bgra16", "rgb16", "", "jpeg"])
+    elif value.HasField("tensor"):
+        value.tensor.dtype = rng.choice(["<f4", "|O8", "O", "<U3", "|S0", "|V8", ">c32", "<U999999999", "b1", "f"])
+        value.tensor.shape.append(rng.choice([-1, 0, 2**62, -(2**63), 2**63 - 1, *numbers]))
+        value.tensor.scalar = rng.random() < 0.5
+    else:
+        value.tensor.frame = rng.choice(numbers)
+    return [frames[0], message.SerializeToString(), *frames[2:]]
