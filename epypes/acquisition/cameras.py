@@ -116,8 +116,7 @@ def _of_capture(capture: Any, opening: Callable[[], Any] | None, fps: float | No
 
 def _of_many(source: Any, fps: float | None, loop: bool) -> Camera:
     if isinstance(source, Iterator):
-        # An iterator can't begin anew: after a stop it goes on where it was.
-        return paced(Sequence(lambda: source, loop=False, rewinds=False), fps)
+        return paced(Sequence(lambda: source, loop=False), fps)
     if isinstance(source, Iterable) and not isinstance(source, bytes | bytearray | memoryview | dict | set | frozenset):
         return paced(Sequence(lambda: source, loop), fps or USUAL_FPS)
     if callable(source):

@@ -56,15 +56,13 @@ class Sequence:
     Parameters
     ----------
     start
-        Returns an iterator; called when the first frame is wanted, and for each further round.
+        Returns an iterable; called when the first frame is wanted, and for each further round.
     loop
         Whether there is another round.
-    rewinds
-        Whether `close` ends a round. What others have made goes on where it was.
     """
 
-    def __init__(self, start: Callable[[], Iterable[Any]], loop: bool = True, *, rewinds: bool = True) -> None:
-        self._start, self._loop, self._rewinds = start, loop, rewinds
+    def __init__(self, start: Callable[[], Iterable[Any]], loop: bool = True) -> None:
+        self._start, self._loop = start, loop
         self._items: Iterator[Any] | None = None
 
     def read(self) -> Any:
@@ -82,9 +80,8 @@ class Sequence:
         return None
 
     def close(self) -> None:
-        """Begin anew with the next `read`, if that can be."""
-        if self._rewinds:
-            self._items = None
+        """Begin anew with the next `read`; an iterator, which can't, goes on where it was."""
+        self._items = None
 
     def __repr__(self) -> str:
         return f"<Sequence of {getattr(self._start, '__qualname__', 'frames'):.60}>"

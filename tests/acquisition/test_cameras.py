@@ -235,6 +235,53 @@ def test_a_device_that_is_not_there_is_named():
         ep.camera(-1)
 
 
+class SlowCapture:
+    """What a cv2.VideoCapture is, with a frame that is long in coming."""
+
+    def __init__(self):
+        self.grabbing, self.go, self.is_open, self.released_while_reading = (
+            threading.Event(),
+            threading.Event(),
+            True,
+            False,
+        )
+
+    def grab(self):
+        self.grabbing.set()
+        self.go.wait()
+        self.grabbing.clear()
+        return True
+
+    def retrieve(self):
+        return True, gray(1)
+
+    def release(self):
+        self.released_while_reading |= self.grabbing.is_set()
+        self.is_open = False
+
+    def isOpened(self):
+        return self.is_open
+
+    def get(self, key):
+        return 0.0
+
+
+def test_a_capture_is_never_released_while_it_is_read():
+    capture = SlowCapture()
+    camera = ep.camera(lambda: capture)
+    frames = []
+    reading = threading.Thread(target=lambda: frames.append(camera.read()))
+    reading.start()
+    assert capture.grabbing.wait(10)
+    camera.close()
+    assert capture.is_open
+    capture.go.set()
+    reading.join(10)
+    assert frames == [None]
+    assert not capture.is_open
+    assert not capture.released_while_reading
+
+
 def test_the_password_of_a_stream_is_not_told():
     with pytest.raises(CameraUnavailable) as info:
         ep.camera("nothing://me:secret@127.0.0.1/film")

@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
 from epypes.acquisition import read_image, write_image
+from epypes.acquisition.quiet import quiet
 from epypes.errors import ImageFileError
 
 
@@ -55,3 +57,12 @@ def test_a_file_holds_the_colours_and_the_caller_says_their_order(tmp_path, chan
     as_opencv = read_image(tmp_path / "red.png")
     assert (as_opencv if channels == 1 else as_opencv[:, :, 2]).max() == 700
     assert (as_opencv if channels == 1 else as_opencv[:, :, 2]).min() == 700
+
+
+def test_opencv_stays_quiet_until_the_last_reader_has_done():
+    before = cv2.utils.logging.getLogLevel()
+    with quiet():
+        with quiet():
+            pass
+        assert cv2.utils.logging.getLogLevel() == cv2.utils.logging.LOG_LEVEL_SILENT
+    assert cv2.utils.logging.getLogLevel() == before
