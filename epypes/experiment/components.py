@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from epypes.acquisition import ImageAcquisition, camera
 from epypes.experiment.graph import orb_graph, orb_hyperparameters, stereo_pair
-from epypes.experiment.messages import T_VREQ, StereoPair, contents_of, read_request
+from epypes.experiment.messages import T_VREQ, Request, StereoPair, contents_of, read_request
 from epypes.graph import CompGraph
 from epypes.pipeline import EventView, FullPipeline
 from epypes.pipeline.reactive import FIn
@@ -157,7 +157,7 @@ def acquisition_graph(cameras: ImageAcquisition) -> CompGraph:
     return CompGraph({"nearest": nearest}, {"nearest": (T_VREQ, "pair")})
 
 
-def payload_of_request(event: bytes) -> dict[str, Any]:
+def payload_of_request(event: Request) -> dict[str, Any]:
     """Return the payload of the acquisition's graph: the f_in for an Event's bytes."""
     return {T_VREQ: read_request(event)}
 

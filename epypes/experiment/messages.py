@@ -27,15 +27,18 @@ _NPY: Final = b"\x93NUMPY"
 
 
 class Request(bytes):
-    """The bytes of an Event, which tells its id when it is asked for, as when a request has failed."""
+    """The bytes of an Event, which are parsed once, when they are asked for something."""
 
-    __slots__ = ()
+    @functools.cached_property
+    def message(self) -> Event:
+        """The Event; MessageError is raised if these bytes are none."""
+        return parsed(Event, self)
 
     @property
     def id(self) -> str:
         """The id of the Event; empty if these are no Event's bytes."""
         try:
-            return parsed(Event, self).id
+            return self.message.id
         except MessageError:
             return ""
 
@@ -85,7 +88,7 @@ def pair_of(envelope: Any) -> StereoPair:
     return StereoPair((envelope.parts[name] for name in _IMAGES), envelope.id, envelope.attributes)
 
 
-def read_request(event: bytes) -> float:
+def read_request(event: Request) -> float:
     """Return the time that a request asks for: Unix time in seconds.
 
     Raises
@@ -93,7 +96,7 @@ def read_request(event: bytes) -> float:
     MessageError
         These are no Event's bytes, or it has no attribute ``t_vreq``.
     """
-    found = attributes(parsed(Event, event)).get(T_VREQ)
+    found = attributes(event.message).get(T_VREQ)
     if not isinstance(found, float):
         raise MessageError("no time", f"A request needs the attribute {T_VREQ!r}: Unix time in seconds, a double.")
     return found

@@ -41,7 +41,7 @@ def test_a_request_tells_its_time_and_its_id():
 @pytest.mark.parametrize("event", [b"", b"\xff\xff", request(), request(t_vreq="now"), request(t_vreq=3)])
 def test_a_request_without_a_time_is_refused(event):
     with pytest.raises(MessageError):
-        read_request(event)
+        read_request(Request(event))
 
 
 def test_what_is_no_event_has_no_id():
