@@ -65,9 +65,12 @@ class Mailbox:
         ------
         queue.Full
             The policy is ``"block"`` and there was no room within ``timeout`` seconds.
+        ValueError
+            ``timeout`` is negative, or not a number.
         MailboxOverflow
             The policy is ``"fault"`` and there was no room.
         """
+        _require_timeout(block, timeout)
         with self._changed:
             dropped = self._make_room(block, timeout) if len(self._items) >= self.size else []
             self._items.append(item)
@@ -90,6 +93,7 @@ class Mailbox:
 
     def get(self, block: bool = True, timeout: float | None = None) -> Any:
         """Take the oldest item; raises queue.Empty if there is none within ``timeout`` seconds."""
+        _require_timeout(block, timeout)
         deadline = None if timeout is None else monotonic() + timeout
         with self._changed:
             while not self._items:
@@ -123,3 +127,9 @@ class Mailbox:
 
     def __repr__(self) -> str:
         return f"<Mailbox {self.policy}: {len(self._items)} of {self.size}, {self.dropped.total()} dropped>"
+
+
+def _require_timeout(block: bool, timeout: float | None) -> None:
+    # As in queue.Queue; NaN, which is neither too short nor too long, would never be over.
+    if block and timeout is not None and not timeout >= 0:
+        raise ValueError(f"timeout is how many seconds to wait, 0 or more, not {timeout!r}.")
