@@ -11,7 +11,7 @@ import time
 import warnings
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -20,9 +20,10 @@ import zmq
 
 from epypes.errors import RecordingError, StillRunning
 from epypes.transport import io
-from epypes.transport.addresses import check_bind
 from epypes.transport.joining import Doorkeeper
+from epypes.transport.keys import Keys, PublicKey
 from epypes.transport.mcapreader import BrokenOff, Recorded, messages
+from epypes.transport.security import Security, security
 
 # Small, since what is kept here when the last one has been handed over must still be sent before the process ends.
 _HIGH_WATER_MARK = 64
@@ -59,14 +60,18 @@ class Player:
     wait
         Whether nothing is sent before there is a subscriber.
     insecure
-        True to bind an address that other machines can reach.
+        True to bind an address that other machines can reach, without keys.
+    keys, allow
+        As for `ZMQPublisher`.
     on_end
         Called on the player's thread when everything was sent, or it was stopped, or the file could not be read.
 
     Raises
     ------
     AddressError
-        If ``bind`` is asked for an address that is not loopback, without ``insecure``.
+        If ``bind`` is asked for an address that is not loopback, with neither keys nor ``insecure``.
+    KeysError
+        If keys can't be read, or it is not said which are allowed.
     ValueError
         If ``speed`` or ``loop`` is negative.
 
@@ -86,14 +91,15 @@ class Player:
         loop: int = 1,
         wait: bool = True,
         insecure: bool = False,
+        keys: Keys | str | Path | None = None,
+        allow: PublicKey | Collection[PublicKey] | None = None,
         on_end: Callable[[], None] = _nothing,
     ) -> None:
         if not 0 <= speed < math.inf:
             raise ValueError(f"speed is {speed}; give 1.0, 0.5, 10 ..., or 0 for as fast as possible.")
         if loop < 0:
             raise ValueError(f"loop is {loop}; give how often, or 0 for without end.")
-        if bind:
-            check_bind(address, insecure)
+        self._security = security(address, bind, insecure, keys, allow)
         self.path = Path(path)
         self._given = address
 
@@ -101,7 +107,6 @@ class Player:
             return _Playing(self.path, speed, loop, wait, on_end)
 
         self._make = make
-        self._bind = bind
         self._lock = threading.Lock()
         self._playing: _Playing | None = None
         self._finalizer: weakref.finalize[Any, Any] | None = None
@@ -131,7 +136,7 @@ class Player:
         with self._lock:
             if self._playing is None or not self._playing.is_running():
                 playing = self._make()
-                playing.start(self._given, self._bind)
+                playing.start(self._given, self._security)
                 self._playing = playing
                 self._finalizer = weakref.finalize(self, _abandon, playing, self._given)
         return self
@@ -195,21 +200,23 @@ class _Playing:
         self.sent = 0
         self.ended = threading.Event()
 
-    def start(self, address: str, bind: bool) -> None:
+    def start(self, address: str, security: Security) -> None:
         """Look into the file, then open the socket, then play."""
         whole = messages(self._path)
         first = next(whole, None)
         if first is None:
             raise RecordingError(self._path, f"{self._path} holds no message.")
+        gate = security.gate()
         options = [
             (zmq.XPUB_MANUAL, 1),
             (zmq.XPUB_NODROP, 1),
             (zmq.SNDHWM, _HIGH_WATER_MARK),
             (zmq.MAXMSGSIZE, _MAX_SUBSCRIPTION_BYTES),
+            *security.options(gate),
         ]
 
         def open_socket(thread: io.IOThread) -> tuple[io.Socket, str]:
-            opened = thread.open(zmq.XPUB, address, bind, self.doorkeeper.read, options)
+            opened = thread.open(zmq.XPUB, address, security.bind, self.doorkeeper.read, options, gate=gate)
             self.doorkeeper.attach(opened)
             return opened, thread.address_of(opened, address)
 
@@ -275,7 +282,9 @@ class _Playing:
     def _send(self, overdue: deque[Recorded]) -> None:
         """Send all of these, as soon as there is room, with few visits to the I/O thread."""
 
-        def send(_: io.IOThread) -> bool:
+        def send(thread: io.IOThread) -> bool:
+            # Sending takes up what ZeroMQ has to say of subscriptions as well.
+            thread.read_again(self._socket)
             while overdue:
                 # Counted before: whoever has received it must find it counted.
                 self.sent += 1

@@ -51,7 +51,7 @@ class Recorder:
         Called on the recorder's thread when the file is closed: there are so many messages in it, or the disk failed,
         or it was stopped.
     **options
-        For the `ZMQSubscriber`: ``insecure``, ``max_message_bytes``, ``high_water_mark``.
+        For the `ZMQSubscriber`: ``insecure``, ``keys``, ``allow``, ``max_message_bytes``, ``high_water_mark``.
 
     Raises
     ------

@@ -19,7 +19,7 @@ import pytest
 import zmq
 
 from epypes.errors import AddressError, RecordingError, StillRunning
-from epypes.transport import Player, Recorder, ZMQPublisher, ZMQSubscriber, recording_info
+from epypes.transport import Player, Recorder, ZMQPublisher, ZMQSubscriber, make_keys, recording_info
 from epypes.transport.mcapformat import Counts
 from epypes.transport.mcapreader import messages
 from epypes.transport.mcapwriter import RecordingWriter
@@ -631,3 +631,18 @@ def test_other_machines_are_let_in_only_when_that_is_said(tmp_path):
         Player(tmp_path / "a.mcap", "tcp://*:5555")
     with pytest.raises(AddressError, match="insecure=True"):
         Recorder("tcp://*:5555", tmp_path / "a.mcap", bind=True)
+
+
+def test_keys_keep_strangers_from_what_is_recorded_and_played(tmp_path):
+    robot, known, stranger = (make_keys(tmp_path / name) for name in ("robot", "known", "stranger"))
+    written(tmp_path / "a.mcap", [(1, [b"t/", b"secret"])])
+    with (
+        Player(tmp_path / "a.mcap", keys=robot, allow=known) as player,
+        Recorder(player.address, tmp_path / "b.mcap", keys=stranger, allow=robot) as enemy,
+    ):
+        assert not enemy.wait_joined(0.3)
+        assert player.sent == 0
+        with Recorder(player.address, tmp_path / "c.mcap", keys=known, allow=robot, messages=1) as recorder:
+            assert recorder.wait(WAIT_S)
+    assert frames_of(tmp_path / "b.mcap") == []
+    assert frames_of(tmp_path / "c.mcap") == [[b"t/", b"secret"]]
