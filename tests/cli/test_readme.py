@@ -40,8 +40,8 @@ def test_the_epypes_commands_run_in_order(tmp_path, monkeypatch, photograph, str
     Path("demo-output").mkdir()
     write_image("demo-output/image.png", photograph)
     lines = [line for block in blocks("sh") for line in block.splitlines() if line.startswith("epypes ")]
-    assert [line.split()[1] for line in lines] == ["promote", "verify", "serve", "call"]
-    promote, verify, serve, call = (shlex.split(line)[1:] for line in lines)
+    assert [line.split()[1] for line in lines] == ["promote", "verify", "serve", "call", "experiment"]
+    promote, verify, serve, call, experiment = (shlex.split(line)[1:] for line in lines)
     for command in (promote, verify):
         done = run_cli(*command)
         assert done.returncode == 0, done.stderr
@@ -50,6 +50,9 @@ def test_the_epypes_commands_run_in_order(tmp_path, monkeypatch, photograph, str
         done = run_cli(*call)
         assert done.returncode == 0, done.stderr
     assert np.array_equal(read_image("edges.png"), straight_edges)
+    done = run_cli(*experiment)
+    assert done.returncode == 0, done.stderr
+    assert len(Path("results/requests.csv").read_text().splitlines()) == 1 + 2 * 100
 
 
 @pytest.mark.parametrize("target", ["demo", "test", "lab", "bench", "fix"])
