@@ -9,6 +9,7 @@ import threading
 import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
+from time import monotonic
 from typing import Any
 
 from epypes.errors import StillRunning
@@ -24,6 +25,8 @@ _left_running: weakref.WeakSet[EventLoop] = weakref.WeakSet()
 class EventLoop:
     """A daemon thread that takes events from a queue and, for each, calls ``callback(**f_in(event))``.
 
+    Without f_in it calls ``callback(event)``.
+
     Parameters
     ----------
     q_in
@@ -32,6 +35,7 @@ class EventLoop:
         Called on the loop's thread.
     f_in
         Makes the callback's keyword arguments from an event. Events can be anything, arrays and None included.
+        Without it the callback takes the event itself.
     on_error
         Called with the event and the exception when f_in or the callback raises; logged without one. The loop
         goes on in any case.
@@ -49,7 +53,7 @@ class EventLoop:
         self,
         q_in: Any,
         callback: Callable[..., Any],
-        f_in: Callable[[Any], Mapping[str, Any]],
+        f_in: Callable[[Any], Mapping[str, Any]] | None = None,
         *,
         on_error: Callable[[Any, BaseException], None] | None = None,
         name: str = "EventLoop",
@@ -68,27 +72,39 @@ class EventLoop:
         """Whether the thread is alive."""
         return self._thread is not None and self._thread.is_alive()
 
-    def start(self) -> None:
-        """Start the thread; does nothing while it runs.
+    def start(self, timeout_s: float = 0.5) -> None:
+        """Start the thread; does nothing while it runs. One that is about to end is waited for.
 
         Raises
         ------
         StillRunning
-            It was stopped, but a function has not returned yet.
+            It was stopped, but a function did not return within ``timeout_s``.
         """
+        deadline_s = monotonic() + timeout_s
+        while not self._is_started():
+            ending = self._thread
+            # Two threads would take from one queue, and an event could be worked on beside the next.
+            if ending is not None:
+                ending.join(max(0.0, deadline_s - monotonic()))
+                if ending.is_alive():
+                    raise StillRunning(self.name, self._busy(), timeout_s)
+
+    def _is_started(self) -> bool:
+        """Start the thread, or let it go on; return False if one has been stopped and has not ended."""
         with self._lock:
-            if self.is_running:
-                if not self._stop.is_set():
-                    return
-                # Two threads would take from one queue, and an event could be worked on beside the next.
-                raise StillRunning(self.name, self._busy(), 0.0)
+            thread = self._thread
+            if thread is not None and thread.is_alive():
+                self._draining.clear()
+                if thread is threading.current_thread():
+                    self._stop.clear()
+                return not self._stop.is_set()
             self._draining.clear()
             self._stop = threading.Event()
-            self._thread = threading.Thread(
-                target=self._loop, args=(self._stop,), name=f"epypes {self.name}", daemon=True
-            )
+            thread = threading.Thread(target=self._loop, args=(self._stop,), name=f"epypes {self.name}", daemon=True)
+            thread.start()
+            self._thread = thread
             _left_running.add(self)
-            self._thread.start()
+            return True
 
     def stop(self, timeout_s: float = 5.0) -> None:
         """Stop after the event under way; may be called twice, from any thread, the loop's own included.
@@ -103,7 +119,7 @@ class EventLoop:
         with self._lock:
             self._stop.set()
             thread = self._thread
-        _left_running.discard(self)
+            _left_running.discard(self)
         if thread is None or thread is threading.current_thread():
             return
         thread.join(timeout_s)
@@ -120,25 +136,37 @@ class EventLoop:
         return not thread.is_alive()
 
     def _loop(self, stop: threading.Event) -> None:
-        while not stop.is_set():
+        is_stopped = stop.is_set
+        while not is_stopped():
             try:
                 event = self.q_in.get(timeout=POLL_S)
             except queue.Empty:
-                if self._draining.is_set():
+                if self._is_drained(stop):
                     return
                 continue
-            except Exception:
+            except BaseException:  # a queue's SystemExit must not end the thread in silence either
                 _log.exception("%s: the queue itself failed", self.name)
                 stop.wait(POLL_S)
                 continue
-            self._handle(event)
+            try:
+                if self.f_in is None:
+                    self.callback(event)
+                else:
+                    self.callback(**self.f_in(event))
+            except BaseException as exception:  # a function's SystemExit must not end the thread in silence
+                self._report(event, exception)
+            # An event may be large: it shall not live on until another comes.
+            del event
             self.handled += 1
 
-    def _handle(self, event: Any) -> None:
-        try:
-            self.callback(**self.f_in(event))
-        except BaseException as exception:  # a function's SystemExit must not end the thread in silence
-            self._report(event, exception)
+    def _is_drained(self, stop: threading.Event) -> bool:
+        """Whether the loop ends now that the queue is empty; from then on it counts as stopped."""
+        if not self._draining.is_set():
+            return False
+        with self._lock:
+            if self._draining.is_set():
+                stop.set()
+            return stop.is_set()
 
     def _report(self, event: Any, exception: BaseException) -> None:
         if self.on_error is None:

@@ -66,6 +66,8 @@ class Mailbox:
         ------
         queue.Full
             The policy is ``"block"`` and there was no room within ``timeout`` seconds.
+        ValueError
+            ``timeout`` is negative, or not a number.
         MailboxOverflow
             The policy is ``"fault"`` and there was no room.
         """
@@ -102,6 +104,7 @@ class Mailbox:
 
     def _keep(self, item: Any, block: bool, timeout: float | None) -> Callable[[Any], object] | None:
         """Keep an item until somebody gets it, or return whom it must be handed to, since this has begun meanwhile."""
+        _require_timeout(block, timeout)
         with self._changed:
             dropped = self._make_room(block, timeout) if len(self._items) >= self.size else []
             if self._take is not None:
@@ -127,6 +130,7 @@ class Mailbox:
 
     def get(self, block: bool = True, timeout: float | None = None) -> Any:
         """Take the oldest item; raises queue.Empty if there is none within ``timeout`` seconds."""
+        _require_timeout(block, timeout)
         deadline = None if timeout is None else monotonic() + timeout
         with self._changed:
             while not self._items:
@@ -160,3 +164,9 @@ class Mailbox:
 
     def __repr__(self) -> str:
         return f"<Mailbox {self.policy}: {len(self._items)} of {self.size}, {self.dropped.total()} dropped>"
+
+
+def _require_timeout(block: bool, timeout: float | None) -> None:
+    # As in queue.Queue; NaN, which is neither too short nor too long, would never be over.
+    if block and timeout is not None and not timeout >= 0:
+        raise ValueError(f"timeout is how many seconds to wait, 0 or more, not {timeout!r}.")

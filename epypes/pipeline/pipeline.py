@@ -8,8 +8,10 @@ from collections.abc import Collection, Mapping
 from time import perf_counter_ns
 from typing import Any
 
-from epypes.errors import PayloadError
+from epypes.errors import HyperparameterError, PayloadError
 from epypes.graph import CompGraph
+from epypes.graph.hinted import annotated_params
+from epypes.hints import Param, Roi
 from epypes.pipeline.network import NodeBasedCompGraph
 from epypes.pipeline.node import Node, is_a_call
 from epypes.pipeline.stages import Stages
@@ -92,7 +94,8 @@ class Pipeline(Node):
             run: Run = self.compute(payload)
             return run
         finally:
-            self.__epypes_called__(perf_counter_ns() - start_ns)
+            self.time = (perf_counter_ns() - start_ns) / 1e9
+            self.run_count = next(self._counter)
             # Not at the end of this frame, which a failure keeps.
             del before
 
@@ -120,6 +123,29 @@ class Pipeline(Node):
 
     def __setitem__(self, token: str, value: Any) -> None:
         self.runner[token] = value
+
+    def set(self, /, **values: Any) -> None:
+        """Set hyperparameters, all or none of them, at once: an event's run has all of the new values or none.
+
+        The run says which by its ``revision``, and the event's view by ``view.run.revision``.
+
+        Raises
+        ------
+        HyperparameterError
+            A function makes the token, or it is not a hyperparameter, or a function's annotation does not allow the
+            value; nothing is set then.
+        UnknownName
+            There is no such token, or a switch has no such branch.
+        """
+        for token, value in values.items():
+            self._require_allowed(token, value)
+        self.runner.set(**values)
+
+    def _require_allowed(self, token: str, value: Any) -> None:
+        for hint in annotated_params(self.source_cg, token):
+            if not _allows(hint, value):
+                text = f"{token}={value!r:.60} is not what its annotation allows: {hint!r:.200}. Nothing was set."
+                raise HyperparameterError(token, text)
 
     def traverse_time(self) -> tuple[Any, ...]:
         """Return ``(name, seconds of the last call, the nodes' tuples)``; 0 seconds for nodes that it left out."""
@@ -156,3 +182,10 @@ class Pipeline(Node):
         from epypes.display import mimebundle
 
         return mimebundle(self)
+
+
+def _allows(hint: Param | Roi, value: Any) -> bool:
+    try:
+        return hint.allows(value)
+    except Exception:  # a value that can't be compared with the ends of a range, be it of whatever class
+        return False

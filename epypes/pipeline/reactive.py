@@ -7,31 +7,31 @@ a FullPipeline does both.
 from __future__ import annotations
 
 import logging
-from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, Final, Self
+from time import perf_counter_ns
+from typing import Any, Literal, Self
 
 from epypes.errors import EpypesError
 from epypes.graph import CompGraph
+from epypes.pipeline.answering import Answering, FOut, OfThread
+from epypes.pipeline.attempts import Attempts, event_id
 from epypes.pipeline.loop import EventLoop
 from epypes.pipeline.pipeline import Pipeline
-from epypes.pipeline.stages import Stage, Stages, function_stage, loop_stage, queue_stage
+from epypes.pipeline.stages import Stages, function_stage, loop_stage, queue_stage
 from epypes.pipeline.stamps import Stamps
-from epypes.pipeline.view import EventView
 from epypes.run import Failure, Run
+from epypes.run.raised import run_that_raised
 from epypes.run.underway import locals_under_way
 
 FIn = Callable[[Any], Mapping[str, Any]]
-FOut = Callable[[EventView], Any]
-
-# Ids of events that failed, for the count of attempts: some for every event that may be sent again.
-_MOST_REMEMBERED: Final = 1_000
+# What an event is in: its f_in, its graph, or its f_out with the put on q_out.
+Where = Literal["f_in", "graph", "f_out"]
 
 _log = logging.getLogger("epypes.pipeline")
 
 
-class SourcePipeline(Pipeline):
+class SourcePipeline(Answering, Pipeline):
     """A Pipeline that puts ``f_out(view)`` on ``q_out`` after every run.
 
     Parameters
@@ -54,22 +54,21 @@ class SourcePipeline(Pipeline):
     ) -> None:
         super().__init__(name, cg, hparams, workers=workers)
         self.q_out, self.f_out = q_out, f_out
+        self._own = OfThread()
 
     def run(self, /, **payload: Any) -> Run:
         """Run the graph on a payload and put the result on q_out."""
         stamps = Stamps()
         run = super().run(**payload)
-        _emit(self, None, run, stamps)
+        # Only now: the graph may run this pipeline itself, on this thread.
+        self._own.stamps = stamps
+        self.emit(None, run)
         return run
-
-    def put(self, answer: Any, view: EventView) -> None:
-        """Put an answer on q_out, when f_out has made it of the view; the hook for subclasses."""
-        self.q_out.put(answer)
 
     @property
     def stages(self) -> Stages:
         """f_out and q_out, as they are at this moment."""
-        return Stages(after=_stages_after(self, self.f_out, self.q_out, ""))
+        return Stages(after=self._stages_after(""))
 
 
 class SinkPipeline(Pipeline):
@@ -108,107 +107,109 @@ class SinkPipeline(Pipeline):
         self.on_error: Callable[[Failure], None] | None = None
         self.failed = 0
         self.working_on: Any = None
-        self._stage = ""
-        self._stamps = Stamps()
-        self._attempts: OrderedDict[str, int] = OrderedDict()
+        self._attempts = Attempts()
         # Where the last event that failed did so, what was raised, and how many had been worked on.
-        self._failed_last = ("", "", 0)
-        self.loop = EventLoop(q_in, self.handle, lambda event: {"event": event}, name=name, busy=self._busy)
+        self._failed_last: tuple[Where | None, str, int] = (None, "", 0)
+        self._own = OfThread()
+        self.loop = EventLoop(q_in, self.handle, name=name, busy=self._busy)
 
     def handle(self, event: Any) -> None:
         """Work on one event; every failure is reported, none is raised. The hook for subclasses."""
-        self._stamps = Stamps()
+        # To free the tokens of the run before takes its time: that is done when the answer is on its way.
+        before = self.runner.last
         self.working_on = event
-        self._work_on(event)
-        self.working_on = None
-
-    def _work_on(self, event: Any) -> None:
+        run: Run | None = None
+        # The stages look at it, in this frame.
+        where: Where | None = "f_in"
+        self._own.stamps = stamps = Stamps()
         try:
-            self._stage = "f_in"
-            payload = self._payload(event)
+            stamps.f_in_start = stamps.react
+            payload = self.f_in(event)
+            stamps.f_in_end = perf_counter_ns()
+            if type(payload) is not dict:
+                self._require_mapping(payload)
+            where = "graph"
             run = self.run(**payload)
-        except BaseException as exception:  # a function's SystemExit is a failure of this event, not the loop's end
-            self._fail(event, self._failure_of(exception, "f_in", {"event": event}))
-            return
-        try:
-            self._stage = "f_out"
+            where = "f_out"
             self.emit(event, run)
-        except BaseException as exception:
-            self._fail(event, Failure("f_out", self.cg.sink_tokens, dict(run), exception))
+        except BaseException as exception:  # a function's SystemExit is a failure of this event, not the loop's end
+            failed_in, where = where, None
+            self._fail(event, failed_in, exception, run)
+        self.working_on = None
+        del before
+
+    def _require_mapping(self, payload: Any) -> None:
+        if not isinstance(payload, Mapping):
+            text = f"f_in of {self.name!r} must return a mapping by free source token, not {type(payload).__name__}."
+            raise TypeError(text)
 
     def _busy(self) -> tuple[str, ...]:
         """Return what has not returned: functions of the graph, or f_in, or f_out with its put on q_out."""
-        return self.network.running or (self._stage,)
+        return self.network.running or tuple(where for where in self._under_way() if where != "graph")
+
+    def _under_way(self) -> list[Where]:
+        """Return what the events under way are in: one, unless handle is called by others than the loop too."""
+        calls = locals_under_way({SinkPipeline.handle.__code__})
+        return [found["where"] for found in calls if found["self"] is self and found.get("where")]
 
     @property
     def stages(self) -> Stages:
         """q_in, the event loop and f_in, as they are at this moment."""
-        is_in_f_in = any(found["self"] is self for found in locals_under_way({SinkPipeline._payload.__code__}))
         return Stages(
             before=(
                 queue_stage("q_in", self.q_in),
                 loop_stage(self.loop, self.failed),
-                function_stage("f_in", self.f_in, is_under_way=is_in_f_in, failure=self._failure_in("f_in")),
+                function_stage(
+                    "f_in", self.f_in, is_under_way="f_in" in self._under_way(), failure=self._failure_in("f_in")
+                ),
             )
         )
 
-    def _failure_in(self, function: str) -> str:
+    def _failure_in(self, where: Where) -> str:
         """Return what f_in or f_out raised for the last event; empty if none did, or that was another event."""
         failed_in, message, count = self._failed_last
-        return message if failed_in == function and count == self.run_count else ""
+        return message if failed_in == where and count == self.run_count else ""
 
     def emit(self, event: Any, run: Run) -> None:
         """Do something with an event's run; a SinkPipeline does nothing. The hook for subclasses."""
 
-    def _payload(self, event: Any) -> Mapping[str, Any]:
-        stamps = self._stamps
-        stamps.f_in_start_ns = stamps.now_ns()
-        payload = self.f_in(event)
-        stamps.f_in_end_ns = stamps.now_ns()
-        if not isinstance(payload, Mapping):
-            text = f"f_in of {self.name!r} must return a mapping by free source token, not {type(payload).__name__}."
-            raise TypeError(text)
-        return payload
-
-    def _failure_of(self, exception: BaseException, otherwise: str, inputs: Mapping[str, Any]) -> Failure:
-        """Return the failure of the graph if that is where the exception is from."""
-        last = self.runner.last
-        if last is not None and last.failure is not None and last.failure.exception is exception:
-            return last.failure
-        return Failure(otherwise, self.runner.free_source_tokens, inputs, exception)
-
-    def _fail(self, event: Any, failure: Failure) -> None:
+    def _fail(self, event: Any, where: Where | None, exception: BaseException, run: Run | None) -> None:
         self.failed += 1
+        failed = run_that_raised(exception, self.runner) if where == "graph" else None
+        if failed is not None and failed.failure is not None:
+            failure = failed.failure
+        elif run is not None:
+            failure = Failure("f_out", self.cg.sink_tokens, dict(run), exception)
+        else:
+            # What the graph refuses to run on came from f_in; anything else was raised by a compute of one's own.
+            where = "f_in" if isinstance(exception, EpypesError) else where
+            function = "compute" if where == "graph" else "f_in"
+            failure = Failure(function, self.runner.free_source_tokens, {"event": event}, exception)
         # The text alone: the exception would keep the event and all its tokens.
-        self._failed_last = failure.function, f"{type(failure.exception).__name__}: {failure.message}", self.run_count
-        event_id = _event_id(event)
-        failure = replace(failure, event_id=event_id, attempt=self._attempt(event_id), source=self.name)
+        self._failed_last = where, f"{type(exception).__name__}: {failure.message}", self.run_count
+        failed_id = event_id(event)
+        self._report(replace(failure, event_id=failed_id, attempt=self._attempts.count(failed_id), source=self.name))
+
+    def _report(self, failure: Failure) -> None:
         if self.on_error is None:
             expected = isinstance(failure.exception, EpypesError)
-            _log.error(
-                "%s: an event failed in %s",
-                self.name,
-                failure,
-                exc_info=None if expected else failure.exception,
-            )
+            error = None if expected else failure.exception
+            _log.error("%s: an event failed in %s", self.name, failure, exc_info=error)
             return
         try:
             self.on_error(failure)
         except BaseException:
             _log.exception("%s: on_error itself failed", self.name)
 
-    def _attempt(self, event_id: str) -> int:
-        """Return which try of an event this was that failed, as far as that is remembered."""
-        if not event_id:
-            return 1
-        self._attempts[event_id] = attempt = self._attempts.pop(event_id, 0) + 1
-        if len(self._attempts) > _MOST_REMEMBERED:
-            self._attempts.popitem(last=False)
-        return attempt
+    def listen(self, timeout_s: float = 0.5) -> None:
+        """Start the event loop; does nothing while it runs. One that is about to end is waited for.
 
-    def listen(self) -> None:
-        """Start the event loop; does nothing while it runs."""
-        self.loop.start()
+        Raises
+        ------
+        StillRunning
+            It was stopped, but a function did not return within ``timeout_s``.
+        """
+        self.loop.start(timeout_s)
 
     def stop(self, timeout_s: float = 5.0) -> None:
         """Stop the event loop; may be called twice, before listen(), and from any thread.
@@ -228,7 +229,7 @@ class SinkPipeline(Pipeline):
         self.stop()
 
 
-class FullPipeline(SinkPipeline):
+class FullPipeline(Answering, SinkPipeline):
     """A Pipeline that runs for every event on ``q_in`` and puts ``f_out(view)`` on ``q_out``.
 
     Parameters
@@ -276,41 +277,7 @@ class FullPipeline(SinkPipeline):
         super().__init__(name, cg, q_in, f_in, hparams, workers=workers)
         self.q_out, self.f_out = q_out, f_out
 
-    def emit(self, event: Any, run: Run) -> None:
-        """Put what f_out makes of the event's run on q_out."""
-        _emit(self, event, run, self._stamps)
-
-    def put(self, answer: Any, view: EventView) -> None:
-        """Put an answer on q_out, when f_out has made it of the view; the hook for subclasses."""
-        self.q_out.put(answer)
-
     @property
     def stages(self) -> Stages:
         """q_in, the event loop, f_in, f_out and q_out, as they are at this moment."""
-        after = _stages_after(self, self.f_out, self.q_out, self._failure_in("f_out"))
-        return replace(super().stages, after=after)
-
-
-def _event_id(event: Any) -> str:
-    """Return an event's id, if it has one that is a string."""
-    try:
-        event_id = event.id
-    except Exception:  # any object can be an event, whatever its attributes do
-        return ""
-    return event_id if isinstance(event_id, str) else ""
-
-
-def _emit(pipeline: SourcePipeline | FullPipeline, event: Any, run: Run, stamps: Stamps) -> None:
-    view = EventView(pipeline.name, event, run, pipeline.attributes, stamps)
-    stamps.f_out_start_ns = stamps.now_ns()
-    answer = pipeline.f_out(view)
-    stamps.f_out_end_ns = stamps.now_ns()
-    pipeline.put(answer, view)
-
-
-def _stages_after(pipeline: Pipeline, f_out: FOut, q_out: Any, failure: str) -> tuple[Stage, Stage]:
-    calls = [found for found in locals_under_way({_emit.__code__}) if found["pipeline"] is pipeline]
-    return (
-        function_stage("f_out", f_out, is_under_way=any("answer" not in found for found in calls), failure=failure),
-        queue_stage("q_out", q_out, is_waited_for=any("answer" in found for found in calls)),
-    )
+        return replace(super().stages, after=self._stages_after(self._failure_in("f_out")))

@@ -27,8 +27,11 @@ class EventView(Mapping[str, Any]):
     """
 
     def __init__(self, name: str, event: Any, run: Run, attributes: Mapping[str, Any], stamps: Stamps) -> None:
-        self.name, self.event, self.run, self.stamps = name, event, run, stamps
+        self.name = name
+        self.event = event
+        self.run = run
         self.attributes = dict(attributes)
+        self.stamps = stamps
 
     @property
     def report(self) -> RunReport:

@@ -259,21 +259,23 @@ def _unpack(program: Program, step: Step) -> Iterator[str]:
 def _lend(name: str, is_locked: bool) -> Iterator[str]:
     """Write out ``lend``, for what it does to most values; the view of a locked array is locked."""
     yield f"k = kind({name})"
-    yield "if k is array:"
-    yield f"    {name} = {name}.view()"
+    yield "if k not in ARRAYLESS:"
+    yield "    if k is array:"
+    yield f"        {name} = {name}.view()"
     if not is_locked:
-        yield f"    {name}.setflags(False)"
-    yield f"elif k not in ARRAYLESS and {_may_hold_arrays(name)}:"
-    yield f"    {name} = lend({name})"
+        yield f"        {name}.setflags(False)"
+    yield f"    elif {_may_hold_arrays(name)}:"
+    yield f"        {name} = lend({name})"
 
 
 def _keep(name: str, is_read: bool) -> Iterator[str]:
     """Write out ``keep``, for what it does to most values; an array that no function reads need not be locked."""
     yield f"k = kind({name})"
-    yield f"if k is array and {name}.base is None and count({name}) <= FRESH_HERE:"
-    yield f"    {name}.setflags(False)" if is_read else "    pass"
-    yield f"elif k not in ARRAYLESS and {_may_hold_arrays(name)}:"
-    yield f"    {name} = keep({name}, FRESH)"
+    yield "if k not in ARRAYLESS:"
+    yield f"    if k is array and {name}.base is None and count({name}) <= FRESH_HERE:"
+    yield f"        {name}.setflags(False)" if is_read else "        pass"
+    yield f"    elif {_may_hold_arrays(name)}:"
+    yield f"        {name} = keep({name}, FRESH)"
 
 
 def _may_hold_arrays(name: str) -> str:

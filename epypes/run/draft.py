@@ -100,6 +100,13 @@ def draft_after(program: Program, last: Run | None, hparams: Hyperparameters) ->
     return draft
 
 
+def tokens_now(program: Program, last: Run | None, hparams: Hyperparameters) -> TokenManager:
+    """Return a run's tokens as they are to be read with these hyperparameters."""
+    if last is not None and last.record[2] is hparams and not program.revised:
+        return last.tokens
+    return draft_after(program, last, hparams).tokens()
+
+
 def is_unchanged(old: Any, new: Any, given: Sequence[Any], guard: bool) -> bool:
     """Whether a function's new value is cheaply known to be what it was.
 

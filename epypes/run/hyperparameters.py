@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import HyperparameterError
 from epypes.run.guard import ARRAYLESS, lend
 from epypes.run.program import Program
 from epypes.run.refused import wrong_payload
 from epypes.run.tokens import NOT_COMPUTED, is_same_value
+
+if TYPE_CHECKING:
+    from epypes.run.attempt import Attempts
 
 _NOTHING: Final[Mapping[str, Any]] = {}
 
@@ -31,17 +34,12 @@ class Hyperparameters:
         That revision; -1 if other tokens were hyperparameters in it.
     plain
         The tokens whose values are numbers, texts or None: they hold no arrays, so functions get them as they are.
-    free_slots
-        The slots of the source tokens that are not frozen, in order of first appearance in func_io.
-    base
-        The values by slot, with which a run begins.
+    start
+        ``base``, ``free_slots`` and the attempts that the runner makes with these plain tokens, once it has made one.
     """
 
-    base: list[Any]
-    free_slots: dict[str, int]
-
     # Made at every move of a slider, so what is rarely asked for is made when it is.
-    __slots__ = ("base", "changed", "entries", "follows", "free_slots", "plain", "program", "revision")
+    __slots__ = ("_base", "_free_slots", "changed", "entries", "follows", "plain", "program", "revision", "start")
 
     def __init__(
         self,
@@ -58,6 +56,9 @@ class Hyperparameters:
         self.changed = changed
         self.follows = follows
         self.plain = plain
+        self.start: tuple[list[Any], dict[str, int], Attempts] | None = None
+        self._base: list[Any] | None = None
+        self._free_slots: dict[str, int] | None = None
 
     @property
     def values(self) -> Mapping[str, Any]:
@@ -69,18 +70,22 @@ class Hyperparameters:
         """The values that the tokens were frozen with, by token."""
         return MappingProxyType({token: entry[1] for token, entry in self.entries.items()})
 
-    def __getattr__(self, name: str) -> Any:
-        """Make ``base`` and ``free_slots`` when they are asked for first; every run asks for them."""
-        if name == "free_slots":
+    @property
+    def free_slots(self) -> dict[str, int]:
+        """The slots of the source tokens that are not frozen, in order of first appearance in func_io."""
+        if self._free_slots is None:
             slots, sources = self.program.slots, self.program.cg.source_tokens
-            self.free_slots = {token: slots[token] for token in sources if token not in self.entries}
-            return self.free_slots
-        if name == "base":
-            self.base = [NOT_COMPUTED] * len(self.program.tokens)
+            self._free_slots = {token: slots[token] for token in sources if token not in self.entries}
+        return self._free_slots
+
+    @property
+    def base(self) -> list[Any]:
+        """The values by slot, with which a run begins."""
+        if self._base is None:
+            self._base = [NOT_COMPUTED] * len(self.program.tokens)
             for token, entry in self.entries.items():
-                self.base[self.program.slots[token]] = entry[0]
-            return self.base
-        raise AttributeError(name)
+                self._base[self.program.slots[token]] = entry[0]
+        return self._base
 
     def frozen(self, changes: Mapping[str, Any], *, also_new: bool = True) -> Hyperparameters:
         """Return these with tokens given values; all or nothing. An equal value changes nothing.

@@ -75,14 +75,12 @@ class Run(Mapping[str, Any]):
             return self._tokens
 
     def __getitem__(self, token: str) -> Any:
-        values, freshness, _, _, _ = self.record
-        if freshness.is_clean:
-            # Everything has a value, and none is out of date.
-            program = freshness.program
-            slot = program.slots.get(token)
-            if slot is not None:
-                value = values[slot]
-                return lend(value) if type(value) not in ARRAYLESS and program.guard else value
+        record = self.record
+        # Of a clean run every token has a value, and none is out of date.
+        slot = record[1].clean_slots.get(token)
+        if slot is not None:
+            value = record[0][slot]
+            return value if type(value) in ARRAYLESS or not record[1].program.guard else lend(value)
         try:
             return self.tokens.read(token)
         except StaleToken:
@@ -95,7 +93,7 @@ class Run(Mapping[str, Any]):
 
     def __iter__(self) -> Iterator[str]:
         tokens = self.tokens
-        return (token for token in self.cg.tokens if tokens.is_computed(token) and not tokens.is_stale(token))
+        return (token for token in self.cg.tokens if tokens.is_readable(token))
 
     def __len__(self) -> int:
         return sum(1 for _ in self)

@@ -9,10 +9,9 @@ from typing import Any
 
 from epypes.errors import StaleToken, require_mapping
 from epypes.graph import CompGraph
-from epypes.graph.redefined import redefined
 from epypes.run.attempt import AttemptsByKind, Outcome
 from epypes.run.call import StepFailed
-from epypes.run.draft import draft_after
+from epypes.run.draft import draft_after, tokens_now
 from epypes.run.guard import lend
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.plan import Plan, plan
@@ -20,11 +19,12 @@ from epypes.run.program import Program
 from epypes.run.record import Run
 from epypes.run.refused import nothing_computed, nothing_run, require_targets
 from epypes.run.report import Reports
-from epypes.run.tokens import TokenManager
+from epypes.run.told import one_line
 from epypes.run.trials import Trials
 from epypes.run.underway import running_functions
 from epypes.run.watchers import Watchers
-from epypes.wording import counted
+
+Payload = Mapping[str, Any]
 
 
 class CompGraphRunner:
@@ -51,8 +51,8 @@ class CompGraphRunner:
 
     Notes
     -----
-    Every run works on a token store of its own and becomes ``last`` when it ends, so runs in several threads do
-    not mix. Semeniuta and Falkman 2019, "Computational graphs".
+    Every run works on a token store of its own and becomes ``last`` when it ends, completed or failed: so runs in
+    several threads do not mix. Semeniuta and Falkman 2019, "Computational graphs".
 
     Examples
     --------
@@ -83,7 +83,7 @@ class CompGraphRunner:
         self._lock = threading.Lock()
         self._trials = Trials()
         self._watchers = Watchers()
-        self._last: Run | None = None
+        self.last: Run | None = None
         given = {**cg.defaults, **hparams}
         self._hparams = Hyperparameters(self._program, {}).frozen(given)
 
@@ -117,32 +117,47 @@ class CompGraphRunner:
         """
         return self.run_on(payload, targets)
 
-    def run_on(self, payload: Mapping[str, Any], targets: Sequence[str] = ()) -> Run:
+    def run_on(self, payload: Payload, targets: Sequence[str] = ()) -> Run:
         """Do what ``run`` does, with the payload as a mapping by free source token."""
         start_ns = perf_counter_ns()
-        if targets:
-            require_targets(self.cg, targets, self.free_source_tokens)
-        hparams, program = self._hparams, self._program
-        values = hparams.with_payload(payload)
-        attempts, has_payload = self._attempts[hparams.plain], len(payload) == len(hparams.free_slots)
+        hparams = self._hparams
+        if hparams.start is None:
+            hparams.start = hparams.base, hparams.free_slots, self._attempts[hparams.plain]
+        base, slots, attempts = hparams.start
         compiled = attempts.short_way.whole
-        if compiled is None or targets or not has_payload:
-            return self._ended(attempts.whole(values, payload, has_payload, targets, start_ns), hparams)
+        if compiled is None or targets or len(payload) != len(slots):
+            return self._run_anyhow(payload, targets, start_ns, hparams)
         # The way of a stream of images: as short as can be.
+        values = base.copy()
+        try:
+            for token in payload:
+                values[slots[token]] = payload[token]
+        except KeyError:
+            return self._run_anyhow(payload, targets, start_ns, hparams)
         try:
             durations_ns = compiled(values)
         except StepFailed as failed:
             outcome = attempts.run_broken_off(values, failed, None, True, start_ns)
         else:
-            times = (program, None, durations_ns, perf_counter_ns() - start_ns, False, -1)
+            times = (self._program, None, durations_ns, perf_counter_ns() - start_ns, False, -1)
             run = Run((values, attempts.clean, hparams, times, None))
-            with self._lock:
-                self._last = run
+            self._lock.acquire()  # half the time of a with statement
+            try:
+                self.last = run
+            finally:
+                self._lock.release()
             self.reports.kept.append(times)
             if self._watchers.callbacks:
                 self._watchers.tell()
             return run
         return self._ended(outcome, hparams)
+
+    def _run_anyhow(self, payload: Payload, targets: Sequence[str], start_ns: int, hparams: Hyperparameters) -> Run:
+        if targets:
+            require_targets(self.cg, targets, tuple(hparams.free_slots))
+        values, has_payload = hparams.with_payload(payload), len(payload) == len(hparams.free_slots)
+        attempts = self._attempts[hparams.plain]
+        return self._ended(attempts.whole(values, payload, has_payload, targets, start_ns), hparams)
 
     def rerun(self, /, *targets: str, **changes: Any) -> Run:
         """Set hyperparameters, all or none of them, then run the stale functions on the last payload.
@@ -162,7 +177,7 @@ class CompGraphRunner:
         if targets:
             require_targets(self.cg, targets, self.free_source_tokens)
         with self._lock:
-            hparams, last = self._hparams.frozen(changes, also_new=False), self._last
+            hparams, last = self._hparams.frozen(changes, also_new=False), self.last
             self._hparams = hparams
         changed, compiled = hparams.changed, None
         if last is None:
@@ -184,7 +199,7 @@ class CompGraphRunner:
                 times = (self._program, None, durations_ns, perf_counter_ns() - start_ns, False, -1)
                 run = Run((values, freshness, hparams, times, None))
                 with self._lock:
-                    self._last = run
+                    self.last = run
                 self.reports.kept.append(times)
                 if self._watchers.callbacks:
                     self._watchers.tell()
@@ -200,7 +215,7 @@ class CompGraphRunner:
         """
         run = Run((*outcome[:2], hparams, *outcome[2:]))
         with self._lock:
-            self._last = run
+            self.last = run
         self.reports.add(run.record[3])
         self._watchers.tell()
         if run.failure is not None:
@@ -258,9 +273,9 @@ class CompGraphRunner:
         if run not in self._trials:
             raise ValueError("Only a run that this runner's trial() returned can be adopted.")
         with self._lock:
-            if not self._trials.began_from(run, self._hparams, self._last):
+            if not self._trials.began_from(run, self._hparams, self.last):
                 return False
-            self._hparams, self._last = run.record[2], run
+            self._hparams, self.last = run.record[2], run
         self.reports.add(run.record[3])
         self._watchers.tell()
         return True
@@ -277,7 +292,7 @@ class CompGraphRunner:
         require_targets(self.cg, targets, self.free_source_tokens)
         hparams, last = self._state
         changed = () if last is None else tuple(hparams.changes_since(last.record[2]))
-        return plan(self._now(last, hparams), targets, changed, hparams)
+        return plan(tokens_now(self._program, last, hparams), targets, changed, hparams)
 
     # -- hyperparameters ----------------------------------------------------------------------------------------
 
@@ -303,9 +318,7 @@ class CompGraphRunner:
 
     def freeze(self, /, **values: Any) -> None:
         """Make source tokens hyperparameters, all or none of them."""
-        with self._lock:
-            self._hparams = self._hparams.frozen(values)
-        self._watchers.tell()
+        self._change(values, also_new=True)
 
     def unfreeze(self, token: str) -> None:
         """Make a hyperparameter a free source token again."""
@@ -313,17 +326,25 @@ class CompGraphRunner:
             self._hparams = self._hparams.unfrozen(token)
         self._watchers.tell()
 
+    def set(self, /, **values: Any) -> None:
+        """Set hyperparameters, all or none of them, at once: a run has all of the new values or none.
+
+        Raises
+        ------
+        HyperparameterError, UnknownName
+            As ``rerun`` does; nothing is set then.
+        """
+        self._change(values, also_new=False)
+
     def __setitem__(self, token: str, value: Any) -> None:
+        self._change({token: value}, also_new=False)
+
+    def _change(self, values: Mapping[str, Any], also_new: bool) -> None:
         with self._lock:
-            self._hparams = self._hparams.frozen({token: value}, also_new=False)
+            self._hparams = self._hparams.frozen(values, also_new=also_new)
         self._watchers.tell()
 
     # -- reading ------------------------------------------------------------------------------------------------
-
-    @property
-    def last(self) -> Run | None:
-        """The last run that ended, completed or failed."""
-        return self._last
 
     @property
     def stale(self) -> tuple[str, ...]:
@@ -339,13 +360,7 @@ class CompGraphRunner:
     def _state(self) -> tuple[Hyperparameters, Run | None]:
         """The hyperparameters and the last run, of one moment."""
         with self._lock:
-            return self._hparams, self._last
-
-    def _now(self, last: Run | None, hparams: Hyperparameters) -> TokenManager:
-        """Return a run's tokens as they are to be read with these hyperparameters."""
-        if last is not None and last.record[2] is hparams and not self._program.revised:
-            return last.tokens
-        return draft_after(self._program, last, hparams).tokens()
+            return self._hparams, self.last
 
     def __getitem__(self, token: str) -> Any:
         hparams, last = self._state
@@ -356,7 +371,7 @@ class CompGraphRunner:
             self.cg.require_token(token)
             raise nothing_computed(token, hparams.free_slots)
         value = last[token]
-        if self._now(last, hparams).is_stale(token):
+        if tokens_now(self._program, last, hparams).is_stale(token):
             raise StaleToken(token)
         return value
 
@@ -372,24 +387,11 @@ class CompGraphRunner:
     def keys(self) -> tuple[str, ...]:
         """Return the tokens that can be read now, in graph order."""
         hparams, last = self._state
-        now = self._now(last, hparams)
-        return tuple(
-            token
-            for token in self.cg.tokens
-            if token in hparams.entries or (now.is_computed(token) and not now.is_stale(token))
-        )
+        now, frozen = tokens_now(self._program, last, hparams), hparams.entries
+        return tuple(token for token in self.cg.tokens if token in frozen or now.is_readable(token))
 
     def __repr__(self) -> str:
-        last, redefinitions = self._last, len(redefined(self.cg))
-        old = f" ({redefinitions} redefined)" * bool(redefinitions)
-        if last is None:
-            state = "not run yet"
-        elif last.failure:
-            state = f"failed in {last.failure.function!r:.{24 - len(old)}}"
-        else:
-            state = f"{counted(len(self.stale), 'function')} stale" if self.stale else "up to date"
-        functions, frozen = counted(len(self.cg.functions), "function"), len(self.hyperparameters)
-        return f"<CompGraphRunner: {functions}{old}, {counted(frozen, 'hyperparameter')}; {state}>"
+        return one_line(self)
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         from epypes.display import mimebundle

@@ -47,13 +47,16 @@ class Freshness:
         Those of nested pipelines, when the run began.
     is_clean
         Whether every step is up to date, for good, and every source token has a value.
+    clean_slots
+        The slots by token if so; otherwise empty.
     """
 
-    __slots__ = ("dirty", "has_payload", "is_clean", "program", "revisions")
+    __slots__ = ("clean_slots", "dirty", "has_payload", "is_clean", "program", "revisions")
 
     def __init__(self, program: Program, dirty: bytes, has_payload: bool, revisions: tuple[Any, ...] = ()) -> None:
         self.program, self.dirty, self.has_payload, self.revisions = program, dirty, has_payload, revisions
         self.is_clean = has_payload and 1 not in dirty and not program.revised
+        self.clean_slots = program.slots if self.is_clean else {}
 
 
 class TokenManager:
@@ -99,6 +102,10 @@ class TokenManager:
             return False
         slot = self.program.slots[token]
         return self.program.makers[slot] in self.stale and self.values[slot] is not NOT_COMPUTED
+
+    def is_readable(self, token: str) -> bool:
+        """Whether the token has a value that is up to date."""
+        return self.is_computed(token) and not self.is_stale(token)
 
     def read(self, token: str) -> Any:
         """Return a token's value, arrays as read-only views.

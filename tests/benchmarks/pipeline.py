@@ -26,7 +26,7 @@ def rows(effort: Effort) -> list[Row]:
     rounds, count = (3, 200) if effort.quick else (_ROUNDS, _EVENTS)
     times = Times({RAW: {}, OURS: {}})
     with _raw() as raw, _pipeline() as ours:
-        for name, queues in ((RAW, raw), (OURS, ours)):
+        for queues in (raw, ours):
             _taken_ns(queues, count)
         for index in range(rounds):
             for name, queues in ((RAW, raw), (OURS, ours)):
