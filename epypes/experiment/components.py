@@ -127,10 +127,10 @@ class Acquisition(Component):
         cg = acquisition_graph(self.cameras)
         super().__init__("acquisition", cg, q_in, q_out, payload_of_request, pack_pair, add_to_pair)
 
-    def listen(self) -> None:
+    def listen(self, timeout_s: float = 0.5) -> None:
         """Start the cameras and the event loop."""
         self.cameras.start()
-        super().listen()
+        super().listen(timeout_s)
 
     def stop(self, timeout_s: float = 5.0) -> None:
         """Stop the event loop and the cameras."""

@@ -30,10 +30,11 @@ class Framing:
         MessageError
             If it can't be sent. What code of the item itself raises comes as it is.
         """
-        if isinstance(item, Envelope):
-            return self._envelope_frames(item)
+        data: bytes
         if isinstance(item, bytes):
             data = item
+        elif isinstance(item, Envelope):
+            return self._envelope_frames(item)
         elif callable(getattr(item, "SerializeToString", None)):
             data = serialized(item)  # type: ignore[arg-type]  # google is imported in wire alone
         elif isinstance(item, Failure):

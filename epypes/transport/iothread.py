@@ -57,7 +57,7 @@ def has_arrived(owned: Socket) -> bool:
 class _Owned:
     """What the I/O thread knows of a socket."""
 
-    descriptor: int
+    source: Socket | int
     reader: Reader
     lock: AbstractContextManager[Any]
     endpoint: str
@@ -75,9 +75,10 @@ class IOThread:
         self._retire, self.has_retired = retire, False
         self._commands: deque[tuple[Callable[[IOThread], Any], Future[Any]]] = deque()
         self._owned: dict[Socket, _Owned] = {}
-        # By file descriptor, and those among them that may have more than they were asked for.
-        self._readers: dict[int, Reader] = {}
-        self._unfinished: set[int] = set()
+        # By what the poller names: the socket, or the file descriptor of one that other threads send on, which it must
+        # not ask for more than that. Such a descriptor gives a signal once: who has more to read is kept in mind.
+        self._readers: dict[Any, Reader] = {}
+        self._unfinished: set[Any] = set()
         self._next_due_s = float("inf")
         self._gatekeeper: Gatekeeper | None = None
         self._context = zmq.Context(io_threads=1)
@@ -152,11 +153,11 @@ class IOThread:
             number = getattr(error, "errno", None) or 0
             raise address_error(address, "bound" if bind else "connected", number, str(error)) from error
         endpoint = new.getsockopt_string(zmq.LAST_ENDPOINT) if bind else ""
-        descriptor = int(new.get(_FD))
-        self._owned[new] = _Owned(descriptor, reader, lock or nullcontext(), endpoint, gate)
-        self._readers[descriptor] = reader
-        self._poller.register(descriptor, zmq.POLLIN)
-        self._unfinished.add(descriptor)
+        source = new if lock is None else int(new.get(_FD))
+        self._owned[new] = _Owned(source, reader, lock or nullcontext(), endpoint, gate)
+        self._readers[source] = reader
+        self._poller.register(source, zmq.POLLIN)
+        self._unfinished.add(source)
         return new
 
     def address_of(self, owned: Socket, address: str) -> str:
@@ -168,7 +169,7 @@ class IOThread:
         """Have a socket read though it gives no signal, since something else has been done with it."""
         known = self._owned.get(owned)
         if known is not None:
-            self._unfinished.add(known.descriptor)
+            self._unfinished.add(known.source)
 
     def every(self, interval_s: float, owned: Socket, tick: Callable[[], None]) -> None:
         """Call something again and again while a socket is open; it may use the socket."""
@@ -180,9 +181,9 @@ class IOThread:
         """Close a socket, twice if you like; return whether it was the last one, so that the thread ends."""
         known = self._owned.pop(owned, None)
         if known is not None:
-            self._poller.unregister(known.descriptor)
-            self._readers.pop(known.descriptor, None)
-            self._unfinished.discard(known.descriptor)
+            self._poller.unregister(known.source)
+            self._readers.pop(known.source, None)
+            self._unfinished.discard(known.source)
             with known.lock:
                 _close(owned, known.endpoint)
             self._unguard(known.gate)
@@ -215,10 +216,10 @@ class IOThread:
     def _run(self) -> None:
         try:
             while not self._ended():
-                # What comes between the poller and a reader is paid for by every message.
-                for descriptor, _ in self._poller.poll(self._wait_ms()):
-                    self._read(descriptor)
-                self._catch_up()
+                for source, _ in self._poller.poll(self._wait_ms()):
+                    self._read(source)
+                if self._unfinished or self._next_due_s <= monotonic():
+                    self._catch_up()
         finally:
             self._context.term()
             self._wake_in.close()
@@ -232,13 +233,13 @@ class IOThread:
         # One more for what is cut off, or it would wake up too early, and again at once.
         return int(max(self._next_due_s - monotonic(), 0.0) * 1000) + 1
 
-    def _read(self, descriptor: Any) -> None:
+    def _read(self, source: Any) -> None:
         """Read a part of what a socket has, so that none waits for another to be empty."""
         # A command or another reader may have closed it.
-        reader = self._readers.get(descriptor)
+        reader = self._readers.get(source)
         try:
             if reader is not None and reader():
-                self._unfinished.add(descriptor)
+                self._unfinished.add(source)
         except Exception:
             # A reader counts what it can't read; this is a bug of ours, and must not stop the others.
             log.exception("a reader failed")
@@ -248,8 +249,8 @@ class IOThread:
             self._tick()
         if self._unfinished:
             unfinished, self._unfinished = self._unfinished, set()
-            for descriptor in unfinished:
-                self._read(descriptor)
+            for source in unfinished:
+                self._read(source)
 
     def _tick(self) -> None:
         now_s = monotonic()
@@ -260,7 +261,7 @@ class IOThread:
                     known.tick()
                 except Exception:
                     log.exception("what was due failed")
-                self._unfinished.add(known.descriptor)
+                self._unfinished.add(known.source)
         self._next_due_s = min((known.due_s for known in self._owned.values()), default=float("inf"))
 
     def _ended(self) -> bool:
@@ -279,7 +280,7 @@ class IOThread:
                 # It belongs to the thread that asked, with its traceback.
                 future.set_exception(error)
         # A command that used a socket may have used up its signal as well.
-        self._unfinished.update(known.descriptor for known in self._owned.values())
+        self._unfinished.update(known.source for known in self._owned.values())
         return False
 
 

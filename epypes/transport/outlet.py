@@ -8,6 +8,7 @@ import threading
 import weakref
 from collections import Counter, deque
 from dataclasses import dataclass, field
+from threading import get_ident
 
 import zmq
 
@@ -98,27 +99,30 @@ class Outlet:
         handler, follows.
         """
         if not self._turn.acquire(False):
-            if self._whose == threading.get_ident():
+            if self._whose == get_ident():
                 self._later.append(item)
                 return
             self._turn.acquire()
+        self._whose = get_ident()
+        # Few calls from here to the socket: after an image has filled the caches each takes 3 to 5 us.
         try:
-            self._whose = threading.get_ident()
-            self._publish(item)
+            frames = self._framing.frames(item)
+            with self._lock:
+                self._send(frames)
+        except Exception as error:
+            self._refuse(item, error)
         finally:
             self._whose = 0
             self._turn.release()
         while self._later:
             self.publish(self._later.popleft())
 
-    def _publish(self, item: object) -> None:
-        try:
-            self._send(self._framing.frames(item))
-        except MessageError as error:
+    def _refuse(self, item: object, error: Exception) -> None:
+        if isinstance(error, MessageError):
             self.reject(error.reason, str(error))
-        except zmq.ZMQError as error:
+        elif isinstance(error, zmq.ZMQError):
             self.reject("not sent", f"a message could not be sent: {error}")
-        except Exception as error:
+        else:
             # The item's own code, called to make bytes of it, may raise anything.
             self.reject(type(error).__name__, f"a {type(item).__name__} could not be sent: {error!r}")
 
@@ -129,19 +133,21 @@ class Outlet:
             log.warning("%s rejected an item (%s): %s", self.address, reason, text)
 
     def _send(self, frames: Frames) -> None:
-        with self._lock:
-            socket = self._socket
-            if socket is None:
-                raise zmq.ZMQError(zmq.ENOTSOCK)
-            # Counted before: whoever has received it must find it counted.
-            self._counts.sent += 1
-            try:
-                _send(socket, frames)
-            except zmq.ZMQError:
-                self._counts.sent -= 1
-                raise
-            if io.has_arrived(socket) and self.doorkeeper.read():
-                io.soon(lambda thread: thread.read_again(socket))
+        socket = self._socket
+        if socket is None:
+            raise zmq.ZMQError(zmq.ENOTSOCK)
+        # Counted before: whoever has received it must find it counted.
+        self._counts.sent += 1
+        try:
+            for frame in frames[:-1]:
+                socket.send(frame, _MORE, copy=not _can_be_lent(frame))
+            last = frames[-1]
+            socket.send(last, _DONTWAIT, copy=len(last) < _LENT_FROM_BYTES or not _can_be_lent(last))
+        except zmq.ZMQError:
+            self._counts.sent -= 1
+            raise
+        if io.has_arrived(socket) and self.doorkeeper.read():
+            io.soon(lambda thread: thread.read_again(socket))
 
     def _read(self) -> bool:
         with self._lock:
@@ -158,12 +164,6 @@ def _forget_outlets() -> None:
 
 
 os.register_at_fork(after_in_child=_forget_outlets)
-
-
-def _send(socket: io.Socket, frames: Frames) -> None:
-    for frame in frames[:-1]:
-        socket.send(frame, _MORE, copy=not _can_be_lent(frame))
-    socket.send(frames[-1], _DONTWAIT, copy=not _can_be_lent(frames[-1]))
 
 
 def _can_be_lent(frame: bytes | memoryview) -> bool:

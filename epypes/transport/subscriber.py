@@ -26,8 +26,6 @@ from epypes.wire import Limits, topic_frame
 
 log = logging.getLogger("epypes.transport")
 
-# Messages read before the I/O thread looks at other sockets again.
-_BATCH = 100
 HIGH_WATER_MARK = 1_000
 # Two small messages in this time cost no CPU to speak of.
 HEARTBEAT_S = 1.0
@@ -280,17 +278,17 @@ class _Opened:
 
     def _read(self) -> bool:
         socket = self._socket
-        for _ in range(_BATCH):
-            # The queue's put may have stopped this subscriber.
-            if socket is None or socket.closed:
-                return False
-            try:
-                frame = socket.recv(_DONTWAIT, copy=False)
-            except zmq.Again:
-                return False
-            self._inbox.accept([frame, *_rest(socket)] if frame.more else [frame], self.guest)
-            self.pulse.heard()
-        return True
+        if socket is None or socket.closed:
+            return False
+        try:
+            frame = socket.recv(_DONTWAIT, copy=False)
+        except zmq.Again:
+            return False
+        self._inbox.accept([frame, *_rest(socket)] if frame.more else [frame], self.guest)
+        # After it, since the thread that waits for the message is woken up by now. Whether there are more the poller
+        # finds out: to ask here would keep the interpreter's lock from that thread.
+        self.pulse.heard()
+        return False
 
 
 def _reporter(subscriber: ZMQSubscriber) -> Callable[[bool], None]:

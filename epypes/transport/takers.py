@@ -65,7 +65,11 @@ class HandOver:
         """Close the outlet; what is put from now on stays in the queue."""
         self.stopping = True
         self._end()
-        self._outlet.close(timeout_s)
+        try:
+            self._outlet.close(timeout_s)
+        except TimeoutError as error:
+            # The I/O thread is held up in a subscriber's queue.
+            raise StillRunning(f"ZMQPublisher {self._outlet.address}", ["put"], timeout_s) from error
 
     def abandon(self) -> None:
         """Stop without waiting."""

@@ -44,7 +44,7 @@ class Payload:
 
 def spoken(path: Path) -> str:
     """Return a path as it is written in Python: ``keypoints[0]['size']``."""
-    return str(path[0]) + "".join(f"[{step!r}]"[:60] for step in path[1:])
+    return str(path[0]) if len(path) == 1 else str(path[0]) + "".join(f"[{step!r}]"[:60] for step in path[1:])
 
 
 def to_value(

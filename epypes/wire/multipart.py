@@ -171,7 +171,7 @@ def decode(frames: Sequence[bytes | bytearray | memoryview], limits: Limits = DE
         For anything that `encode` does not make, and nothing else, whatever the bytes are; its ``reason`` is a
         short word to count by.
     """
-    views = [_view(frame) for frame in frames]
+    views = [*map(_view, frames)]
     _check_sizes([view.nbytes for view in views], limits)
     _check_topic(views[0])
     header = _parse(views[1])
@@ -185,12 +185,15 @@ def decode(frames: Sequence[bytes | bytearray | memoryview], limits: Limits = DE
             rgb.add(entry.name)
         return value
 
+    def read_attribute(entry: Any) -> Any:
+        return reader.read(entry.value, (entry.name,))
+
     try:
         envelope = Envelope(
             **{name: getattr(header, name) for name in _PLAIN_FIELDS},
             parts=_read_unique(header.parts, "parts", limits, read_part),
-            attributes=_read_unique(header.attributes, "attributes", limits, lambda e: reader.read(e.value, (e.name,))),
-            timings=_read_unique(header.timings, "timings", limits, lambda e: e.duration_ns, lambda e: e.function),
+            attributes=_read_unique(header.attributes, "attributes", limits, read_attribute),
+            timings=_read_unique(header.timings, "timings", limits, _duration, _function),
             failure=_read_failure(header.failure) if header.HasField("failure") else None,
             rgb=rgb,
         )
@@ -257,6 +260,14 @@ def _check_version(version: int) -> None:
 
 def _name(entry: Any) -> str:
     return str(entry.name)
+
+
+def _function(entry: Any) -> str:
+    return str(entry.function)
+
+
+def _duration(entry: Any) -> int:
+    return int(entry.duration_ns)
 
 
 def _read_unique(

@@ -9,6 +9,7 @@ import threading
 import numpy as np
 import pytest
 
+from epypes.errors import StillRunning
 from epypes.pipeline import Mailbox
 from epypes.run import Failure
 from epypes.transport import ZMQPublisher, ZMQSubscriber
@@ -118,6 +119,29 @@ def test_a_stop_from_within_put_ends_it():
     out.put(Item())
     assert "stopped" in repr(pub)
     assert pub.rejected == {"not sent": 1}
+
+
+def test_a_queue_that_holds_up_the_io_thread_does_not_hold_up_what_is_sent_and_is_named_at_the_stop():
+    let_go, entered = threading.Event(), threading.Event()
+
+    class Stuck(queue.Queue):
+        def put(self, item, block=True, timeout=None):
+            entered.set()
+            let_go.wait(60)
+
+    out = Mailbox()
+    pub = ZMQPublisher(LOCAL, out).start()
+    with ZMQSubscriber(pub.address, Stuck()) as sub:
+        assert sub.wait_joined(WAIT_S)
+        out.put(b"x")
+        assert entered.wait(WAIT_S)
+        for _ in range(100):
+            out.put(b"y")
+        assert pub.sent == 101
+        with pytest.raises(StillRunning, match="put"):
+            pub.stop(timeout_s=0.1)
+        let_go.set()
+        pub.stop()
 
 
 def test_a_taker_that_waits_in_get_is_woken_up_when_items_are_handed_over():
