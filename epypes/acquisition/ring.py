@@ -67,21 +67,22 @@ class Ring:
             frames = tuple(self._frames)
         if not frames:
             raise FrameUnavailable(wanted_ns, None, None, f"{self.name} has no frame yet.")
-        # By time and not by place: a system's clock may be set back.
-        oldest_ns = min(frame.captured_ns for frame in frames)
         found = min(frames, key=lambda frame: abs(frame.captured_ns - wanted_ns))
         away_s = abs(found.captured_ns - wanted_ns) / 1e9
-        if wanted_ns >= oldest_ns and away_s <= max_age_s:
+        # Where the nearest is later, an earlier one may have been let go. By time and not by place, since a system's
+        # clock may be set back.
+        is_kept = found.captured_ns <= wanted_ns or any(frame.captured_ns <= wanted_ns for frame in frames)
+        if is_kept and away_s <= max_age_s:
             return found
-        newest_ns = max(frame.captured_ns for frame in frames)
+        times_ns = [frame.captured_ns for frame in frames]
         why = (
-            f"keeps no frame of {wanted_ns} ns: that is {away_s:.3g} s before its oldest one. "
-            "Ask sooner, or keep more frames."
-            if wanted_ns < oldest_ns
-            else f"has no frame within {max_age_s:g} s of {wanted_ns} ns: the nearest is {away_s:.3g} s away. "
+            f"has no frame within {max_age_s:g} s of {wanted_ns} ns: the nearest is {away_s:.3g} s away. "
             "Does the camera still run?"
+            if is_kept
+            else f"keeps no frame of {wanted_ns} ns: that is {away_s:.3g} s before its oldest one. "
+            "Ask sooner, or keep more frames."
         )
-        raise FrameUnavailable(wanted_ns, oldest_ns, newest_ns, f"{self.name} {why}")
+        raise FrameUnavailable(wanted_ns, min(times_ns), max(times_ns), f"{self.name} {why}")
 
     def __len__(self) -> int:
         return len(self._frames)
