@@ -10,6 +10,7 @@ import threading
 import time
 import warnings
 import weakref
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
@@ -28,6 +29,8 @@ _HIGH_WATER_MARK = 64
 _MAX_SUBSCRIPTION_BYTES = 64 * 1024
 # How often it is looked whether there is a subscriber, and whether a full subscriber has room again.
 _LOOK_S, _RETRY_S = 0.025, 0.001
+# Messages that are due are handed to the I/O thread together, so many at most.
+_BATCH = 64
 
 
 class _Asked(Exception):
@@ -252,29 +255,41 @@ class _Playing:
 
     def _play(self, recorded: Iterator[Recorded]) -> None:
         begin, first_ns = time.monotonic(), None
+        overdue: deque[Recorded] = deque()
         try:
             for message in recorded:
                 first_ns = message.time_ns if first_ns is None else first_ns
                 due = begin + (message.time_ns - first_ns) / 1e9 / self._speed if self._speed else begin
-                self._pause(due - time.monotonic())
-                self._send(message)
+                wait_s = due - time.monotonic()
+                if wait_s > 0:
+                    self._send(overdue)
+                    self._pause(wait_s)
+                overdue.append(message)
+                if wait_s > 0 or len(overdue) == _BATCH:
+                    self._send(overdue)
         except BrokenOff as error:
             # What is whole may be played again all the same.
             self._failure = error
+        self._send(overdue)
 
-    def _send(self, message: Recorded) -> None:
+    def _send(self, overdue: deque[Recorded]) -> None:
+        """Send all of these, as soon as there is room, with few visits to the I/O thread."""
+
         def send(_: io.IOThread) -> bool:
-            # Counted before: whoever has received it must find it counted.
-            self.sent += 1
-            try:
-                self._socket.send_multipart(message.frames, zmq.DONTWAIT, copy=False)
-            except zmq.ZMQError as error:
-                self.sent -= 1
-                if isinstance(error, zmq.Again):
-                    return False
-                raise
+            while overdue:
+                # Counted before: whoever has received it must find it counted.
+                self.sent += 1
+                try:
+                    self._socket.send_multipart(overdue[0].frames, zmq.DONTWAIT, copy=False)
+                except zmq.ZMQError as error:
+                    self.sent -= 1
+                    if isinstance(error, zmq.Again):
+                        return False
+                    raise
+                overdue.popleft()
             return True
 
+        self._pause(0.0)
         while not io.call(send):
             self._pause(_RETRY_S)
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import threading
 import time
 import weakref
-from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from epypes.errors import RecordingError, StillRunning
-from epypes.transport.mcapformat import Counts, Frames
+from epypes.transport.backlog import Backlog
+from epypes.transport.mcapformat import Counts
 from epypes.transport.mcapwriter import RecordingWriter
 from epypes.transport.subscriber import ZMQSubscriber
 
@@ -22,7 +22,6 @@ BACKLOG_BYTES = 512 * 1024**2
 _FLUSH_S = 1.0
 # Part of the time for a stop in which the rest is written; then the file is finished without it.
 _DRAIN_SHARE = 0.8
-_SLOW, _FAILED = "disk too slow", "disk failed"
 
 
 def _nothing() -> None:
@@ -61,8 +60,8 @@ class Recorder:
 
     Notes
     -----
-    Start it, or use ``with``. Nothing is decoded. A time is the Unix time of the start plus what a monotonic clock has
-    counted since, so that a clock that is set meanwhile does no harm.
+    Start it, or use ``with``. Nothing is decoded. Times are Unix times, read once and counted on by a monotonic clock,
+    so that a clock that is set meanwhile does no harm.
     """
 
     def __init__(
@@ -83,7 +82,7 @@ class Recorder:
         about = {"address": address, "topic": topic}
 
         def make() -> tuple[ZMQSubscriber, _Recording]:
-            recording = _Recording(self.path, about, force, _Backlog(messages, backlog_bytes), on_end)
+            recording = _Recording(self.path, about, force, Backlog(messages, backlog_bytes), on_end)
             return ZMQSubscriber(address, recording.backlog, topic, bind, undecoded=True, **options), recording
 
         self._make = make
@@ -171,89 +170,11 @@ class Recorder:
         return f"<Recorder {str(self.path)[-40:]} {state}: {self.counts}>"
 
 
-class _Backlog:
-    """What waits for the disk. The I/O thread puts, the recorder's thread takes."""
-
-    def __init__(self, messages: int | None, most_bytes: int) -> None:
-        self._left, self._most_bytes = messages, most_bytes
-        self._items: deque[tuple[int, Frames, int]] = deque()
-        self._bytes = 0
-        self._counts = Counts()
-        self._closed = self._failed = False
-        self._changed = threading.Condition()
-        # The clocks are read together once: later times differ as those of the monotonic one.
-        self._offset_ns = time.time_ns() - time.perf_counter_ns()
-
-    def put(self, item: Frames, *, block: bool) -> None:
-        """Take the frames of a message, or count them as dropped."""
-        now_ns = self._offset_ns + time.perf_counter_ns()
-        size = sum(map(len, item))
-        with self._changed:
-            if self._closed and not self._failed:
-                return
-            self._counts.received += 1
-            if self._failed:
-                self._counts.dropped[_FAILED] += 1
-            elif self._items and self._bytes + size > self._most_bytes:
-                self._counts.dropped[_SLOW] += 1
-            else:
-                self._accept(now_ns, item, size)
-
-    def _accept(self, now_ns: int, item: Frames, size: int) -> None:
-        self._items.append((now_ns, item, size))
-        self._bytes += size
-        if self._left is not None:
-            self._left -= 1
-            self._closed = self._left <= 0
-        self._changed.notify_all()
-
-    def take(self, timeout_s: float | None) -> tuple[int, Frames] | None:
-        """Return the next message, or None if there is none within ``timeout_s`` or none will come."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._items or self._closed, timeout_s)
-            if not self._items:
-                return None
-            time_ns, frames, size = self._items.popleft()
-            self._bytes -= size
-            return time_ns, frames
-
-    def close(self) -> None:
-        """Take no more; safe in a finalizer, since the lock is re-entrant."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-
-    def is_over(self) -> bool:
-        """Return whether everything was taken and nothing will come."""
-        with self._changed:
-            return self._closed and not self._items
-
-    def drop_rest(self, reason: str, more: int = 0) -> None:
-        """Drop what waits, and so many that had been taken."""
-        with self._changed:
-            self._failed = self._failed or reason == _FAILED
-            lost = len(self._items) + more
-            if lost:
-                self._counts.dropped[reason] += lost
-            self._items.clear()
-            self._bytes = 0
-
-    def wrote(self, messages: int) -> None:
-        """Count messages that are in the file."""
-        with self._changed:
-            self._counts.written = messages
-
-    def counts(self) -> Counts:
-        """Return a copy of the counts."""
-        with self._changed:
-            return Counts(self._counts.received, self._counts.written, Counter(self._counts.dropped))
-
-
 class _Recording:
     """From a start to its stop: one file and the thread that writes it."""
 
     def __init__(
-        self, path: Path, about: Mapping[str, str], force: bool, backlog: _Backlog, on_end: Callable[[], None]
+        self, path: Path, about: Mapping[str, str], force: bool, backlog: Backlog, on_end: Callable[[], None]
     ) -> None:
         self._path, self._about, self._force, self._on_end = path, about, force, on_end
         self._appended = 0
@@ -296,7 +217,7 @@ class _Recording:
         except Exception as error:
             text = f"{self._path} can't be written: {error!r}."
             self._failure = error if isinstance(error, RecordingError) else RecordingError(self._path, text)
-            self.backlog.drop_rest(_FAILED, writer.pending)
+            self.backlog.fail(writer.pending)
             self.backlog.wrote(self._appended - writer.pending)
         finally:
             writer.close()
@@ -307,7 +228,7 @@ class _Recording:
         due = 0.0
         while not self.backlog.is_over():
             if time.monotonic() > self._deadline:
-                self.backlog.drop_rest(_SLOW)
+                self.backlog.give_up()
                 break
             taken = self.backlog.take(max(0.0, due - time.monotonic()) if writer.pending else None)
             if taken is not None:

@@ -6,6 +6,7 @@ that is not UTF-8.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from epypes.errors import MessageError
@@ -70,19 +71,24 @@ def parsed(kind: type[M], data: bytes | bytearray | memoryview) -> M:
     return message
 
 
+@cache
+def _looked_at(descriptor: Any) -> list[tuple[str, bool]]:
+    """Return the names of the fields of text and of messages, and whether it is text.
+
+    Fields of bytes are left alone: to look at an image would copy it.
+    """
+    return [(field.name, field.type == _TEXT) for field in descriptor.fields if field.type in (_TEXT, _MESSAGE)]
+
+
 def _check_text(message: Any, path: str) -> None:
-    for field in message.DESCRIPTOR.fields:
-        # Fields of bytes are left alone: to look at an image would copy it.
-        if field.type not in (_TEXT, _MESSAGE):
-            continue
-        value = getattr(message, field.name)
-        where = f"{path}.{field.name}"
+    for name, is_text in _looked_at(message.DESCRIPTOR):
+        value = getattr(message, name)
         if isinstance(value, bytes):
-            raise MessageError("not utf-8", f"{where} is not UTF-8: {value[:40]!r}.")
-        if field.type == _TEXT:
+            raise MessageError("not utf-8", f"{path}.{name} is not UTF-8: {value[:40]!r}.")
+        if is_text:
             continue
         if not hasattr(value, "DESCRIPTOR"):
             for index, item in enumerate(value):
-                _check_text(item, f"{where}[{index}]")
-        elif message.HasField(field.name):
-            _check_text(value, where)
+                _check_text(item, f"{path}.{name}[{index}]")
+        elif message.HasField(name):
+            _check_text(value, f"{path}.{name}")

@@ -172,6 +172,23 @@ def test_the_times_and_topics_of_the_messages_are_kept(tmp_path):
     assert found.counts == Counts(6, 6)
 
 
+def test_any_reader_of_mcap_finds_topics_times_and_messages(tmp_path):
+    from mcap.reader import make_reader
+
+    written(tmp_path / "a.mcap", [(1_000 * number, [b"a/" if number % 2 else b"b/", b"x"]) for number in range(100)])
+    with (tmp_path / "a.mcap").open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary.statistics.message_count == 100
+        assert {channel.topic for channel in summary.channels.values()} == {"a", "b"}
+        found = list(reader.iter_messages(topics=["a"], starting_at=90_000))
+        assert [message.log_time for _, _, message in found] == [91_000, 93_000, 95_000, 97_000, 99_000]
+        assert {record.name: record.metadata for record in reader.iter_metadata()} == {
+            "epypes.recording": {"address": "by hand"},
+            "epypes.counts": {"received": "100", "written": "100"},
+        }
+
+
 def test_one_topic_can_be_recorded_alone(tmp_path):
     left, right = queue.SimpleQueue(), queue.SimpleQueue()
     with (
@@ -222,6 +239,20 @@ def test_it_plays_as_often_as_it_is_told(tmp_path):
     with Player(tmp_path / "a.mcap", loop=0) as player, ZMQSubscriber(player.address, into):
         assert [into.get(timeout=WAIT_S) for _ in range(100)] == [b"a", b"b"] * 50
         assert not player.wait(0.0)
+
+
+def test_another_subscriber_may_join_while_it_plays(tmp_path):
+    written(tmp_path / "a.mcap", [(1, [b"t/", bytes(1_000)]), (2, [b"x"])])
+    first, second = queue.SimpleQueue(), queue.SimpleQueue()
+    with (
+        Player(tmp_path / "a.mcap", speed=0, loop=0) as player,
+        ZMQSubscriber(player.address, first, undecoded=True),
+    ):
+        first.get(timeout=WAIT_S)
+        for _ in range(3):
+            with ZMQSubscriber(player.address, second, "t", undecoded=True) as other:
+                assert other.wait_joined(WAIT_S)
+                assert bytes(second.get(timeout=WAIT_S)[0]) == b"t/"
 
 
 def test_nothing_is_sent_before_somebody_listens_unless_it_is_told_so(tmp_path):
