@@ -71,7 +71,6 @@ class Mailbox:
         MailboxOverflow
             The policy is ``"fault"`` and there was no room.
         """
-        _require_timeout(block, timeout)
         take = self._take or self._keep(item, block, timeout)
         if take is not None:
             take(item)
@@ -105,6 +104,7 @@ class Mailbox:
 
     def _keep(self, item: Any, block: bool, timeout: float | None) -> Callable[[Any], object] | None:
         """Keep an item until somebody gets it, or return whom it must be handed to, since this has begun meanwhile."""
+        _require_timeout(block, timeout)
         with self._changed:
             dropped = self._make_room(block, timeout) if len(self._items) >= self.size else []
             if self._take is not None:

@@ -133,8 +133,7 @@ class SinkPipeline(Pipeline):
             where = "f_out"
             self.emit(event, run)
         except BaseException as exception:  # a function's SystemExit is a failure of this event, not the loop's end
-            # The failure keeps this frame, and may be kept itself.
-            before, failed_in, where = None, where, None
+            failed_in, where = where, None
             self._fail(event, failed_in, exception, run)
         self.working_on = None
         del before

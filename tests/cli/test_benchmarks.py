@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from tests.apart import apart
-from tests.benchmarks import engine, tuning
+from tests.benchmarks import engine, pipeline, tuning
 from tests.benchmarks.peers import natural_functions
 from tests.benchmarks.row import OURS, Goal, Row, row
 from tests.benchmarks.table import as_table, write_json
@@ -54,6 +54,13 @@ def test_a_quick_run_of_the_engines_benchmarks_keeps_every_row(tmp_path):
         assert medians[each["ours"]] > 0, each
         assert (each["reached"] is None) == (each["goal"] is None), each
     assert as_table(rows).row_count == len(WORKS)
+
+
+def test_a_quick_run_of_the_pipelines_benchmark_compares_the_same_events():
+    (found,) = pipeline.rows(QUICK)
+    assert found.limit_ns > 0
+    assert found.ours_ns > 0
+    assert found.reached is not None
 
 
 def test_contenders_that_compute_something_else_are_not_timed():

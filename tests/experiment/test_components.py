@@ -71,6 +71,18 @@ def test_a_request_older_than_the_ring_is_a_failure_with_its_id(acquisition, que
     assert q_out.get(timeout=TIMEOUT_S).id == "now"
 
 
+@pytest.mark.parametrize(("fps", "is_answered"), [(50.0, False), (0.2, True)])
+def test_a_slow_camera_is_no_dead_one(images, queues, fps, is_answered):
+    q_in, _ = queues
+    said = queue.SimpleQueue()
+    node = NODES["acquisition"](q_in, said, Settings(images, fps=fps))
+    node.on_error = said.put
+    with node:
+        assert node.wait_until_ready(TIMEOUT_S)
+        q_in.put(request(time.time() + 3, "in 3 s"))
+        assert isinstance(said.get(timeout=TIMEOUT_S), StereoPair) is is_answered
+
+
 def test_what_is_no_request_is_a_failure_and_the_next_one_is_answered(acquisition, queues):
     q_in, q_out = queues
     q_in.put(Request(b"\xff\xff"))

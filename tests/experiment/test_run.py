@@ -53,10 +53,6 @@ def test_pickled_contents_are_sent_and_read_when_they_are_asked_for(images):
     check(run_experiment("one", **SMALL, cameras=images, unsafe_pickle=True), "one", 3, 2)
 
 
-def test_slow_cameras_are_no_dead_ones(images):
-    check(run_experiment("one", requests=3, experiments=1, fps=0.2, cameras=images), "one", 3, 1)
-
-
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
