@@ -83,7 +83,7 @@ class Component(FullPipeline):
     ) -> None:
         super().__init__(name, cg, q_in, q_out, f_in, self._answer, hparams, workers=workers)
         self.pack, self.add = pack, add
-        self._keys = tuple(f"{name}.{time}" for time in _TIMES)
+        *self._keys, self._t_fout_end, self._t_pub = (f"{name}.{time}" for time in _TIMES)
 
     def _answer(self, view: EventView) -> Any:
         answer = self.pack(view)
@@ -97,15 +97,14 @@ class Component(FullPipeline):
             self.compute_overhead(),
             stamps.f_out_start_ns / _NS,
         )
-        for key, time in zip(self._keys, times, strict=False):
+        for key, time in zip(self._keys, times, strict=True):
             self.add(answer, key, time)
         return answer
 
     def put(self, answer: Any, view: EventView) -> None:
         """Write the end of f_out and the time of publishing into an answer, then put it on q_out."""
-        *_, t_fout_end, t_pub = self._keys
-        self.add(answer, t_fout_end, view.stamps.f_out_end_ns / _NS)
-        self.add(answer, t_pub, view.stamps.now_ns() / _NS)
+        self.add(answer, self._t_fout_end, view.stamps.f_out_end_ns / _NS)
+        self.add(answer, self._t_pub, view.stamps.now_ns() / _NS)
         super().put(answer, view)
 
     def wait_until_ready(self, timeout_s: float) -> bool:
