@@ -19,16 +19,17 @@ _OPENCV_PLACE: Final = re.compile(r"^OpenCV\([^)]*\) \S+ error: ")
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A function, or a reactive pipeline's f_in or f_out, that raised.
+    """A function that raised, or a reactive pipeline's f_in, f_out or compute.
 
     Attributes
     ----------
     function
-        Its name in the graph, or ``"f_in"`` or ``"f_out"``.
+        Its name in the graph; ``"f_in"`` also for a payload that the graph refuses, ``"f_out"`` also for the put of the
+        answer, ``"compute"`` for what a subclass does around its graph.
     tokens
         Its input tokens, then its output tokens.
     inputs
-        The values that it was called with, by token; by ``"event"`` for f_in.
+        The values that it was called with, by token; by ``"event"`` for f_in and compute.
     exception
         What it raised, unchanged.
     event_id

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import NotComputed, StaleToken
 from epypes.graph.redefined import redefined
@@ -114,3 +115,7 @@ class Run(Mapping[str, Any]):
         from epypes.display import mimebundle
 
         return mimebundle(self)
+
+
+# Half the time of Run(...), whose one assignment follows it on the short ways.
+new_run: Final[Callable[[], Run]] = partial(object.__new__, Run)

@@ -16,7 +16,7 @@ from epypes.run.guard import lend
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.plan import Plan, plan
 from epypes.run.program import Program
-from epypes.run.record import Run
+from epypes.run.record import Run, new_run
 from epypes.run.refused import nothing_computed, nothing_run, require_targets
 from epypes.run.report import Reports
 from epypes.run.told import one_line
@@ -140,7 +140,8 @@ class CompGraphRunner:
             outcome = attempts.run_broken_off(values, failed, None, True, start_ns)
         else:
             times = (self._program, None, durations_ns, perf_counter_ns() - start_ns, False, -1)
-            run = Run((values, attempts.clean, hparams, times, None))
+            run = new_run()
+            run.record = values, attempts.clean, hparams, times, None
             self._lock.acquire()  # half the time of a with statement
             try:
                 self.last = run
