@@ -30,7 +30,7 @@ def experiment(
     requests: Annotated[int, typer.Option(help="Requests in each experiment, one after another.")] = 500,
     experiments: Annotated[int, typer.Option(help="How often it is repeated, with everything started anew.")] = 5,
     workers: Annotated[int, typer.Option(help="How many functions of the graph may run at once.")] = 1,
-    fps: Annotated[float, typer.Option(help="Frames per second of cameras that are files.")] = 10.0,
+    fps: Annotated[float, typer.Option(help="Frames per second of cameras that are files.")] = 5.0,
     camera: Annotated[
         list[str] | None,
         typer.Option(help="An image, folder or video, or the number of a device; twice. Without: scikit-image's pair."),

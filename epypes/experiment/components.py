@@ -28,6 +28,7 @@ _TIMES: Final = ("t_react", "t_fin_start", "t_fin_end", "t_p", "o_cg", "t_fout_s
 
 Pack = Callable[[EventView], Any]
 AddAttribute = Callable[[Any, str, float], None]
+SetAttribute = Callable[[Any, int, str, float], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +49,7 @@ class Settings:
     """
 
     cameras: tuple[str | int, ...] = ()
-    fps: float = 10.0
+    fps: float = 5.0
     workers: int = 1
     unsafe_pickle: bool = False
 
@@ -66,6 +67,8 @@ class Component(FullPipeline):
         Makes an answer from the event's view; it is f_out but for the times.
     add
         Adds an attribute to an answer.
+    set_last
+        Sets one that has been added: given the answer, its place from the end (-1 is the last), its key and the value.
     """
 
     def __init__(
@@ -77,12 +80,13 @@ class Component(FullPipeline):
         f_in: FIn,
         pack: Pack,
         add: AddAttribute,
+        set_last: SetAttribute,
         hparams: Mapping[str, Any] | None = None,
         *,
         workers: int = 1,
     ) -> None:
         super().__init__(name, cg, q_in, q_out, f_in, self._answer, hparams, workers=workers)
-        self.pack, self.add = pack, add
+        self.pack, self.add, self.set_last = pack, add, set_last
         *self._keys, self._t_fout_end, self._t_pub = (f"{name}.{time}" for time in _TIMES)
 
     def _answer(self, view: EventView) -> Any:
@@ -99,12 +103,15 @@ class Component(FullPipeline):
         )
         for key, time in zip(self._keys, times, strict=True):
             self.add(answer, key, time)
+        # Their values are not known yet; to set them takes less of the time that they are about than to add them.
+        self.add(answer, self._t_fout_end, 0.0)
+        self.add(answer, self._t_pub, 0.0)
         return answer
 
     def put(self, answer: Any, view: EventView) -> None:
         """Write the end of f_out and the time of publishing into an answer, then put it on q_out."""
-        self.add(answer, self._t_fout_end, view.stamps.f_out_end_ns / _NS)
-        self.add(answer, self._t_pub, view.stamps.now_ns() / _NS)
+        self.set_last(answer, -2, self._t_fout_end, view.stamps.f_out_end_ns / _NS)
+        self.set_last(answer, -1, self._t_pub, view.stamps.now_ns() / _NS)
         super().put(answer, view)
 
     def wait_until_ready(self, timeout_s: float) -> bool:
@@ -124,7 +131,7 @@ class Acquisition(Component):
             on_error=self._report_camera,
         )
         cg = acquisition_graph(self.cameras)
-        super().__init__("acquisition", cg, q_in, q_out, payload_of_request, pack_pair, add_to_pair)
+        super().__init__("acquisition", cg, q_in, q_out, payload_of_request, pack_pair, add_to_pair, set_in_pair)
 
     def listen(self, timeout_s: float = 0.5) -> None:
         """Start the cameras and the event loop."""
@@ -171,17 +178,38 @@ def add_to_pair(pair: StereoPair, key: str, value: float) -> None:
     pair.attributes[key] = value
 
 
+def set_in_pair(pair: StereoPair, _place: int, key: str, value: float) -> None:
+    """Set an attribute of a pair."""
+    pair.attributes[key] = value
+
+
 def vision(q_in: Any, q_out: Any, settings: Settings) -> Component:
     """Return the component that runs the ORB graph on pairs."""
     pack = pack_pickled if settings.unsafe_pickle else pack_keypoints
     cg, hparams = orb_graph(), orb_hyperparameters()
-    return Component("vision", cg, q_in, q_out, payload_of_pair, pack, add_attribute, hparams, workers=settings.workers)
+    return Component(
+        "vision",
+        cg,
+        q_in,
+        q_out,
+        payload_of_pair,
+        pack,
+        add_attribute,
+        set_in_answer,
+        hparams,
+        workers=settings.workers,
+    )
 
 
 def payload_of_pair(pair: StereoPair) -> dict[str, Any]:
     """Return the payload of the ORB graph: the f_in for a pair."""
     image_1, image_2 = pair
     return {"image_1": image_1, "image_2": image_2}
+
+
+def set_in_answer(answer: JustBytes, place: int, _key: str, value: float) -> None:
+    """Set an attribute that has been added to an answer."""
+    answer.attributes.entries[place].double_val = value
 
 
 def pack_keypoints(view: EventView) -> JustBytes:

@@ -28,7 +28,7 @@ def run_experiment(
     requests: int = 500,
     experiments: int = 5,
     workers: int = 1,
-    fps: float = 10.0,
+    fps: float = 5.0,
     unsafe_pickle: bool = False,
     progress: Progress | None = None,
     cameras: Sequence[str | Path | int] = (),

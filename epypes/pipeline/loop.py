@@ -17,6 +17,8 @@ from epypes.errors import StillRunning
 # How long one take from a queue may block before the stop flag is looked at. Queues that others made can't be
 # woken without putting a sentinel into them, which would be an event of theirs.
 POLL_S = 0.05
+# Of a queue that has been empty for a while: to wake up takes up to 100 us of a core.
+LONGEST_POLL_S = 0.2
 
 _log = logging.getLogger("epypes.pipeline")
 _left_running: weakref.WeakSet[EventLoop] = weakref.WeakSet()
@@ -136,13 +138,14 @@ class EventLoop:
         return not thread.is_alive()
 
     def _loop(self, stop: threading.Event) -> None:
-        is_stopped = stop.is_set
+        is_stopped, poll_s = stop.is_set, POLL_S
         while not is_stopped():
             try:
-                event = self.q_in.get(timeout=POLL_S)
+                event = self.q_in.get(timeout=poll_s)
             except queue.Empty:
                 if self._is_drained(stop):
                     return
+                poll_s = min(2 * poll_s, LONGEST_POLL_S)
                 continue
             except BaseException:  # a queue's SystemExit must not end the thread in silence either
                 _log.exception("%s: the queue itself failed", self.name)
@@ -155,6 +158,7 @@ class EventLoop:
                     self.callback(**self.f_in(event))
             except BaseException as exception:  # a function's SystemExit must not end the thread in silence
                 self._report(event, exception)
+            poll_s = POLL_S
             # An event may be large: it shall not live on until another comes.
             del event
             self.handled += 1

@@ -41,8 +41,8 @@ class Node:
 
     Attributes
     ----------
-    time
-        How long the last call took, in seconds; 0.0 before the first.
+    duration_ns
+        How long the last call took, in nanoseconds; 0 before the first.
     run_count
         How often it was called, failed calls included.
 
@@ -62,10 +62,10 @@ class Node:
             raise TypeError(f"Node {name!r:.40} needs a function to call, not {type(func).__name__!r}.")
         self.name = name
         self.func = func
-        self.time = 0.0
+        self.duration_ns = 0
         self.run_count = 0
         # Whole in every thread, which counting up is not.
-        self._counter = itertools.count(1)
+        self.next_count = itertools.count(1).__next__
         # Gives the node its function's signature, so that a graph of nodes is checked like one of functions.
         functools.update_wrapper(self, func, updated=())
         # Marks go along; whatever else a callable object or another node keeps must not take the place of our own.
@@ -79,20 +79,22 @@ class Node:
         try:
             return self.compute(*args)
         finally:
-            self.__epypes_called__(perf_counter_ns() - start_ns)
+            # What calls ``func`` in its place does these two as well.
+            self.duration_ns = perf_counter_ns() - start_ns
+            self.run_count = self.next_count()
+
+    @property
+    def time(self) -> float:
+        """How long the last call took, in seconds; 0.0 before the first."""
+        return self.duration_ns / 1e9
 
     def compute(self, *args: Any) -> Any:
         """Compute the node's value from its inputs; the hook for subclasses."""
         return self.func(*args)
 
-    def __epypes_called__(self, duration_ns: int) -> None:
-        """Take a call into account that took so long."""
-        self.time = duration_ns / 1e9
-        self.run_count = next(self._counter)
-
     @property
     def __epypes_is_its_func__(self) -> bool:
-        """Whether it comes to the same to call ``func``, and to tell ``__epypes_called__`` how long that took."""
+        """Whether it comes to the same to call ``func``, set ``duration_ns`` and count the call."""
         kind = type(self)
         return kind.__call__ is Node.__call__ and kind.compute is Node.compute and "compute" not in vars(self)
 

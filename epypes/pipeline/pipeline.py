@@ -94,8 +94,8 @@ class Pipeline(Node):
             run: Run = self.compute(payload)
             return run
         finally:
-            self.time = (perf_counter_ns() - start_ns) / 1e9
-            self.run_count = next(self._counter)
+            self.duration_ns = perf_counter_ns() - start_ns
+            self.run_count = self.next_count()
             # Not at the end of this frame, which a failure keeps.
             del before
 

@@ -51,7 +51,10 @@ class Stamps:
 
     def now_ns(self) -> int:
         """Return the time at this moment, by the event's clock."""
-        return self._offset() + perf_counter_ns()
+        try:
+            return self._offset_ns + perf_counter_ns()
+        except AttributeError:
+            return self._offset() + perf_counter_ns()
 
     def _unix_ns(self, name: str) -> int:
         reading: int = getattr(self, name, 0)

@@ -17,7 +17,7 @@ from typing import Any, Final, NoReturn
 from epypes.run.call import StepFailed, call, unpack
 from epypes.run.draft import is_unchanged
 from epypes.run.guard import ARRAYLESS, FRESH, FRESH_HERE, HARMLESS, LONG, array_type, keep, lend
-from epypes.run.program import CALLED, Program, Step, is_its_func
+from epypes.run.program import Program, Step, count_call, is_its_func
 
 # Runs its steps on values by slot, and gives nanoseconds by step; -1, or none, for those that did not run. A rerun is
 # given the new values of the source tokens too.
@@ -42,7 +42,7 @@ def _failed(program: Program, error: BaseException, duration_ns: int, found: Map
     """
     function = program.steps[found["at"]].function
     if duration_ns and is_its_func(function):
-        getattr(function, CALLED)(duration_ns)
+        count_call(function, duration_ns)
     failed = error if isinstance(error, StepFailed) else StepFailed(found["at"], error, duration_ns)
     numbered = [(name[0], int(name[1:]), value) for name, value in found.items() if name[1:].isdigit()]
     failed.done_ns = {number: spent for letter, number, spent in numbered if letter == "d"}
@@ -190,7 +190,8 @@ def _body(program: Program, steps: list[Step], plain: Collection[int], changed: 
             lines += _store(slot, "made" if step.single else f"made[{place}]", given)
         lines.append(f"d{step.place} = spent")
         if _is_direct(step):
-            lines.append(f"f{step.place}.{CALLED}(spent)")
+            # As count_call does, which would be a call into cold code.
+            lines += [f"f{step.place}.duration_ns = spent", f"f{step.place}.run_count = f{step.place}.next_count()"]
         if step.switch is None:
             locked.update(step.outputs)
         if new:

@@ -16,9 +16,8 @@ from epypes.run.guard import is_unguarded
 
 # What a function has that keeps hyperparameters of its own: a value that is another one whenever they have changed.
 REVISION: Final = "__epypes_revision__"
-# What a function has that keeps account of its calls: it is told the nanoseconds of each call of its ``func`` in its
-# place, which may be called so where IS_ITS_FUNC is true.
-CALLED: Final = "__epypes_called__"
+# What a function has that keeps account of its calls: where it is true, its ``func`` may be called in its place, if
+# ``count_call`` is called too.
 IS_ITS_FUNC: Final = "__epypes_is_its_func__"
 
 
@@ -183,4 +182,10 @@ def longest_path_ns(program: Program, durations_ns: Mapping[int, int]) -> int:
 
 def is_its_func(function: object) -> bool:
     """Whether a function keeps account of its calls, and its ``func`` may be called in its place."""
-    return hasattr(type(function), CALLED) and bool(getattr(function, IS_ITS_FUNC))
+    return hasattr(type(function), IS_ITS_FUNC) and bool(getattr(function, IS_ITS_FUNC))
+
+
+def count_call(function: Any, duration_ns: int) -> None:
+    """Have a function take a call of its ``func`` in its place into account."""
+    function.duration_ns = duration_ns
+    function.run_count = function.next_count()

@@ -26,7 +26,9 @@ def rows(effort: Effort) -> list[Row]:
         row(f"{_PAPER}: o_network", _times(pair, "o_network"), goal=Goal("ratio", 1.2)),
         _mode_row("vision.o_cg", pair, 20_000, "paper 0.3 ms"),
         _mode_row("vision.o_epypes", pair, 7_000, "paper 0.02 ms"),
-        Row(f"{_PAPER}: CPU per request", {name: found.cpu_ns for name, found in pair.items()}, goal=Goal("ratio", 1.05)),
+        Row(
+            f"{_PAPER}: CPU per request", {name: found.cpu_ns for name, found in pair.items()}, goal=Goal("ratio", 1.05)
+        ),
         Row(
             f"{_PAPER}: CPU of one idle second",
             {name: found.idle_cpu_ns for name, found in pair.items()},
