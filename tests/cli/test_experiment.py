@@ -16,6 +16,8 @@ import pytest
 
 from epypes.cli import main
 
+pytestmark = pytest.mark.slow  # each runs the command
+
 TIMEOUT_S = 30.0
 
 

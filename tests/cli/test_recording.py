@@ -17,6 +17,8 @@ from epypes.transport.mcapformat import Counts
 from epypes.transport.mcapwriter import RecordingWriter
 from epypes.wire import Envelope
 
+pytestmark = pytest.mark.slow  # each runs the commands
+
 LOCAL = "tcp://127.0.0.1:*"
 WAIT_S = 5.0
 

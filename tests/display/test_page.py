@@ -23,6 +23,8 @@ from epypes.display.views.graphview import GraphView
 from epypes.display.views.source import LINE_CHARACTERS, SIGNATURE_CHARACTERS, SOURCE_LINES, signature_and_source
 from tests.pictures import assert_same_picture
 
+pytestmark = pytest.mark.slow  # whole pages are made and measured
+
 SVG = "{http://www.w3.org/2000/svg}"
 
 

@@ -17,6 +17,8 @@ from matplotlib.figure import Figure
 from epypes.experiment.figures import figure_14, figure_15, figure_16
 from epypes.experiment.fits import lognormal_fit
 
+pytestmark = pytest.mark.slow  # each draws figures
+
 OF_OVERHEADS = [(figure_15, "vision.o_cg", "300"), (figure_16, "vision.o_epypes", "20")]
 ALL = [figure_14, figure_15, figure_16]
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import epypes as ep
+
+pytestmark = pytest.mark.slow  # many graphs are made
 
 
 def computing(name, count):

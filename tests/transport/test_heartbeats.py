@@ -14,6 +14,8 @@ from epypes.transport import ZMQPublisher, ZMQSubscriber
 from epypes.wire import Envelope
 from tests.transport.peers import LOCAL, PUBLISHER, WAIT_S, line_of, process, publish, wait_until
 
+pytestmark = pytest.mark.slow  # each waits for heartbeats
+
 
 class Changes:
     """What on_stale was told, and when."""

@@ -25,6 +25,8 @@ from epypes.transport.mcapreader import messages
 from epypes.transport.mcapwriter import RecordingWriter
 from epypes.wire import Envelope, JustBytes, decode, encode
 
+pytestmark = pytest.mark.slow  # files are written, cut off and played
+
 LOCAL = "tcp://127.0.0.1:*"
 WAIT_S = 5.0
 HOUR_NS = 3_600 * 10**9
