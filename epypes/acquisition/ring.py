@@ -76,10 +76,10 @@ class Ring:
             return found
         times_ns = [frame.captured_ns for frame in frames]
         why = (
-            f"has no frame within {max_age_s:g} s of {wanted_ns} ns: the nearest is {away_s:.3g} s away. "
+            f"has no frame within {max_age_s:g} s of that time: the nearest is {away_s:,.3f} s away. "
             "Does the camera still run?"
             if is_kept
-            else f"keeps no frame of {wanted_ns} ns: that is {away_s:.3g} s before its oldest one. "
+            else f"keeps nothing of that time, which is {away_s:,.3f} s before its oldest frame. "
             "Ask sooner, or keep more frames."
         )
         raise FrameUnavailable(wanted_ns, min(times_ns), max(times_ns), f"{self.name} {why}")

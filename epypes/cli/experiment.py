@@ -137,7 +137,7 @@ def _write(results: Results, folder: Path, *, side_by_side: bool) -> list[Path]:
     try:
         results.to_csv(csv)
         for path, figure in files.items():
-            figure.savefig(path)
+            figure.savefig(path, metadata={"Date": None})
     except OSError as error:
         raise ExperimentError("out", f"{folder} can't be written to: {error.strerror}.") from error
     return [csv, *files]
