@@ -50,7 +50,7 @@ def test_no_frame_is_given_that_is_too_far_from_the_time(captured_ns, wanted_ns,
 
 def test_a_request_older_than_the_ring_is_refused_with_the_times():
     with pytest.raises(
-        FrameUnavailable, match=r"keeps no frame of 2000000000 ns: that is 2 s before its oldest"
+        FrameUnavailable, match=r"keeps nothing of that time, which is 2\.000 s before its oldest frame"
     ) as info:
         ring_of(1 * 10**9, 4 * 10**9, 5 * 10**9, size=2).nearest(2 * 10**9)
     error = info.value
