@@ -30,7 +30,7 @@ class Ring:
     3
     >>> ring.nearest(120)
     Traceback (most recent call last):
-    epypes.errors.FrameUnavailable: The camera keeps no frame of 120 ns: that is 8e-08 s before its oldest one. ...
+    epypes.errors.FrameUnavailable: The camera keeps nothing of that time, which is 0.000 s before its oldest frame. ...
     """
 
     def __init__(self, size: int = 8, *, name: str = "The camera") -> None:

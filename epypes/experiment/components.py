@@ -147,7 +147,7 @@ class Acquisition(Component):
 
     def _report_camera(self, index: int, exception: BaseException) -> None:
         if self.on_error is not None:
-            self.on_error(Failure(f"camera {index + 1}", (), {}, exception, source=self.name))
+            self.on_error(Failure(f"camera {index}", (), {}, exception, source=self.name))
 
     def wait_until_ready(self, timeout_s: float) -> bool:
         """Return whether every camera has given a frame within ``timeout_s`` seconds."""

@@ -94,7 +94,7 @@ def test_what_is_no_request_is_a_failure_and_the_next_one_is_answered(acquisitio
 def test_a_camera_that_fails_while_it_runs_is_reported(acquisition):
     acquisition._report_camera(1, OSError("unplugged"))
     failure = acquisition.failures.get(timeout=TIMEOUT_S)
-    assert str(failure) == "camera 2: OSError: unplugged"
+    assert str(failure) == "camera 1: OSError: unplugged"
     assert failure.source == "acquisition"
 
 
