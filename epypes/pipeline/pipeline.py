@@ -165,10 +165,13 @@ class Pipeline(Node):
         Nodes that a switch or a failure kept from running do not count. Where nodes ran side by side, it is that of
         the last run's report: wall time less the critical path.
         """
-        last = self.runner.last
-        if last is not None and last.report.side_by_side:
-            return last.report.overhead_ns / 1e9
-        return self.time - sum(self.network.nodes[function].time for function in self._counted())
+        last, nodes = self.runner.last, self.network.nodes
+        report = None if last is None else last.report
+        if report is not None and report.side_by_side:
+            return report.overhead_ns / 1e9
+        # This is asked of every event, where the whole graph ran, and entries by function take their time to make.
+        counted = nodes.values() if report is not None and report.is_whole else map(nodes.__getitem__, self._counted())
+        return (self.duration_ns - sum(node.duration_ns for node in counted)) / 1e9
 
     def _counted(self) -> Collection[str]:
         """Return the functions that took part in the last call."""

@@ -103,6 +103,12 @@ class RunReport:
         return tuple(self.durations_ns)
 
     @property
+    def is_whole(self) -> bool:
+        """Whether every function of the graph ran, and none failed."""
+        durations_ns = self._durations_ns
+        return type(durations_ns) is tuple and self._failed_at < 0 and min(durations_ns, default=0) >= 0
+
+    @property
     def failed(self) -> str | None:
         """The function that failed, or None."""
         return None if self._failed_at < 0 else self._program.steps[self._failed_at].name
