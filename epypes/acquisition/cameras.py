@@ -95,9 +95,10 @@ def _of_text(source: str | Path, fps: float | None, loop: bool) -> Camera:
 def _is_image(path: Path) -> bool:
     import cv2
 
-    # By its first bytes: reading the whole file as an image would load a film into the memory.
+    # By its first bytes: reading the whole file as an image would load a film into the memory. What only is called like
+    # an image would open as a film without a frame.
     with quiet():
-        return bool(cv2.haveImageReader(str(path)))
+        return bool(cv2.haveImageReader(str(path)) or (path.suffix and cv2.haveImageWriter(str(path))))
 
 
 def _of_number(number: int, fps: float | None) -> Camera:

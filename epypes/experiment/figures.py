@@ -29,10 +29,13 @@ _PARTS: Final = {
 # Of a curve, by as many sigmas from mu as there is something to see: a narrow peak on a wide axis has them all.
 _POINTS: Final = 160
 _SIGMAS: Final = 5.0
+# By as many the axis reaches below mu, at least.
+_SIGMAS_LEFT: Final = 2.5
+_BINS: Final = 60
 # What is beside the outermost mark, as a factor.
 _MARGIN: Final = 1.5
 # On more decades there is no room for numbers at 2 and 5.
-_FEW_DECADES: Final = 3.0
+_FEW_DECADES: Final = 3.6
 
 
 @in_style()
@@ -90,8 +93,8 @@ def figure_15(table: pd.DataFrame, *, side_by_side: bool = False) -> Figure:
     -------
     Figure
         Log-normal densities on a logarithmic axis of microseconds: a shape per experiment and a curve over all, a thin
-        line at its mode, thick lines at the measured range, and a dashed line at the mode in the paper. Values that
-        aren't positive are counted in the text, not fitted.
+        line at its mode, thick lines at the measured range, a dashed line at the mode in the paper, and behind them a
+        histogram of what was measured. Values that aren't positive are counted in the text, not fitted.
 
     Raises
     ------
@@ -134,8 +137,10 @@ def _densities(table: pd.DataFrame, column: str, title: str, meaning: str) -> Fi
     if not whole.count:
         return told(figure, axes, f"Of {counted(len(rows), 'value')} none is positive, so there is nothing to fit.")
     experiments = [lognormal_fit(values) for _, values in rows.groupby("experiment")[column]]
-    _axis(axes, rows.loc[rows[column] > 0, column], whole, PAPER[column])
+    positive = rows.loc[rows[column] > 0, column]
+    _axis(axes, positive, whole, PAPER[column])
     axes.set_xlabel(meaning)
+    _histogram(axes, positive)
     _curves(axes, whole, experiments)
     return finished(
         figure,
@@ -155,12 +160,21 @@ def _axis(axes: Axes, times: pd.Series[float], whole: LogNormal, paper: float) -
         axes.axvline(time, color=INK, linewidth=3, label=label, ymax=0.25)
     axes.axvline(mode, color=INK, linewidth=0.9, label=f"mode: {_number(mode)} µs")
     axes.axvline(paper, color=RED, linewidth=1.6, linestyle=(0, (4, 2)), label=f"the paper's mode: {_number(paper)} µs")
-    low, high = min(least, mode, paper) / _MARGIN, max(most, mode, paper) * _MARGIN
+    # To the left a fit may reach further than what was measured.
+    low = min(least, mode, paper, _US * float(np.exp(whole.mu - _SIGMAS_LEFT * whole.sigma))) / _MARGIN
+    high = max(most, mode, paper) * _MARGIN
     axes.set_xscale("log")
     axes.set_xlim(low, high)
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if np.log10(high / low) < _FEW_DECADES else (1,)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda time, _: _number(time)))
     axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _histogram(axes: Axes, times: pd.Series[float]) -> None:
+    """Draw how dense the measured values are, in bins that are equally wide on the axis."""
+    if times.nunique() > 1:
+        bins = np.geomspace(_US * times.min(), _US * times.max(), _BINS)
+        axes.hist(_US * times, bins=bins, density=True, color=INK, alpha=0.16, label="histogram", zorder=0)
 
 
 def _curves(axes: Axes, whole: LogNormal, experiments: list[LogNormal]) -> None:

@@ -61,4 +61,7 @@ def message_class(full_name: str) -> Any:
         if not _pools:
             _pools.append(_filled_pool())
         found = GetMessageClass(_pools[0].FindMessageTypeByName(full_name))
+        # Protobuf sets neither; help() fails without a module, and tells nobody of the fields.
+        found.__module__ = "epypes.wire"
+        found.__doc__ = f"The message {full_name}: {', '.join(found.DESCRIPTOR.fields_by_name)}."
         return _classes.setdefault(full_name, found)

@@ -396,3 +396,10 @@ def test_closing_ends_the_wait_for_the_next_frame_at_once():
 def test_a_pace_slower_than_any_clock_can_wait_is_possible():
     camera = ep.camera(GRAY, fps=5e-324)
     assert camera.read() is not None
+
+
+@pytest.mark.parametrize("name", ["text.png", "text.jpg", "text.tiff"])
+def test_a_file_that_is_only_called_like_an_image_is_refused(tmp_path, name):
+    (tmp_path / name).write_text("no image, although it is called like one")
+    with pytest.raises(ImageFileError, match=name):
+        ep.camera(tmp_path / name)

@@ -65,6 +65,15 @@ def test_the_rows_given_are_drawn_whatever_their_index(measured):
 
 
 @pytest.mark.parametrize(("draw", "column", "paper"), OF_OVERHEADS)
+def test_what_was_measured_is_seen_beside_what_was_fitted(measured, draw, column, paper):
+    figure = draw(measured)
+    (bars,) = figure.axes[0].containers
+    assert sum(bar.get_width() * bar.get_height() for bar in bars) == pytest.approx(1)
+    assert bars[0].get_x() == pytest.approx(1e6 * measured[column].min())
+    assert "histogram" in texts(figure)
+
+
+@pytest.mark.parametrize(("draw", "column", "paper"), OF_OVERHEADS)
 def test_lines_stand_at_the_mode_the_measured_range_and_the_papers_mode(measured, draw, column, paper):
     figure = draw(measured)
     least, most, mode, papers = (line.get_xdata()[0] for line in figure.axes[0].lines[:4])

@@ -269,3 +269,12 @@ def ours():
 @pytest.mark.parametrize("order", ["users(); ours()", "ours(); users(); ours()"])
 def test_a_users_own_messages_of_the_same_names_do_not_clash(order):
     subprocess.run([sys.executable, "-c", USER + order], check=True, timeout=60)
+
+
+def test_help_tells_of_the_messages_and_their_fields():
+    import pydoc
+
+    from epypes import wire
+
+    assert "class Event" in pydoc.plain(pydoc.render_doc(wire))
+    assert "contents, id, attributes" in pydoc.plain(pydoc.render_doc(wire.JustBytes))
