@@ -9,8 +9,13 @@ import math
 import pytest
 from rich.console import Console
 
+from epypes.experiment.components import Settings
+from epypes.experiment.layouts import LAYOUTS, running
+from epypes.experiment.robot import Robot
+from epypes.wire import attributes
 from tests.apart import apart
-from tests.benchmarks import engine, pipeline, tuning
+from tests.benchmarks import case, engine, pipeline, tuning
+from tests.benchmarks.case.by_hand import ByHand
 from tests.benchmarks.peers import natural_functions
 from tests.benchmarks.row import OURS, Goal, Row, row
 from tests.benchmarks.table import as_table, write_json
@@ -61,6 +66,31 @@ def test_a_quick_run_of_the_pipelines_benchmark_compares_the_same_events():
     assert found.limit_ns > 0
     assert found.ours_ns > 0
     assert found.reached is not None
+
+
+@pytest.mark.slow
+def test_a_quick_run_of_the_case_system_keeps_every_row():
+    rows = case.rows(QUICK)
+    assert [found.work.removeprefix("the case system: ") for found in rows] == [
+        "trip",
+        "trip, two at a time",
+        "o_network",
+        "vision.o_cg, mode",
+        "vision.o_epypes, mode",
+        "CPU per request",
+        "CPU of one idle second",
+    ]
+    assert all(found.ours_ns > 0 and found.goal is not None for found in rows)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("threads", [1, 2])
+def test_hand_written_processes_answer_as_the_case_system_does(threads):
+    with ByHand(threads) as system, running(LAYOUTS["paper"], Settings(workers=threads)) as ours:
+        _, by_hand = system.ask()
+        answer = Robot(ours.requests, ours.inbox).ask()
+    assert by_hand.contents == answer.contents
+    assert attributes(by_hand).keys() == answer.attributes.keys()
 
 
 def test_contenders_that_compute_something_else_are_not_timed():
