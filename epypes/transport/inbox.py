@@ -75,8 +75,8 @@ class Inbox:
         except queues.Full:
             self.received -= 1
             self.dropped["queue full"] += 1
-        except Exception as error:
-            # The user's queue may raise anything, a Mailbox of policy "fault" does; the others' sockets go on.
+        except BaseException as error:
+            # The user's queue may raise anything, even SystemExit, a Mailbox of policy "fault" does; the others' sockets go on.
             self.received -= 1
             self.dropped[type(error).__name__] += 1
             log.warning("the queue refused a message: %r", error)
