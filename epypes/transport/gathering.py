@@ -28,11 +28,6 @@ class Gatherer:
         self._bytes = 0
         self._reason = ""
 
-    @property
-    def is_amid(self) -> bool:
-        """Whether the message that was begun goes on."""
-        return bool(self._frames or self._reason)
-
     def read(self, socket: zmq.Socket[bytes]) -> Sequence[zmq.Frame] | None:
         """Return the frames of a message, or None if it goes on; none if it is `refused`.
 

@@ -83,7 +83,7 @@ class Inbox:
             self.received -= 1
             self.dropped["queue full"] += 1
         except BaseException as error:
-            # The user's queue may raise anything, even SystemExit, a Mailbox of policy "fault" does; the others' sockets go on.
+            # The user's queue may raise anything, as a Mailbox of policy "fault" does; the others' sockets go on.
             self.received -= 1
             self.dropped[type(error).__name__] += 1
             log.warning("the queue refused a message: %r", error)
