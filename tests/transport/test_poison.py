@@ -109,12 +109,11 @@ def test_of_a_message_of_too_many_or_too_large_frames_none_is_kept_and_the_next_
         assert sub.rejected == {"too large": 1, "too many frames": 1}
 
 
-def test_a_message_of_very_many_frames_is_read_a_part_at_a_time_so_that_other_sockets_get_their_turn(poisoner):
-    with zmq.Context() as context, context.socket(zmq.SUB) as socket:
-        socket.subscribe(b"")
-        port = socket.bind_to_random_port("tcp://127.0.0.1")
-        poisoner(f"tcp://127.0.0.1:{port}").send_multipart([b"/", *[b""] * 5_000])
-        assert socket.poll(WAIT_S * 1000)
+def test_a_message_of_very_many_frames_is_read_a_part_at_a_time_so_that_other_sockets_get_their_turn():
+    with zmq.Context() as context, context.socket(zmq.PULL) as socket, context.socket(zmq.PUSH) as peer:
+        socket.bind("inproc://long")
+        peer.connect("inproc://long")
+        peer.send_multipart([b"/", *[b""] * 5_000])
         gatherer, parts = Gatherer(Limits()), 1
         while (frames := gatherer.read(socket)) is None:
             parts += 1
