@@ -13,6 +13,9 @@ from epypes.wire.multipart import Stamp
 
 Frames = Sequence[bytes | memoryview]
 
+# Sources are remembered by whoever numbers their envelopes, and by whoever counts what is lost of them.
+_MAX_SOURCE_BYTES = 1_024
+
 
 class Framing:
     """Makes frames of items, and numbers the envelopes among them; one from a publisher's start to its stop."""
@@ -54,9 +57,17 @@ class Framing:
         return (data,)
 
     def _envelope_frames(self, envelope: Envelope) -> Frames:
+        check_source(envelope.source)
         number = self._sequences[envelope.source] + 1
         stamp = Stamp(self._epoch, number, time.time_ns())
         frames = encode(envelope, self._topic, limits=self._limits, stamp=stamp)
         # Counted when it can be sent: a rejected item is no loss on the way.
         self._sequences[envelope.source] = number
         return frames
+
+
+def check_source(source: str) -> None:
+    """Raise MessageError if a source's name is too long."""
+    size = len(source.encode(errors="surrogatepass"))
+    if size > _MAX_SOURCE_BYTES:
+        raise MessageError("bad source", f"A source's name of {size:,} bytes; {_MAX_SOURCE_BYTES:,} is the limit.")

@@ -67,6 +67,6 @@ class Pulse:
         self.is_stale = is_stale
         try:
             self._report(is_stale)
-        except Exception:
+        except BaseException:
             # It is the user's; the other sockets go on.
             log.exception("on_stale itself failed")

@@ -12,7 +12,8 @@ from typing import Any, Protocol
 import zmq
 
 from epypes.errors import MessageError
-from epypes.transport.joining import Guest
+from epypes.transport.framing import check_source
+from epypes.transport.joining import IDENTITY_BYTES, Guest
 from epypes.wire import Envelope, Limits, decode
 
 log = logging.getLogger("epypes.transport")
@@ -45,7 +46,8 @@ class Inbox:
 
     def accept(self, frames: Sequence[zmq.Frame], guest: Guest) -> None:
         """Take a message: the answer to a join, an envelope, or one of 2019."""
-        if len(frames) == 2 and guest.saw(frames[0].bytes, frames[1].bytes):
+        # A message that is no answer for its size goes the way of others.
+        if len(frames) == 2 and len(frames[1]) == IDENTITY_BYTES and guest.saw(frames[0].bytes, frames[1].bytes):
             return
         if self._undecoded:
             self.put(tuple(frame.buffer for frame in frames))
@@ -55,12 +57,17 @@ class Inbox:
             return
         try:
             envelope = decode([frame.buffer for frame in frames], self._limits)
+            check_source(envelope.source)
         except MessageError as error:
-            self.rejected[error.reason] += 1
-            log.warning("rejected a message (%s): %s", error.reason, error)
+            self.reject(error.reason, str(error))
             return
         self._follow(envelope)
         self.put(envelope)
+
+    def reject(self, reason: str, text: str) -> None:
+        """Count a message that can't be understood."""
+        self.rejected[reason] += 1
+        log.warning("rejected a message (%s): %s", reason, text)
 
     def begin(self) -> None:
         """Take note that a socket is opened."""
@@ -75,8 +82,8 @@ class Inbox:
         except queues.Full:
             self.received -= 1
             self.dropped["queue full"] += 1
-        except Exception as error:
-            # The user's queue may raise anything, a Mailbox of policy "fault" does; the others' sockets go on.
+        except BaseException as error:
+            # The user's queue may raise anything, as a Mailbox of policy "fault" does; the others' sockets go on.
             self.received -= 1
             self.dropped[type(error).__name__] += 1
             log.warning("the queue refused a message: %r", error)

@@ -240,9 +240,9 @@ class IOThread:
         try:
             if reader is not None and reader():
                 self._unfinished.add(source)
-        except Exception:
+        except BaseException as error:
             # A reader counts what it can't read; this is a bug of ours, and must not stop the others.
-            log.exception("a reader failed")
+            _complain("a reader failed", error)
 
     def _catch_up(self) -> None:
         if monotonic() >= self._next_due_s:
@@ -259,8 +259,8 @@ class IOThread:
                 known.due_s = now_s + known.every_s
                 try:
                     known.tick()
-                except Exception:
-                    log.exception("what was due failed")
+                except BaseException as error:
+                    _complain("what was due failed", error)
                 self._unfinished.add(known.source)
         self._next_due_s = min((known.due_s for known in self._owned.values()), default=float("inf"))
 
@@ -276,12 +276,18 @@ class IOThread:
             command, future = self._commands.popleft()
             try:
                 future.set_result(command(self))
-            except Exception as error:
+            except BaseException as error:
                 # It belongs to the thread that asked, with its traceback.
                 future.set_exception(error)
         # A command that used a socket may have used up its signal as well.
         self._unfinished.update(known.source for known in self._owned.values())
         return False
+
+
+def _complain(text: str, error: BaseException) -> None:
+    # A handler of the user's may raise anything as well.
+    with contextlib.suppress(BaseException):
+        log.error(text, exc_info=error)
 
 
 def _close(owned: Socket, endpoint: str) -> None:

@@ -19,6 +19,10 @@ import zmq
 from epypes.transport.iothread import Socket, has_arrived
 
 JOIN_PREFIX = b"\xff\xffepypes/join/"
+# Of the publisher that answers: a UUID.
+IDENTITY_BYTES = 16
+# A peer that invents identities must not fill the memory.
+_MAX_PUBLISHERS = 512
 _SUBSCRIBE, _UNSUBSCRIBE = 1, 0
 _BATCH = 100
 # ZMQ_XPUB_MANUAL_LAST_VALUE: the next message goes only to the peer whose subscription was read last. It is a draft
@@ -111,7 +115,8 @@ class Guest:
         """Take note of a message that is an answer to a join; return whether it is one, of any subscriber's."""
         if topic == self.topic:
             with self._changed:
-                self._publishers.add(identity)
+                if len(self._publishers) < _MAX_PUBLISHERS:
+                    self._publishers.add(identity)
                 self._changed.notify_all()
         return topic.startswith(JOIN_PREFIX)
 

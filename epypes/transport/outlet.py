@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import threading
 import weakref
 from collections import Counter, deque
 from dataclasses import dataclass, field
-from threading import get_ident
 
 import zmq
 
@@ -26,6 +26,7 @@ log = logging.getLogger("epypes.transport")
 _MAX_SUBSCRIPTION_BYTES = 64 * 1024
 # Below this a copy takes less time than to keep account of a buffer that is lent.
 _LENT_FROM_BYTES = 64 * 1024
+_BREAK_TRIES = 5
 _DONTWAIT, _MORE = int(zmq.DONTWAIT), int(zmq.DONTWAIT | zmq.SNDMORE)
 
 
@@ -48,8 +49,9 @@ class Outlet:
         self._counts = counts
         self._process = os.getpid()
         # The turn is held while an item is made into frames, which runs its own code, the lock to touch the socket.
-        self._turn, self._lock = threading.Lock(), threading.Lock()
-        self._whose = 0
+        # Re-entrant, since a signal's handler may publish anywhere: it gets the turn, and is busy or not.
+        self._turn, self._lock = threading.RLock(), threading.Lock()
+        self._is_busy = self._has_asked = False
         self._later: deque[object] = deque()
         self._socket: io.Socket | None = None
         self.doorkeeper = Doorkeeper()
@@ -79,8 +81,9 @@ class Outlet:
 
     def forget(self) -> None:
         """Forget the socket, and the threads that held the locks, in a forked child."""
-        self._turn, self._lock = threading.Lock(), threading.Lock()
-        self._socket, self._whose = None, 0
+        self._turn, self._lock = threading.RLock(), threading.Lock()
+        self._socket, self._is_busy = None, False
+        self._later.clear()
 
     def close(self, timeout_s: float = 10.0) -> None:
         """Close the socket; what was sent still leaves."""
@@ -96,28 +99,31 @@ class Outlet:
         """Send an item; what can't be sent is counted and logged. Arrays that could be changed are copied first.
 
         From any thread, one after the other; an item that is published from within, by its own code or by a signal's
-        handler, follows.
+        handler, follows. What such a handler raises, as Ctrl+C does, comes as it is, and the next item is sent.
         """
-        if not self._turn.acquire(False):
-            if self._whose == get_ident():
-                self._later.append(item)
-                return
-            self._turn.acquire()
-        self._whose = get_ident()
-        # Few calls from here to the socket: after an image has filled the caches each takes 3 to 5 us.
-        try:
-            frames = self._framing.frames(item)
-            with self._lock:
-                self._send(frames)
-        except Exception as error:
-            self._refuse(item, error)
-        finally:
-            self._whose = 0
-            self._turn.release()
-        while self._later:
-            self.publish(self._later.popleft())
+        # A signal is handled neither between the lock and its block nor between a flag and its try; wherever else one
+        # comes, its handler finds the flag down and sends, or up and leaves its item to whoever has put it up.
+        with self._turn:
+            self._later.append(item)
+            while self._later and not self._is_busy:
+                self._is_busy = True
+                sent = self._counts.sent
+                # Few calls from here to the socket: after an image has filled the caches each takes 3 to 5 us.
+                try:
+                    item = self._later.popleft()
+                    frames = self._framing.frames(item)
+                    with self._lock:
+                        self._send(frames)
+                except BaseException as error:
+                    self._refuse(item, error, self._counts.sent > sent)
+                    if not isinstance(error, Exception):
+                        raise
+                finally:
+                    self._is_busy = False
 
-    def _refuse(self, item: object, error: Exception) -> None:
+    def _refuse(self, item: object, error: BaseException, has_left: bool) -> None:
+        if has_left:
+            return
         if isinstance(error, MessageError):
             self.reject(error.reason, str(error))
         elif isinstance(error, zmq.ZMQError):
@@ -138,19 +144,28 @@ class Outlet:
             raise zmq.ZMQError(zmq.ENOTSOCK)
         # Counted before: whoever has received it must find it counted.
         self._counts.sent += 1
+        is_last = False
         try:
             for frame in frames[:-1]:
                 socket.send(frame, _MORE, copy=not _can_be_lent(frame))
-            last = frames[-1]
+            last, is_last = frames[-1], True
             socket.send(last, _DONTWAIT, copy=len(last) < _LENT_FROM_BYTES or not _can_be_lent(last))
         except zmq.ZMQError:
             self._counts.sent -= 1
             raise
-        if io.has_arrived(socket) and self.doorkeeper.read():
+        except BaseException:
+            # Within the last frame nobody can tell whether it has left; mostly it has.
+            self._counts.sent -= not is_last
+            _break_off(socket, frames)
+            raise
+        # The I/O thread reads it: an answer to a join must not be interrupted by a signal.
+        if io.has_arrived(socket) and not self._has_asked:
             io.soon(lambda thread: thread.read_again(socket))
+            self._has_asked = True
 
     def _read(self) -> bool:
         with self._lock:
+            self._has_asked = False
             return self.doorkeeper.read()
 
 
@@ -171,3 +186,19 @@ def _can_be_lent(frame: bytes | memoryview) -> bool:
     if len(frame) < _LENT_FROM_BYTES:
         return False
     return isinstance(frame, bytes) or is_settled(frame)
+
+
+def _break_off(socket: io.Socket, frames: Frames) -> None:
+    """End a message that was interrupted, so that the receiver rejects it, and not the next one as well.
+
+    How many frames have left can't be told. After some of them these two make a message that has the wrong ones; alone
+    they make one without a header.
+    """
+    if len(frames) < 2:
+        return
+    for _ in range(_BREAK_TRIES):
+        # Another signal may come.
+        with contextlib.suppress(BaseException):
+            socket.send(frames[0], _MORE)
+            socket.send(b"", _DONTWAIT)
+            return

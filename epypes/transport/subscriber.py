@@ -17,6 +17,7 @@ import zmq
 
 from epypes.errors import StillRunning
 from epypes.transport import io
+from epypes.transport.gathering import Gatherer
 from epypes.transport.heartbeat import Pulse
 from epypes.transport.inbox import Inbox, PutQueue, Source
 from epypes.transport.joining import Guest
@@ -29,7 +30,6 @@ log = logging.getLogger("epypes.transport")
 HIGH_WATER_MARK = 1_000
 # Two small messages in this time cost no CPU to speak of.
 HEARTBEAT_S = 1.0
-_DONTWAIT = int(zmq.DONTWAIT)
 
 
 class ZMQSubscriber:
@@ -55,7 +55,9 @@ class ZMQSubscriber:
         With keys: the public keys of the peers that may connect, as text, .key files or a folder of these; where it
         connects itself, the one of the peer that is bound there.
     max_message_bytes
-        A peer that sends a larger frame is disconnected; a larger message is counted in `rejected`.
+        A peer that sends a larger frame is disconnected; a larger message of several frames is counted in `rejected`.
+        ZeroMQ keeps such a message in memory until its last frame has come: from peers that may do harm only keys
+        protect.
     high_water_mark
         Messages kept by ZeroMQ until the I/O thread has read them.
     undecoded
@@ -164,7 +166,8 @@ class ZMQSubscriber:
         """
         with self._lock:
             if self._opened is None or self._opened.is_gone():
-                self._opened = opened = _Opened(self._inbox, Pulse(self._heartbeat_s, _reporter(self)))
+                pulse = Pulse(self._heartbeat_s, _reporter(self))
+                self._opened = opened = _Opened(self._inbox, pulse, self._limits)
                 try:
                     opened.open(self._given, self._security, self._options(opened.guest), self._heartbeat_s)
                 except BaseException:
@@ -233,8 +236,9 @@ class ZMQSubscriber:
 class _Opened:
     """From a start to its stop: the socket, and who has confirmed its subscription."""
 
-    def __init__(self, inbox: Inbox, pulse: Pulse) -> None:
+    def __init__(self, inbox: Inbox, pulse: Pulse, limits: Limits) -> None:
         self._inbox, self.pulse = inbox, pulse
+        self._gatherer = Gatherer(limits)
         self._process = os.getpid()
         self._socket: io.Socket | None = None
         self.guest = Guest()
@@ -281,10 +285,15 @@ class _Opened:
         if socket is None or socket.closed:
             return False
         try:
-            frame = socket.recv(_DONTWAIT, copy=False)
+            frames = self._gatherer.read(socket)
         except zmq.Again:
             return False
-        self._inbox.accept([frame, *_rest(socket)] if frame.more else [frame], self.guest)
+        if frames is None:
+            return True
+        if frames:
+            self._inbox.accept(frames, self.guest)
+        else:
+            self._inbox.reject(self._gatherer.refused(), "it is larger than the limits")
         # After it, since the thread that waits for the message is woken up by now. Whether there are more the poller
         # finds out: to ask here would keep the interpreter's lock from that thread.
         self.pulse.heard()
@@ -301,13 +310,6 @@ def _reporter(subscriber: ZMQSubscriber) -> Callable[[bool], None]:
             found.on_stale(is_stale)
 
     return report
-
-
-def _rest(socket: io.Socket) -> list[zmq.Frame]:
-    frames = [socket.recv(_DONTWAIT, copy=False)]
-    while frames[-1].more:
-        frames.append(socket.recv(_DONTWAIT, copy=False))
-    return frames
 
 
 def _abandon(opened: _Opened, address: str) -> None:

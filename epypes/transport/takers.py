@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import queue as queues
 import threading
@@ -132,15 +133,20 @@ class Bridge:
             item = self._queue.get(timeout=timeout_s)
         except queues.Empty:
             return False
-        except Exception as error:
+        except BaseException as error:
             # A queue that is shut down or broken raises at once, each time: without the pause this would spin.
             self._outlet.reject("queue failed", f"the queue raised {error!r}", log_once=True)
             time.sleep(_TICK_S)
             return False
-        self._outlet.publish(item)
+        # The outlet has counted what the item's own code raises, even SystemExit; the thread goes on.
+        with contextlib.suppress(BaseException):
+            self._outlet.publish(item)
         return True
 
 
 def _size(queue: object) -> int | None:
-    size = getattr(queue, "qsize", None)
-    return int(size()) if callable(size) else None
+    """Return how many items a queue has, or None if it can't tell, as one of multiprocessing on macOS."""
+    try:
+        return int(queue.qsize())  # type: ignore[attr-defined]  # not every queue has one
+    except BaseException:
+        return None

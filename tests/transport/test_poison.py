@@ -11,8 +11,10 @@ import pytest
 import zmq
 
 from epypes.errors import MessageError
-from epypes.transport import ZMQSubscriber
-from epypes.wire import Envelope, decode, encode
+from epypes.pipeline import Mailbox
+from epypes.transport import ZMQPublisher, ZMQSubscriber
+from epypes.transport.gathering import Gatherer
+from epypes.wire import Envelope, Limits, decode, encode
 from tests.wire.mutants import mutate_description, mutate_frames
 
 WAIT_S = 30.0
@@ -92,3 +94,64 @@ def test_of_10000_broken_messages_through_a_socket_each_is_counted_and_the_next_
         assert not sub.dropped
     assert len(sub.rejected) >= 12, "many kinds of broken messages were tried"
     assert not caplog.records, "no reader failed"
+
+
+@pytest.mark.parametrize("undecoded", [False, True])
+def test_of_a_message_of_too_many_or_too_large_frames_none_is_kept_and_the_next_one_arrives(poisoner, undecoded):
+    into = queue.SimpleQueue()
+    with ZMQSubscriber("tcp://127.0.0.1:*", into, bind=True, max_message_bytes=100_000, undecoded=undecoded) as sub:
+        socket = poisoner(sub.address)
+        socket.send_multipart([b"/", *[bytes(90_000)] * 20])
+        socket.send_multipart([b"/", *[b""] * 5_000])
+        socket.send_multipart(encode(Envelope("good")))
+        item = into.get(timeout=WAIT_S)
+        assert len(item) == 2 if undecoded else item.type == "good"
+        assert sub.rejected == {"too large": 1, "too many frames": 1}
+
+
+def test_a_message_of_very_many_frames_is_read_a_part_at_a_time_so_that_other_sockets_get_their_turn():
+    with zmq.Context() as context, context.socket(zmq.PULL) as socket, context.socket(zmq.PUSH) as peer:
+        socket.bind("inproc://long")
+        peer.connect("inproc://long")
+        peer.send_multipart([b"/", *[b""] * 5_000])
+        gatherer, parts = Gatherer(Limits()), 1
+        while (frames := gatherer.read(socket)) is None:
+            parts += 1
+        assert parts > 10
+        assert len(frames) == 0
+        assert gatherer.refused() == "too many frames"
+
+
+def test_false_answers_to_a_join_are_counted_if_they_are_none_and_bounded_if_they_are(poisoner):
+    into = queue.SimpleQueue()
+    with ZMQSubscriber("tcp://127.0.0.1:*", into, bind=True) as sub:
+        context = zmq.Context()
+        socket = context.socket(zmq.XPUB)
+        socket.connect(sub.address)
+        topics = [socket.recv()[1:] for _ in range(2)]
+        join = max(topics)
+        socket.send_multipart([join, bytes(100_000)])
+        for number in range(2_000):
+            socket.send_multipart([join, number.to_bytes(16, "little")])
+            # Not more at once than a socket keeps.
+            if number % BATCH == 0:
+                socket.send_multipart(encode(Envelope("good")))
+                assert into.get(timeout=WAIT_S).type == "good"
+        assert sub.rejected.total() == 1
+        assert sub.wait_joined(WAIT_S, publishers=100)
+        assert not sub.wait_joined(0.0, publishers=1_000)
+        socket.close(linger=0)
+        context.term()
+
+
+def test_a_source_with_an_endless_name_is_rejected_on_both_sides(poisoner):
+    into, out = queue.SimpleQueue(), Mailbox()
+    with ZMQSubscriber("tcp://127.0.0.1:*", into, bind=True) as sub:
+        socket = poisoner(sub.address)
+        socket.send_multipart(encode(Envelope("x", source="s" * 2_000, sequence=1, epoch=1)))
+        socket.send_multipart(encode(Envelope("x", source="s" * 1_024, sequence=1, epoch=1)))
+        assert len(into.get(timeout=WAIT_S).source) == 1_024
+        assert sub.rejected == {"bad source": 1}
+    with ZMQPublisher("tcp://127.0.0.1:*", out) as pub:
+        out.put(Envelope("x", source="s" * 2_000))
+        assert pub.rejected == {"bad source": 1}
