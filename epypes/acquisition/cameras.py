@@ -12,10 +12,13 @@ from epypes.acquisition.files import read_image
 from epypes.acquisition.pace import Camera, paced, require_fps
 from epypes.acquisition.pictures import Sequence, Still, folder
 from epypes.acquisition.quiet import quiet
+from epypes.errors import ImageFileError
 from epypes.run.guard import is_array
 
 # Of sources that would give frames as fast as a processor can.
 USUAL_FPS: Final = 10.0
+# OpenCV takes the number of a device as a C int.
+LAST_DEVICE: Final = 2**31 - 1
 
 
 def camera(source: Any, fps: float | None = None, *, loop: bool = True) -> Camera:
@@ -82,9 +85,14 @@ def _of_text(source: str | Path, fps: float | None, loop: bool) -> Camera:
     if isinstance(source, str) and "://" in source:
         return captures.device(source, fps)
     path = Path(source)
-    if path.is_char_device():
+    try:
+        is_device, is_folder = path.is_char_device(), path.is_dir()
+    except OSError as error:  # of a name that is too long
+        text = f"Image '{source!s:.80}' can't be read: {error.strerror}. Check the path."
+        raise ImageFileError(str(path), text) from error
+    if is_device:
         return captures.device(str(path), fps)
-    if path.is_dir():
+    if is_folder:
         return paced(folder(path, loop), fps or USUAL_FPS)
     if not path.is_file() or _is_image(path):
         return paced(Still(read_image(path), loop), fps or USUAL_FPS)
@@ -102,8 +110,8 @@ def _is_image(path: Path) -> bool:
 
 
 def _of_number(number: int, fps: float | None) -> Camera:
-    if number < 0:
-        raise ValueError(f"No camera has the number {number}. The first one is 0.")
+    if not 0 <= number <= LAST_DEVICE:
+        raise ValueError(f"No camera has the number {number}. They go from 0 to {LAST_DEVICE}.")
     return captures.device(number, fps)
 
 

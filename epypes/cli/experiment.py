@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 # Drawing takes the processor from what is measured: so it is done between requests, and not often.
 _DRAW_EVERY_S = 0.5
+_MOST_DIGITS = 100
 
 
 def experiment(
@@ -57,7 +58,7 @@ def experiment(
             fps=fps,
             unsafe_pickle=unsafe_pickle,
             progress=on_request,
-            cameras=[int(source) if source.isdecimal() else source for source in camera or ()],
+            cameras=[_source(text) for text in camera or ()],
             timeout_s=timeout,
         )
     _print_table(results)
@@ -65,6 +66,11 @@ def experiment(
     if to is not None:
         written = _write(results, to, side_by_side=workers > 1)
         out.print(f"Left in {to}: {', '.join(path.name for path in written)}.")
+
+
+def _source(text: str) -> str | int:
+    # More digits than these are no number that Python reads.
+    return int(text) if text.isdecimal() and len(text) <= _MOST_DIGITS else text
 
 
 def _make_folder(folder: Path) -> None:

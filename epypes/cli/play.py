@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,6 +11,7 @@ import typer
 
 from epypes.cli.ending import Ending
 from epypes.cli.terminal import out
+from epypes.errors import RecordingError
 from epypes.wording import counted
 
 if TYPE_CHECKING:
@@ -35,6 +37,8 @@ def play(
     if only_info:
         _print_info(file, recording_info(file))
         return
+    if speed == math.inf:
+        raise RecordingError(file, "--speed inf is no speed. 0 is as fast as possible.")
     place = address.removeprefix(_CONNECT)
     bind = not address.startswith(_CONNECT)
     with Ending() as ending:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +10,7 @@ import typer
 
 from epypes.cli.ending import Ending
 from epypes.cli.terminal import out
+from epypes.errors import RecordingError
 
 _BIND = "bind:"
 # Long enough for a publisher that is there to confirm; one of 2019 never does.
@@ -29,6 +31,9 @@ def record(
     """Write every message that is published into a file, until SIGTERM or Ctrl+C."""
     from epypes.transport import Recorder
 
+    if seconds is not None and seconds > threading.TIMEOUT_MAX:
+        text = f"--seconds {seconds:g} is too long: {threading.TIMEOUT_MAX:.0f} at most; without it, Ctrl+C ends it."
+        raise RecordingError(file, text)
     bind = address.startswith(_BIND)
     place = address.removeprefix(_BIND)
     with Ending() as ending:

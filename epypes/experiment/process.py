@@ -1,7 +1,7 @@
 """How are nodes run in a process of their own, and how does it end?
 
 The process is told by a line of JSON what to do, tells by another where it can be reached, and ends when the pipe to
-its standard input is closed: so it never outlives this process, even if this one is killed.
+its standard input is closed: so it never outlives this process, even if this one is killed while it starts.
 """
 
 from __future__ import annotations

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from epypes.acquisition.cameras import LAST_DEVICE
 from epypes.errors import ExperimentError
 from epypes.experiment.components import Settings
 from epypes.experiment.layouts import LAYOUTS, running
@@ -77,7 +79,8 @@ def run_experiment(
     import pandas as pd  # noqa: F401 - missing here, rather than after the last experiment
 
     _check(layout, requests=requests, experiments=experiments, workers=workers)
-    _check_numbers(fps=fps, timeout_s=timeout_s)
+    _check_number("fps", fps)
+    _check_number("timeout_s", timeout_s, threading.TIMEOUT_MAX)
     settings = Settings(_checked_cameras(cameras), float(fps), workers, bool(unsafe_pickle))
     rows: list[dict[str, Any]] = []
     counts: Counter[str] = Counter()
@@ -123,10 +126,11 @@ def _check(layout: str, **counts: int) -> None:
             raise ExperimentError(name, f"{name} must be a whole number from 1, not {count!r}.")
 
 
-def _check_numbers(**numbers: float) -> None:
-    for name, number in numbers.items():
-        if isinstance(number, bool) or not isinstance(number, int | float) or not 0 < number < math.inf:
-            raise ExperimentError(name, f"{name} must be a number above 0, not {number!r}.")
+def _check_number(name: str, number: float, most: float = math.inf) -> None:
+    if isinstance(number, bool) or not isinstance(number, int | float) or not 0 < number < math.inf:
+        raise ExperimentError(name, f"{name} must be a number above 0, not {number!r}.")
+    if number > most:
+        raise ExperimentError(name, f"{name} must be at most {most:.0f}, not {number!r}.")
 
 
 def _checked_cameras(cameras: Sequence[str | Path | int]) -> tuple[str | int, ...]:
@@ -134,4 +138,7 @@ def _checked_cameras(cameras: Sequence[str | Path | int]) -> tuple[str | int, ..
     given = [cameras] if isinstance(cameras, str | Path | int) else list(cameras)
     if len(given) not in (0, 2) or any(not isinstance(source, str | Path | int) for source in given):
         raise ExperimentError("cameras", f"cameras must be two, each a path or the number of a device, not {given!r}.")
+    for source in given:
+        if type(source) is int and not 0 <= source <= LAST_DEVICE:
+            raise ExperimentError("cameras", f"No camera has the number {source}. They go from 0 to {LAST_DEVICE}.")
     return tuple(source if type(source) is int else str(Path(str(source)).absolute()) for source in given)

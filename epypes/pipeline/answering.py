@@ -45,9 +45,16 @@ class Answering:
         """Put an answer on q_out, when f_out has made it of the view; the hook for subclasses."""
         self.q_out.put(answer)
 
+    def _is_putting(self) -> bool:
+        """Whether an answer that f_out has made is on its way into q_out."""
+        return any("answer" in found for found in self._emitting())
+
+    def _emitting(self) -> list[dict[str, Any]]:
+        return [found for found in locals_under_way({Answering.emit.__code__}) if found["self"] is self]
+
     def _stages_after(self, failure: str) -> tuple[Stage, Stage]:
         """Return f_out and q_out as they are at this moment; ``failure`` is what f_out raised for the last event."""
-        calls = [found for found in locals_under_way({Answering.emit.__code__}) if found["self"] is self]
+        calls = self._emitting()
         is_in_f_out = any("view" in found and "answer" not in found for found in calls)
         return (
             function_stage("f_out", self.f_out, is_under_way=is_in_f_out, failure=failure),

@@ -14,9 +14,10 @@ def event_id(event: Any) -> str:
     """Return an event's id, if it has one that is a string; empty otherwise."""
     try:
         found = event.id
+        # A plain string, since a class of one's own may refuse to be compared.
+        return str.__str__(found) if isinstance(found, str) else ""
     except BaseException:  # any object can be an event, whatever its attributes do
         return ""
-    return found if isinstance(found, str) else ""
 
 
 class Attempts:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import logging
 import queue
 import threading
 import warnings
@@ -13,6 +12,7 @@ from time import monotonic
 from typing import Any
 
 from epypes.errors import StillRunning
+from epypes.pipeline.log import log_error
 
 # How long one take from a queue may block before the stop flag is looked at. Queues that others made can't be
 # woken without putting a sentinel into them, which would be an event of theirs.
@@ -20,7 +20,6 @@ POLL_S = 0.05
 # Of a queue that has been empty for a while: to wake up takes up to 100 us of a core.
 LONGEST_POLL_S = 0.2
 
-_log = logging.getLogger("epypes.pipeline")
 _left_running: weakref.WeakSet[EventLoop] = weakref.WeakSet()
 
 
@@ -147,8 +146,8 @@ class EventLoop:
                     return
                 poll_s = min(2 * poll_s, LONGEST_POLL_S)
                 continue
-            except BaseException:  # a queue's SystemExit must not end the thread in silence either
-                _log.exception("%s: the queue itself failed", self.name)
+            except BaseException as exception:  # a queue's SystemExit must not end the thread in silence either
+                log_error("%s: the queue itself failed", self.name, error=exception)
                 stop.wait(POLL_S)
                 continue
             try:
@@ -174,12 +173,12 @@ class EventLoop:
 
     def _report(self, event: Any, exception: BaseException) -> None:
         if self.on_error is None:
-            _log.error("%s: an event failed", self.name, exc_info=exception)
+            log_error("%s: an event failed", self.name, error=exception)
             return
         try:
             self.on_error(event, exception)
-        except BaseException:
-            _log.exception("%s: on_error itself failed", self.name)
+        except BaseException as its_own:
+            log_error("%s: on_error itself failed", self.name, error=its_own)
 
     def __repr__(self) -> str:
         state = "running" if self.is_running else "stopped"

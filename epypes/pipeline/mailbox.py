@@ -10,9 +10,12 @@ from time import monotonic
 from typing import Any, Final, Literal, get_args
 
 from epypes.errors import MailboxOverflow
+from epypes.pipeline.log import log_error
 
 Policy = Literal["latest", "drop_oldest", "block", "fault"]
 _POLICIES: Final = get_args(Policy)
+# What the policies that drop items call it.
+_DROPPED: Final = {"latest": "superseded", "drop_oldest": "oldest"}
 
 
 class Mailbox:
@@ -26,7 +29,8 @@ class Mailbox:
     size
         How many items it holds; 1 for ``"latest"``.
     on_drop
-        Called with each item that was dropped, on the thread that put the newer one.
+        Called with each item that was dropped, on the thread that put the newer one, when that is in the mailbox. What
+        it raises is logged (``epypes.pipeline``) and not raised from `put`, which has done what it should.
 
     Attributes
     ----------
@@ -106,15 +110,29 @@ class Mailbox:
         """Keep an item until somebody gets it, or return whom it must be handed to, since this has begun meanwhile."""
         _require_timeout(block, timeout)
         with self._changed:
-            dropped = self._make_room(block, timeout) if len(self._items) >= self.size else []
+            dropped: list[Any] = []
+            # A signal's handler may put between any two of these lines: its thread holds the lock already.
+            while len(self._items) >= self.size:
+                dropped += self._make_room(block, timeout)
             if self._take is not None:
                 return self._take
             self._items.append(item)
+            if len(self._items) > self.size and self.policy in _DROPPED:
+                dropped += self._drop_beyond(self.size)
             self._changed.notify_all()
-        if self._on_drop is not None:
-            for old in dropped:
-                self._on_drop(old)
+        for old in dropped:
+            self._tell(old)
         return None
+
+    def _tell(self, dropped: Any) -> None:
+        if self._on_drop is None:
+            return
+        try:
+            self._on_drop(dropped)
+        except KeyboardInterrupt:  # of the user, whom on_drop does not concern
+            raise
+        except BaseException as exception:
+            log_error("%r: on_drop failed", self, error=exception)
 
     def _make_room(self, block: bool, timeout: float | None) -> list[Any]:
         """Make room for one item; return what was dropped for it."""
@@ -125,8 +143,19 @@ class Mailbox:
             if not self._changed.wait_for(lambda: len(self._items) < self.size, wait_s):
                 raise queue.Full
             return []
-        self.dropped["superseded" if self.policy == "latest" else "oldest"] += 1
-        return [self._items.popleft()]
+        return self._drop_beyond(self.size - 1)
+
+    def _drop_beyond(self, most: int) -> list[Any]:
+        """Drop the oldest items until there are no more than so many; return them."""
+        items, dropped = self._items, []
+        try:
+            # Not by len(): after a call a signal's handler may run, and what was true may be so no more.
+            while True:
+                _ = items[most]
+                dropped.append(items.popleft())
+        except IndexError:
+            self.dropped[_DROPPED[self.policy]] += len(dropped)
+        return dropped
 
     def get(self, block: bool = True, timeout: float | None = None) -> Any:
         """Take the oldest item; raises queue.Empty if there is none within ``timeout`` seconds."""

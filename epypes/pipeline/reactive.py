@@ -6,7 +6,6 @@ a FullPipeline does both.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from time import perf_counter_ns
@@ -16,6 +15,7 @@ from epypes.errors import EpypesError
 from epypes.graph import CompGraph
 from epypes.pipeline.answering import Answering, FOut, OfThread
 from epypes.pipeline.attempts import Attempts, event_id
+from epypes.pipeline.log import log_error
 from epypes.pipeline.loop import EventLoop
 from epypes.pipeline.pipeline import Pipeline
 from epypes.pipeline.stages import Stages, function_stage, loop_stage, queue_stage
@@ -27,8 +27,6 @@ from epypes.run.underway import locals_under_way
 FIn = Callable[[Any], Mapping[str, Any]]
 # What an event is in: its f_in, its graph, or its f_out with the put on q_out.
 Where = Literal["f_in", "graph", "f_out"]
-
-_log = logging.getLogger("epypes.pipeline")
 
 
 class SourcePipeline(Answering, Pipeline):
@@ -175,31 +173,38 @@ class SinkPipeline(Pipeline):
 
     def _fail(self, event: Any, where: Where | None, exception: BaseException, run: Run | None) -> None:
         self.failed += 1
-        failed = run_that_raised(exception, self.runner) if where == "graph" else None
-        if failed is not None and failed.failure is not None:
-            failure = failed.failure
-        elif run is not None:
-            failure = Failure("f_out", self.cg.sink_tokens, dict(run), exception)
-        else:
-            # What the graph refuses to run on came from f_in; anything else was raised by a compute of one's own.
-            where = "f_in" if isinstance(exception, EpypesError) else where
-            function = "compute" if where == "graph" else "f_in"
-            failure = Failure(function, self.runner.free_source_tokens, {"event": event}, exception)
+        try:
+            where, failure = self._failure_of(event, where, exception, run)
+        except BaseException:  # whatever a run of one's own does, the failure is told
+            failure = Failure(where or "compute", (), {"event": event}, exception)
         # The text alone: the exception would keep the event and all its tokens.
-        self._failed_last = where, f"{type(exception).__name__}: {failure.message}", self.run_count
+        self._failed_last = where, f"{failure.kind}: {failure.message}", self.run_count
         failed_id = event_id(event)
         self._report(replace(failure, event_id=failed_id, attempt=self._attempts.count(failed_id), source=self.name))
 
+    def _failure_of(
+        self, event: Any, where: Where | None, exception: BaseException, run: Run | None
+    ) -> tuple[Where | None, Failure]:
+        """Return what failed, and where."""
+        failed = run_that_raised(exception, self.runner) if where == "graph" else None
+        if failed is not None and failed.failure is not None:
+            return where, failed.failure
+        if run is not None:
+            return where, Failure("f_out", self.cg.sink_tokens, dict(run), exception)
+        # What the graph refuses to run on came from f_in; anything else was raised by a compute of one's own.
+        where = "f_in" if issubclass(type(exception), EpypesError) else where
+        function = "compute" if where == "graph" else "f_in"
+        return where, Failure(function, self.runner.free_source_tokens, {"event": event}, exception)
+
     def _report(self, failure: Failure) -> None:
         if self.on_error is None:
-            expected = isinstance(failure.exception, EpypesError)
-            error = None if expected else failure.exception
-            _log.error("%s: an event failed in %s", self.name, failure, exc_info=error)
+            expected = issubclass(type(failure.exception), EpypesError)
+            log_error("%s: an event failed in %s", self.name, failure, error=None if expected else failure.exception)
             return
         try:
             self.on_error(failure)
-        except BaseException:
-            _log.exception("%s: on_error itself failed", self.name)
+        except BaseException as its_own:
+            log_error("%s: on_error itself failed", self.name, error=its_own)
 
     def listen(self, timeout_s: float = 0.5) -> None:
         """Start the event loop; does nothing while it runs. One that is about to end is waited for.
@@ -276,6 +281,10 @@ class FullPipeline(Answering, SinkPipeline):
     ) -> None:
         super().__init__(name, cg, q_in, f_in, hparams, workers=workers)
         self.q_out, self.f_out = q_out, f_out
+
+    def _busy(self) -> tuple[str, ...]:
+        """Return what has not returned, and tell f_out from the put of its answer."""
+        return tuple("put on q_out" if name == "f_out" and self._is_putting() else name for name in super()._busy())
 
     @property
     def stages(self) -> Stages:

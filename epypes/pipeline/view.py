@@ -21,7 +21,7 @@ class EventView(Mapping[str, Any]):
     run
         The event's run.
     attributes
-        A copy of the pipeline's attributes, this event's own.
+        A shallow copy of the pipeline's attributes: the mapping is this event's own, the values are the pipeline's.
     stamps
         When the event was taken, and when f_in and f_out worked on it.
     """

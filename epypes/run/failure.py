@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final
 
 from epypes.run.draft import Draft
@@ -42,24 +42,42 @@ class Failure:
 
     function: str
     tokens: tuple[str, ...]
-    inputs: Mapping[str, Any] = field(repr=False)
+    inputs: Mapping[str, Any]
     exception: BaseException
     event_id: str = ""
     attempt: int = 1
     source: str = ""
 
     @property
+    def kind(self) -> str:
+        """Name of the exception's class."""
+        # Past what a class of classes may have instead.
+        name: str = type.__dict__["__name__"].__get__(type(self.exception))
+        return str.__str__(name)
+
+    @property
     def message(self) -> str:
         """What the exception says, without OpenCV's place in its own source."""
         try:
-            text = str(self.exception).strip()
+            # A plain string, whatever methods the one that is returned has.
+            text = str.__str__(str(self.exception)).strip()
         except BaseException:  # an exception's own __str__ may raise
             text = "(its message can't be had)"
         return _OPENCV_PLACE.sub("", text)
 
     def __str__(self) -> str:
-        kind, text = type(self.exception).__name__, self.message
-        return f"{self.function}: {kind}{': ' + text if text else ''}"
+        text = self.message
+        return f"{self.function}: {self.kind}{': ' + text if text else ''}"
+
+    def __repr__(self) -> str:
+        try:
+            raised = str.__str__(repr(self.exception))
+        except BaseException:  # an exception's own __repr__ may raise
+            raised = f"<{self.kind}>"
+        return (
+            f"Failure(function={self.function!r}, tokens={self.tokens!r}, exception={raised}, "
+            f"event_id={self.event_id!r}, attempt={self.attempt!r}, source={self.source!r})"
+        )
 
 
 def failure_of(draft: Draft, index: int, exception: BaseException) -> Failure:
@@ -69,14 +87,18 @@ def failure_of(draft: Draft, index: int, exception: BaseException) -> Failure:
     outputs = tuple(tokens[slot] for slot in step.outputs)
     values = {token: _lent(draft.values[slot]) for token, slot in zip(inputs, step.inputs, strict=True)}
     told = ", ".join(f"{token}{_brief(value)}" for token, value in values.items())
-    note = f"In function {step.name!r}: ({told}) -> ({', '.join(outputs)})"
+    begin, end = f"In function {step.name!r}: (", f") -> ({', '.join(outputs)})"
+    note = f"{begin}{told}{end}"
     # Whatever the exception's own methods do, the failure is told.
     with contextlib.suppress(BaseException):
         why = None if step.unguarded else explain_write(step.name, inputs, exception)
         note = f"{note}\n{why}" if why else note
     with contextlib.suppress(BaseException):
-        if note not in getattr(exception, "__notes__", ()):
-            exception.add_note(note)
+        # One exception may be raised for event after event, with other values each time.
+        for earlier in list(getattr(exception, "__notes__", ())):
+            if earlier.startswith(begin) and earlier.partition("\n")[0].endswith(end):
+                exception.__notes__.remove(earlier)
+        exception.add_note(note)
     return Failure(step.name, (*inputs, *outputs), values, exception)
 
 

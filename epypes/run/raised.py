@@ -15,7 +15,8 @@ def run_that_raised(exception: BaseException, runner: Any) -> Run | None:
     twice belongs to the run that raised it last.
     """
     code = type(runner)._ended.__code__
-    traceback: TracebackType | None = exception.__traceback__
+    # Past what the exception's class may have instead.
+    traceback: TracebackType | None = BaseException.__dict__["__traceback__"].__get__(exception)
     while traceback is not None:
         frame = traceback.tb_frame
         if frame.f_code is code and frame.f_locals.get("self") is runner:

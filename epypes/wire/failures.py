@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Final
 
 from epypes.run import Failure
@@ -21,14 +22,12 @@ def failure_event(failure: Failure, source: str = "", bundle_digest: str = "") -
     bundle_digest
         Digest of the bundle that was run, if it was one.
     """
-    notes = getattr(failure.exception, "__notes__", None)
-    said = [failure.message, *(notes if isinstance(notes, list) else ())]
     input_id = _sendable(failure.event_id)
     record = FailureRecord(
         function=_sendable(failure.function),
         tokens=tuple(map(_sendable, failure.tokens)),
-        exception=_sendable(type(failure.exception).__name__),
-        message=_sendable(" | ".join(text for text in said if isinstance(text, str))),
+        exception=_sendable(failure.kind),
+        message=_sendable(" | ".join([failure.message, *_notes(failure.exception)])),
         input_id=input_id,
         attempt=failure.attempt,
     )
@@ -39,6 +38,15 @@ def failure_event(failure: Failure, source: str = "", bundle_digest: str = "") -
         bundle_digest=bundle_digest,
         failure=record,
     )
+
+
+def _notes(exception: BaseException) -> list[str]:
+    """Return the notes of an exception that are strings, if they can be had."""
+    with contextlib.suppress(BaseException):  # whatever the exception's own attributes do
+        notes = getattr(exception, "__notes__", None)
+        if isinstance(notes, list):
+            return [str.__str__(note) for note in list.__iter__(notes) if isinstance(note, str)]
+    return []
 
 
 def _sendable(text: str) -> str:

@@ -70,6 +70,10 @@ def test_one_command_runs_the_experiment_prints_its_times_and_leaves_figures(epy
         (("--workers", 0), "workers must be a whole number from 1, not 0."),
         (("--fps", "nan"), "fps must be a number above 0, not nan."),
         (("--timeout", 0), "timeout_s must be a number above 0, not 0.0."),
+        (("--timeout", "1e10"), "timeout_s must be at most 9223372036, not 10000000000.0."),
+        (("--timeout", "inf"), "timeout_s must be a number above 0, not inf."),
+        (("--camera", "9" * 20, "--camera", 1), f"No camera has the number {'9' * 20}. They go from 0 to 2147483647."),
+        (("--layout", "one", "--camera", "9" * 5_000, "--camera", 1), "Image '"),
         (("--camera", "left.png"), "cameras must be two"),
     ],
 )

@@ -147,3 +147,14 @@ def test_what_can_not_be_played_is_one_line(epypes, recording, tmp_path):
         assert "is in use" in one_line(epypes("play", recording, pub.address))
     assert "insecure=True" in one_line(epypes("play", recording, "tcp://0.0.0.0:5555"))
     assert epypes("play", recording, "--speed", -1).returncode == 2
+
+
+@pytest.mark.parametrize("seconds", ["1e300", "inf"])
+def test_a_time_that_no_clock_can_wait_for_is_refused_in_one_line(epypes, tmp_path, seconds):
+    done = epypes("record", f"bind:{LOCAL}", tmp_path / "a.mcap", "--seconds", seconds)
+    assert "is too long" in one_line(done)
+    assert not (tmp_path / "a.mcap").exists()
+
+
+def test_an_endless_speed_is_refused_in_one_line(epypes, recording):
+    assert "0 is as fast as possible" in one_line(epypes("play", recording, "--speed", "inf"))

@@ -137,6 +137,38 @@ def test_no_process_outlives_its_parent_however_that_ends(images):
 
 
 @IN_CHILDREN
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM])
+def test_a_process_that_hangs_while_it_starts_ends_with_its_parent(end, tmp_path):
+    pipe = tmp_path / "camera"
+    os.mkfifo(pipe)
+    code = (
+        "from epypes.experiment.process import ChildStation\n"
+        "from epypes.experiment.components import Settings\n"
+        f"station = ChildStation(['acquisition'], Settings(({str(pipe)!r},) * 2), print)\n"
+        "print(station.pid, flush=True); station.start('tcp://127.0.0.1:1')"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as parent:
+        orphan = psutil.Process(int(parent.stdout.readline()))
+        writer = opened_by_both(pipe)
+        parent.send_signal(end)
+    try:
+        orphan.wait(TIMEOUT_S)
+    finally:
+        os.close(writer)
+
+
+def opened_by_both(pipe) -> int:
+    """Return a named pipe's end for writing, when somebody has opened it for reading."""
+    deadline_s = time.monotonic() + TIMEOUT_S
+    while True:
+        try:
+            return os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)
+        except OSError:
+            assert time.monotonic() < deadline_s, "nobody reads"
+            threading.Event().wait(0.02)
+
+
+@IN_CHILDREN
 def test_a_process_that_cannot_start_says_why_in_the_error(tmp_path):
     missing = str(tmp_path / "nothing.png")
     with (

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import itertools
 import queue
+import signal
 import subprocess
 import sys
 import threading
@@ -463,7 +465,7 @@ def test_a_full_output_queue_is_named_when_it_holds_up_the_stop():
     pipe.listen()
     q_in.put(1)
     assert reached.wait(TIMEOUT_S)
-    with pytest.raises(StillRunning, match="still in 'f_out'"):
+    with pytest.raises(StillRunning, match="still in 'put on q_out'"):
         pipe.stop(timeout_s=0.05)
     q_out.get()
     pipe.stop()
@@ -475,6 +477,48 @@ def test_a_mailbox_tells_what_it_dropped():
     for item in range(5):
         mailbox.put(item)
     assert dropped == [0, 1, 2]
+
+
+@pytest.mark.parametrize("policy", ["latest", "drop_oldest"])
+def test_an_on_drop_that_raises_is_logged_and_the_item_has_been_put(policy, caplog):
+    def refuse(item):
+        raise SystemExit(item)
+
+    mailbox = ep.Mailbox(policy, on_drop=refuse)
+    for item in range(3):
+        mailbox.put(item)
+    assert mailbox.get_nowait() == 2
+    assert mailbox.dropped.total() == 2
+    assert caplog.text.count("on_drop failed") == 2
+    assert "SystemExit: 1" in caplog.text
+
+
+def test_an_answer_whose_put_drops_an_older_one_is_no_failure_if_on_drop_raises():
+    q_out = ep.Mailbox("latest", on_drop=lambda item: 1 / 0)
+    cg = ep.CompGraph({"f": lambda x: x}, {"f": ("x", "y")})
+    pipe = ep.FullPipeline("p", cg, queue.Queue(), q_out, lambda event: {"x": event}, lambda view: view["y"])
+    for event in range(3):
+        pipe.handle(event)
+    assert (pipe.failed, q_out.get_nowait()) == (0, 2)
+
+
+@pytest.mark.parametrize(("policy", "size"), [("latest", 1), ("drop_oldest", 3)])
+def test_a_signal_handler_that_puts_never_makes_a_mailbox_hold_more_than_its_size(policy, size):
+    mailbox, by_handler, put, most = ep.Mailbox(policy, size), itertools.count(), 0, 0
+    before = signal.signal(signal.SIGALRM, lambda *_: mailbox.put(next(by_handler)))
+    try:
+        for _ in range(2_000):
+            # One signal at a time, or a slow machine would do nothing but handle them.
+            signal.setitimer(signal.ITIMER_REAL, 2e-5)
+            for _ in range(30):
+                mailbox.put(put)
+                put += 1
+                most = max(most, mailbox.qsize())
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    assert most == mailbox.qsize() == size
+    assert mailbox.dropped.total() + size == put + next(by_handler)
 
 
 def test_a_token_may_be_called_self():

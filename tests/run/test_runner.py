@@ -631,3 +631,18 @@ for _ in range(150):
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_an_exception_that_is_raised_again_and_again_has_one_note_of_each_function():
+    error = ValueError("always the same")
+    inner = ep.Pipeline("inner", ep.CompGraph({"f": raising(error)}, {"f": ("x", ("y", "z"))}))
+
+    def outer(n):
+        error.__traceback__ = None
+        inner.run(x=2)
+
+    runner = ep.CompGraphRunner(ep.CompGraph({"g": outer}, {"g": ("n", "m")}))
+    for n in range(50):
+        with pytest.raises(ValueError, match="always"):
+            runner.run(n=n)
+    assert error.__notes__ == ["In function 'f': (x=2) -> (y, z)", "In function 'g': (n=49) -> (m)"]

@@ -53,7 +53,7 @@ def with_run(
 def _function_view(function: FunctionView, run: Run, stale: frozenset[str], entry: FunctionTime | None) -> FunctionView:
     name = function.name
     if run.failure and run.failure.function == name:
-        message = run.failure.message or type(run.failure.exception).__name__
+        message = run.failure.message or run.failure.kind
         return replace(function, state="failed", duration_ns=entry.duration_ns if entry else None, message=message)
     if function.state == "left out":
         return function
