@@ -173,7 +173,7 @@ def _axis(axes: Axes, times: pd.Series[float], whole: LogNormal, paper: float) -
 def _histogram(axes: Axes, times: pd.Series[float]) -> None:
     """Draw how dense the measured values are, in bins that are equally wide on the axis."""
     if times.nunique() > 1:
-        bins = np.geomspace(_US * times.min(), _US * times.max(), _BINS)
+        bins = np.geomspace(_US * times.min(), _US * times.max(), _BINS).tolist()
         axes.hist(_US * times, bins=bins, density=True, color=INK, alpha=0.16, label="histogram", zorder=0)
 
 

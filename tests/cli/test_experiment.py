@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+from functools import partial
 
 import cv2
 import numpy as np
@@ -107,7 +108,9 @@ def test_requests_that_failed_are_counted_with_their_reason(epypes, tmp_path):
 def test_ctrl_c_ends_everything_without_a_traceback(layout):
     command = [sys.executable, "-m", "epypes.cli", "experiment", "--layout", layout, "--requests", "100000"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen(command, **pipes, start_new_session=True) as process:
+    # What is started in the background of a shell ignores Ctrl+C, and so would its children.
+    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with subprocess.Popen(command, **pipes, start_new_session=True, preexec_fn=heard) as process:
         watchdog = threading.Timer(TIMEOUT_S, process.kill)
         watchdog.start()
         mine = psutil.Process(process.pid)

@@ -33,7 +33,16 @@ def robot_of(system, timeout_s=TIMEOUT_S) -> Robot:
 
 
 def children() -> list[psutil.Process]:
-    return psutil.Process().children(recursive=True)
+    """Those of the experiment; tests of other things have children, too."""
+    found = psutil.Process().children(recursive=True)
+    return [child for child in found if child.is_running() and "epypes.experiment.node" in _command(child)]
+
+
+def _command(child: psutil.Process) -> list[str]:
+    try:
+        return child.cmdline()
+    except psutil.Error:  # it has ended meanwhile
+        return []
 
 
 def test_the_layouts_are_those_of_the_paper_and_the_two_beside_it():
