@@ -33,7 +33,7 @@ with ZMQSubscriber(sys.argv[1], asked, bind=True) as sub, ZMQPublisher(sys.argv[
 
 # Sends a lot to a subscriber that does not read, and is then told to end.
 STUFFED = """
-import queue, signal, sys
+import queue, signal, sys, threading
 from epypes.transport import ZMQPublisher
 def end(number, frame):
     raise SystemExit
@@ -45,8 +45,9 @@ with ZMQPublisher("tcp://127.0.0.1:*", out) as pub:
     for _ in range(300):
         out.put(bytes(1_000_000))
     print("stuffed", flush=True)
+    # Again and again: a signal that comes right before a wait without an end would never be handled.
     while True:
-        signal.pause()
+        threading.Event().wait(0.05)
 """
 
 SUBSCRIBER = """
