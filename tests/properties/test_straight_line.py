@@ -8,10 +8,13 @@ import sys
 import zlib
 from pathlib import Path
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import epypes as ep
+
+pytestmark = pytest.mark.slow  # many graphs are written and run
 
 RUFF = shutil.which("ruff", path=str(Path(sys.executable).parent)) or "ruff"
 LOG: list[tuple] = []

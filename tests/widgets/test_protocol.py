@@ -14,6 +14,8 @@ from epypes.errors import StillRunning
 from epypes_widgets import Panel, sender, tune
 from tests.widgets.frontend import BadLine, FrontEnd
 
+pytestmark = pytest.mark.slow  # messages are lost and delayed
+
 
 @pytest.fixture
 def front_end(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> FrontEnd:
