@@ -1,4 +1,4 @@
-"""Other processes for these tests: publishers that can be stopped, continued and killed."""
+"""Other processes for these tests, and how they wait: publishers that can be stopped, continued and killed."""
 
 from __future__ import annotations
 

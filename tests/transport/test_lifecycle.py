@@ -15,6 +15,7 @@ import zmq
 
 from epypes.errors import AddressError, StillRunning
 from epypes.transport import ZMQPublisher, ZMQSubscriber, io
+from tests.transport.peers import wait_until
 
 LOCAL = "tcp://127.0.0.1:*"
 WAIT_S = 5.0
@@ -22,16 +23,6 @@ WAIT_S = 5.0
 
 def io_threads() -> list[threading.Thread]:
     return [thread for thread in threading.enumerate() if thread.name.startswith("epypes-")]
-
-
-def wait_until(condition, timeout_s: float = WAIT_S) -> None:
-    """Wait on an event that nobody sets, a little at a time, until a counter of another thread is right."""
-    never = threading.Event()
-    for _ in range(int(timeout_s / 0.005)):
-        if condition():
-            return
-        never.wait(0.005)
-    raise AssertionError("the condition did not come true in time")
 
 
 @pytest.mark.parametrize("make", [ZMQPublisher, ZMQSubscriber])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import queue
-import threading
 
 import numpy as np
 import pytest
@@ -12,37 +11,10 @@ import zmq
 from epypes.errors import AddressError, MessageError
 from epypes.transport import ZMQPublisher, ZMQSubscriber
 from epypes.wire import Envelope, JustBytes, encode
+from tests.transport.peers import wait_until
 
 LOCAL = "tcp://127.0.0.1:*"
 WAIT_S = 5.0
-
-
-@pytest.fixture
-def peer():
-    """Makes raw sockets, as a peer without EPypes has them."""
-    context = zmq.Context()
-    made = []
-
-    def make(kind: int) -> zmq.Socket:
-        socket = context.socket(kind)
-        socket.rcvtimeo = int(WAIT_S * 1000)
-        made.append(socket)
-        return socket
-
-    yield make
-    for socket in made:
-        socket.close(linger=0)
-    context.term()
-
-
-def wait_until(condition, timeout_s: float = WAIT_S) -> None:
-    """Wait on an event that nobody sets, a little at a time, until a counter of another thread is right."""
-    never = threading.Event()
-    for _ in range(int(timeout_s / 0.005)):
-        if condition():
-            return
-        never.wait(0.005)
-    raise AssertionError("the condition did not come true in time")
 
 
 def test_an_envelope_with_an_image_arrives_as_it_was():

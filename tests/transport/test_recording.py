@@ -24,42 +24,13 @@ from epypes.transport.mcapformat import Counts
 from epypes.transport.mcapreader import messages
 from epypes.transport.mcapwriter import RecordingWriter
 from epypes.wire import Envelope, JustBytes, decode, encode
+from tests.transport.peers import wait_until
 
 pytestmark = pytest.mark.slow  # files are written, cut off and played
 
 LOCAL = "tcp://127.0.0.1:*"
 WAIT_S = 5.0
 HOUR_NS = 3_600 * 10**9
-
-
-@pytest.fixture
-def peer():
-    """Makes raw sockets, as a peer without EPypes has them."""
-    context = zmq.Context()
-    made = []
-
-    def make(kind: int, **options: int) -> zmq.Socket:
-        socket = context.socket(kind)
-        socket.rcvtimeo = int(WAIT_S * 1000)
-        for name, value in options.items():
-            setattr(socket, name, value)
-        made.append(socket)
-        return socket
-
-    yield make
-    for socket in made:
-        socket.close(linger=0)
-    context.term()
-
-
-def wait_until(condition, timeout_s: float = WAIT_S) -> None:
-    """Wait on an event that nobody sets, a little at a time, until a counter of another thread is right."""
-    never = threading.Event()
-    for _ in range(int(timeout_s / 0.005)):
-        if condition():
-            return
-        never.wait(0.005)
-    raise AssertionError("the condition did not come true in time")
 
 
 def written(path, recorded) -> None:

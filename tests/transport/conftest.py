@@ -1,0 +1,28 @@
+"""What do several tests of sockets begin with?"""
+
+from __future__ import annotations
+
+import pytest
+import zmq
+
+from tests.transport.peers import WAIT_S
+
+
+@pytest.fixture
+def peer():
+    """Makes raw sockets, as a peer without EPypes has them."""
+    context = zmq.Context()
+    made = []
+
+    def make(kind: int, **options: int) -> zmq.Socket:
+        socket = context.socket(kind)
+        socket.rcvtimeo = int(WAIT_S * 1000)
+        for name, value in options.items():
+            setattr(socket, name, value)
+        made.append(socket)
+        return socket
+
+    yield make
+    for socket in made:
+        socket.close(linger=0)
+    context.term()
