@@ -1,0 +1,237 @@
+"""What does a machine need so that it starts a service by itself: a systemd unit, or a container?
+
+Both are text that a person reads, changes and keeps beside the bundle; they say how they are used at their top.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from epypes.bundle.load import SETTINGS
+from epypes.bundle.seal import check_seal
+from epypes.bundle.settings import read_settings
+from epypes.errors import ServiceError
+
+# Python 3.11 is the oldest that EPypes runs on; the container takes the one that the bundle was proved with.
+_PYTHON: Final = f"{sys.version_info.major}.{sys.version_info.minor}"
+# A service drains in bounded time; what has not ended by then is killed.
+_STOP_MARGIN_S: Final = 15
+# Longer than loading, which includes a replay of all samples, should ever take.
+_START_LIMIT_S: Final = 600
+
+_UNIT: Final = """\
+# The service of {bundle}, started by systemd and kept running.
+#
+#   sudo install -m 644 {file} /etc/systemd/system/{file}
+#   sudo systemctl daemon-reload
+#   sudo systemctl enable --now {file}
+#   journalctl --follow --unit {file}
+#
+# Commands find the service by the state file that it keeps, as user {user}:
+#
+#   XDG_RUNTIME_DIR=/run/{name} XDG_STATE_HOME=/var/lib/{name} epypes call {shown} image.png
+#
+# After a new promotion: epypes deploy, or sudo systemctl restart {file}
+
+[Unit]
+Description={description}
+After=network.target
+StartLimitIntervalSec=300
+StartLimitBurst=5
+
+[Service]
+# READY is said when the samples have been replayed identical and the sockets are bound.
+Type=notify
+NotifyAccess=main
+TimeoutStartSec={start_s}
+ExecStart={command}
+User={user}
+Restart=on-failure
+RestartSec=2
+# SIGTERM goes to the service alone, which answers what it has accepted; then its worker is ended with it.
+KillMode=mixed
+TimeoutStopSec={stop_s}
+RuntimeDirectory={name}
+RuntimeDirectoryMode=0700
+StateDirectory={name}
+StateDirectoryMode=0700
+Environment=XDG_RUNTIME_DIR=/run/{name}
+Environment=XDG_STATE_HOME=/var/lib/{name}
+Environment=PYTHONUNBUFFERED=1
+NoNewPrivileges=yes
+ProtectSystem=full
+ProtectControlGroups=yes
+ProtectKernelTunables=yes
+RestrictSUIDSGID=yes
+
+[Install]
+WantedBy=multi-user.target
+"""
+
+_CONTAINERFILE: Final = """\
+# The service of the bundle {name} in a container.
+#
+#   docker build --tag {tag} .
+#   docker run --rm --init --network host {tag}
+#
+# With the host's network the service binds the host's loopback, which no other machine reaches. To serve other
+# machines, bind 0.0.0.0 with keys (epypes keys), which are mounted when the container starts:
+#
+#   docker run --rm --init --publish 5555:5555 --publish 5556:5556 --volume ./keys:/keys:ro {tag} \\
+#       --sub tcp://0.0.0.0:5555 --pub tcp://0.0.0.0:5556 --keys /keys/service.key_secret --allow /keys/allowed
+
+FROM python:{python}-slim
+RUN useradd --create-home --uid 10001 epypes
+WORKDIR /service
+COPY requirements.txt ./
+{wheels}RUN pip install --no-cache-dir {find}--requirement requirements.txt
+COPY bundle ./bundle
+USER epypes
+ENV PYTHONUNBUFFERED=1
+STOPSIGNAL SIGTERM
+# What comes behind the image's name at docker run is added to this command.
+ENTRYPOINT {entrypoint}
+"""
+
+
+def systemd_unit(bundle: str | Path, options: Sequence[str] = (), *, user: str, stop_s: int = _STOP_MARGIN_S) -> str:
+    """Return a unit that runs ``epypes serve`` with this Python.
+
+    Parameters
+    ----------
+    bundle
+        The bundle's folder; its seal is checked.
+    options
+        Further arguments of ``epypes serve``.
+    user
+        Whom the service runs as; it must be able to read the bundle and this Python.
+    stop_s
+        Seconds after SIGTERM until what still runs is killed.
+
+    Raises
+    ------
+    BundleError
+        The folder is not the bundle that was promoted.
+
+    Notes
+    -----
+    systemd.service(5), systemd.exec(5); quoting by systemd.syntax(7).
+    """
+    folder, name = _checked(bundle)
+    command = [sys.executable, "-m", "epypes.cli", "serve", str(folder), *options]
+    return _UNIT.format(
+        bundle=_one_line(str(folder)),
+        shown=_one_line(shlex.quote(str(folder))),
+        name=f"epypes-{name}",
+        file=unit_name(bundle),
+        description=_specifiers(_one_line(f"EPypes service {name}")),
+        command=" ".join(map(_quoted, command)),
+        user=_specifiers(user),
+        start_s=_START_LIMIT_S,
+        stop_s=stop_s,
+    )
+
+
+def unit_name(bundle: str | Path) -> str:
+    """Return how the unit of a bundle is called: ``epypes-edges.service``."""
+    return f"epypes-{_checked(bundle)[1]}.service"
+
+
+def write_container(
+    bundle: str | Path, to: str | Path, options: Sequence[str] = (), *, requirements: Sequence[str], wheel: Path | None
+) -> Path:
+    """Write a folder from which a container is built: Containerfile, requirements and a copy of the bundle.
+
+    Parameters
+    ----------
+    bundle
+        The bundle's folder; its seal is checked.
+    to
+        The folder to write; it must not exist, or be empty.
+    options
+        Further arguments of ``epypes serve``.
+    requirements
+        What is installed besides the bundle's own requirements: EPypes with what serving stands on.
+    wheel
+        A wheel of EPypes to install from, where no index has this version; copied into the folder.
+
+    Returns
+    -------
+    Path
+        The Containerfile.
+
+    Raises
+    ------
+    BundleError
+        The folder is not the bundle that was promoted.
+    ServiceError
+        The folder can't be written.
+    """
+    folder, name = _checked(bundle)
+    target = Path(to)
+    try:
+        if target.exists() and (not target.is_dir() or any(target.iterdir())):
+            raise ServiceError(to, f"{to} is there already and not empty. Name another folder.")
+        target.mkdir(parents=True, exist_ok=True)
+        shutil.copytree(folder, target / "bundle")
+        if wheel is not None:
+            (target / "wheels").mkdir()
+            shutil.copy(wheel, target / "wheels")
+        own = (folder / "requirements.txt").read_text(encoding="utf-8").splitlines()
+        kept = [line for line in own if re.split(r"[^\w-]", line, maxsplit=1)[0].lower() != "epypes"]
+        (target / "requirements.txt").write_text("\n".join([*kept, *requirements]) + "\n", encoding="utf-8")
+        entrypoint = ["epypes", "serve", "/service/bundle", *options]
+        text = _CONTAINERFILE.format(
+            name=name,
+            tag=f"epypes-{name}",
+            python=_PYTHON,
+            wheels="COPY wheels ./wheels\n" if wheel is not None else "",
+            find="--find-links wheels " if wheel is not None else "",
+            entrypoint=_json_list(entrypoint),
+        )
+        path = target / "Containerfile"
+        path.write_text(text, encoding="utf-8")
+    except (OSError, UnicodeError) as error:
+        if isinstance(error, ServiceError):
+            raise
+        raise ServiceError(to, f"{to} can't be written: {error}. Name another folder.") from error
+    return path
+
+
+def _checked(bundle: str | Path) -> tuple[Path, str]:
+    """Return the folder of a whole bundle, and a word for its name that systemd and containers take."""
+    folder = Path(bundle).resolve()
+    check_seal(folder)
+    return folder, _word(read_settings(folder / SETTINGS).name)
+
+
+def _word(name: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-") or "service"
+
+
+def _one_line(text: str) -> str:
+    return text.replace("\n", " ").replace("\r", " ")
+
+
+def _specifiers(text: str) -> str:
+    """Return text in which systemd expands nothing."""
+    return text.replace("%", "%%")
+
+
+def _quoted(argument: str) -> str:
+    """Return one argument of a unit's command as systemd reads it back."""
+    if re.fullmatch(r"[\w@+=:,./*-]+", argument, re.ASCII):
+        return argument
+    escaped = argument.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n").replace("\r", "\\r")
+    return f'"{_specifiers(escaped).replace("$", "$$")}"'
+
+
+def _json_list(arguments: Sequence[str]) -> str:
+    return json.dumps(list(arguments), ensure_ascii=False)
