@@ -29,7 +29,8 @@ Everything an error's text mentions is an attribute of it::
     |   +-- ReplayDiffers       a bundle computes something else; .report
     +-- ExperimentError         the paper's experiment can't begin or go on; .name
     +-- ServiceError            a service can't start or can't be called; .path
-        +-- RemoteFailure       a function failed in the service; .function, .message
+    |   +-- RemoteFailure       a function failed in the service; .function, .message
+    +-- FailureNotKept          a failure of a service, or its event, can't be had; .id, .path
 
 The user's own exceptions are never wrapped: they keep their type and traceback and get a note.
 """
@@ -333,3 +334,11 @@ class RemoteFailure(ServiceError):
     def __init__(self, path: object, function: str, exception: str, message: str) -> None:
         self.function, self.exception, self.message = function, exception, message
         super().__init__(path, f"Function {function!r} failed in the service: {exception}: {message}")
+
+
+class FailureNotKept(EpypesError):
+    """A failure of a service, or the event that failed, can't be had any more, or was never kept."""
+
+    def __init__(self, id: str, path: object, text: str) -> None:  # noqa: A002 - that is what it is called everywhere
+        self.id, self.path = id, str(path)
+        super().__init__(text)
