@@ -13,7 +13,7 @@ from epypes.run import Failure
 from epypes.service.failurerecord import FailureRecord
 from epypes.service.failurestore import FailureStore
 from epypes.service.latency import Stopwatch
-from epypes.service.ledger import Entry
+from epypes.service.ledger import Entry, Outcome
 from epypes.wire import Envelope
 from epypes.wire.failures import failure_event
 
@@ -54,6 +54,13 @@ class Result:
     failure: FailureRecord | None = None
     revision: int = 0
     total_ns: int = 0
+
+    @property
+    def outcome(self) -> Outcome:
+        """What has become of the event."""
+        if self.failure is None:
+            return "answered"
+        return "dead_letters" if self.failure.dead_letter else "failed"
 
 
 def event_id(event: object) -> str:
@@ -112,7 +119,9 @@ def refused(entry: Entry, why: str, setting: Setting) -> Result:
 def dead_letter(entry: Entry, ending: str, function: str, setting: Setting) -> Result:
     """Return the result of an event that killed the worker again and again."""
     again = f", and so it was {entry.deaths} times" if entry.deaths > 1 else ""
-    error = ServiceError(setting.bundle, f"{ending} while this event was all that it worked on{again}. It is put aside.")
+    error = ServiceError(
+        setting.bundle, f"{ending} while this event was all that it worked on{again}. It is put aside."
+    )
     return failed_without_worker(entry, error, setting, "killed", function=function, is_dead=True)
 
 
