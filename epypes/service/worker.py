@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import ctypes
 import faulthandler
+import io
 import logging
 import os
 import signal
@@ -171,7 +172,7 @@ class _Hearer:
         except EOFError:
             os._exit(FRONT_GONE)
         except (MessageError, LookupError, TypeError, ValueError) as error:
-            print(f"epypes worker: the front said what can't be understood: {error!r}", file=sys.stderr, flush=True)
+            _LOG.error("the front said what can't be understood: %r", error)
             os._exit(NOT_UNDERSTOOD)
 
     def _hear(self, header: dict[str, Any], frames: list[memoryview]) -> None:
@@ -191,6 +192,9 @@ def _stay_with_the_front(faults: int | None) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     os.dup2(2, 1)
+    # What is printed shall not wait for a buffer to be full, and be lost when the process is killed.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(line_buffering=True)
     if faults is not None:
         os.set_inheritable(faults, False)
         faulthandler.enable(file=faults)
