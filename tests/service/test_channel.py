@@ -83,7 +83,9 @@ def test_messages_larger_than_all_buffers_arrive_whole_in_both_directions_at_onc
         header, got = receive()
         send()
         assert header == {"n": 1}
-        assert all(np.array_equal(np.frombuffer(frame, np.uint8), sent) for frame, sent in zip(got, frames, strict=True))
+        assert all(
+            np.array_equal(np.frombuffer(frame, np.uint8), sent) for frame, sent in zip(got, frames, strict=True)
+        )
         assert all(frame.readonly for frame in got)
 
 

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 import signal
@@ -21,7 +20,7 @@ from epypes.bundle.seal import seal
 from epypes.display.views.jsonview import from_json
 from epypes.service.channel import channel_pair
 from epypes.service.packing import MARK
-from epypes.wire import Envelope, JustBytes, encode
+from epypes.wire import Envelope, encode
 from tests.service.bundles import written_bundle
 from tests.service.workers import TIMEOUT_S, ready_worker, worker_of
 
@@ -385,7 +384,7 @@ def test_before_an_event_the_graph_is_seen_and_no_value(own):
         header, (view,) = front.ask("view")
         assert [function.name for function in from_json(json.loads(view)).functions] == ["act", "tell"]
         assert front.ask("svg")[1][0].startswith(b"<svg")
-        assert front.ask("preview", token="k", max_side_px=64)[1] == [b"2\nint"]
+        assert front.ask("preview", token="k", max_side_px=64)[1] == [b"2\nint 2"]
         for ask in ({"what": "preview", "token": "out", "max_side_px": 64}, {"what": "run", "tokens": ["out"]}):
             header, frames = front.ask(**ask)
             assert (header["reason"], frames) == ("not computed", [])
@@ -401,7 +400,10 @@ def test_what_is_asked_is_of_the_last_completed_run(shared):
     header, (picture,) = shared.ask("preview", token="out", max_side_px=100)
     assert header["media_type"].startswith("image/")
     assert max(header["width"], header["height"]) <= 100
-    assert cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_UNCHANGED).shape[:2] == (header["height"], header["width"])
+    assert cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_UNCHANGED).shape[:2] == (
+        header["height"],
+        header["width"],
+    )
     header, (text,) = shared.ask("preview", token="what", max_side_px=100)
     assert (header["media_type"], text.decode().partition("\n")[0]) == ("text/plain", "'zeros'")
     _, (view,) = shared.ask("view")
@@ -598,9 +600,3 @@ def test_a_worker_that_waits_costs_nothing(own):
         threading.Event().wait(1.0)
         assert process.num_ctx_switches().voluntary - before[0] <= 5, "no thread polls"
         assert sum(process.cpu_times()[:2]) - before[1] <= 0.02
-        assert os.listdir(f"/proc/{front.process.pid}/fd")
-
-
-def test_2019_messages_are_taken_and_given_as_bytes_by_pipelines_that_do_so():
-    message = JustBytes(contents=b"abc")
-    assert isinstance(message.SerializeToString(), bytes)
