@@ -2,15 +2,38 @@
 
 from __future__ import annotations
 
+import ast
 import json
-from collections.abc import Mapping, Sequence
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
 
+from epypes.bundle.graphs import GraphText, grouped
+from epypes.bundle.lines import LINE, assignment, laid_out, piece_of
 from epypes.bundle.settings import Settings
 from epypes.bundle.slicer import Slice
 from epypes.graph import CompGraph
 
+_USE = """\
+Its functions, and how data flows between them; the values of its hyperparameters stand
+in pipeline.toml beside it.
 
-def emit_module(settings: Settings, cg: CompGraph, needed: Slice, references: Mapping[str, str]) -> str:
+    import epypes as ep
+
+    runner = ep.load(FOLDER)
+    run = runner.run({payload})
+{results}
+`epypes verify FOLDER` proves that it computes what the notebook computed.
+"""
+
+
+def emit_module(
+    settings: Settings,
+    cg: CompGraph,
+    needed: Slice,
+    written: Mapping[str, str] | GraphText,
+    blocks: Sequence[Sequence[str]] = (),
+    own: Sequence[Sequence[str]] = (),
+) -> str:
     """Write ``pipeline.py``: imports, constants, the functions' own source, then the graph.
 
     Parameters
@@ -21,23 +44,62 @@ def emit_module(settings: Settings, cg: CompGraph, needed: Slice, references: Ma
         The graph.
     needed
         What its functions need.
-    references
-        By function of the graph, the expression that refers to it.
+    written
+        How its functions are written, or by function the expression that refers to it.
+    blocks
+        Lines that stand before the graph: switches, nodes and pipelines that are functions of it.
+    own
+        Lines that stand behind it: what the bundle has of its own in place of the usual ports and pipeline.
     """
-    ends = f"{', '.join(settings.inputs) or 'nothing'} -> {', '.join(settings.outputs)}"
-    sections = [f'"""{_escaped(f"The computational graph {settings.name}: {ends}.")}"""\n']
+    text = written if isinstance(written, GraphText) else GraphText(written)
+    head = [_docstring(settings)]
     if needed.imports:
-        sections.append("\n".join(ordered_imports(list(needed.imports.values()))) + "\n")
-    if needed.constants:
-        sections.append("".join(f"{constant} = {source}\n" for constant, source in needed.constants.items()))
-    body = "\n".join(sections)
-    for found in needed.definitions.values():
-        body += f"\n\n{found.text}"
-    functions = "".join(f"    {quoted(function)}: {reference},\n" for function, reference in references.items())
-    io = "".join(
-        f"    {quoted(function)}: ({_side(given)}, {_side(made)}),\n" for function, (given, made) in cg.func_io.items()
-    )
-    return f"{body}\n\nfunc_dict = {{\n{functions}}}\n\nfunc_io = {{\n{io}}}\n"
+        head.append("\n".join(ordered_imports(list(needed.imports.values()))))
+    early = [name for name in needed.constants if not _needs(needed, name)]
+    if early:
+        head.append("\n".join(line for name in early for line in _constant(needed, name)))
+    sections = ["\n\n".join(head), *_definitions(needed)]
+    tail = ["\n".join(block) for block in blocks]
+    tail += ["\n".join(text.functions("func_dict")), "\n".join(text.io("func_io", cg))]
+    if cg.groups:
+        lines = [line for item in grouped(cg) for line in laid_out(item, 1, ",")]
+        tail.append("\n".join(["# Drawn as one box each.", "func_groups = {", *lines, "}"]))
+    tail += ["\n".join(block) for block in own]
+    return "\n\n\n".join([*sections, "\n\n".join(tail)]) + "\n"
+
+
+def _docstring(settings: Settings) -> str:
+    ends = f"{', '.join(settings.inputs) or 'nothing'} -> {', '.join(settings.outputs)}"
+    title = _escaped(f"The computational graph {settings.name}: {ends}.")
+    if len(title) > LINE - 3:
+        parts = _escaped(f"The computational graph {settings.name}."), _escaped(f"{ends}.")
+        title = "\n\n".join([parts[0], *textwrap.wrap(parts[1], LINE, break_long_words=False)[:1]])
+    return f'"""{title}"""'
+
+
+def _constant(needed: Slice, name: str) -> list[str]:
+    return assignment([name], True, piece_of(needed.constants[name]), 0)
+
+
+def _needs(needed: Slice, constant: str) -> set[str]:
+    """Return the definitions that a constant is made with."""
+    read = {node.id for node in ast.walk(ast.parse(needed.constants[constant])) if isinstance(node, ast.Name)}
+    return read & needed.definitions.keys()
+
+
+def _definitions(needed: Slice) -> Iterator[str]:
+    """Give functions and classes, each followed by the constants that are made with it."""
+    waiting = {name: _needs(needed, name) for name in needed.constants}
+    waiting = {name: needs for name, needs in waiting.items() if needs}
+    there: set[str] = set()
+    for name, found in needed.definitions.items():
+        yield found.text.rstrip()
+        there.add(name)
+        ready = [constant for constant, needs in waiting.items() if needs <= there]
+        for constant in ready:
+            del waiting[constant]
+        if ready:
+            yield "\n".join(line for constant in ready for line in _constant(needed, constant))
 
 
 def _escaped(text: str) -> str:
@@ -48,16 +110,3 @@ def _escaped(text: str) -> str:
 def ordered_imports(statements: Sequence[str]) -> list[str]:
     """Sort as linters want it: plain imports first, then from-imports, each by name."""
     return sorted(dict.fromkeys(statements), key=lambda statement: (statement.startswith("from"), statement))
-
-
-def quoted(text: str) -> str:
-    """Return a string literal, in double quotes where that needs no escapes."""
-    literal = repr(text)
-    return f'"{text}"' if literal == f"'{text}'" and '"' not in text else literal
-
-
-def _side(tokens: str | Sequence[str] | None) -> str:
-    if tokens is None or isinstance(tokens, str):
-        return "None" if tokens is None else quoted(tokens)
-    inner = ", ".join(map(quoted, tokens))
-    return f"({inner},)" if len(tokens) == 1 else f"({inner})"
