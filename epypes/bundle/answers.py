@@ -21,7 +21,9 @@ _BYTES: Final = "bytes"
 _Parts = Mapping[str, Any]
 
 
-def record_answer(path: Path, f_out: Callable[[EventView], Any], name: str, runs: tuple[Run, Run], attributes: _Parts) -> bool:
+def record_answer(
+    path: Path, f_out: Callable[[EventView], Any], name: str, runs: tuple[Run, Run], attributes: _Parts
+) -> bool:
     """Write what f_out makes of a run, if it makes the same of another one of the same payload.
 
     Parameters

@@ -81,7 +81,9 @@ def class_definition(kind: type, around: Mapping[str, Any], what: str) -> ClassD
             if not problem:
                 return _definition(kind, around, what, file, lines, node)
             why = why or f"{problem} ({_place(file, node)})"
-    raise Refused(f"{what} is not to be had as text: {why or 'it has no source'}. Define it in a cell again, and what was made of it.")
+    raise Refused(
+        f"{what} is not to be had as text: {why or 'it has no source'}. Define it in a cell again, and what was made of it."
+    )
 
 
 def _definition(
@@ -201,7 +203,11 @@ def _fields(kind: type) -> Mapping[str, Any]:
     """Return the defaults of a dataclass's or NamedTuple's fields, which may not be attributes of the class."""
     fields = vars(kind).get("__dataclass_fields__", {})
     defaults = {name: field.default for name, field in fields.items()}
-    return {**defaults, **dict.fromkeys(vars(kind).get("_fields", ()), MISSING), **vars(kind).get("_field_defaults", {})}
+    return {
+        **defaults,
+        **dict.fromkeys(vars(kind).get("_fields", ()), MISSING),
+        **vars(kind).get("_field_defaults", {}),
+    }
 
 
 def _is_as_written(kind: type, name: str, expression: ast.expr) -> bool:

@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
-import ast
+import itertools
 import json
-import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from typing import Final
 
+from epypes.bundle.definitions import definitions, early_constants
 from epypes.bundle.graphs import GraphText, grouped
-from epypes.bundle.lines import LINE, assignment, laid_out, piece_of
+from epypes.bundle.imports import ordered_imports
+from epypes.bundle.lines import LINE, laid_out
 from epypes.bundle.settings import Settings
 from epypes.bundle.slicer import Slice
+from epypes.errors import run_call
 from epypes.graph import CompGraph
 
-_USE = """\
-Its functions, and how data flows between them; the values of its hyperparameters stand
-in pipeline.toml beside it.
+# The folder is wherever the bundle is: it may be moved.
+_TEXT: Final = '''"""{title}
 
-    import epypes as ep
+It was promoted from a notebook. In Python, with FOLDER the one in which this file is:
 
-    runner = ep.load(FOLDER)
-    run = runner.run({payload})
-{results}
-`epypes verify FOLDER` proves that it computes what the notebook computed.
-"""
+    runner = epypes.load(FOLDER)
+{run}
+
+`epypes verify FOLDER` proves that it computes what the notebook did; `epypes serve`
+lets it answer events. The values of its hyperparameters stand in pipeline.toml.
+"""'''
 
 
 def emit_module(
@@ -55,58 +58,40 @@ def emit_module(
     head = [_docstring(settings)]
     if needed.imports:
         head.append("\n".join(ordered_imports(list(needed.imports.values()))))
-    early = [name for name in needed.constants if not _needs(needed, name)]
-    if early:
-        head.append("\n".join(line for name in early for line in _constant(needed, name)))
-    sections = ["\n\n".join(head), *_definitions(needed)]
+    constants = early_constants(needed)
+    if constants:
+        head.append(constants)
+    sections = ["\n\n".join(head), *definitions(needed)]
     tail = ["\n".join(block) for block in blocks]
     tail += ["\n".join(text.functions("func_dict")), "\n".join(text.io("func_io", cg))]
     if cg.groups:
         lines = [line for item in grouped(cg) for line in laid_out(item, 1, ",")]
         tail.append("\n".join(["# Drawn as one box each.", "func_groups = {", *lines, "}"]))
     tail += ["\n".join(block) for block in own]
-    return "\n\n\n".join([*sections, "\n\n".join(tail)]) + "\n"
+    return "\n\n\n".join([*sections, _spaced(tail)]) + "\n"
+
+
+def _spaced(blocks: Sequence[str]) -> str:
+    """Join blocks by one empty line; by two where one of them defines something."""
+    text = blocks[0]
+    for before, block in itertools.pairwise(blocks):
+        defines = any(line.startswith(("def ", "class ")) for line in f"{before}\n{block}".splitlines())
+        text += ("\n\n\n" if defines else "\n\n") + block
+    return text
 
 
 def _docstring(settings: Settings) -> str:
+    """Say what the module is and how it is used; names are data, whatever they hold."""
     ends = f"{', '.join(settings.inputs) or 'nothing'} -> {', '.join(settings.outputs)}"
     title = _escaped(f"The computational graph {settings.name}: {ends}.")
     if len(title) > LINE - 3:
-        parts = _escaped(f"The computational graph {settings.name}."), _escaped(f"{ends}.")
-        title = "\n\n".join([parts[0], *textwrap.wrap(parts[1], LINE, break_long_words=False)[:1]])
-    return f'"""{title}"""'
-
-
-def _constant(needed: Slice, name: str) -> list[str]:
-    return assignment([name], True, piece_of(needed.constants[name]), 0)
-
-
-def _needs(needed: Slice, constant: str) -> set[str]:
-    """Return the definitions that a constant is made with."""
-    read = {node.id for node in ast.walk(ast.parse(needed.constants[constant])) if isinstance(node, ast.Name)}
-    return read & needed.definitions.keys()
-
-
-def _definitions(needed: Slice) -> Iterator[str]:
-    """Give functions and classes, each followed by the constants that are made with it."""
-    waiting = {name: _needs(needed, name) for name in needed.constants}
-    waiting = {name: needs for name, needs in waiting.items() if needs}
-    there: set[str] = set()
-    for name, found in needed.definitions.items():
-        yield found.text.rstrip()
-        there.add(name)
-        ready = [constant for constant, needs in waiting.items() if needs <= there]
-        for constant in ready:
-            del waiting[constant]
-        if ready:
-            yield "\n".join(line for constant in ready for line in _constant(needed, constant))
+        title = _escaped(f"The computational graph {settings.name}.")
+    run = f"    runner.{run_call(settings.inputs)}"
+    if not all(token.isidentifier() for token in settings.inputs) or len(run) > LINE:
+        run = "    runner.run(**payload)"
+    return _TEXT.format(title=title, run=_escaped(run))
 
 
 def _escaped(text: str) -> str:
     """Return text as it may stand between triple quotes: names are data, whatever they hold."""
     return json.dumps(text)[1:-1]
-
-
-def ordered_imports(statements: Sequence[str]) -> list[str]:
-    """Sort as linters want it: plain imports first, then from-imports, each by name."""
-    return sorted(dict.fromkeys(statements), key=lambda statement: (statement.startswith("from"), statement))

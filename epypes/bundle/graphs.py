@@ -12,7 +12,7 @@ from epypes.bundle.slicer import Slice, slice_functions
 from epypes.bundle.source import Refused
 from epypes.bundle.values import expression
 from epypes.bundle.words import word_of
-from epypes.graph import CompGraph, Switch, as_switch
+from epypes.graph import CompGraph, Switch, as_switch, is_placeholder
 from epypes.pipeline import Node, Pipeline
 
 
@@ -108,13 +108,18 @@ class Graphs:
         """Give the functions that have a text or a name of their own, with those inside of nodes and pipelines."""
         for name, function in cg.functions.items():
             what = f"Function {name!r}{where}"
-            if as_switch(function) is None:
+            if is_placeholder(function):
+                way_out = f"Give it: ep.extend(cg, {{{name!r}: ...}}), and run that graph."
+                self.gathered.refusals.append(f"{what} is a placeholder. {way_out}")
+            elif as_switch(function) is None:
                 yield from self._callables_in(bare(function), what)
 
     def _callables_in(self, value: Any, what: str) -> Iterator[tuple[str, Callable[..., Any]]]:
         if isinstance(value, CompGraph):
             yield from self._callables(value, f" of {what[0].lower()}{what[1:]}")
         elif isinstance(value, Node):
+            if type(value) is not Pipeline:
+                yield f"Class {type(value).__name__!r} of {what[0].lower()}{what[1:]}", type(value)
             for part in self._arguments_of(value, what).values():
                 if isinstance(part, CompGraph | Node) or callable(part):
                     yield from self._callables_in(bare(part), what)
@@ -138,7 +143,7 @@ class Graphs:
             found = as_switch(function)
             if found is not None:
                 switches[name] = references[name] = self._switch(cg, name, found, what)
-            else:
+            elif not is_placeholder(function):
                 references[name] = self._value(bare(function), what, name)
         return GraphText(references, switches)
 

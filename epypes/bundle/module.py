@@ -19,7 +19,7 @@ def write_module(subject: Subject, settings: Settings) -> tuple[str, Settings, l
     """Return the text of ``pipeline.py``, the settings with what it has of its own, and the reasons against it."""
     gathered = Slice()
     graphs = Graphs(gathered)
-    text = graphs.write(subject.cg, subject.ports)
+    text = graphs.write(subject.cg, {**subject.ports, **subject.classes})
     own = dict(own_lines(gathered, graphs, subject))
     if settings.has_groups:
         _keep(gathered, "func_groups")
@@ -52,7 +52,12 @@ def _listed(gathered: Slice, kinds: Iterable[type[enum.Enum]]) -> list[str]:
         if found.setdefault(kind.__qualname__, reference) != reference:
             gathered.refusals.append(f"Two hyperparameters are of two classes called {kind.__name__!r}. Rename one.")
     _keep(gathered, "enums")
-    return ["# Whose members stand in pipeline.toml.", "enums = {", *(f'    "{n}": {r},' for n, r in found.items()), "}"]
+    return [
+        "# Whose members stand in pipeline.toml.",
+        "enums = {",
+        *(f'    "{n}": {r},' for n, r in found.items()),
+        "}",
+    ]
 
 
 def _keep(gathered: Slice, name: str) -> None:

@@ -99,9 +99,7 @@ def _check_place(target: Path) -> None:
         )
 
 
-def _write(
-    draft: Path, target: Path, subject: Subject, outputs: Sequence[str] | None, samples: Iterable[Any]
-) -> None:
+def _write(draft: Path, target: Path, subject: Subject, outputs: Sequence[str] | None, samples: Iterable[Any]) -> None:
     """Write all that can be written without running anything new; raise every reason against it at once."""
     runner, cg = subject.runner, subject.cg
     wanted = cg.sink_tokens if outputs is None else tuple(outputs)
@@ -109,10 +107,6 @@ def _write(
         cg.require_token(token)
     reasons = [*_unready(runner, wanted), *unwritable(runner.hyperparameters)]
     reasons += unwritable(subject.attributes, "Attribute")
-    reasons += [
-        f"Function {name!r} is a placeholder. Give it: ep.extend(cg, {{{name!r}: ...}}), and run that graph."
-        for name in cg.placeholders
-    ]
     hyperparameters, free = runner.hyperparameters, runner.free_source_tokens
     rgb = tuple(token for token in dict.fromkeys((*free, *wanted)) if colour_order(cg, token) == "rgb")
     settings = Settings(

@@ -96,7 +96,9 @@ def replay(bundle: Bundle) -> ReplayReport:
                 differences.append(Difference(path.stem, token, text))
         text = bundle_answer_difference(bundle, path.stem, run)
         if text:
-            differences.append(Difference(path.stem, ", ".join(bundle.settings.outputs), f"the answer of f_out: {text}"))
+            differences.append(
+                Difference(path.stem, ", ".join(bundle.settings.outputs), f"the answer of f_out: {text}")
+            )
     return ReplayReport(len(bundle.samples), tokens, tuple(differences), imported_requirements())
 
 

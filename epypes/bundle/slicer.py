@@ -21,6 +21,8 @@ from epypes.hints import Param
 from epypes.images import Image
 from epypes.run.guard import is_plain_array
 
+AnyDefinition = Definition | ClassDefinition
+
 _CONSTANT_CHARACTERS: Final = 400
 RESERVED: Final = frozenset({"func_dict", "func_io"})
 
@@ -49,7 +51,7 @@ class Slice:
         self.reserved = reserved
         self.imports: dict[tuple[str, str], str] = {}
         self.constants: dict[str, str] = {}
-        self.definitions: dict[str, Definition | ClassDefinition] = {}
+        self.definitions: dict[str, AnyDefinition] = {}
         self.refusals: list[str] = []
         self._meanings: dict[str, tuple[str, object]] = {}
         self._seen: set[int] = set()
@@ -101,7 +103,7 @@ class Slice:
 
     def _add_definition(
         self, function: Callable[..., Any], what: str, around: Mapping[str, Any] | None = None
-    ) -> Definition | ClassDefinition:
+    ) -> AnyDefinition:
         found = self._found(function, what, around)
         self._claim(found.name, ("object", id(function)), what)
         if id(function) in self._seen:
@@ -117,9 +119,7 @@ class Slice:
         self.definitions[found.name] = found
         return found
 
-    def _found(
-        self, function: Callable[..., Any], what: str, around: Mapping[str, Any] | None
-    ) -> Definition | ClassDefinition:
+    def _found(self, function: Callable[..., Any], what: str, around: Mapping[str, Any] | None) -> AnyDefinition:
         if isinstance(function, type):
             return class_definition(function, self._around(function) if around is None else around, what)
         return definition(function, what)
@@ -139,7 +139,7 @@ class Slice:
                 "Rename one of the two."
             )
 
-    def _add_name(self, name: str, found: Definition | ClassDefinition, what: str) -> None:
+    def _add_name(self, name: str, found: AnyDefinition, what: str) -> None:
         """Add what one global name of a function means at the time of promotion."""
         names = found.names
         if name not in names:
@@ -161,7 +161,7 @@ class Slice:
         else:
             self._add_constant(name, value, found, what)
 
-    def _add_notebook_class(self, name: str, kind: type, found: Definition | ClassDefinition, what: str) -> None:
+    def _add_notebook_class(self, name: str, kind: type, found: AnyDefinition, what: str) -> None:
         if kind.__name__ != name:
             raise Refused(
                 f"{what} uses {name!r} ({found.place}), which was defined as class {kind.__name__!r}. "
@@ -169,7 +169,7 @@ class Slice:
             )
         self.add_class(kind, found.names, f"Class {name!r}, which {what[0].lower()}{what[1:]} uses,")
 
-    def _add_helper(self, name: str, helper: types.FunctionType, found: Definition | ClassDefinition, what: str) -> None:
+    def _add_helper(self, name: str, helper: types.FunctionType, found: AnyDefinition, what: str) -> None:
         if helper.__name__ != name and helper.__name__ != "<lambda>":
             raise Refused(
                 f"{what} calls {name!r} ({found.place}), which was defined as {helper.__name__!r}. "
@@ -177,7 +177,7 @@ class Slice:
             )
         self._add_definition(helper, f"Function {name!r}, which {what[0].lower()}{what[1:]} calls,")
 
-    def _add_constant(self, name: str, value: Any, found: Definition | ClassDefinition, what: str) -> None:
+    def _add_constant(self, name: str, value: Any, found: AnyDefinition, what: str) -> None:
         if is_plain_array(value):
             source = self.array_source(value, what)
         else:
@@ -194,12 +194,12 @@ class Slice:
             self._claim(name, ("constant", name), what)
             self.constants[name] = source
 
-    def _made(self, value: Any, found: Definition | ClassDefinition, what: str) -> str:
+    def _made(self, value: Any, found: AnyDefinition, what: str) -> str:
         """Return the expression that makes a member of an enumeration, or a record of literals, again."""
 
-
         def class_of(kind: type) -> str:
-            return self.add_class(kind, found.names, f"Class {kind.__name__!r} of a value that {what[0].lower()}{what[1:]} uses")
+            told = f"Class {kind.__name__!r} of a value that {what[0].lower()}{what[1:]} uses"
+            return self.add_class(kind, found.names, told)
 
         return made_again(value, lambda part: literal_source(part) or self._made(part, found, what), class_of)
 
@@ -216,9 +216,7 @@ class Slice:
         parts = [self.annotation_source(mark, what) for mark in value.__metadata__] if home else [""]
         if home is None or not all(parts):
             return ""
-        plain = (
-            home.qualname if home.module == "builtins" else f"{self.module_name(home.module, what)}.{home.qualname}"
-        )
+        plain = home.qualname if home.module == "builtins" else f"{self.module_name(home.module, what)}.{home.qualname}"
         return f"{self.module_name('typing', what)}.Annotated[{plain}, {', '.join(parts)}]"
 
     def array_source(self, array: Any, what: str) -> str:
@@ -232,7 +230,7 @@ class Slice:
             return ""
         return f"{self.module_name('numpy', what)}.array({listed}, dtype={str(array.dtype)!r})".replace("'", '"')
 
-    def _add_module(self, name: str, module: types.ModuleType, found: Definition | ClassDefinition, what: str) -> None:
+    def _add_module(self, name: str, module: types.ModuleType, found: AnyDefinition, what: str) -> None:
         if module.__name__ == "__main__":
             raise Refused(f"{what} uses the notebook itself as module {name!r} ({found.place}).")
         if name != module.__name__:

@@ -50,6 +50,14 @@ class Subject:
     ports: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def classes(self) -> Mapping[str, type]:
+        """The class of the pipeline by how reasons call it, if it is not one of EPypes."""
+        kind = type(self.pipeline)
+        if self.pipeline is None or kind in _OURS:
+            return {}
+        return {f"Class {kind.__name__!r} of pipeline {self.pipeline.name!r}": kind}
+
 
 def subject_of(given: object, f_in: Any, f_out: Any) -> Subject:
     """Return what is promoted.
@@ -146,7 +154,8 @@ def _answering(gathered: Slice, kind: type[Pipeline], known: str, what: str) -> 
         raise Refused(f"{what} is of class {kind.__name__!r}, whose emit() a service would not call. {way_out}")
     usual = [*inspect.signature(Pipeline.__init__).parameters]
     if [*inspect.signature(kind.__init__).parameters] != usual and not issubclass(kind, SinkPipeline):
-        raise Refused(f"{what} is of class {kind.__name__!r}, whose __init__ takes what a service can't give. {way_out}")
+        text = f"{what} is of class {kind.__name__!r}, whose __init__ takes what a service can't give."
+        raise Refused(f"{text} {way_out}")
     name = f"Answering{kind.__name__}"
     gathered.keep_name(name)
     full = f"{gathered.module_name('epypes', what)}.FullPipeline"

@@ -118,9 +118,7 @@ def _bare(code: types.CodeType) -> types.CodeType:
     return code.replace(co_consts=constants, co_filename="", co_firstlineno=1, co_linetable=b"")
 
 
-def same_methods(
-    text: str, node: ast.ClassDef, written: Mapping[str, Sequence[types.FunctionType]]
-) -> str:
+def same_methods(text: str, node: ast.ClassDef, written: Mapping[str, Sequence[types.FunctionType]]) -> str:
     """Return the name of a method in the text of a class that is not what the class has; "" if there is none."""
     for method in node.body:
         if not isinstance(method, ast.FunctionDef):
