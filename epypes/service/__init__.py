@@ -1,6 +1,34 @@
-"""A bundle as a running process, and how to call it."""
+"""A bundle as running processes, and how to call it."""
 
-from epypes.service.call import Answer, Client, call
-from epypes.service.server import Service, serve
+from __future__ import annotations
 
-__all__ = ["Answer", "Client", "Service", "call", "serve"]
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from epypes.service.client import Answer, Client, call
+    from epypes.service.parameters import Parameters
+    from epypes.service.server import Service
+    from epypes.service.serving import serve
+
+__all__ = ["Answer", "Client", "Parameters", "Service", "call", "serve"]
+
+_HOME = {
+    "Answer": "client",
+    "Client": "client",
+    "Parameters": "parameters",
+    "Service": "server",
+    "call": "client",
+    "serve": "serving",
+}
+
+
+def __getattr__(name: str) -> Any:
+    # A worker, which is in this room too, needs none of them.
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"epypes.service.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
