@@ -55,8 +55,8 @@ def answer_with(
     """Return an f_out: an Envelope with the output tokens and the times, which answers the event by its id.
 
     The arrays are copies, since a function may use the memory of its result again for the next event before this one
-    is sent; ``detach=False`` is for who encodes an answer before the next event. Images of the tokens named in ``rgb`` are sent as RGB. What can't be sent raises MessageError here, where
-    it becomes the event's failure.
+    is sent; ``detach=False`` is for who encodes an answer before the next event. Images of the tokens named in ``rgb``
+    are sent as RGB. What can't be sent raises MessageError here, where it becomes the event's failure.
     """
 
     def f_out(view: EventView) -> Envelope:
