@@ -62,12 +62,13 @@ def answer_with(
     def f_out(view: EventView) -> Envelope:
         from epypes.wire import Envelope, encode
 
+        event = view.event if isinstance(view.event, Envelope) else None
         answer = Envelope(
             type=RESULT,
             parts={token: detached(view[token]) if detach else view[token] for token in outputs},
             source=view.name,
-            correlation_id=view.event.id,
-            acquired_ns=view.event.acquired_ns,
+            correlation_id=event.id if event else "",
+            acquired_ns=event.acquired_ns if event else 0,
             revision=view.run.revision,
             bundle_digest=bundle_digest,
             attributes={**view.attributes, "total_ns": view.report.total_ns, "overhead_ns": view.report.overhead_ns},
