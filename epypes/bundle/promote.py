@@ -39,6 +39,7 @@ def promote(
     outputs: Sequence[str] | None = None,
     f_in: Callable[[Any], Mapping[str, Any]] | None = None,
     f_out: Callable[[Any], Any] | None = None,
+    *,
     samples: Iterable[Any] = (),
 ) -> Bundle:
     """Write a bundle: a folder of text that computes what the runner's last run computed, and proves it.

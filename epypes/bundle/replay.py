@@ -15,7 +15,7 @@ from pathlib import Path
 
 from epypes.bundle.answers import bundle_answer_difference
 from epypes.bundle.compare import Difference, ReplayReport, first_difference
-from epypes.bundle.load import Bundle, read_bundle
+from epypes.bundle.load import Bundle, pipeline_of, read_bundle
 from epypes.bundle.requirements import imported_requirements
 from epypes.errors import BundleError, EpypesError, ReplayDiffers
 from epypes.run import CompGraphRunner
@@ -82,6 +82,7 @@ def replay(bundle: Bundle) -> ReplayReport:
 
     differences: list[Difference] = []
     tokens = 0
+    pipeline_of(bundle, None, None)  # what serves it can be made
     for path in bundle.samples:
         inputs, outputs = load_sample(path)
         if (set(inputs), set(outputs)) != (set(bundle.settings.inputs), set(bundle.settings.outputs)):

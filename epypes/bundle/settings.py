@@ -17,7 +17,7 @@ from epypes.hints import Param
 from epypes.images import Order
 
 FORMAT: Final = 1
-# Of a bundle that has what the first format did not: its own ports or pipeline, groups, attributes, values of new kinds.
+# Of a bundle with what the first one has not: ports or a pipeline of its own, groups, attributes, values of new kinds.
 _FORMAT_WITH_MORE: Final = 2
 _FIRST_KINDS: Final = (None, "none", "tuple")
 _LINE: Final = 100
@@ -50,7 +50,7 @@ class Settings:
     has_groups
         Whether the module says which functions are drawn as one box.
     entries
-        The hyperparameters as they stand in the file: value and kind, range, unit; ready for JSON. Empty until it was read.
+        The hyperparameters as they stand in the file: value and kind, range, unit; ready for JSON. Empty before that.
     """
 
     name: str
@@ -98,7 +98,8 @@ def unwritable(values: Mapping[str, Any], what: str = "Hyperparameter") -> list[
             way_out = "or unfreeze it and pass it to run()" if what == "Hyperparameter" else "or leave it out"
             reasons.append(
                 f"{what} {token!r} is {found}, which pipeline.toml can't hold. "
-                f"Use numbers, strings, a small array or tuples, lists and dicts of them; make it in a function; {way_out}."
+                "Use numbers, strings, a small array or tuples, lists and dicts of them; make it in a function; "
+                f"{way_out}."
             )
     return reasons
 
