@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 
+from epypes.bundle.constants import constants_text
 from epypes.bundle.settings import Settings
 from epypes.bundle.slicer import Slice
 from epypes.graph import CompGraph
@@ -29,7 +30,7 @@ def emit_module(settings: Settings, cg: CompGraph, needed: Slice, references: Ma
     if needed.imports:
         sections.append("\n".join(ordered_imports(list(needed.imports.values()))) + "\n")
     if needed.constants:
-        sections.append("".join(f"{constant} = {source}\n" for constant, source in needed.constants.items()))
+        sections.append("\n".join(constants_text(needed.constants, needed.remarks)) + "\n")
     body = "\n".join(sections)
     for found in needed.definitions.values():
         body += f"\n\n{found.text}"
