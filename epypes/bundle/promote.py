@@ -7,29 +7,25 @@ bundle that passed them all takes the place of an older one.
 
 from __future__ import annotations
 
-import ctypes
-import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from epypes.bundle.emit import emit_module
+from epypes.bundle.exchange import exchange as _exchange
 from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
 from epypes.bundle.nodes import called_by, is_plain_pipeline
-from epypes.bundle.replay import replay_isolated
-from epypes.bundle.seal import MANIFEST, seal
+from epypes.bundle.proof import prove
+from epypes.bundle.seal import MANIFEST
 from epypes.bundle.settings import Settings, unwritable, writable_defaults, write_settings
 from epypes.bundle.slicer import slice_graph
+from epypes.bundle.tolerance import Learnt, learn
 from epypes.errors import BundleError, EpypesError, MessageError, PromotionRefused, run_call
 from epypes.graph import CompGraph, as_switch, colour_order, is_placeholder
 from epypes.pipeline import Node, Pipeline
 from epypes.run import CompGraphRunner, Run
 
-REQUIREMENTS: Final = "requirements.txt"
-# From Linux's fcntl.h and fs.h.
-_AT_FDCWD: Final = -100
-_RENAME_EXCHANGE: Final = 2
 _NO_RUNNER: Final = (
     "An object of class {} can't be promoted. Make a runner and run it: "
     "runner = CompGraphRunner(cg, hparams); runner.run(...)."
@@ -46,6 +42,8 @@ def promote(
     outputs: Sequence[str] | None = None,
     f_in: Callable[[Any], Mapping[str, Any]] | None = None,
     f_out: Callable[[Any], Any] | None = None,
+    *,
+    told: Callable[[str], None] = lambda text: None,
 ) -> Bundle:
     """Write a bundle: a folder of text that computes what the runner's last run computed, and proves it.
 
@@ -59,6 +57,9 @@ def promote(
         The tokens that the service answers with; the sink tokens without.
     f_in, f_out
         Refused so far: a bundle takes and gives Envelopes with one part per token.
+    told
+        Is told what is being done: the functions are run three times more, to learn which tokens they repeat to the
+        last bit and how far noise puts the others apart.
 
     Raises
     ------
@@ -79,8 +80,9 @@ def promote(
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{target.name[:40]}-", dir=target.parent) as scratch:
             draft = Path(scratch) / target.name
-            _write(draft, target, runner, cg, outputs)
-            _prove(draft, target)
+            _write(draft, target, runner, cg, outputs, told)
+            told("replaying in a fresh process")
+            prove(draft, target)
             _replace(draft, target)
     except (OSError, UnicodeError) as error:
         if isinstance(error, EpypesError):
@@ -112,7 +114,14 @@ def _subject(given: object, target: Path) -> tuple[CompGraphRunner, CompGraph]:
     raise PromotionRefused(target, [_NO_RUNNER.format(type(given).__name__)])
 
 
-def _write(draft: Path, target: Path, runner: CompGraphRunner, cg: CompGraph, outputs: Sequence[str] | None) -> None:
+def _write(
+    draft: Path,
+    target: Path,
+    runner: CompGraphRunner,
+    cg: CompGraph,
+    outputs: Sequence[str] | None,
+    told: Callable[[str], None],
+) -> None:
     """Write all that can be written without running anything; raise every reason against it at once."""
     wanted = cg.sink_tokens if outputs is None else tuple(outputs)
     for token in wanted:
@@ -124,12 +133,13 @@ def _write(draft: Path, target: Path, runner: CompGraphRunner, cg: CompGraph, ou
     reasons += needed.refusals
     if reasons:
         raise PromotionRefused(target, reasons)
+    learnt = _learnt(target, runner, cg, wanted, told)
     (draft / SAMPLES).mkdir(parents=True)
     free = runner.free_source_tokens
     rgb = tuple(token for token in dict.fromkeys((*free, *wanted)) if colour_order(cg, token) == "rgb")
     hyperparameters = runner.hyperparameters
     defaults = writable_defaults(cg, hyperparameters)
-    settings = Settings(target.name, free, wanted, hyperparameters, rgb, defaults, cg.types)
+    settings = Settings(target.name, free, wanted, hyperparameters, rgb, defaults, cg.types, learnt.tolerances)
     (draft / MODULE).write_text(emit_module(settings, cg, needed, references), encoding="utf-8")
     write_settings(draft / SETTINGS, settings, cg)
     if runner.last is not None:  # as _unready has made sure
@@ -171,6 +181,20 @@ def _unready(runner: CompGraphRunner, outputs: Sequence[str]) -> list[str]:
     return []
 
 
+def _learnt(
+    target: Path, runner: CompGraphRunner, cg: CompGraph, outputs: Sequence[str], told: Callable[[str], None]
+) -> Learnt:
+    """Return the tolerances of the outputs; refuse outputs that are something else at every run."""
+    samples = [runner.last] if runner.last is not None else []
+    try:
+        learnt = learn(cg, runner.hyperparameters, samples, outputs, told)
+    except BundleError as error:
+        raise PromotionRefused(target, [str(error)]) from error
+    if learnt.reasons:
+        raise PromotionRefused(target, learnt.reasons)
+    return learnt
+
+
 def _record(path: Path, target: Path, run: Run, settings: Settings) -> None:
     from epypes.wire.samples import save_sample
 
@@ -181,21 +205,6 @@ def _record(path: Path, target: Path, run: Run, settings: Settings) -> None:
         raise PromotionRefused(target, [str(error)]) from error
 
 
-def _prove(draft: Path, target: Path) -> None:
-    try:
-        report = replay_isolated(draft, sealed=False)
-    except BundleError as error:
-        raise PromotionRefused(target, [str(error).replace(str(draft.resolve()), str(target))]) from error
-    if not report.identical:
-        why = (
-            "A function may depend on something that is not a token, such as a file, the current folder, a counter, "
-            "the time or random numbers. Pass it in as a token."
-        )
-        raise PromotionRefused(target, [*map(str, report.differences), why])
-    (draft / REQUIREMENTS).write_text("".join(f"{line}\n" for line in report.requirements), encoding="utf-8")
-    seal(draft)
-
-
 def _replace(draft: Path, target: Path) -> None:
     """Put the new bundle in the place of the old one; at every moment one of the two is there."""
     if target.exists():
@@ -203,15 +212,3 @@ def _replace(draft: Path, target: Path) -> None:
         _exchange(draft, target)
     else:
         draft.rename(target)
-
-
-def _exchange(left: Path, right: Path) -> None:
-    """Exchange two folders in one step, which Python has no call for; rename by rename where the system has none."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    exchange = getattr(libc, "renameat2", None)
-    if exchange and exchange(_AT_FDCWD, os.fsencode(left), _AT_FDCWD, os.fsencode(right), _RENAME_EXCHANGE) == 0:
-        return
-    aside = left.with_name("old")
-    right.rename(aside)
-    left.rename(right)
-    aside.rename(left)

@@ -8,7 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from epypes.bundle.compare import Tolerance
 from epypes.bundle.entries import fits, plain, read, written
+from epypes.bundle.tolerance import add_tolerances, read_tolerances
 from epypes.errors import BundleError
 from epypes.graph import CompGraph, annotated_params
 from epypes.hints import Param, Roi
@@ -37,6 +39,8 @@ class Settings:
         The graph's defaults of hyperparameters by token: what they are where the graph is used without these settings.
     types
         Whether the graph compares annotations, as CompGraph does unless told otherwise.
+    tolerances
+        How far outputs may be from what was recorded, by token; those of all others not at all.
     """
 
     name: str
@@ -46,6 +50,7 @@ class Settings:
     rgb: tuple[str, ...] = ()
     defaults: Mapping[str, Any] = field(default_factory=dict)
     types: bool = True
+    tolerances: Mapping[str, Tolerance] = field(default_factory=dict)
 
     def order(self, token: str) -> Order:
         """Return the order of a token's colours."""
@@ -104,6 +109,7 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
         for token, value in settings.defaults.items():
             defaults.add(token, _entry(plain(value), None))
         document.add("defaults", defaults)
+    add_tolerances(document, settings.tolerances)
     path.write_text(tomlkit.dumps(document), encoding="utf-8")
 
 
@@ -144,6 +150,7 @@ def read_settings(path: Path) -> Settings:
             _strings(ports.get("rgb", [])),
             _values(document.get("defaults", {})),
             bundle.get("types", True) is not False,
+            read_tolerances(document),
         )
     except KeyError as error:
         raise BundleError(path, f"{path} lacks {error.args[0]!r}. Promote the graph again.") from error

@@ -150,7 +150,7 @@ class Writer:
     def _set(self, message: Any, value: Collection[object], path: Path) -> None:
         items = message.set if type(value) is set else message.frozen_set
         items.SetInParent()
-        for item in sorted(value, key=_sorted_by):
+        for item in sorted(value, key=set_order):
             self.fill(items.items.add(), item, (*path, item))
 
     def _list(self, message: Any, value: Sequence[object], path: Path) -> None:
@@ -246,9 +246,9 @@ _PLAIN: dict[type, Callable[[Writer, Any, Any, Path], None]] = {
 }
 
 
-def _sorted_by(item: object) -> str:
+def set_order(item: object) -> str:
     """Return the text by which a set's items are sorted: that of their hashes changes from process to process."""
     if type(item) in (tuple, frozenset):
-        texts = map(_sorted_by, cast("Collection[object]", item))
+        texts = map(set_order, cast("Collection[object]", item))
         return f"{type(item).__name__}({','.join(sorted(texts) if type(item) is frozenset else texts)})"
     return f"{type(item).__name__} {item:x}" if type(item) is int else f"{type(item).__name__} {item!r}"
