@@ -168,7 +168,7 @@ def _told(error: BaseException, folder: Path) -> str:
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.startswith(str(folder))]
     where = f" at {Path(frames[-1].filename).name}, line {frames[-1].lineno}: {frames[-1].line}" if frames else ""
     notes = "; ".join(getattr(error, "__notes__", ()))
-    text = f"The replay of {folder} failed{where}: {type(error).__name__}: {error}"
+    text = f"The replay of {folder} failed{where}: {type(error).__name__}: {' '.join(str(error).split())}"
     if isinstance(error, ModuleNotFoundError):
         text += ". Only installed packages can be imported in a bundle: install it, or move the code into the notebook"
     return f"{text} ({notes})" if notes else text

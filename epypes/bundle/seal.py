@@ -81,7 +81,7 @@ def changed_since_recorded(folder: Path) -> list[str]:
     """Return as sentences which files, at which line, are not those that the samples were recorded with."""
     facts = _facts(folder)
     found = [
-        f"{name} was changed since the samples were recorded{_changed_line(folder, name, facts)}."
+        f"Since the samples were recorded, {name} was changed{_changed_line(folder, name, facts)}."
         for name in _TEXTS
         if f"{_LINES}{name}" in facts and (folder / name).is_file() and _sums(folder / name) != facts[_LINES + name]
     ]

@@ -30,6 +30,10 @@ RUNS: Final = 3
 SAFETY: Final = 10.0
 # Noise goes up and down. Of as many distances between runs 1 in 120 grows each time by chance.
 _RUNS_OF_SUSPECTS: Final = 6
+_MEANING: Final = (
+    f"{counted(RUNS, 'more run')} in the notebook gave other last digits: a replay may differ by {SAFETY:g} times as",
+    "much, and by no more than the relative part of the largest magnitude.",
+)
 Told = Callable[[str], None]
 
 
@@ -212,10 +216,8 @@ def add_tolerances(document: Any, tolerances: Mapping[str, Tolerance]) -> None:
     entries = tomlkit.table(is_super_table=True)
     for token, tolerance in tolerances.items():
         entry = tomlkit.table()
-        entry.add(
-            tomlkit.comment(f"{counted(RUNS, 'more run')} in the notebook gave other last digits: {SAFETY:g} times")
-        )
-        entry.add(tomlkit.comment("their largest difference, and that as a part of the largest magnitude. Both hold."))
+        for line in _MEANING:
+            entry.add(tomlkit.comment(line))
         entry.add("absolute", tolerance.absolute)
         entry.add("relative", tolerance.relative)
         entries.add(token, entry)
