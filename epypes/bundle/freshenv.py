@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Final
@@ -29,6 +29,8 @@ _NO_NETWORK: Final = re.compile(
     r"network is unreachable|tunneling|timed out|offline",
     re.IGNORECASE,
 )
+# uv keeps the wheels that it has built of folders, also when their code has changed.
+_REFRESHED: Final = ("--refresh-package", _OURS)
 _ADDRESSES: Final = re.compile(r"https?://\S+")
 
 
@@ -58,7 +60,15 @@ def _wanted(folder: Path) -> list[str]:
     pinned = pins(lines)
     named = [_source(name, version) for name, version in pinned.items() if name != _OURS]
     needed = [requirement for name, requirement in _own_needs().items() if name not in pinned]
-    return [*named, *needed, _source(_OURS, pinned.get(_OURS, metadata.version(_OURS)))]
+    return [*named, *needed, _ours(pinned)]
+
+
+def _ours(pinned: Mapping[str, str]) -> str:
+    """Return where to install EPypes from: the checkout that runs now, if it is one."""
+    checkout = Path(__file__).resolve().parents[2]
+    if (checkout / "pyproject.toml").is_file():
+        return str(checkout)
+    return _source(_OURS, pinned.get(_OURS, metadata.version(_OURS)))
 
 
 def _source(name: str, version: str) -> str:
@@ -97,7 +107,7 @@ def _steps(home: Path, wanted: Sequence[str]) -> list[tuple[str, list[str]]]:
     if uv != [""]:
         return [
             (made, [*uv, "venv", "--quiet", "--no-project", "--python", sys.executable, str(home)]),
-            (installed, [*uv, "pip", "install", "--quiet", "--python", python, *wanted]),
+            (installed, [*uv, "pip", "install", "--quiet", *_REFRESHED, "--python", python, *wanted]),
         ]
     pip = [python, "-I", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-input"]
     return [(made, [sys.executable, "-I", "-m", "venv", str(home)]), (installed, [*pip, *wanted])]
