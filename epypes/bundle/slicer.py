@@ -31,7 +31,6 @@ from epypes.bundle.values import expression
 from epypes.bundle.words import is_word, word_of
 from epypes.hints import Param
 from epypes.images import Image
-from epypes.run.guard import is_plain_array
 
 AnyDefinition = Definition | ClassDefinition
 
@@ -337,7 +336,11 @@ class Slice:
         if remark and not self._made_here(source):
             self.remarks[name] = remark
         if self._made_here(source):
-            self._write(name, "\n".join([*(remark.above if remark else ()), *_assigned(name, source)]) + "\n", self._binding(name, found))
+            self._write(
+                name,
+                "\n".join([*(remark.above if remark else ()), *_assigned(name, source)]) + "\n",
+                self._binding(name, found),
+            )
         else:
             self.constants[name] = source
 

@@ -16,8 +16,33 @@ from epypes.run.guard import is_plain_array
 
 # Methods of lists, dicts, sets, deques and arrays that change them.
 CHANGING: Final = frozenset(
-    "append appendleft extend extendleft insert pop popleft popitem remove clear update setdefault add discard sort reverse"
-    " difference_update intersection_update symmetric_difference_update fill itemset put resize setfield setflags".split()
+    [
+        "append",
+        "appendleft",
+        "extend",
+        "extendleft",
+        "insert",
+        "pop",
+        "popleft",
+        "popitem",
+        "remove",
+        "clear",
+        "update",
+        "setdefault",
+        "add",
+        "discard",
+        "sort",
+        "reverse",
+        "difference_update",
+        "intersection_update",
+        "symmetric_difference_update",
+        "fill",
+        "itemset",
+        "put",
+        "resize",
+        "setfield",
+        "setflags",
+    ]
 )
 _ASKED: Final = {
     "get_ipython": "the notebook itself, as magics and shell escapes do. Write it in Python, or outside of the function",
@@ -30,7 +55,7 @@ _ASKED: Final = {
     "Out": "what the notebook's cells have shown. Make the value a token",
 }
 _OF_A_MODULE: Final = frozenset(
-    "__name__ __file__ __doc__ __spec__ __loader__ __package__ __builtins__ __cached__".split()
+    ["__name__", "__file__", "__doc__", "__spec__", "__loader__", "__package__", "__builtins__", "__cached__"]
 )
 
 
