@@ -328,6 +328,15 @@ def test_the_usual_ports_of_a_bundle_are_not_written_out(names, tmp_path):
     assert ep.promote(served, tmp_path / "c").settings.own == ()
 
 
+def test_a_sample_brings_what_was_unfrozen_too(tmp_path):
+    names = cell("def shift(x, by=1):\n    return x + by\n")
+    runner = ep.CompGraphRunner(ep.CompGraph.from_functions(names["shift"]))
+    runner.unfreeze("by")
+    runner.run(x=1, by=5)
+    bundle = ep.promote(runner, tmp_path / "b", samples=[{"x": 2, "by": 7}])
+    assert (bundle.settings.inputs, verify(bundle.path).samples) == (("x", "by"), 2)
+
+
 def refusals(pipe_or_runner, folder, **more) -> str:
     with pytest.raises(PromotionRefused) as refused:
         ep.promote(pipe_or_runner, folder, **more)
