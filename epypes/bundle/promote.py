@@ -145,7 +145,7 @@ def _runs(target: Path, subject: Subject, samples: Iterable[Any]) -> Iterator[Ru
     for number, sample in enumerate(samples, 1):
         payload = sample if isinstance(sample, Mapping) else dict(zip(free[:1], [sample], strict=False))
         try:
-            run = CompGraphRunner(subject.cg, subject.runner.hyperparameters).run_on(payload)
+            run = subject.fresh_runner().run_on(payload)
         except Exception as error:  # whatever a function raises on it
             text = f"Sample {number} can't be run: {type(error).__name__}: {error}"
             raise PromotionRefused(target, [text]) from error
@@ -168,7 +168,7 @@ def _learnt(
 def _record_answer(path: Path, subject: Subject, run: Run, settings: Settings) -> None:
     """Record what f_out makes of a run where that is no accident: another run of the same payload tells."""
     payload = {token: run[token] for token in settings.inputs}
-    again = CompGraphRunner(subject.cg, settings.hyperparameters).run_on(payload)
+    again = subject.fresh_runner().run_on(payload)
     record_answer(path, subject.ports["f_out"], settings.name, (run, again), settings.attributes)
 
 
