@@ -32,12 +32,12 @@ def verify(
         found = error.report if isinstance(error, ReplayDiffers) else None
         if as_json:
             fields = found.to_dict() if found else {"identical": False}
-            print(json.dumps({**fields, "bundle": str(bundle), "error": str(error)}, indent=1))
+            out.print(json.dumps({**fields, "bundle": str(bundle), "error": str(error)}, indent=1), markup=False)
         elif found:
             out.print(str(found), markup=False)
         raise BundleError(bundle, _in_one_line(bundle, found) if found else str(error)) from error
     if as_json:
-        print(json.dumps({**report.to_dict(), "bundle": str(bundle)}, indent=1))
+        out.print(json.dumps({**report.to_dict(), "bundle": str(bundle)}, indent=1), markup=False)
         return
     where = " in a new environment" if fresh_env else ""
     out.print(f"{bundle}: {report}{where}.", markup=False)
