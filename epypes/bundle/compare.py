@@ -127,7 +127,13 @@ def _in_records(expected: Any, got: Any, tolerance: Tolerance | None, where: str
 
 
 def _in_tables(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:
-    yield from _in_mappings(table_parts(expected), table_parts(got), tolerance, where)
+    left, right = table_parts(expected), table_parts(got)
+    ours_at, theirs_at = ([place for place, _ in parts] for parts in (left, right))
+    if ours_at != theirs_at:
+        yield _named(where, f"the parts {ours_at!r:.80}", f"{theirs_at!r:.80}")
+        return
+    for (place, ours), (_, theirs) in zip(left, right, strict=True):
+        yield from differences(ours, theirs, tolerance, f"{where}{place} ")
 
 
 def _in_numbers(expected: complex, got: complex, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:

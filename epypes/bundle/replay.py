@@ -18,7 +18,7 @@ from typing import Any
 from epypes.bundle.answers import answer_differences
 from epypes.bundle.compare import differences
 from epypes.bundle.environment import environment
-from epypes.bundle.imports import ImportWatch
+from epypes.bundle.importwatch import ImportWatch
 from epypes.bundle.load import SAMPLES, Bundle, pipeline_of, read_bundle
 from epypes.bundle.report import Difference, ReplayReport, difference, report_from
 from epypes.bundle.requirements import owner, requirement_lines

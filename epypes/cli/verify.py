@@ -29,16 +29,15 @@ def verify(
     try:
         report = verify_bundle(bundle, fresh_env=fresh_env)
     except BundleError as error:
+        found = error.report if isinstance(error, ReplayDiffers) else None
         if as_json:
-            found = error.report.to_dict() if isinstance(error, ReplayDiffers) else {"identical": False}
-            print(json.dumps({**found, "bundle": str(bundle), "error": str(error)}, indent=1))
-            raise
-        if not isinstance(error, ReplayDiffers):
-            raise
-        out.print(str(error.report), markup=False)
-        raise BundleError(bundle, _in_one_line(bundle, error.report)) from error
+            fields = found.to_dict() if found else {"identical": False}
+            out.print(json.dumps({**fields, "bundle": str(bundle), "error": str(error)}, indent=1), markup=False)
+        elif found:
+            out.print(str(found), markup=False)
+        raise BundleError(bundle, _in_one_line(bundle, found) if found else str(error)) from error
     if as_json:
-        print(json.dumps({**report.to_dict(), "bundle": str(bundle)}, indent=1))
+        out.print(json.dumps({**report.to_dict(), "bundle": str(bundle)}, indent=1), markup=False)
         return
     where = " in a new environment" if fresh_env else ""
     out.print(f"{bundle}: {report}{where}.", markup=False)

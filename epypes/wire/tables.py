@@ -82,16 +82,20 @@ def _plain_column(column: Any, path: Path) -> tuple[str, Any]:
     raise MessageError("no codec", text)
 
 
-def table_parts(value: Any) -> dict[str, Any]:
-    """Return what a table is made of, as plain values and arrays, so that two tables can be compared."""
-    where = ("table",)
-    parts: dict[str, Any] = {"index": (*_plain_column(value.index, where), value.index.name)}
+def table_parts(value: Any) -> list[tuple[str, Any]]:
+    """Return what a table is made of, each with where it is: plain values and arrays, so that two can be compared."""
+    parts = _parts_of(".index", value.index, value.index.name)
     if value.ndim == 1:
-        return {**parts, "name": value.name, "values": _plain_column(value, where)}
-    parts["columns"] = (*_plain_column(value.columns, where), value.columns.name)
+        return [*parts, *_parts_of("", value, value.name)]
+    parts += _parts_of(".columns", value.columns, value.columns.name)
     for place, label in enumerate(value.columns):
-        parts[f"column {place}: {label!r}"] = _plain_column(value.iloc[:, place], where)
+        parts += _parts_of(f"[{label!r}]", value.iloc[:, place], None)
     return parts
+
+
+def _parts_of(where: str, column: Any, name: object) -> list[tuple[str, Any]]:
+    dtype, values = _plain_column(column, (where,))
+    return [(f"{where}.name", name), (f"{where}.dtype", dtype), (where, values)]
 
 
 def read_table(reader: Reader, content: Any, path: Path) -> Any:
