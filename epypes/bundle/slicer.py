@@ -13,12 +13,12 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any, Final, get_origin
 
-from epypes.bundle.callables import found_definition, method_of
+from epypes.bundle.callables import found_definition, is_function, method_of
 from epypes.bundle.cells import cell_of, names_of, statements_of
 from epypes.bundle.closures import FactoryCall, factory_call
 from epypes.bundle.constants import Remark, imported_as, remark_on
 from epypes.bundle.defaults import check_defaults
-from epypes.bundle.lines import assignment, piece_of
+from epypes.bundle.lines import assignment, flat, piece_of
 from epypes.bundle.literal import is_data, literal_source
 from epypes.bundle.order import Position, arranged
 from epypes.bundle.source import Definition, Importable, Refused, importable
@@ -77,6 +77,7 @@ class Slice:
         self._meanings: dict[str, tuple[str, object]] = {}
         self._names: dict[int, str] = {}
         self._positions: dict[str, Position] = {}
+        self._reads: dict[str, frozenset[str]] = {}
         self._files: dict[str, int] = {}
         self._notebook: Mapping[str, Any] = {}
 
@@ -94,6 +95,9 @@ class Slice:
     def reference(self, home: Importable, what: str) -> str:
         """Return the expression for what can be imported: ``cv2.Canny``, or ``len``, which needs no import."""
         top = home.qualname.partition(".")[0]
+        known = [name for name, imported in self.imports if imported == f"{home.module}.{top}"]
+        if known:
+            return min(known) + home.qualname.removeprefix(top)
         builtin = ("builtin", top)
         if home.module == "builtins" and self._meanings.setdefault(top, builtin) == builtin:
             return home.qualname
@@ -115,7 +119,7 @@ class Slice:
     def arrange(self) -> None:
         """Put the definitions into the order of the notebook."""
         texts = {name: found.text for name, found in self.definitions.items()}
-        self.definitions = {name: self.definitions[name] for name in arranged(texts, self._positions)}
+        self.definitions = {name: self.definitions[name] for name in arranged(texts, self._positions, self._reads)}
 
     def module_name(self, module: str, what: str) -> str:
         """Import a module, unless a function has brought it already under a name of its own (``np``)."""
@@ -172,7 +176,7 @@ class Slice:
         if not source or (len(source) > _CONSTANT_CHARACTERS and not callable(value)):
             text = f"{what} has a value of type {type(value).__name__} inside, which no short expression makes again"
             raise Refused(f"{text}. Make it a token, or make it inside the function.")
-        return source
+        return flat(piece_of(source))
 
     def _add_definition(self, function: Any, what: str, wanted: str = "") -> Written:
         """Add a function of the notebook."""
@@ -187,6 +191,7 @@ class Slice:
             return self.definitions[name]
         check_defaults(found, what)
         names = list(global_names(found))
+        self._reads[name] = frozenset(names)
         check_state(found, names, what)
         for needed in names:
             try:
@@ -268,7 +273,7 @@ class Slice:
         if home is not None:
             self._claim(name, ("object", id(value)), what)
             self._import_from(home, name)
-        elif callable(value) and not isinstance(value, type):
+        elif is_function(value):
             self._add_helper(name, value, found, what)
         else:
             self._add_constant(name, value, found, what)
@@ -297,7 +302,9 @@ class Slice:
         if name in self.constants or name in self.definitions:
             return
         self._claim(name, ("constant", name), what)
-        remark = remark_on(name, value, found.names, code) if name not in found.captured else None
+        factory = code.co_qualname.partition(".")[0]
+        captured = Remark(self._position(found), beside=f"# as {factory}() had it in the notebook")
+        remark = captured if name in found.captured else remark_on(name, value, source, found.names, code)
         if remark:
             self.remarks[name] = remark
         self.constants[name] = source
@@ -392,7 +399,7 @@ def _leaves(value: Any, depth: int = 5) -> list[Any]:
 
 
 def _is_own(value: Any) -> bool:
-    return callable(value) and not isinstance(value, type) and importable(value) is None
+    return is_function(value) and importable(value) is None
 
 
 def slice_functions(gathered: Slice, functions: Sequence[tuple[str, Callable[..., Any]]]) -> list[str]:

@@ -65,10 +65,21 @@ def _container(gathered: Slice, value: Any, what: str, function: FunctionWriter 
 
 def _called(gathered: Slice, value: Any, what: str, function: FunctionWriter | None) -> str:
     """Return the call that makes a simple object again."""
+    if isinstance(value, re.Pattern):
+        return _pattern(gathered, value, what)
     made_by, arguments = _call_of(value)
     home = importable(made_by) if made_by is not None else None
     parts = [expression(gathered, argument, what, function) for argument in arguments] if home else []
     return f"{gathered.reference(home, what)}({', '.join(parts)})" if home and all(parts) else ""
+
+
+def _pattern(gathered: Slice, value: re.Pattern[Any], what: str) -> str:
+    """Return the call that compiles a pattern again, its flags by name."""
+    # The flag for text is what re.compile adds by itself.
+    flags = re.RegexFlag(value.flags) & ~(re.UNICODE if isinstance(value.pattern, str) else re.NOFLAG)
+    module = gathered.module_name("re", what)
+    named = " | ".join(f"{module}.{flag.name}" for flag in flags)
+    return f"{module}.compile({', '.join(filter(None, (literal_source(value.pattern), named)))})"
 
 
 def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]]:
@@ -78,10 +89,6 @@ def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]]:
         return range, every if value.step != 1 else every[not value.start : 2]
     if type(value) is slice:
         return slice, (value.start, value.stop) if value.step is None else (value.start, value.stop, value.step)
-    if isinstance(value, re.Pattern):
-        # The flag for text is what re.compile adds by itself.
-        flags = value.flags & ~re.UNICODE.value if isinstance(value.pattern, str) else value.flags
-        return re.compile, (value.pattern, flags) if flags else (value.pattern,)
     if isinstance(value, pathlib.PurePath):
         return pathlib.Path, (str(value),)
     if type(value).__module__.partition(".")[0] == "numpy" and isinstance(value, sys.modules["numpy"].dtype):
