@@ -33,7 +33,7 @@ def found_definition(function: Any, what: str) -> Definition:
 
 def is_function(value: Any) -> bool:
     """Whether a value is a function, or made of functions: a partial, a method, what a decorator has wrapped."""
-    kinds = types.FunctionType | types.MethodType | types.BuiltinMethodType | types.MethodDescriptorType | partial
+    kinds = (types.FunctionType, types.MethodType, types.BuiltinMethodType, types.MethodDescriptorType, partial)
     return isinstance(value, kinds) or len(layers(value)) > 1
 
 

@@ -53,7 +53,8 @@ def _without_magic(cell: str) -> str:
     """Return what a cell magic such as %%capture or %%time has executed of its cell, on the same lines."""
     tree = parsed(cell) if cell.lstrip().startswith(_CELL_MAGIC) else None
     call = getattr(tree.body[0], "value", None) if tree and len(tree.body) == 1 else None
-    texts = [part.value for part in getattr(call, "args", ()) if isinstance(part, ast.Constant)]
+    constants = (part.value for part in getattr(call, "args", ()) if isinstance(part, ast.Constant))
+    texts = [value for value in constants if isinstance(value, str)]
     return f"\n{texts[2]}" if len(texts) == 3 and texts[0] in _EXECUTING else cell
 
 

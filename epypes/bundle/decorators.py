@@ -15,7 +15,7 @@ from typing import Any, Final
 from epypes.bundle.cells import place_in, place_of
 from epypes.bundle.closures import rebound
 from epypes.bundle.evaluate import is_same
-from epypes.bundle.source import Definition, Refused, definition, importable, evaluated, other_decorators
+from epypes.bundle.source import Definition, Refused, definition, evaluated, importable, other_decorators
 from epypes.bundle.text import definition_of, nested_codes
 
 # A wrapper may be made to wrap itself; nobody wraps this deep on purpose.

@@ -223,7 +223,7 @@ def _check_kept(function: types.FunctionType, node: ast.FunctionDef, what: str) 
     code = function.__code__
     for part in ast.walk(node):
         kept = [name for name in part.names if name in code.co_freevars] if isinstance(part, ast.Nonlocal) else []
-        if kept:
+        if kept and isinstance(part, ast.Nonlocal):
             text = f"{what} changes {kept[0]!r} of the function around it ({place_in(code.co_filename, part.lineno)})"
             raise Refused(f"{text}, so that every call finds it different. Make it a token, or return the value.")
 

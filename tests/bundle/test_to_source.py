@@ -279,7 +279,9 @@ def test_a_value_without_an_expression_is_refused_by_name_with_the_way_out(value
 
 
 def test_every_reason_is_given_at_once_with_its_place():
-    cell = "class C:\n    def m(self, x):\n        return x\n    __call__ = m\na = C().m\n"
+    cell = (
+        "class C:\n    def m(self, x):\n        return x\n    def __call__(self, *xs):\n        return xs\na = C().m\n"
+    )
     names = notebook(cell + "b = functools.partial(C(), 2)\ndef c(x):\n    return p + q\n")
     inner = ep.Pipeline("inner", ep.CompGraph({"d": names["a"]}, {"d": (("x",), "y")}))
     functions = {name: names[name] for name in "abc"} | {"i": inner}
