@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 import types
 from functools import partial
 from typing import Any
 
 from epypes.bundle.cells import place_of, place_of_object
-from epypes.bundle.decorators import decorated, layers
+from epypes.bundle.decorators import decorated, has_decorators, layers
+from epypes.bundle.lines import flat, piece_of
 from epypes.bundle.literal import literal_source
 from epypes.bundle.source import Definition, Importable, Refused, definition, importable
 from epypes.bundle.state import CHANGING
@@ -21,12 +23,18 @@ def found_definition(function: Any, what: str) -> Definition:
     Refused
         It has none, or that does not say all of it.
     """
-    if len(layers(function)) > 1:
+    if len(layers(function)) > 1 and (isinstance(function, types.FunctionType) or has_decorators(function)):
         return decorated(function, what)
     if not isinstance(function, types.FunctionType):
         text = f"{what} is {_kind(function)}{_place(function, what)}."
         raise Refused(f"{text} Write a plain function (def) that makes the object and calls it.")
     return definition(function, what)
+
+
+def is_function(value: Any) -> bool:
+    """Whether a value is a function, or made of functions: a partial, a method, what a decorator has wrapped."""
+    kinds = (types.FunctionType, types.MethodType, types.BuiltinMethodType, types.MethodDescriptorType, partial)
+    return isinstance(value, kinds) or len(layers(value)) > 1
 
 
 def method_of(function: Any) -> tuple[str | Importable, str] | None:
@@ -39,6 +47,7 @@ def method_of(function: Any) -> tuple[str | Importable, str] | None:
         return None
     source = literal_source(owner) if name not in CHANGING else ""
     if source:
+        source = flat(piece_of(source))
         return f"({source})" if source[0] not in "\"'[({" else source, name
     home = importable(owner) if isinstance(owner, type) else None
     return (home, name) if home else None
@@ -56,14 +65,14 @@ def _kind(value: object) -> str:
 
 def _place(value: Any, what: str) -> str:
     """Return where a callable is from, as far as that is known, in brackets."""
-    names = vars(__import__("__main__"))
+    names = vars(sys.modules["__main__"])
     key = what.split("'")[1] if what.startswith("Function '") else ""
-    code = getattr(value, "__code__", None) or getattr(getattr(type(value), "__call__", None), "__code__", None)
-    code = code if code is not None else _code_in(value)
+    kind = value if isinstance(value, type) else type(getattr(value, "__self__", value))
+    code = getattr(value, "__code__", None) or (_code_in(kind) if importable(kind) is None else None)
     where = place_of_object(value, names, key) or (place_of(code) if code is not None else "")
     return f" ({where})" if where else ""
 
 
-def _code_in(kind: Any) -> types.CodeType | None:
-    methods = (getattr(value, "__code__", None) for value in vars(kind).values()) if isinstance(kind, type) else ()
+def _code_in(kind: type) -> types.CodeType | None:
+    methods = (getattr(value, "__code__", None) for value in vars(kind).values())
     return next((code for code in methods if code is not None), None)

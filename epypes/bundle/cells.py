@@ -12,9 +12,12 @@ import types
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, Final
 
 from epypes.bundle.text import lines_of, parsed
+
+_CELL_MAGIC: Final = "get_ipython().run_cell_magic("
+_EXECUTING: Final = ("capture", "time", "prun")
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +44,18 @@ def executed_cells(names: Mapping[str, Any]) -> list[tuple[int, str]]:
     cells = names.get("In")
     if not isinstance(cells, list):
         return []
-    return [(number, cell) for number, cell in enumerate(cells) if isinstance(cell, str) and cell.strip()]
+    texts = ((number, _without_magic(cell)) for number, cell in enumerate(cells) if isinstance(cell, str))
+    return [(number, text) for number, text in texts if text.strip()]
+
+
+@lru_cache(maxsize=512)
+def _without_magic(cell: str) -> str:
+    """Return what a cell magic such as %%capture or %%time has executed of its cell, on the same lines."""
+    tree = parsed(cell) if cell.lstrip().startswith(_CELL_MAGIC) else None
+    call = getattr(tree.body[0], "value", None) if tree and len(tree.body) == 1 else None
+    constants = (part.value for part in getattr(call, "args", ()) if isinstance(part, ast.Constant))
+    texts = [value for value in constants if isinstance(value, str)]
+    return f"\n{texts[2]}" if len(texts) == 3 and texts[0] in _EXECUTING else cell
 
 
 def cell_of(file: str, names: Mapping[str, Any]) -> int:
@@ -58,8 +72,11 @@ def place_of(code: types.CodeType) -> str:
 
 def place_in(file: str, number: int) -> str:
     """Return a place in a file or cell: the cell's number, if it is from a notebook, and the line."""
-    cell = cell_of(file, vars(sys.modules["__main__"]))
-    return f"cell [{cell}], line {number}" if cell else f"{file}, line {number}"
+    names = vars(sys.modules["__main__"])
+    cell = cell_of(file, names)
+    # What a cell magic has executed begins on the second line.
+    below = any(known == cell and text.startswith("\n") for known, text in executed_cells(names))
+    return f"cell [{cell}], line {number + below}" if cell else f"{file}, line {number}"
 
 
 def statements_of(name: str, names: Mapping[str, Any], code: types.CodeType | None = None) -> Iterator[Statement]:

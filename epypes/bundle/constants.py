@@ -49,17 +49,24 @@ def imported_as(name: str, value: Any, names: Mapping[str, Any], code: types.Cod
             return "", ""
         own = next((alias.name for alias in node.names if (alias.asname or alias.name) == name), name)
         there = getattr(sys.modules.get(node.module), own, UNKNOWN)
-        return (node.module, own) if there is value or is_same_data(there, value) else ("", "")
-    return "", ""
+        return (node.module, own) if _is_same(there, value) else ("", "")
+    stars = (statement.node for statement in statements_of("*", names, code))
+    modules = (node.module for node in stars if isinstance(node, ast.ImportFrom) and not node.level)
+    found = (module for module in modules if _is_same(getattr(sys.modules.get(module or ""), name, UNKNOWN), value))
+    return next(((module, name) for module in found if module), ("", ""))
 
 
-def remark_on(name: str, value: Any, names: Mapping[str, Any], code: types.CodeType) -> Remark | None:
+def _is_same(one: Any, other: Any) -> bool:
+    return one is other or is_same_data(one, other)
+
+
+def remark_on(name: str, value: Any, source: str, names: Mapping[str, Any], code: types.CodeType) -> Remark | None:
     """Return what a notebook says where it last gave a name this value; None if it does not say it.
 
     Parameters
     ----------
-    name, value
-        The constant.
+    name, value, source
+        The constant, and the expression that makes it again.
     names
         The notebook's names.
     code
@@ -71,7 +78,7 @@ def remark_on(name: str, value: Any, names: Mapping[str, Any], code: types.CodeT
             continue
         written = value_of(given, {}) if _is_assignment_to(name, statement.node) else UNKNOWN
         if written is UNKNOWN or is_same_data(written, value):
-            return _remark(name, value, given, statement, written is not UNKNOWN)
+            return _remark(name, value, source, given, statement, written is not UNKNOWN)
     return None
 
 
@@ -82,7 +89,7 @@ def _is_assignment_to(name: str, node: ast.stmt) -> bool:
     return plain and isinstance(targets[0], ast.Name) and targets[0].id == name
 
 
-def _remark(name: str, value: Any, given: ast.expr, statement: Statement, is_known: bool) -> Remark:
+def _remark(name: str, value: Any, source: str, given: ast.expr, statement: Statement, is_known: bool) -> Remark:
     node, lines = statement.node, statement.lines
     position = (statement.cell, node.lineno)
     if not _is_assignment_to(name, node):
@@ -95,7 +102,8 @@ def _remark(name: str, value: Any, given: ast.expr, statement: Statement, is_kno
     beside = rest if rest.startswith("#") else ""
     if is_known:
         return Remark(position, above, beside, _spelled(given, "\n".join(lines)))
-    if not beside and (is_data(value) or is_plain_array(value)):
+    is_computed = is_data(value) or is_plain_array(value)
+    if not beside and is_computed and ast.unparse(ast.parse(source)) != ast.unparse(given):
         beside = f"# {ast.unparse(given)} in the notebook"
         beside = beside if fits(0, beside) else ""
     return Remark(position, above, beside)

@@ -30,6 +30,15 @@ def layers(function: Any) -> list[Any]:
     return found
 
 
+def has_decorators(function: Any) -> bool:
+    """Whether the text of what an object wraps names decorators that may have made the object."""
+    innermost = layers(function)[-1]
+    if not isinstance(innermost, types.FunctionType):
+        return False
+    _, node = definition_of(innermost.__code__)
+    return node is not None and bool(other_decorators(node, innermost.__globals__))
+
+
 def decorated(function: Any, what: str) -> Definition:
     """Return the definition, with its decorators, of a function that wraps another.
 

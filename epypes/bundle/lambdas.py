@@ -57,9 +57,9 @@ def _holds(body: ast.expr, code: types.CodeType) -> bool:
 def _shown(code: types.CodeType) -> Iterator[tuple[int, int, int, int]]:
     """Return the positions of code that have a text: some versions of Python put the return at the line's beginning."""
     for line, end_line, column, end_column in code.co_positions():
-        if line is not None and end_line is not None and column is not None and end_column is not None:
-            if (line, column) != (end_line, end_column):
-                yield line, end_line, column, end_column
+        is_known = line is not None and end_line is not None and column is not None and end_column is not None
+        if is_known and (line, column) != (end_line, end_column):
+            yield line or 0, end_line or 0, column or 0, end_column or 0
 
 
 def _start(node: ast.expr) -> tuple[int, int]:
@@ -94,9 +94,9 @@ def _returned(source: str, body: ast.expr) -> str:
     text = f"    return {ast.get_source_segment(source, body)}"
     tree = parsed(f"def f():\n{text}\n")
     returned = getattr(tree.body[0], "body", [])[0] if tree else None
-    if "\n" not in text and fits(0, text) and isinstance(returned, ast.Return) and returned.value is not None:
-        if spelled_tree(returned.value) == spelled_tree(body):
-            return text
+    value = returned.value if isinstance(returned, ast.Return) else None
+    if value is not None and "\n" not in text and fits(0, text) and spelled_tree(value) == spelled_tree(body):
+        return text
     return "\n".join(laid_out(prefixed("return ", piece_of(ast.unparse(body))), 1))
 
 

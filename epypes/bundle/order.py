@@ -23,7 +23,9 @@ class _Reads:
     calls: bool
 
 
-def arranged(texts: Mapping[str, str], positions: Mapping[str, Position]) -> list[str]:
+def arranged(
+    texts: Mapping[str, str], positions: Mapping[str, Position], known_reads: Mapping[str, frozenset[str]]
+) -> list[str]:
     """Return the names of definitions in the order in which they stand in a module.
 
     Parameters
@@ -32,8 +34,10 @@ def arranged(texts: Mapping[str, str], positions: Mapping[str, Position]) -> lis
         The definitions by name, in an order in which they could stand but for those that need each other.
     positions
         Where they stand in the notebook, as far as that is known; others stand before what needs them.
+    known_reads
+        The names that definitions read from outside, as far as that is known; of others, all that they mention.
     """
-    reads = {name: _reads(text) for name, text in texts.items()}
+    reads = {name: _reads(text, known_reads.get(name)) for name, text in texts.items()}
     known = sorted((name for name in texts if name in positions), key=lambda name: positions[name])
     rank = {name: number for number, name in enumerate([*known, *(name for name in texts if name not in positions)])}
     done: dict[str, None] = {}
@@ -70,7 +74,7 @@ def _needs(name: str, reads: Mapping[str, _Reads]) -> set[str]:
     return found - {name}
 
 
-def _reads(text: str) -> _Reads:
+def _reads(text: str, ever: frozenset[str] | None) -> _Reads:
     tree = parsed(text)
     node = tree.body[0] if tree and tree.body else None
     if node is None:
@@ -78,7 +82,7 @@ def _reads(text: str) -> _Reads:
     at_once = frozenset(_names(_at_once(node)))
     calls = isinstance(node, ast.ClassDef) or any(isinstance(part, ast.Call) for part in _at_once(node))
     calls = calls or bool(getattr(node, "decorator_list", []))
-    return _Reads(at_once, frozenset(_names(ast.walk(node))), calls)
+    return _Reads(at_once, frozenset(_names(ast.walk(node))) if ever is None else ever, calls)
 
 
 def _names(parts: Iterator[ast.AST]) -> Iterator[str]:

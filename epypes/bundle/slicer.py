@@ -12,25 +12,23 @@ import sys
 import types
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
-from typing import Annotated, Any, Final, get_origin
+from typing import Any, Final
 
-from epypes.bundle.callables import found_definition, method_of
-from epypes.bundle.cells import cell_of, names_of, statements_of
+from epypes.bundle.callables import found_definition, is_function, method_of
+from epypes.bundle.cells import cell_of, statements_of
 from epypes.bundle.classes import ClassDefinition, class_definition, class_names
 from epypes.bundle.closures import FactoryCall, factory_call
 from epypes.bundle.constants import Remark, imported_as, remark_on
 from epypes.bundle.defaults import check_defaults
-from epypes.bundle.lines import assignment, piece_of
-from epypes.bundle.literal import is_data, literal_source
+from epypes.bundle.lines import assignment, flat, piece_of
+from epypes.bundle.literal import is_data
+from epypes.bundle.names import Names, of_object
 from epypes.bundle.order import Position, arranged
 from epypes.bundle.source import Definition, Importable, Refused, importable
 from epypes.bundle.state import check_asked, check_state, check_written
 from epypes.bundle.text import renamed
 from epypes.bundle.uses import global_names, replaced, submodules
 from epypes.bundle.values import expression
-from epypes.bundle.words import is_word, word_of
-from epypes.hints import Param
-from epypes.images import Image
 
 AnyDefinition = Definition | ClassDefinition
 
@@ -56,6 +54,8 @@ class Slice:
 
     Attributes
     ----------
+    names
+        What its names mean.
     imports
         Import statements, by the name that each binds and what it binds it to.
     constants
@@ -69,17 +69,15 @@ class Slice:
     """
 
     def __init__(self, reserved: Collection[str] = RESERVED) -> None:
-        self.reserved = reserved
+        self.names = Names(reserved)
         self.imports: dict[tuple[str, str], str] = {}
         self.constants: dict[str, str] = {}
         self.remarks: dict[str, Remark] = {}
         self.definitions: dict[str, Written] = {}
         self.refusals: list[str] = []
-        # What functions read by name, which is theirs before anything is named freely.
-        self.read: dict[str, object] = {}
-        self._meanings: dict[str, tuple[str, object]] = {}
-        self._names: dict[int, str] = {}
+        self._known: dict[int, str] = {}
         self._positions: dict[str, Position] = {}
+        self._reads: dict[str, frozenset[str]] = {}
         self._files: dict[str, int] = {}
         self._notebook: Mapping[str, Any] = {}
 
@@ -97,37 +95,38 @@ class Slice:
     def reference(self, home: Importable, what: str) -> str:
         """Return the expression for what can be imported: ``cv2.Canny``, or ``len``, which needs no import."""
         top = home.qualname.partition(".")[0]
+        known = [name for name, imported in self.imports if imported == f"{home.module}.{top}"]
+        if known:
+            return min(known) + home.qualname.removeprefix(top)
         builtin = ("builtin", top)
-        if home.module == "builtins" and self._meanings.setdefault(top, builtin) == builtin:
+        if home.module == "builtins" and self.names.may_mean(top, builtin):
             return home.qualname
         return f"{self.module_name(home.module, what)}.{home.qualname}"
 
     def is_taken(self, name: str) -> bool:
         """Whether a name means something in the module already."""
-        return name in self.reserved or name in self._meanings or name in self.read or hasattr(builtins, name)
+        return self.names.is_taken(name)
 
     def add_made_constant(self, name: str, source: str) -> None:
         """Add a constant under a name that is not taken."""
-        self._claim(name, ("constant", name), f"Constant {name!r}")
+        self.names.claim(name, ("constant", name), f"Constant {name!r}")
         self.constants[name] = source
 
     def keep_name(self, name: str) -> None:
         """Keep a name that is not taken for what is written below the functions."""
-        self._claim(name, ("kept", name), f"Function {name!r}")
+        self.names.claim(name, ("kept", name), f"Function {name!r}")
 
     def arrange(self) -> None:
         """Put the definitions into the order of the notebook."""
         texts = {name: found.text for name, found in self.definitions.items()}
-        self.definitions = {name: self.definitions[name] for name in arranged(texts, self._positions)}
+        self.definitions = {name: self.definitions[name] for name in arranged(texts, self._positions, self._reads)}
 
     def module_name(self, module: str, what: str) -> str:
         """Import a module, unless a function has brought it already under a name of its own (``np``)."""
         aliases = [name for name, imported in self.imports if imported == module]
         if aliases:
             return min(aliases)
-        found = sys.modules.get(module)
-        own = (name for name in names_of(found, self._notebook) if name != module and self._is_free(name, found))
-        name = next(own, "")
+        name = self.names.alias_for(sys.modules.get(module), self._notebook, module)
         if not name:
             self._import_module(module, what)
             return module
@@ -139,8 +138,8 @@ class Slice:
         home = importable(function)
         if home is not None:
             return self.reference(home, what)
-        if id(function) in self._names:
-            return self._names[id(function)]
+        if id(function) in self._known:
+            return self._known[id(function)]
         owner = method_of(function)
         if owner is not None:
             of, method = owner
@@ -167,12 +166,13 @@ class Slice:
         home = importable(kind)
         if home is not None:
             return self.reference(home, what)
-        if id(kind) in self._names:
-            return self._names[id(kind)]
+        if id(kind) in self._known:
+            return self._known[id(kind)]
         found = class_definition(kind, around or self._notebook or vars(sys.modules["__main__"]), what)
-        self._claim(found.name, ("object", id(kind)), what)
-        self._names[id(kind)] = found.name
+        self.names.claim(found.name, of_object(kind), what)
+        self._known[id(kind)] = found.name
         names = list(class_names(found))
+        self._reads[found.name] = frozenset(names)
         check_written(found, names, what)
         self._add_names(names, found, what)
         self._write(found.name, found.text, self._position(found))
@@ -194,12 +194,12 @@ class Slice:
         ]
         parts = [called, *(name + self._argument(value, what) for name, value in given)]
         source = f"{self.module_name('functools', what)}.partial({', '.join(parts)})"
-        names = (name for name, value in self.read.items() if value is function)
+        names = (name for name, value in self.names.read.items() if value is function)
         name = min(names, default="")
         if not name:
             return source
-        self._claim(name, ("object", id(function)), what)
-        self._names[id(function)] = name
+        self.names.claim(name, of_object(function), what)
+        self._known[id(function)] = name
         self._write(name, f"{name} = {source}\n", self._binding(name, None))
         return name
 
@@ -210,21 +210,22 @@ class Slice:
         if not source or (len(source) > _CONSTANT_CHARACTERS and not callable(value)):
             text = f"{what} has a value of type {type(value).__name__} inside, which no short expression makes again"
             raise Refused(f"{text}. Make it a token, or make it inside the function.")
-        return source
+        return flat(piece_of(source))
 
     def _add_definition(self, function: Any, what: str, wanted: str = "") -> Written:
         """Add a function of the notebook."""
         found = found_definition(function, what)
         self._notebook = self._notebook or found.function.__globals__
-        name = self._name_for(function, found, wanted)
-        self._claim(name, ("object", id(function)), what)
-        self._names[id(function)] = name
+        name = self.names.name_for(function, found, wanted)
+        self.names.claim(name, of_object(function), what)
+        self._known[id(function)] = name
         made = factory_call(found) if found.captured and function is found.function else None
         if made is not None:
             self._add_made(name, made, found, what)
             return self.definitions[name]
         check_defaults(found, what)
         names = list(global_names(found))
+        self._reads[name] = frozenset(names)
         check_state(found, names, what)
         self._add_names(names, found, what)
         self._write(name, renamed(found.text, found.name, name), self._position(found))
@@ -257,33 +258,6 @@ class Slice:
         given = next(statements_of(name, self._notebook, code), None)
         return (given.cell, 0, given.node.lineno) if given else ()
 
-    def _name_for(self, function: Any, found: Definition, wanted: str) -> str:
-        """Return what a function is called in the module: as in the notebook, if that means nothing else there."""
-        own, bound = "" if found.is_lambda else found.name, names_of(function, found.names)
-        is_known_otherwise = bool(found.captured) or found.names.get(own, function) is not function
-        others = [wanted, own] if is_known_otherwise else [own, wanted]
-        candidates = [*(name for name in bound if name == own), *bound, *others]
-        free = (name for name in candidates if is_word(name) and self._is_free(name, function))
-        return next(free, "") or word_of(own or wanted or found.name, self.is_taken)
-
-    def _is_free(self, name: str, function: Any) -> bool:
-        """Whether a name can mean a function in the module."""
-        if name in self.read:
-            return self.read[name] is function
-        if name in self.reserved or self._meanings.get(name, ("object", id(function))) != ("object", id(function)):
-            return False
-        return not hasattr(builtins, name) and name not in sys.modules
-
-    def _claim(self, name: str, meaning: tuple[str, object], what: str) -> None:
-        """Make a name mean one thing in the module."""
-        if name in self.reserved:
-            raise Refused(f"{what} uses the name {name!r}, which the module keeps for the graph. Rename it.")
-        if self._meanings.setdefault(name, meaning) != meaning:
-            raise Refused(
-                f"{what} uses the name {name!r}, which means something else in another function of the graph. "
-                "Rename one of the two."
-            )
-
     def _add_name(self, name: str, found: AnyDefinition, what: str) -> None:
         """Add what one global name of a function means at the time of promotion."""
         names = found.names
@@ -294,15 +268,15 @@ class Slice:
                 place = found.place_of(name)
                 raise Refused(f"{what} uses {name!r}, which is not defined ({place}). Define it, or rename.")
             return
-        self.read[name] = value
+        self.names.read[name] = value
         if isinstance(value, types.ModuleType):
             self._add_module(name, value, found, what)
             return
         home = importable(value, name) if callable(value) or not is_data(value) else None
         if home is not None:
-            self._claim(name, ("object", id(value)), what)
+            self.names.claim(name, of_object(value), what)
             self._import_from(home, name)
-        elif callable(value):
+        elif is_function(value) or isinstance(value, type):
             self._add_helper(name, value, found, what)
         else:
             self._add_constant(name, value, found, what)
@@ -312,39 +286,37 @@ class Slice:
         kind, uses = ("Class", "uses") if isinstance(helper, type) else ("Function", "calls")
         source = self._callable(helper, f"{kind} {name!r}, which {what[0].lower()}{what[1:]} {uses},", name)
         if source != name and name not in self.definitions:
-            self._claim(name, ("object", id(helper)), what)
+            self.names.claim(name, of_object(helper), what)
             self._write(name, f"{name} = {source}\n", self._binding(name, found))
 
     def _add_constant(self, name: str, value: Any, found: AnyDefinition, what: str) -> None:
         code = found.origin
         module, own = imported_as(name, value, found.names, code) if name not in found.captured else ("", "")
         if module:
-            self._claim(name, ("constant", name), what)
+            self.names.claim(name, ("constant", name), what)
             self._import_from(Importable(module, own), name)
             return
         if self._add_table(name, value, found, what):
             return
         source = self._constant_source(name, value, found, what)
         if self.constants.get(name, source) != source:
-            raise Refused(
-                f"{what} uses {name!r} ({found.place_of(name)}), which has another value elsewhere. Rename one of the two."
-            )
+            text = f"{what} uses {name!r} ({found.place_of(name)}), which has another value elsewhere"
+            raise Refused(f"{text}. Rename one of the two.")
         if name in self.constants or name in self.definitions:
             return
-        self._claim(name, ("constant", name), what)
-        remark = remark_on(name, value, found.names, code) if name not in found.captured else None
-        if remark and not self._made_here(source):
+        self.names.claim(name, ("constant", name), what)
+        factory = code.co_qualname.partition(".")[0]
+        captured = Remark(self._position(found), beside=f"# as {factory}() had it in the notebook")
+        remark = captured if name in found.captured else remark_on(name, value, source, found.names, code)
+        if self._is_made_here(source):
+            lines = [*(remark.above if remark else ()), *assignment([name], True, piece_of(source), 0)]
+            self._write(name, "".join(f"{line}\n" for line in lines), self._binding(name, found))
+            return
+        if remark:
             self.remarks[name] = remark
-        if self._made_here(source):
-            self._write(
-                name,
-                "\n".join([*(remark.above if remark else ()), *_assigned(name, source)]) + "\n",
-                self._binding(name, found),
-            )
-        else:
-            self.constants[name] = source
+        self.constants[name] = source
 
-    def _made_here(self, source: str) -> bool:
+    def _is_made_here(self, source: str) -> bool:
         """Whether an expression needs something that the module defines."""
         names = (node.id for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Name))
         return any(name in self.definitions for name in names)
@@ -353,10 +325,10 @@ class Slice:
         """Add a dict or sequence with functions of the notebook in it; return whether it is one."""
         if not isinstance(value, dict | list | tuple) or not any(map(_is_own, _leaves(value))):
             return False
-        self._claim(name, ("object", id(value)), what)
+        self.names.claim(name, of_object(value), what)
         if name not in self.definitions:
             source = self._argument(value, f"{name!r}, which {what[0].lower()}{what[1:]} uses,")
-            text = "\n".join(_assigned(name, source))
+            text = "\n".join(assignment([name], True, piece_of(source), 0))
             self._write(name, f"{text}\n", self._binding(name, found))
         return True
 
@@ -369,33 +341,6 @@ class Slice:
                 f"Make {name} a token, make it inside the function, or move both into a module that is installed."
             )
         return source
-
-    def annotation_source(self, value: Any, what: str) -> str:
-        """Return the source of a mark, or of ``Annotated`` with marks, as annotations use them; "" for any other."""
-        if isinstance(value, Image | Param):
-            given = [(field.name, getattr(value, field.name), field.default) for field in dataclasses.fields(value)]
-            words = [(name, literal_source(setting)) for name, setting, default in given if setting != default]
-            if not all(source for _, source in words):
-                return ""
-            listed = ", ".join(f"{name}={source}" for name, source in words)
-            return f"{self.module_name('epypes', what)}.{type(value).__name__}({listed})"
-        home = importable(value.__origin__) if get_origin(value) is Annotated else None
-        parts = [self.annotation_source(mark, what) for mark in value.__metadata__] if home else [""]
-        if home is None or not all(parts):
-            return ""
-        plain = home.qualname if home.module == "builtins" else f"{self.module_name(home.module, what)}.{home.qualname}"
-        return f"{self.module_name('typing', what)}.Annotated[{plain}, {', '.join(parts)}]"
-
-    def array_source(self, array: Any, what: str) -> str:
-        """Return a small array of numbers as source that makes it again, to the last bit; "" for any other."""
-        import numpy as np
-
-        if array.dtype.kind not in "biuf" or array.dtype.itemsize > 8 or array.size * 2 > _CONSTANT_CHARACTERS:
-            return ""
-        listed = repr(array.tolist())
-        if "nan" in listed or "inf" in listed or np.array(array.tolist(), array.dtype).shape != array.shape:
-            return ""
-        return f"{self.module_name('numpy', what)}.array({listed}, dtype={str(array.dtype)!r})".replace("'", '"')
 
     def _add_module(self, name: str, module: types.ModuleType, found: AnyDefinition, what: str) -> None:
         if module.__name__ == "__main__":
@@ -411,12 +356,12 @@ class Slice:
             self._import_module(dotted, what)
 
     def _import_as(self, module: str, name: str, what: str) -> None:
-        self._claim(name, ("object", id(sys.modules.get(module))), what)
+        self.names.claim(name, of_object(sys.modules.get(module)), what)
         self.imports[name, module] = f"import {module} as {name}"
 
     def _import_module(self, module: str, what: str) -> None:
         top = module.partition(".")[0]
-        self._claim(top, ("module", top), what)
+        self.names.claim(top, ("module", top), what)
         self.imports[module, module] = f"import {module}"
 
     def _import_from(self, home: Importable, name: str) -> None:
@@ -430,10 +375,6 @@ class Slice:
         self.imports[name, f"{home.module}.{top}"] = f"from {home.module} import {top}{alias}"
 
 
-def _assigned(name: str, source: str) -> list[str]:
-    return assignment([name], True, piece_of(source), 0)
-
-
 def _leaves(value: Any, depth: int = 5) -> list[Any]:
     """Return what is in tuples, lists and dicts."""
     if depth and type(value) in (tuple, list, dict):
@@ -443,14 +384,14 @@ def _leaves(value: Any, depth: int = 5) -> list[Any]:
 
 
 def _is_own(value: Any) -> bool:
-    return callable(value) and not isinstance(value, type) and importable(value) is None
+    return is_function(value) and importable(value) is None
 
 
 def slice_functions(gathered: Slice, functions: Sequence[tuple[str, Callable[..., Any]]]) -> list[str]:
     """Add functions of graphs, each given with how reasons call it; return the expressions that refer to them."""
-    survey = Slice(gathered.reserved)
+    survey = Slice(gathered.names.reserved)
     _add_all(survey, functions)
-    gathered.read.update(survey.read)
+    gathered.names.read.update(survey.names.read)
     references = _add_all(gathered, functions)
     gathered.arrange()
     return references

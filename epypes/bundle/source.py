@@ -195,33 +195,42 @@ def _lambda(function: types.FunctionType, what: str, place: str) -> Definition:
 
 
 def _give_values(arguments: ast.arguments, function: types.FunctionType) -> None:
-    """Write the values into the defaults of a lambda whose names mean something else by now (``k=k`` in a loop)."""
-    known = [*zip(arguments.defaults, function.__defaults__ or (), strict=False)]
-    values = {
-        id(default): literal_source(value)
-        for default, value in known
-        if not is_same(default, value, function.__globals__)
-    }
-    by_name = function.__kwdefaults__ or {}
-    for argument, default in zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True):
-        if default and argument.arg in by_name and not is_same(default, by_name[argument.arg], function.__globals__):
-            values[id(default)] = literal_source(by_name[argument.arg])
-    arguments.defaults = [_given(default, values) for default in arguments.defaults]
-    arguments.kw_defaults = [default and _given(default, values) for default in arguments.kw_defaults]
+    """Write the values into the defaults of a lambda whose names mean something else by now, as in a loop (``k=k``)."""
+    by_position, by_name = function.__defaults__ or (), function.__kwdefaults__ or {}
+    every = [*arguments.posonlyargs, *arguments.args][-len(by_position) :] if by_position else []
+    names = function.__globals__
+    values = zip(every, arguments.defaults, by_position, strict=False)
+    arguments.defaults = [_given(argument, default, value, names) for argument, default, value in values]
+    arguments.kw_defaults = [
+        default and _given(argument, default, by_name.get(argument.arg), names)
+        for argument, default in zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True)
+    ]
 
 
-def _given(default: ast.expr, values: Mapping[int, str]) -> ast.expr:
-    source = values.get(id(default))
+def _given(argument: ast.arg, default: ast.expr, value: Any, names: Mapping[str, Any]) -> ast.expr:
+    is_own_name = isinstance(default, ast.Name) and default.id == argument.arg
+    source = literal_source(value) if is_own_name or not is_same(default, value, names) else ""
     return ast.parse(source, mode="eval").body if source else default
 
 
 def _defined(function: types.FunctionType, text: str, node: ast.FunctionDef, what: str, place: str) -> Definition:
+    _check_kept(function, node, what)
     code = code_on_its_own(text, node, function.__code__)
     if code is None:
         reason = f"{what} computes something else if its text is moved to another place ({place})."
         raise Refused(f"{reason} Define it at the margin of a cell, not in a class.")
     captured = _captured(function, what, place)
     return Definition(node.name, function, text, node, place, code, captured, node.name == UNNAMED)
+
+
+def _check_kept(function: types.FunctionType, node: ast.FunctionDef, what: str) -> None:
+    """Refuse a function that keeps something from call to call in the function around it."""
+    code = function.__code__
+    for part in ast.walk(node):
+        kept = [name for name in part.names if name in code.co_freevars] if isinstance(part, ast.Nonlocal) else []
+        if kept and isinstance(part, ast.Nonlocal):
+            text = f"{what} changes {kept[0]!r} of the function around it ({place_in(code.co_filename, part.lineno)})"
+            raise Refused(f"{text}, so that every call finds it different. Make it a token, or return the value.")
 
 
 def _captured(function: types.FunctionType, what: str, place: str) -> dict[str, Any]:

@@ -16,36 +16,14 @@ from epypes.run.guard import is_plain_array
 
 # Methods of lists, dicts, sets, deques and arrays that change them.
 CHANGING: Final = frozenset(
-    [
-        "append",
-        "appendleft",
-        "extend",
-        "extendleft",
-        "insert",
-        "pop",
-        "popleft",
-        "popitem",
-        "remove",
-        "clear",
-        "update",
-        "setdefault",
-        "add",
-        "discard",
-        "sort",
-        "reverse",
-        "difference_update",
-        "intersection_update",
-        "symmetric_difference_update",
-        "fill",
-        "itemset",
-        "put",
-        "resize",
-        "setfield",
-        "setflags",
-    ]
+    {
+        *("append", "appendleft", "extend", "extendleft", "insert", "pop", "popleft", "popitem", "remove", "clear"),
+        *("update", "setdefault", "add", "discard", "sort", "reverse", "fill", "itemset", "put", "resize"),
+        *("difference_update", "intersection_update", "symmetric_difference_update", "setfield", "setflags"),
+    }
 )
 _ASKED: Final = {
-    "get_ipython": "the notebook itself, as magics and shell escapes do. Write it in Python, or outside of the function",
+    "get_ipython": "the notebook itself, as magics and shell escapes do. Write it in Python, or elsewhere",
     "display": "which shows something in the notebook; a service has nobody to show it to. Return it as a token",
     "input": "which asks a person. Make the answer a token",
     "breakpoint": "which waits for a person. Leave it out",
@@ -71,15 +49,11 @@ def check_state(found: Definition, names: Collection[str], what: str) -> None:
     what
         How to call it in a reason.
     """
-    captured = found.function.__code__.co_freevars
     for code in nested_codes(found.function.__code__):
         for instruction in dis.get_instructions(code):
             name = instruction.argval
             if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
                 raise Refused(f"{what} changes the global {name!r} ({found.place_of(name)}). Return the value.")
-            if instruction.opname in ("STORE_DEREF", "DELETE_DEREF") and name in captured and name in code.co_freevars:
-                text = f"{what} changes {name!r} of the function around it ({found.place_of(name)})"
-                raise Refused(f"{text}, so that every call finds it different. Make it a token, or return the value.")
     check_written(found, names, what)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pathlib
 import re
 import sys
@@ -10,11 +11,13 @@ from datetime import timedelta
 from decimal import Decimal
 from fractions import Fraction
 from operator import attrgetter, itemgetter, methodcaller
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin
 
 from epypes.bundle.classes import made_again
 from epypes.bundle.literal import literal_source
 from epypes.bundle.source import Importable, importable
+from epypes.hints import Param
+from epypes.images import Image
 from epypes.run.guard import is_plain_array
 
 if TYPE_CHECKING:
@@ -22,6 +25,8 @@ if TYPE_CHECKING:
 
 FunctionWriter = Callable[[Any], str]
 _TELL_THEIR_CALL: Final = (itemgetter, attrgetter, methodcaller, timedelta, Fraction, Decimal)
+# What a person still reads.
+_MOST_NUMBERS: Final = 200
 
 
 def expression(gathered: Slice, value: Any, what: str, function: FunctionWriter | None = None) -> str:
@@ -65,10 +70,21 @@ def _container(gathered: Slice, value: Any, what: str, function: FunctionWriter 
 
 def _called(gathered: Slice, value: Any, what: str, function: FunctionWriter | None) -> str:
     """Return the call that makes a simple object again."""
+    if isinstance(value, re.Pattern):
+        return _pattern(gathered, value, what)
     made_by, arguments = _call_of(value)
     home = importable(made_by) if made_by is not None else None
     parts = [expression(gathered, argument, what, function) for argument in arguments] if home else []
     return f"{gathered.reference(home, what)}({', '.join(parts)})" if home and all(parts) else ""
+
+
+def _pattern(gathered: Slice, value: re.Pattern[Any], what: str) -> str:
+    """Return the call that compiles a pattern again, its flags by name."""
+    # The flag for text is what re.compile adds by itself.
+    flags = re.RegexFlag(value.flags) & ~(re.UNICODE if isinstance(value.pattern, str) else re.NOFLAG)
+    module = gathered.module_name("re", what)
+    named = " | ".join(f"{module}.{flag.name}" for flag in flags)
+    return f"{module}.compile({', '.join(filter(None, (literal_source(value.pattern), named)))})"
 
 
 def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]]:
@@ -78,10 +94,6 @@ def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]]:
         return range, every if value.step != 1 else every[not value.start : 2]
     if type(value) is slice:
         return slice, (value.start, value.stop) if value.step is None else (value.start, value.stop, value.step)
-    if isinstance(value, re.Pattern):
-        # The flag for text is what re.compile adds by itself.
-        flags = value.flags & ~re.UNICODE.value if isinstance(value.pattern, str) else value.flags
-        return re.compile, (value.pattern, flags) if flags else (value.pattern,)
     if isinstance(value, pathlib.PurePath):
         return pathlib.Path, (str(value),)
     if type(value).__module__.partition(".")[0] == "numpy" and isinstance(value, sys.modules["numpy"].dtype):
@@ -94,7 +106,7 @@ def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]]:
 
 def _object(gathered: Slice, value: Any, what: str, function: FunctionWriter | None) -> str:
     if is_plain_array(value):
-        return gathered.array_source(value, what)
+        return _array(gathered, value, what)
     if type(value) is float:
         # Only what is no number has no literal.
         return f'{gathered.reference(Importable("builtins", "float"), what)}("{value!r}")'
@@ -111,7 +123,7 @@ def _object(gathered: Slice, value: Any, what: str, function: FunctionWriter | N
     home = importable(value)
     if home is None and function is not None and callable(value) and not isinstance(value, type):
         return function(value)
-    return gathered.reference(home, what) if home else gathered.annotation_source(value, what)
+    return gathered.reference(home, what) if home else _mark(gathered, value, what)
 
 
 def _is_numpy_number(value: Any) -> bool:
@@ -120,3 +132,32 @@ def _is_numpy_number(value: Any) -> bool:
     if numpy is None or not isinstance(value, numpy.number | numpy.bool_):
         return False
     return value.dtype.kind in "biuf" and value.dtype.itemsize <= 8
+
+
+def _array(gathered: Slice, array: Any, what: str) -> str:
+    """Return a small array of numbers as source that makes it again, to the last bit; "" for any other."""
+    import numpy as np
+
+    if array.dtype.kind not in "biuf" or array.dtype.itemsize > 8 or array.size > _MOST_NUMBERS:
+        return ""
+    listed = repr(array.tolist())
+    if "nan" in listed or "inf" in listed or np.array(array.tolist(), array.dtype).shape != array.shape:
+        return ""
+    return f"{gathered.module_name('numpy', what)}.array({listed}, dtype={str(array.dtype)!r})".replace("'", '"')
+
+
+def _mark(gathered: Slice, value: Any, what: str) -> str:
+    """Return the source of a mark, or of ``Annotated`` with marks, as annotations use them; "" for any other."""
+    if isinstance(value, Image | Param):
+        given = [(field.name, getattr(value, field.name), field.default) for field in dataclasses.fields(value)]
+        words = [(name, literal_source(setting)) for name, setting, default in given if setting != default]
+        if not all(source for _, source in words):
+            return ""
+        listed = ", ".join(f"{name}={source}" for name, source in words)
+        return f"{gathered.module_name('epypes', what)}.{type(value).__name__}({listed})"
+    home = importable(value.__origin__) if get_origin(value) is Annotated else None
+    parts = [_mark(gathered, mark, what) for mark in value.__metadata__] if home else [""]
+    if home is None or not all(parts):
+        return ""
+    plain = home.qualname if home.module == "builtins" else f"{gathered.module_name(home.module, what)}.{home.qualname}"
+    return f"{gathered.module_name('typing', what)}.Annotated[{plain}, {', '.join(parts)}]"

@@ -490,7 +490,7 @@ def test_marks_are_promoted_and_the_bundle_says_which_ports_are_rgb(tmp_path):
     bundle = ep.promote(runner, tmp_path / "red", outputs=["red", "unsaid"])
     assert verify(bundle.path).identical
     source, ports = bundle.path / "pipeline.py", tomllib.loads((bundle.path / "pipeline.toml").read_text())["ports"]
-    assert 'RGB = epypes.Image(dtype=("uint8",), shape=(None, None, 3), order="rgb")' in source.read_text()
+    assert 'RGB = ep.Image(dtype=("uint8",), shape=(None, None, 3), order="rgb")' in source.read_text()
     assert ports == {"inputs": ["image"], "outputs": ["red", "unsaid"], "rgb": ["image", "red"]}
     assert bundle.settings.rgb == ("image", "red")
     assert [colour_order(ep.load(bundle.path).cg, token) for token in ("image", "red", "unsaid")] == [
