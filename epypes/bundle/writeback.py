@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from epypes.bundle.answers import record_answers_again
-from epypes.bundle.entries import fits, read, written
+from epypes.bundle.entries import alike, fits, read, written
 from epypes.bundle.exchange import exchange
 from epypes.bundle.load import SETTINGS, read_bundle
 from epypes.bundle.proof import prove
@@ -110,10 +110,10 @@ def changed_settings(text: str, values: Mapping[str, Any]) -> str:
     for token, value in values.items():
         if token not in entries:
             raise UnknownName("hyperparameter", token, entries, "in this bundle")
-        if not fits(value):
+        if not fits(alike(entries[token], value)):
             kind = type(value).__name__
             raise HyperparameterError(token, f"Hyperparameter {token!r} can't be a {kind}: {SETTINGS} can't hold one.")
-        _change(entries[token], written(value))
+        _change(entries[token], written(alike(entries[token], value)))
     return tomlkit.dumps(document)
 
 
