@@ -113,7 +113,7 @@ def _object(gathered: Slice, value: Any, what: str, function: FunctionWriter | N
     if _is_numpy_number(value):
         number = expression(gathered, value.item(), what)
         return f"{gathered.reference(Importable('numpy', type(value).__name__), what)}({number})"
-    made = made_again(
+    made = _mark(gathered, value, what) or made_again(
         value,
         lambda part: expression(gathered, part, what, function),
         lambda kind: gathered.add_class(kind, None, f"Class {kind.__name__!r} of {what[0].lower()}{what[1:]}"),
@@ -123,7 +123,7 @@ def _object(gathered: Slice, value: Any, what: str, function: FunctionWriter | N
     home = importable(value)
     if home is None and function is not None and callable(value) and not isinstance(value, type):
         return function(value)
-    return gathered.reference(home, what) if home else _mark(gathered, value, what)
+    return gathered.reference(home, what) if home else ""
 
 
 def _is_numpy_number(value: Any) -> bool:
