@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 RUNS: Final = 3
 # The next run may be further off than the worst of a few; ten times that is far below any change of an algorithm.
 SAFETY: Final = 10.0
-# Noise goes up and down. Of as many distances between runs 1 in 120 grows each time by chance.
-_RUNS_OF_SUSPECTS: Final = 6
+# Noise goes up and down: 1 in 5,040 series of as many runs goes further away each time by chance.
+_RUNS_OF_SUSPECTS: Final = 8
 _MEANING: Final = (
     f"{counted(RUNS, 'more run')} in the notebook gave other last digits: a replay may differ by {SAFETY:g} times as",
     "much, and by no more than the relative part of the largest magnitude.",
@@ -74,7 +74,7 @@ def learn(
     BundleError
         A function fails that did not fail before.
     """
-    # A default would freeze again what was unfrozen.
+    # Without its defaults, so that what was unfrozen is taken from the payload.
     runner = CompGraphRunner(with_defaults(apart(cg), {}), hyperparameters)
     tolerances: dict[str, Tolerance] = {}
     reasons: list[str] = []
@@ -114,9 +114,10 @@ class _Seen:
         self._distances: dict[str, list[float]] = {}
         for number in range(RUNS):
             self._run(number + 1, RUNS)
-        if any(_grows(self._distances[token]) for token in self.unlike):
-            for number in range(RUNS, _RUNS_OF_SUSPECTS):
-                self._run(number + 1, _RUNS_OF_SUSPECTS)
+        for number in range(RUNS, _RUNS_OF_SUSPECTS):
+            if not self.growing():
+                break
+            self._run(number + 1, _RUNS_OF_SUSPECTS)
 
     def _run(self, number: int, of: int) -> None:
         self._told(f"running the functions again to learn what they repeat: {number} of {of}")
@@ -138,7 +139,7 @@ class _Seen:
 
     def growing(self) -> frozenset[str]:
         """Return the tokens whose differences grow from run to run."""
-        return frozenset(token for token in self.unlike if _grows(self._distances[token], _RUNS_OF_SUSPECTS))
+        return frozenset(token for token in self.unlike if _grows(self._distances[token]))
 
     def reason(self, outputs: Sequence[str]) -> str:
         """Return why the outputs can't be verified, with the first function that differs; "" if they can."""
@@ -173,14 +174,10 @@ def _distance(first: Any, value: Any) -> float:
     return max((unlike.largest or 0.0 for unlike in differences(first, value)), default=0.0)
 
 
-def _grows(distances: Sequence[float], runs: int = RUNS) -> bool:
-    """Whether a value goes further and further from that of the first run, as a clock does."""
-    later = distances[1:runs]
-    if len(distances) < runs or 0.0 in later:
-        return False
-    # To run more often is cheap enough to begin with half a suspicion.
-    is_far = later[-1] > 1.5 * later[0] or runs < _RUNS_OF_SUSPECTS
-    return is_far and all(left < right for left, right in itertools.pairwise(later))
+def _grows(distances: Sequence[float]) -> bool:
+    """Whether a value went further from that of the first run at every run, as a clock does."""
+    later = distances[1:]
+    return 0.0 not in later and all(left < right for left, right in itertools.pairwise(later))
 
 
 def _is_noise(found: Sequence[Unlike]) -> bool:
