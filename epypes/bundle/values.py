@@ -53,7 +53,7 @@ def _object(gathered: Slice, value: Any, what: str) -> str:
     if _is_numpy_number(value):
         number = expression(gathered, value.item(), what)
         return f"{gathered.reference(Importable('numpy', type(value).__name__), what)}({number})"
-    made = made_again(
+    made = gathered.annotation_source(value, what) or made_again(
         value,
         lambda part: expression(gathered, part, what),
         lambda kind: gathered.add_class(kind, None, f"Class {kind.__name__!r} of {what[0].lower()}{what[1:]}"),
@@ -61,7 +61,7 @@ def _object(gathered: Slice, value: Any, what: str) -> str:
     if made:
         return made
     home = importable(value)
-    return gathered.reference(home, what) if home else gathered.annotation_source(value, what)
+    return gathered.reference(home, what) if home else ""
 
 
 def _is_numpy_number(value: Any) -> bool:
