@@ -18,6 +18,7 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cached_property
 from typing import Any, Final
 
+from epypes.bundle.cells import place_in
 from epypes.bundle.literal import is_data, is_same_data
 from epypes.bundle.source import Refused, evaluated
 from epypes.bundle.text import class_code, nested_codes, own_text, parsed, same_methods
@@ -37,8 +38,8 @@ class ClassDefinition:
         Its source with the comment above it and its decorators, not indented.
     node
         Its syntax tree.
-    place
-        Cell and line, for people.
+    file
+        The file, or cell as Python knows it, that it is from.
     code
         What that text compiles to, as a module.
     names
@@ -48,9 +49,28 @@ class ClassDefinition:
     name: str
     text: str
     node: ast.ClassDef
-    place: str
+    file: str
     code: types.CodeType
     names: Mapping[str, Any]
+
+    @property
+    def captured(self) -> Mapping[str, Any]:
+        """Nothing: a class in a function is refused."""
+        return {}
+
+    @property
+    def origin(self) -> types.CodeType:
+        """Its code where it was defined."""
+        return self.code.replace(co_filename=self.file, co_firstlineno=self.node.lineno)
+
+    def place_in(self, node: ast.AST) -> str:
+        """Return where a part of it stands, for people."""
+        return place_in(self.file, getattr(node, "lineno", self.node.lineno))
+
+    def place_of(self, name: str) -> str:
+        """Return where it uses a name, for people."""
+        uses = (node for node in ast.walk(self.node) if isinstance(node, ast.Name) and node.id == name)
+        return self.place_in(next(uses, self.node))
 
 
 def class_definition(kind: type, around: Mapping[str, Any], what: str) -> ClassDefinition:
@@ -80,7 +100,7 @@ def class_definition(kind: type, around: Mapping[str, Any], what: str) -> ClassD
             problem = next(_differences(kind, node, "".join(lines)), "")
             if not problem:
                 return _definition(kind, around, what, file, lines, node)
-            why = why or f"{problem} ({_place(file, node)})"
+            why = why or f"{problem} ({place_in(file, node.lineno)})"
     text = f"{what} is not to be had as text: {why or 'it has no source'}."
     raise Refused(f"{text} Define it in a cell again, and what was made of it.")
 
@@ -90,7 +110,7 @@ def _definition(
 ) -> ClassDefinition:
     own = next((function.__globals__ for function in functions_of(kind).values()), None)
     names = around if own is None else own
-    place = _place(file, node)
+    place = place_in(file, node.lineno)
     _check_bases(kind, node, names, f"{what} ({place})")
     text = own_text(lines, node, ())
     code = class_code(text, node)
@@ -101,7 +121,7 @@ def _definition(
             if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
                 text = f"{what} changes the global {instruction.argval!r} ({place})."
                 raise Refused(f"{text} Keep it in the object.")
-    return ClassDefinition(kind.__name__, text, node, place, code, names)
+    return ClassDefinition(kind.__name__, text, node, file, code, names)
 
 
 def class_names(found: ClassDefinition) -> Iterator[str]:
@@ -149,12 +169,6 @@ def _classes(lines: list[str], name: str) -> list[ast.ClassDef]:
     tree = parsed(text) if f"class {name}" in text else None
     found = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef) and node.name == name] if tree else []
     return found[::-1]
-
-
-def _place(file: str, node: ast.ClassDef) -> str:
-    from epypes.bundle.source import place_in
-
-    return place_in(file, node.lineno)
 
 
 def _differences(kind: type, node: ast.ClassDef, text: str) -> Iterator[str]:

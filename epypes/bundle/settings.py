@@ -9,8 +9,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
+from epypes.bundle.compare import Tolerance
 from epypes.bundle.entries import Unwritable, fits, members_in, plain, read, written
 from epypes.bundle.ranges import range_of
+from epypes.bundle.tolerance import add_tolerances, read_tolerances
 from epypes.errors import BundleError
 from epypes.graph import CompGraph
 from epypes.hints import Param
@@ -43,6 +45,8 @@ class Settings:
         The graph's defaults of hyperparameters by token: what they are where the graph is used without these settings.
     types
         Whether the graph compares annotations, as CompGraph does unless told otherwise.
+    tolerances
+        How far outputs may be from what was recorded, by token; those of all others not at all.
     own
         What of the pipeline the module defines itself: ``"f_in"``, ``"f_out"``, ``"make_pipeline"``.
     attributes
@@ -60,6 +64,7 @@ class Settings:
     rgb: tuple[str, ...] = ()
     defaults: Mapping[str, Any] = field(default_factory=dict)
     types: bool = True
+    tolerances: Mapping[str, Tolerance] = field(default_factory=dict)
     own: tuple[str, ...] = ()
     attributes: Mapping[str, Any] = field(default_factory=dict)
     has_groups: bool = False
@@ -142,6 +147,7 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
             for name, value in values.items():
                 table.add(name, _table(written(value)))
             document.add(section, table)
+    add_tolerances(document, settings.tolerances)
     path.write_text(tomlkit.dumps(document), encoding="utf-8")
 
 
@@ -271,6 +277,7 @@ def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Setting
             _strings(ports.get("rgb", [])),
             _values(document.get("defaults", {}), enums),
             bundle.get("types", True) is not False,
+            read_tolerances(document),
             _strings(ports.get("own", [])),
             _values(document.get("attributes", {}), enums),
             bundle.get("groups", False) is True,

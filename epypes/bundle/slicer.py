@@ -1,6 +1,6 @@
 """What does a notebook function need to stand in a module of its own?
 
-Imports, small constants and other plain functions are followed; everything else is refused by name.
+Imports, constants and other functions of the notebook are followed; everything else is refused by name.
 """
 
 from __future__ import annotations
@@ -10,21 +10,38 @@ import builtins
 import dataclasses
 import sys
 import types
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from typing import Annotated, Any, Final, get_origin
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
+from typing import Any, Final
 
-from epypes.bundle.classes import ClassDefinition, class_definition, class_names, made_again
-from epypes.bundle.literal import is_data, is_same_data, literal_source
-from epypes.bundle.source import Definition, Importable, Refused, definition, importable
-from epypes.bundle.uses import global_names, in_module, submodules
-from epypes.hints import Param
-from epypes.images import Image
-from epypes.run.guard import is_plain_array
+from epypes.bundle.callables import found_definition, is_function, method_of
+from epypes.bundle.cells import cell_of, statements_of
+from epypes.bundle.classes import ClassDefinition, class_definition, class_names
+from epypes.bundle.closures import FactoryCall, factory_call
+from epypes.bundle.constants import Remark, imported_as, remark_on
+from epypes.bundle.defaults import check_defaults
+from epypes.bundle.lines import assignment, flat, piece_of
+from epypes.bundle.literal import is_data
+from epypes.bundle.names import Names, of_object
+from epypes.bundle.order import Position, arranged
+from epypes.bundle.source import Definition, Importable, Refused, importable
+from epypes.bundle.state import check_asked, check_state, check_written
+from epypes.bundle.text import renamed
+from epypes.bundle.uses import global_names, replaced, submodules
+from epypes.bundle.values import expression
 
 AnyDefinition = Definition | ClassDefinition
 
 _CONSTANT_CHARACTERS: Final = 400
 RESERVED: Final = frozenset({"func_dict", "func_io"})
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Written:
+    """What the module defines under a name: a function, or what an expression makes."""
+
+    name: str
+    text: str
 
 
 class Slice:
@@ -37,33 +54,40 @@ class Slice:
 
     Attributes
     ----------
+    names
+        What its names mean.
     imports
         Import statements, by the name that each binds and what it binds it to.
     constants
         Source of values, by name.
+    remarks
+        What the notebook says about constants, by name.
     definitions
-        Functions by name, each after those that it calls.
+        Functions, and objects made of them, by name: in the order of the notebook, each after what it needs.
     refusals
         Why something can't be promoted.
     """
 
     def __init__(self, reserved: Collection[str] = RESERVED) -> None:
-        self.reserved = reserved
+        self.names = Names(reserved)
         self.imports: dict[tuple[str, str], str] = {}
         self.constants: dict[str, str] = {}
-        self.definitions: dict[str, AnyDefinition] = {}
+        self.remarks: dict[str, Remark] = {}
+        self.definitions: dict[str, Written] = {}
         self.refusals: list[str] = []
-        self._meanings: dict[str, tuple[str, object]] = {}
-        self._seen: set[int] = set()
+        self._known: dict[int, str] = {}
+        self._positions: dict[str, Position] = {}
+        self._reads: dict[str, frozenset[str]] = {}
+        self._files: dict[str, int] = {}
+        self._notebook: Mapping[str, Any] = {}
 
-    def add_graph_function(self, what: str, function: Callable[..., Any]) -> str:
+    def add_graph_function(self, what: str, function: Callable[..., Any], wanted: str = "") -> str:
         """Add a function of the graph; return the expression by which the module refers to it.
 
-        ``what`` is how reasons call it, as ``"Function 'blur'"``.
+        ``what`` is how reasons call it, as ``"Function 'blur'"``; ``wanted`` its name if it has none of its own.
         """
-        home = importable(function)
         try:
-            return self._add_definition(function, what).name if home is None else self.reference(home, what)
+            return self._callable(function, what, wanted)
         except Refused as refusal:
             self.refusals.append(str(refusal))
             return "None"
@@ -71,178 +95,273 @@ class Slice:
     def reference(self, home: Importable, what: str) -> str:
         """Return the expression for what can be imported: ``cv2.Canny``, or ``len``, which needs no import."""
         top = home.qualname.partition(".")[0]
+        known = [name for name, imported in self.imports if imported == f"{home.module}.{top}"]
+        if known:
+            return min(known) + home.qualname.removeprefix(top)
         builtin = ("builtin", top)
-        if home.module == "builtins" and self._meanings.setdefault(top, builtin) == builtin:
+        if home.module == "builtins" and self.names.may_mean(top, builtin):
             return home.qualname
         return f"{self.module_name(home.module, what)}.{home.qualname}"
 
     def is_taken(self, name: str) -> bool:
         """Whether a name means something in the module already."""
-        return name in self.reserved or name in self._meanings or hasattr(builtins, name)
+        return self.names.is_taken(name)
 
     def add_made_constant(self, name: str, source: str) -> None:
         """Add a constant under a name that is not taken."""
-        self._claim(name, ("constant", name), f"Constant {name!r}")
+        self.names.claim(name, ("constant", name), f"Constant {name!r}")
         self.constants[name] = source
 
     def keep_name(self, name: str) -> None:
         """Keep a name that is not taken for what is written below the functions."""
-        self._claim(name, ("kept", name), f"Function {name!r}")
+        self.names.claim(name, ("kept", name), f"Function {name!r}")
+
+    def arrange(self) -> None:
+        """Put the definitions into the order of the notebook."""
+        texts = {name: found.text for name, found in self.definitions.items()}
+        self.definitions = {name: self.definitions[name] for name in arranged(texts, self._positions, self._reads)}
 
     def module_name(self, module: str, what: str) -> str:
         """Import a module, unless a function has brought it already under a name of its own (``np``)."""
         aliases = [name for name, imported in self.imports if imported == module]
-        if not aliases:
+        if aliases:
+            return min(aliases)
+        name = self.names.alias_for(sys.modules.get(module), self._notebook, module)
+        if not name:
             self._import_module(module, what)
-        return min(aliases, default=module)
+            return module
+        self._import_as(module, name, what)
+        return name
+
+    def _callable(self, function: Any, what: str, wanted: str) -> str:
+        """Return the expression of anything that can be called, with what it needs."""
+        home = importable(function)
+        if home is not None:
+            return self.reference(home, what)
+        if id(function) in self._known:
+            return self._known[id(function)]
+        owner = method_of(function)
+        if owner is not None:
+            of, method = owner
+            return f"{of if isinstance(of, str) else self.reference(of, what)}.{method}"
+        if type(function) is partial and not function.__dict__:
+            return self._add_partial(function, what, wanted)
+        if isinstance(function, type):
+            return self.add_class(function, None, what)
+        source = "" if isinstance(function, types.FunctionType) else expression(self, function, what)
+        return source or self._add_definition(function, what, wanted).name
 
     def add_class(self, kind: type, around: Mapping[str, Any] | None, what: str) -> str:
-        """Add a class, which reads the names ``around`` it if it is the notebook's; return its expression."""
-        home = importable(kind)
-        return self.reference(home, what) if home else self._add_definition(kind, what, around).name
+        """Add a class; return its expression.
 
-    def _add_definition(
-        self, function: Callable[..., Any], what: str, around: Mapping[str, Any] | None = None
-    ) -> AnyDefinition:
-        found = self._found(function, what, around)
-        self._claim(found.name, ("object", id(function)), what)
-        if id(function) in self._seen:
-            return found
-        self._seen.add(id(function))
-        if isinstance(found, Definition):
-            _check_defaults(found, what)
-        for name in global_names(found, what) if isinstance(found, Definition) else class_names(found):
+        Parameters
+        ----------
+        kind
+            The class.
+        around
+            The names of the notebook, as far as the class does not know them; None for those of the functions.
+        what
+            How to call it in a reason.
+        """
+        home = importable(kind)
+        if home is not None:
+            return self.reference(home, what)
+        if id(kind) in self._known:
+            return self._known[id(kind)]
+        found = class_definition(kind, around or self._notebook or vars(sys.modules["__main__"]), what)
+        self.names.claim(found.name, of_object(kind), what)
+        self._known[id(kind)] = found.name
+        names = list(class_names(found))
+        self._reads[found.name] = frozenset(names)
+        check_written(found, names, what)
+        self._add_names(names, found, what)
+        self._write(found.name, found.text, self._position(found))
+        return found.name
+
+    def _add_names(self, names: Sequence[str], found: AnyDefinition, what: str) -> None:
+        for needed in names:
             try:
-                self._add_name(name, found, what)
+                self._add_name(needed, found, what)
             except Refused as refusal:
                 self.refusals.append(str(refusal))
-        self.definitions[found.name] = found
-        return found
 
-    def _found(self, function: Callable[..., Any], what: str, around: Mapping[str, Any] | None) -> AnyDefinition:
-        if isinstance(function, type):
-            return class_definition(function, self._around(function) if around is None else around, what)
-        return definition(function, what)
+    def _add_partial(self, function: partial[Any], what: str, wanted: str) -> str:
+        """Return the expression of a partial, or the name that functions call it by."""
+        inner = f"The function of {what[0].lower()}{what[1:]}"
+        called = self._callable(function.func, inner, wanted)
+        given = [("", value) for value in function.args] + [
+            (f"{name}=", value) for name, value in function.keywords.items()
+        ]
+        parts = [called, *(name + self._argument(value, what) for name, value in given)]
+        source = f"{self.module_name('functools', what)}.partial({', '.join(parts)})"
+        names = (name for name, value in self.names.read.items() if value is function)
+        name = min(names, default="")
+        if not name:
+            return source
+        self.names.claim(name, of_object(function), what)
+        self._known[id(function)] = name
+        self._write(name, f"{name} = {source}\n", self._binding(name, None))
+        return name
 
-    def _around(self, kind: type) -> Mapping[str, Any]:
-        """Return the names of the notebook that has a class."""
-        known = (found.names for found in self.definitions.values())
-        return next((names for names in known if names.get(kind.__name__) is kind), vars(sys.modules["__main__"]))
+    def _argument(self, value: Any, what: str) -> str:
+        """Return the expression of what a function of the notebook was given."""
+        inner = f"A function that {what[0].lower()}{what[1:]} has"
+        source = expression(self, value, what, lambda function: self._callable(function, inner, ""))
+        if not source or (len(source) > _CONSTANT_CHARACTERS and not callable(value)):
+            text = f"{what} has a value of type {type(value).__name__} inside, which no short expression makes again"
+            raise Refused(f"{text}. Make it a token, or make it inside the function.")
+        return flat(piece_of(source))
 
-    def _claim(self, name: str, meaning: tuple[str, object], what: str) -> None:
-        """Make a name mean one thing in the module."""
-        if name in self.reserved:
-            raise Refused(f"{what} uses the name {name!r}, which the module keeps for the graph. Rename it.")
-        if self._meanings.setdefault(name, meaning) != meaning:
-            raise Refused(
-                f"{what} uses the name {name!r}, which means something else in another function of the graph. "
-                "Rename one of the two."
-            )
+    def _add_definition(self, function: Any, what: str, wanted: str = "") -> Written:
+        """Add a function of the notebook."""
+        found = found_definition(function, what)
+        self._notebook = self._notebook or found.function.__globals__
+        name = self.names.name_for(function, found, wanted)
+        self.names.claim(name, of_object(function), what)
+        self._known[id(function)] = name
+        made = factory_call(found) if found.captured and function is found.function else None
+        if made is not None:
+            self._add_made(name, made, found, what)
+            return self.definitions[name]
+        check_defaults(found, what)
+        names = list(global_names(found))
+        self._reads[name] = frozenset(names)
+        check_state(found, names, what)
+        self._add_names(names, found, what)
+        self._write(name, renamed(found.text, found.name, name), self._position(found))
+        return self.definitions[name]
+
+    def _add_made(self, name: str, made: FactoryCall, found: Definition, what: str) -> None:
+        """Add a closure as a call of the function that made it."""
+        check_state(found, list(global_names(found)), what)
+        arguments = [self._argument(value, what) for value in made.positional]
+        arguments += [f"{word}={self._argument(value, what)}" for word, value in made.named.items()]
+        inner = f"Function {made.factory.__name__!r}, which makes {what[0].lower()}{what[1:]},"
+        factory = self._callable(made.factory, inner, "")
+        position = self._binding(name, found) or self._position(found)
+        self._write(name, f"{name} = {factory}({', '.join(arguments)})\n", position)
+
+    def _write(self, name: str, text: str, position: Position) -> None:
+        self.definitions[name] = Written(name, text)
+        if position:
+            self._positions[name] = position
+
+    def _position(self, found: AnyDefinition) -> Position:
+        """Return where a function stands in the notebook: cell, or file, and line."""
+        code = found.origin
+        cell = cell_of(code.co_filename, found.names)
+        return (cell, 0 if cell else self._files.setdefault(code.co_filename, len(self._files)), code.co_firstlineno)
+
+    def _binding(self, name: str, found: AnyDefinition | None) -> Position:
+        """Return where a notebook gave a name its value, () if it does not say."""
+        code = found.origin if found else None
+        given = next(statements_of(name, self._notebook, code), None)
+        return (given.cell, 0, given.node.lineno) if given else ()
 
     def _add_name(self, name: str, found: AnyDefinition, what: str) -> None:
         """Add what one global name of a function means at the time of promotion."""
         names = found.names
+        value = names.get(name)
+        check_asked(name, value, found, what)
         if name not in names:
             if not hasattr(builtins, name):
-                raise Refused(f"{what} uses {name!r}, which is not defined ({found.place}). Define it, or rename.")
+                place = found.place_of(name)
+                raise Refused(f"{what} uses {name!r}, which is not defined ({place}). Define it, or rename.")
             return
-        value = names[name]
+        self.names.read[name] = value
         if isinstance(value, types.ModuleType):
             self._add_module(name, value, found, what)
             return
         home = importable(value, name) if callable(value) or not is_data(value) else None
         if home is not None:
-            self._claim(name, ("object", id(value)), what)
+            self.names.claim(name, of_object(value), what)
             self._import_from(home, name)
-        elif isinstance(value, types.FunctionType):
+        elif is_function(value) or isinstance(value, type):
             self._add_helper(name, value, found, what)
-        elif isinstance(value, type):
-            self._add_notebook_class(name, value, found, what)
         else:
             self._add_constant(name, value, found, what)
 
-    def _add_notebook_class(self, name: str, kind: type, found: AnyDefinition, what: str) -> None:
-        if kind.__name__ != name:
-            raise Refused(
-                f"{what} uses {name!r} ({found.place}), which was defined as class {kind.__name__!r}. "
-                "Call it by the name that it was defined with."
-            )
-        self.add_class(kind, found.names, f"Class {name!r}, which {what[0].lower()}{what[1:]} uses,")
-
-    def _add_helper(self, name: str, helper: types.FunctionType, found: AnyDefinition, what: str) -> None:
-        if helper.__name__ != name and helper.__name__ != "<lambda>":
-            raise Refused(
-                f"{what} calls {name!r} ({found.place}), which was defined as {helper.__name__!r}. "
-                "Call it by the name that it was defined with."
-            )
-        self._add_definition(helper, f"Function {name!r}, which {what[0].lower()}{what[1:]} calls,")
+    def _add_helper(self, name: str, helper: Any, found: AnyDefinition, what: str) -> None:
+        """Add something that a function calls, under the name by which it calls it."""
+        kind, uses = ("Class", "uses") if isinstance(helper, type) else ("Function", "calls")
+        source = self._callable(helper, f"{kind} {name!r}, which {what[0].lower()}{what[1:]} {uses},", name)
+        if source != name and name not in self.definitions:
+            self.names.claim(name, of_object(helper), what)
+            self._write(name, f"{name} = {source}\n", self._binding(name, found))
 
     def _add_constant(self, name: str, value: Any, found: AnyDefinition, what: str) -> None:
-        if is_plain_array(value):
-            source = self.array_source(value, what)
-        else:
-            source = self.annotation_source(value, what) or literal_source(value) or self._made(value, found, what)
+        code = found.origin
+        module, own = imported_as(name, value, found.names, code) if name not in found.captured else ("", "")
+        if module:
+            self.names.claim(name, ("constant", name), what)
+            self._import_from(Importable(module, own), name)
+            return
+        if self._add_table(name, value, found, what):
+            return
+        source = self._constant_source(name, value, found, what)
+        if self.constants.get(name, source) != source:
+            text = f"{what} uses {name!r} ({found.place_of(name)}), which has another value elsewhere"
+            raise Refused(f"{text}. Rename one of the two.")
+        if name in self.constants or name in self.definitions:
+            return
+        self.names.claim(name, ("constant", name), what)
+        factory = code.co_qualname.partition(".")[0]
+        captured = Remark(self._position(found), beside=f"# as {factory}() had it in the notebook")
+        remark = captured if name in found.captured else remark_on(name, value, source, found.names, code)
+        if self._is_made_here(source):
+            lines = [*(remark.above if remark else ()), *assignment([name], True, piece_of(source), 0)]
+            self._write(name, "".join(f"{line}\n" for line in lines), self._binding(name, found))
+            return
+        if remark:
+            self.remarks[name] = remark
+        self.constants[name] = source
+
+    def _is_made_here(self, source: str) -> bool:
+        """Whether an expression needs something that the module defines."""
+        names = (node.id for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Name))
+        return any(name in self.definitions for name in names)
+
+    def _add_table(self, name: str, value: Any, found: AnyDefinition, what: str) -> bool:
+        """Add a dict or sequence with functions of the notebook in it; return whether it is one."""
+        if not isinstance(value, dict | list | tuple) or not any(map(_is_own, _leaves(value))):
+            return False
+        self.names.claim(name, of_object(value), what)
+        if name not in self.definitions:
+            source = self._argument(value, f"{name!r}, which {what[0].lower()}{what[1:]} uses,")
+            text = "\n".join(assignment([name], True, piece_of(source), 0))
+            self._write(name, f"{text}\n", self._binding(name, found))
+        return True
+
+    def _constant_source(self, name: str, value: Any, found: AnyDefinition, what: str) -> str:
+        source = expression(self, value, what)
         if not source or len(source) > _CONSTANT_CHARACTERS:
-            kind = f"the class {name!r}" if isinstance(value, type) else f"of type {type(value).__name__}"
+            kind = f"of type {type(value).__name__}"
             raise Refused(
-                f"{what} is defined in the notebook ({found.place}) and uses {name!r} from it, {kind}. "
+                f"{what} is defined in the notebook ({found.place_of(name)}) and uses {name!r} from it, {kind}. "
                 f"Make {name} a token, make it inside the function, or move both into a module that is installed."
             )
-        if self.constants.get(name, source) != source:
-            raise Refused(f"{what} uses {name!r}, which has another value elsewhere. Rename one of the two.")
-        if name not in self.constants:
-            self._claim(name, ("constant", name), what)
-            self.constants[name] = source
-
-    def _made(self, value: Any, found: AnyDefinition, what: str) -> str:
-        """Return the expression that makes a member of an enumeration, or a record of literals, again."""
-
-        def class_of(kind: type) -> str:
-            told = f"Class {kind.__name__!r} of a value that {what[0].lower()}{what[1:]} uses"
-            return self.add_class(kind, found.names, told)
-
-        return made_again(value, lambda part: literal_source(part) or self._made(part, found, what), class_of)
-
-    def annotation_source(self, value: Any, what: str) -> str:
-        """Return the source of a mark, or of ``Annotated`` with marks, as annotations use them; "" for any other."""
-        if isinstance(value, Image | Param):
-            given = [(field.name, getattr(value, field.name), field.default) for field in dataclasses.fields(value)]
-            words = [(name, literal_source(setting)) for name, setting, default in given if setting != default]
-            if not all(source for _, source in words):
-                return ""
-            listed = ", ".join(f"{name}={source}" for name, source in words)
-            return f"{self.module_name('epypes', what)}.{type(value).__name__}({listed})"
-        home = importable(value.__origin__) if get_origin(value) is Annotated else None
-        parts = [self.annotation_source(mark, what) for mark in value.__metadata__] if home else [""]
-        if home is None or not all(parts):
-            return ""
-        plain = home.qualname if home.module == "builtins" else f"{self.module_name(home.module, what)}.{home.qualname}"
-        return f"{self.module_name('typing', what)}.Annotated[{plain}, {', '.join(parts)}]"
-
-    def array_source(self, array: Any, what: str) -> str:
-        """Return a small array of numbers as source that makes it again, to the last bit; "" for any other."""
-        import numpy as np
-
-        if array.dtype.kind not in "biuf" or array.dtype.itemsize > 8 or array.size * 2 > _CONSTANT_CHARACTERS:
-            return ""
-        listed = repr(array.tolist())
-        if "nan" in listed or "inf" in listed or np.array(array.tolist(), array.dtype).shape != array.shape:
-            return ""
-        return f"{self.module_name('numpy', what)}.array({listed}, dtype={str(array.dtype)!r})".replace("'", '"')
+        return source
 
     def _add_module(self, name: str, module: types.ModuleType, found: AnyDefinition, what: str) -> None:
         if module.__name__ == "__main__":
-            raise Refused(f"{what} uses the notebook itself as module {name!r} ({found.place}).")
+            raise Refused(f"{what} uses the notebook itself as module {name!r} ({found.place_of(name)}).")
+        other = replaced(found.node, name, module)
+        if other:
+            text = f"{what} uses {other!r} ({found.place_of(name)}), which the notebook has replaced by its own"
+            raise Refused(f"{text}. Call yours by a name of its own.")
         if name != module.__name__:
-            self._claim(name, ("object", id(module)), what)
-            self.imports[name, module.__name__] = f"import {module.__name__} as {name}"
+            self._import_as(module.__name__, name, what)
             return
         for dotted in submodules(found.node, name, module) or (name,):
             self._import_module(dotted, what)
 
+    def _import_as(self, module: str, name: str, what: str) -> None:
+        self.names.claim(name, of_object(sys.modules.get(module)), what)
+        self.imports[name, module] = f"import {module} as {name}"
+
     def _import_module(self, module: str, what: str) -> None:
         top = module.partition(".")[0]
-        self._claim(top, ("module", top), what)
+        self.names.claim(top, ("module", top), what)
         self.imports[module, module] = f"import {module}"
 
     def _import_from(self, home: Importable, name: str) -> None:
@@ -256,38 +375,29 @@ class Slice:
         self.imports[name, f"{home.module}.{top}"] = f"from {home.module} import {top}{alias}"
 
 
-def _check_defaults(found: Definition, what: str) -> None:
-    for default, value in _defaults(found, what):
-        text = f"{what} has the default {ast.unparse(default)!r} ({found.place})"
-        try:
-            written = ast.literal_eval(default)
-        except ValueError:
-            if _is_constant(value) and in_module(default, found.function.__globals__) is value:
-                continue
-            raise Refused(f"{text}, which is no literal and no constant of a module. Write the value itself.") from None
-        if not is_same_data(written, value):
-            raise Refused(f"{text}, which has another value by now. Define the function again, with that value.")
+def _leaves(value: Any, depth: int = 5) -> list[Any]:
+    """Return what is in tuples, lists and dicts."""
+    if depth and type(value) in (tuple, list, dict):
+        parts = value.values() if isinstance(value, dict) else value
+        return [leaf for part in parts for leaf in _leaves(part, depth - 1)]
+    return [value]
 
 
-def _defaults(found: Definition, what: str) -> Iterator[tuple[ast.expr, Any]]:
-    """Return every default as it is written, with its value."""
-    arguments, function = found.node.args, found.function
-    by_position, by_name = function.__defaults__ or (), function.__kwdefaults__ or {}
-    named = zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True)
-    written = {argument.arg: default for argument, default in named if default}
-    if len(by_position) != len(arguments.defaults) or by_name.keys() != written.keys():
-        text = f"{what} has other parameters with defaults by now than its text says ({found.place})."
-        raise Refused(f"{text} Define the function again, with these defaults.")
-    yield from zip(arguments.defaults, by_position, strict=True)
-    yield from ((default, by_name[name]) for name, default in written.items())
-
-
-def _is_constant(value: object) -> bool:
-    return isinstance(value, type) or type(value) in (bool, int, float, complex, str, bytes)
+def _is_own(value: Any) -> bool:
+    return is_function(value) and importable(value) is None
 
 
 def slice_functions(gathered: Slice, functions: Sequence[tuple[str, Callable[..., Any]]]) -> list[str]:
     """Add functions of graphs, each given with how reasons call it; return the expressions that refer to them."""
+    survey = Slice(gathered.names.reserved)
+    _add_all(survey, functions)
+    gathered.names.read.update(survey.names.read)
+    references = _add_all(gathered, functions)
+    gathered.arrange()
+    return references
+
+
+def _add_all(gathered: Slice, functions: Sequence[tuple[str, Callable[..., Any]]]) -> list[str]:
     homes = {id(function): importable(function) for _, function in functions}
     # The notebook's own functions first: they know by which names they import modules.
     own_first = sorted(range(len(functions)), key=lambda index: homes[id(functions[index][1])] is not None)
@@ -296,7 +406,8 @@ def slice_functions(gathered: Slice, functions: Sequence[tuple[str, Callable[...
     for index in own_first:
         what, function = functions[index]
         refused = len(gathered.refusals)
-        references[index] = known.get(id(function)) or gathered.add_graph_function(what, function)
+        wanted = what.partition("'")[2].partition("'")[0]
+        references[index] = known.get(id(function)) or gathered.add_graph_function(what, function, wanted)
         if len(gathered.refusals) == refused:
             known[id(function)] = references[index]
     return [references[index] for index in range(len(functions))]

@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import ast
 import copy
-import linecache
 import sys
 import types
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
 from inspect import CO_ASYNC_GENERATOR, CO_COROUTINE
 from typing import Any, TypeGuard
 
+from epypes.bundle.cells import place_in, place_of
+from epypes.bundle.evaluate import is_same
+from epypes.bundle.lambdas import UNNAMED, as_function, lambdas_of
+from epypes.bundle.literal import literal_source
 from epypes.bundle.text import code_on_its_own, definition_of, own_text
 from epypes.graph import outputs
 from epypes.run.guard import unguarded
@@ -39,6 +41,10 @@ class Definition:
 
     Attributes
     ----------
+    name
+        What its text calls it.
+    function
+        The function that has this text: of a decorated one, the innermost.
     text
         Its source with the comment above it, not indented.
     node
@@ -47,6 +53,10 @@ class Definition:
         Cell and line, for people.
     code
         What that text compiles to, where it is written to.
+    captured
+        What it has from the function around it, by name.
+    is_lambda
+        Whether it had no name.
     """
 
     name: str
@@ -55,11 +65,28 @@ class Definition:
     node: ast.FunctionDef
     place: str
     code: types.CodeType
+    captured: Mapping[str, Any] = field(default_factory=dict)
+    is_lambda: bool = False
 
     @property
     def names(self) -> Mapping[str, Any]:
-        """The names of the notebook."""
-        return self.function.__globals__
+        """What its global names mean by now."""
+        return {**self.function.__globals__, **self.captured} if self.captured else self.function.__globals__
+
+    @property
+    def origin(self) -> types.CodeType:
+        """Its code where it was defined."""
+        return self.function.__code__
+
+    def place_in(self, node: ast.AST) -> str:
+        """Return where a part of it stands, for people."""
+        code = self.function.__code__
+        return place_in(code.co_filename, getattr(node, "lineno", code.co_firstlineno))
+
+    def place_of(self, name: str) -> str:
+        """Return where it uses a name, for people."""
+        uses = (node for node in ast.walk(self.node) if isinstance(node, ast.Name) and node.id == name)
+        return self.place_in(next(uses, self.node))
 
 
 def importable(value: Any, *names: str) -> Importable | None:
@@ -123,7 +150,7 @@ def _modules_with(name: str, value: Any) -> Iterator[str]:
             yield module_name
 
 
-def definition(function: Callable[..., Any], what: str) -> Definition:
+def definition(function: types.FunctionType, what: str, decorated: Collection[ast.expr] = ()) -> Definition:
     """Return the source of a function that was defined in the notebook or the main script.
 
     Parameters
@@ -132,91 +159,129 @@ def definition(function: Callable[..., Any], what: str) -> Definition:
         The function.
     what
         How to call it in a reason, as ``"Function 'blur'"``.
+    decorated
+        Its decorators that are known to have made what the notebook has.
 
     Raises
     ------
     Refused
-        It is not a plain function, or its source is not to be had.
+        Its source is not to be had, or does not say all of it.
     """
-    if not isinstance(function, types.FunctionType):
-        raise Refused(f"{what} is {_kind(function)}. Write a plain function (def) that makes the object and calls it.")
     place = place_of(function.__code__)
     _check_kind(function, what, place)
+    if function.__code__.co_name == "<lambda>":
+        return _lambda(function, what, place)
     lines, node = definition_of(function.__code__)
-    if not lines:
-        raise Refused(f"{what} has no source ({place}). Define it in a cell, or in a module that is installed.")
+    _check_found(bool(lines), node is not None, what, place)
     if node is None:
-        text = f"{what} is not what its source says ({place}): that was changed since it was run, or the function was."
-        raise Refused(f"{text} Run it again, so that both are the same.")
-    _check_decorators(node, function, what, place)
+        raise Refused(what)
+    _check_decorators(node, function, what, place, {ast.unparse(decorator) for decorator in decorated})
     _check_attributes(function, what, place)
     names = function.__globals__
     text = own_text(lines, node, [mark for mark in node.decorator_list if _names_outputs(mark, names)])
-    kept = _without_outputs(node, names)
-    code = code_on_its_own(text, kept, function.__code__)
+    return _defined(function, text, _without_outputs(node, names), what, place)
+
+
+def _lambda(function: types.FunctionType, what: str, place: str) -> Definition:
+    lines, nodes = lambdas_of(function.__code__)
+    _check_found(bool(lines), bool(nodes), what, place)
+    if len(nodes) > 1:
+        text = f"{what} is one of {len(nodes)} lambdas on a line, which nothing tells apart ({place})."
+        raise Refused(f"{text} Give each a line of its own, and run the cell again.")
+    _check_attributes(function, what, place)
+    _give_values(nodes[0].args, function)
+    text, node = as_function(lines, nodes[0])
+    return _defined(function, text, node, what, place)
+
+
+def _give_values(arguments: ast.arguments, function: types.FunctionType) -> None:
+    """Write the values into the defaults of a lambda whose names mean something else by now, as in a loop (``k=k``)."""
+    by_position, by_name = function.__defaults__ or (), function.__kwdefaults__ or {}
+    every = [*arguments.posonlyargs, *arguments.args][-len(by_position) :] if by_position else []
+    names = function.__globals__
+    values = zip(every, arguments.defaults, by_position, strict=False)
+    arguments.defaults = [_given(argument, default, value, names) for argument, default, value in values]
+    arguments.kw_defaults = [
+        default and _given(argument, default, by_name.get(argument.arg), names)
+        for argument, default in zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True)
+    ]
+
+
+def _given(argument: ast.arg, default: ast.expr, value: Any, names: Mapping[str, Any]) -> ast.expr:
+    is_own_name = isinstance(default, ast.Name) and default.id == argument.arg
+    source = literal_source(value) if is_own_name or not is_same(default, value, names) else ""
+    return ast.parse(source, mode="eval").body if source else default
+
+
+def _defined(function: types.FunctionType, text: str, node: ast.FunctionDef, what: str, place: str) -> Definition:
+    _check_kept(function, node, what)
+    code = code_on_its_own(text, node, function.__code__)
     if code is None:
-        text = f"{what} computes something else if its text is moved to another place ({place})."
-        raise Refused(f"{text} Define it at the margin of a cell, not in a class.")
-    return Definition(node.name, function, text, kept, place, code)
+        reason = f"{what} computes something else if its text is moved to another place ({place})."
+        raise Refused(f"{reason} Define it at the margin of a cell, not in a class.")
+    captured = _captured(function, what, place)
+    return Definition(node.name, function, text, node, place, code, captured, node.name == UNNAMED)
+
+
+def _check_kept(function: types.FunctionType, node: ast.FunctionDef, what: str) -> None:
+    """Refuse a function that keeps something from call to call in the function around it."""
+    code = function.__code__
+    for part in ast.walk(node):
+        kept = [name for name in part.names if name in code.co_freevars] if isinstance(part, ast.Nonlocal) else []
+        if kept and isinstance(part, ast.Nonlocal):
+            text = f"{what} changes {kept[0]!r} of the function around it ({place_in(code.co_filename, part.lineno)})"
+            raise Refused(f"{text}, so that every call finds it different. Make it a token, or return the value.")
+
+
+def _captured(function: types.FunctionType, what: str, place: str) -> dict[str, Any]:
+    try:
+        cells = [cell.cell_contents for cell in function.__closure__ or ()]
+    except ValueError as error:
+        text = f"{what} uses names of the function around it that have no value ({place})."
+        raise Refused(f"{text} Define them before, or define it outside.") from error
+    return dict(zip(function.__code__.co_freevars, cells, strict=True))
+
+
+def _check_found(has_lines: bool, has_node: bool, what: str, place: str) -> None:
+    if not has_lines:
+        way_out = "Define it in a cell, or in a module that is installed."
+        if "<timed exec>" in place:
+            way_out = "Define it in a cell without %%time."
+        raise Refused(f"{what} has no source ({place}). {way_out}")
+    if not has_node:
+        text = f"{what} is not what its source says ({place}): that was changed since it was run, or the function was."
+        raise Refused(f"{text} Run it again, so that both are the same.")
 
 
 def _check_kind(function: types.FunctionType, what: str, place: str) -> None:
-    """Refuse functions that have no text of their own, or whose text is not all of them."""
-    code = function.__code__
-    if function.__name__ == "<lambda>" or code.co_name == "<lambda>":
-        raise Refused(f"{what} is a lambda ({place}). Write it as a function (def) with a name.")
-    if code.co_flags & (CO_COROUTINE | CO_ASYNC_GENERATOR):
+    if function.__code__.co_flags & (CO_COROUTINE | CO_ASYNC_GENERATOR):
         raise Refused(f"{what} is asynchronous ({place}), which no graph waits for. Write a plain function (def).")
-    if hasattr(function, "__wrapped__"):
-        raise Refused(f"{what} is wrapped by a decorator ({place}). Call the decorator's work inside the function.")
-    if function.__closure__:
-        captured = ", ".join(map(repr, code.co_freevars))
-        raise Refused(f"{what} captures {captured} from the function around it ({place}). Make it a token.")
 
 
-def _kind(value: object) -> str:
-    if isinstance(value, partial):
-        return "a functools.partial"
-    if isinstance(value, type):
-        return f"the class {value.__name__!r}, defined in the notebook"
-    if isinstance(value, types.MethodType):
-        return f"a method of an object of class {type(value.__self__).__name__!r}"
-    return f"an object of class {type(value).__name__!r}"
-
-
-def place_of(code: types.CodeType) -> str:
-    """Return where code stands: the cell's number, if it is from a notebook, and the line."""
-    return place_in(code.co_filename, code.co_firstlineno)
-
-
-def place_in(file: str, number: int) -> str:
-    """Return a place in a file or cell: the cell's number, if it is from a notebook, and the line."""
-    line = f"line {number}"
-    source = "".join(linecache.getlines(file)).strip()
-    cells = getattr(sys.modules.get("__main__"), "In", None)
-    if isinstance(cells, list) and source:
-        cell = max((index for index, cell in enumerate(cells) if str(cell).strip() == source), default=None)
-        if cell is not None:
-            return f"cell [{cell}], {line}"
-    return f"{file}, {line}"
-
-
-def _check_decorators(node: ast.FunctionDef, function: types.FunctionType, what: str, place: str) -> None:
-    for decorator in node.decorator_list:
-        if not _is_our_mark(decorator, function.__globals__):
-            text = f"{what} is decorated by @{ast.unparse(decorator)} ({place})."
-            raise Refused(f"{text} Call the decorator's work inside the function.")
+def _check_decorators(
+    node: ast.FunctionDef, function: types.FunctionType, what: str, place: str, known: Collection[str]
+) -> None:
+    for decorator in other_decorators(node, function.__globals__):
+        if ast.unparse(decorator) not in known:
+            text = f"{what} is decorated by @{ast.unparse(decorator)} ({place}), and does not say so itself."
+            raise Refused(f"{text} Use functools.wraps in the decorator, or call its work inside the function.")
 
 
 def _check_attributes(function: types.FunctionType, what: str, place: str) -> None:
     """Refuse what was hung on a function besides our marks: its text does not say it, and its code may read it."""
-    own = ", ".join(repr(name) for name in function.__dict__ if not name.startswith("__epypes_"))
+    own = [name for name in function.__dict__ if not name.startswith("__epypes_") and name != "__wrapped__"]
     if own:
-        text = f"{what} has attributes that its text does not give it, {own} ({place})."
+        listed = ", ".join(map(repr, own))
+        text = f"{what} has attributes that its text does not give it, {listed} ({place})."
         raise Refused(f"{text} Make them constants or tokens, and define the function again.")
 
 
-def _is_our_mark(decorator: ast.expr, names: dict[str, Any]) -> bool:
+def other_decorators(node: ast.FunctionDef, names: Mapping[str, Any]) -> list[ast.expr]:
+    """Return the decorators of a definition that are no marks of EPypes."""
+    return [decorator for decorator in node.decorator_list if not _is_our_mark(decorator, names)]
+
+
+def _is_our_mark(decorator: ast.expr, names: Mapping[str, Any]) -> bool:
     """Whether a decorator is ``@ep.unguarded``, or ``@ep.outputs`` of literals: both return the function itself."""
     if _names_outputs(decorator, names):
         call = decorator
@@ -224,11 +289,11 @@ def _is_our_mark(decorator: ast.expr, names: dict[str, Any]) -> bool:
     return evaluated(decorator, names) is unguarded
 
 
-def _names_outputs(decorator: ast.expr, names: dict[str, Any]) -> TypeGuard[ast.Call]:
+def _names_outputs(decorator: ast.expr, names: Mapping[str, Any]) -> TypeGuard[ast.Call]:
     return isinstance(decorator, ast.Call) and evaluated(decorator.func, names) is outputs
 
 
-def _without_outputs(node: ast.FunctionDef, names: dict[str, Any]) -> ast.FunctionDef:
+def _without_outputs(node: ast.FunctionDef, names: Mapping[str, Any]) -> ast.FunctionDef:
     """Return the definition without ``@ep.outputs``: what is written out has the graph's io, and no need of it."""
     kept = copy.copy(node)
     kept.decorator_list = [decorator for decorator in node.decorator_list if not _names_outputs(decorator, names)]

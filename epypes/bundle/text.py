@@ -21,7 +21,7 @@ from functools import lru_cache
 from itertools import takewhile
 from typing import Final
 
-_LATE_ANNOTATIONS: Final = __future__.annotations.compiler_flag
+LATE_ANNOTATIONS: Final = __future__.annotations.compiler_flag
 # Above a function these say something about their whole file.
 _ABOUT_THE_FILE: Final = re.compile(r"\s*#(!|.*coding[:=])")
 
@@ -46,29 +46,34 @@ def definition_of(code: types.CodeType) -> tuple[list[str], ast.FunctionDef | No
 
 def _defined_as(lines: list[str], code: types.CodeType) -> ast.FunctionDef | None:
     for apart in (False, True):
-        known = _definitions("".join(lines), code.co_flags & _LATE_ANNOTATIONS, apart)
+        known = _definitions("".join(lines), code.co_flags & LATE_ANNOTATIONS, apart)
         found = known.get((code.co_name, code.co_firstlineno))
-        if found is not None and _computes_the_same(found[1], code):
+        if found is not None and computes_the_same(found[1], code):
             return found[0]
     return None
 
 
 @lru_cache(maxsize=16)  # one cell often defines many functions
 def _definitions(source: str, flags: int, apart: bool) -> dict[tuple[str, int], tuple[ast.FunctionDef, types.CodeType]]:
-    """Return the definitions in a cell, with their code, by name and first line, decorators included.
+    """Return the definitions in a cell, with their code, by name and first line, decorators included."""
+    tree = parsed(source)
+    if tree is None:
+        return {}
+    codes = {(code.co_name, code.co_firstlineno): code for code in codes_in(tree, flags, apart)}
+    nodes = ((node.name, first_line(node), node) for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
+    return {(name, line): (node, codes[name, line]) for name, line, node in nodes if (name, line) in codes}
+
+
+def codes_in(tree: ast.Module, flags: int, apart: bool) -> Iterator[types.CodeType]:
+    """Return all code in a script, or in a cell.
 
     A script is compiled as a whole, a cell statement by statement (``apart``). That is not the same: Python calls
     ``cv2.blur`` in another way where it sees that cv2 is imported.
     """
-    tree = parsed(source)
-    if tree is None:
-        return {}
     units = [ast.Module([statement], []) for statement in tree.body] if apart else [tree]
-    modules = filter(None, (_compiled(unit, flags) for unit in units))
-    every = (code for module in modules for code in nested_codes(module))
-    codes = {(code.co_name, code.co_firstlineno): code for code in every}
-    nodes = ((node.name, first_line(node), node) for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
-    return {(name, line): (node, codes[name, line]) for name, line, node in nodes if (name, line) in codes}
+    for unit in units:
+        module = compiled(unit, flags)
+        yield from nested_codes(module) if module else ()
 
 
 def parsed(source: str) -> ast.Module | None:
@@ -80,7 +85,7 @@ def parsed(source: str) -> ast.Module | None:
         return None
 
 
-def _compiled(tree: ast.Module, flags: int) -> types.CodeType | None:
+def compiled(tree: ast.Module, flags: int) -> types.CodeType | None:
     """Compile as a cell is compiled, which may await; None if that can't be done."""
     try:
         with _without_warnings():
@@ -107,7 +112,7 @@ def nested_codes(code: types.CodeType) -> Iterator[types.CodeType]:
             yield from nested_codes(constant)
 
 
-def _computes_the_same(one: types.CodeType, other: types.CodeType) -> bool:
+def computes_the_same(one: types.CodeType, other: types.CodeType) -> bool:
     """Whether two pieces of code are the same, but for the place where they stand."""
     return _bare(one) == _bare(other)
 
@@ -124,9 +129,9 @@ def same_methods(text: str, node: ast.ClassDef, written: Mapping[str, Sequence[t
         if not isinstance(method, ast.FunctionDef):
             continue
         codes = [function.__code__ for function in written[method.name]]
-        late = _LATE_ANNOTATIONS if any(code.co_flags & _LATE_ANNOTATIONS for code in codes) else 0
+        late = LATE_ANNOTATIONS if any(code.co_flags & LATE_ANNOTATIONS for code in codes) else 0
         known = [_definitions(text, late, apart).get((method.name, first_line(method))) for apart in (False, True)]
-        if not any(found and any(_computes_the_same(found[1], code) for code in codes) for found in known):
+        if not any(found and any(computes_the_same(found[1], code) for code in codes) for found in known):
             return method.name
     return ""
 
@@ -134,9 +139,9 @@ def same_methods(text: str, node: ast.ClassDef, written: Mapping[str, Sequence[t
 def class_code(text: str, node: ast.ClassDef) -> types.CodeType | None:
     """Compile a class that was taken out, as a module; None if it means something else there."""
     tree = parsed(text)
-    if tree is None or len(tree.body) != 1 or _spelled_tree(tree.body[0]) != _spelled_tree(node):
+    if tree is None or len(tree.body) != 1 or spelled_tree(tree.body[0]) != spelled_tree(node):
         return None
-    return _compiled(tree, 0)
+    return compiled(tree, 0)
 
 
 def first_line(node: ast.FunctionDef | ast.ClassDef) -> int:
@@ -148,14 +153,24 @@ def own_text(lines: list[str], node: ast.FunctionDef | ast.ClassDef, dropped: Co
     """Return a definition with the comment above it, not indented, without the decorators that are dropped."""
     first = first_line(node) - 1
     margin = lines[first][: len(lines[first]) - len(lines[first].lstrip())]
-    while first and _is_comment(lines[first - 1], first):
+    while first and is_comment(lines[first - 1], first):
         first -= 1
     gone = {number for decorator in dropped for number in range(decorator.lineno, (decorator.end_lineno or 0) + 1)}
     kept = [line for number, line in enumerate(lines[first : node.end_lineno], first + 1) if number not in gone]
     return _dedented(kept, margin).rstrip() + "\n"
 
 
-def _is_comment(line: str, number: int) -> bool:
+def renamed(text: str, old: str, new: str) -> str:
+    """Return a definition under another name."""
+    if old == new:
+        return text
+    number = ast.parse(text).body[0].lineno - 1
+    lines = text.splitlines(keepends=True)
+    lines[number] = re.sub(rf"\bdef(\s+){old}\b", rf"def\g<1>{new}", lines[number], count=1)
+    return "".join(lines)
+
+
+def is_comment(line: str, number: int) -> bool:
     """Whether a line is a comment on what stands below; one on the encoding would change all that is written."""
     return line.lstrip().startswith("#") and not (number <= 2 and _ABOUT_THE_FILE.match(line))
 
@@ -200,7 +215,7 @@ def code_on_its_own(text: str, node: ast.FunctionDef, code: types.CodeType) -> t
     node
         The definition, without the decorators that were dropped.
     code
-        The function's code.
+        The function's code. What it captured is global in the module.
 
     Returns
     -------
@@ -208,19 +223,28 @@ def code_on_its_own(text: str, node: ast.FunctionDef, code: types.CodeType) -> t
         The code; None if it means something else than the function's.
     """
     tree = parsed(text)
-    if tree is None or len(tree.body) != 1 or _spelled_tree(tree.body[0]) != _spelled_tree(node):
+    if tree is None or len(tree.body) != 1 or spelled_tree(tree.body[0]) != spelled_tree(node):
         return None
-    as_before = _code_of(node.name, tree, code.co_flags & _LATE_ANNOTATIONS)
+    as_before = _code_of(node.name, _captured(tree, code.co_freevars), code.co_flags & LATE_ANNOTATIONS)
     # Inside of a class Python renames what begins with two underscores.
     return _code_of(node.name, tree, 0) if as_before and _names_in(as_before) == _names_in(code) else None
 
 
+def _captured(tree: ast.Module, names: Collection[str]) -> ast.Module:
+    """Return a definition inside of a function that has some names."""
+    if not names:
+        return tree
+    around = ast.parse(f"def around({', '.join(names)}):\n    pass")
+    vars(around.body[0]).update(name="<around>", body=tree.body)
+    return around
+
+
 def _code_of(name: str, tree: ast.Module, flags: int) -> types.CodeType | None:
-    module = _compiled(tree, flags)
+    module = compiled(tree, flags)
     return next((code for code in nested_codes(module) if code.co_name == name), None) if module else None
 
 
-def _spelled_tree(tree: ast.AST) -> list[object]:
+def spelled_tree(tree: ast.AST) -> list[object]:
     """Return all that a syntax tree says, without its lines; not by ast.dump, which a long sum is too deep for."""
     return [(type(node), [_spelled(value) for _, value in ast.iter_fields(node)]) for node in ast.walk(tree)]
 

@@ -5,20 +5,17 @@ from __future__ import annotations
 import ast
 import dis
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
-from epypes.bundle.source import Definition, Refused
+from epypes.bundle.source import Definition
 from epypes.bundle.text import nested_codes
 
 
-def global_names(found: Definition, what: str) -> Iterator[str]:
+def global_names(found: Definition) -> Iterator[str]:
     """Return the global names that a function reads when it is called or defined, each once, in order of use."""
     names: dict[str, None] = {}
     for code in nested_codes(found.code):
-        for instruction in dis.get_instructions(code):
-            if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
-                raise Refused(f"{what} changes the global {instruction.argval!r} ({found.place}). Return the value.")
         names.update(dict.fromkeys(names_from_outside(code)))
     arguments = found.node.args
     every = (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs, arguments.vararg, arguments.kwarg)
@@ -61,15 +58,16 @@ def submodules(tree: ast.AST, name: str, module: types.ModuleType) -> tuple[str,
     return tuple(found)
 
 
-def in_module(expression: ast.AST, names: Mapping[str, Any]) -> Any:
-    """Return what a dotted name means that starts with a module (``cv2.NORM_HAMMING``); None for anything else."""
-    chain = _chain(expression)
-    reached = names.get(chain[0]) if chain else None
-    if not isinstance(reached, types.ModuleType) or reached.__name__ == "__main__":
-        return None
-    for part in chain[1:]:
-        reached = getattr(reached, part, None)
-    return reached
+def replaced(tree: ast.AST, name: str, module: types.ModuleType) -> str:
+    """Return what of a module a notebook has replaced by a function of its own (``cv2.blur = ...``); "" if nothing."""
+    for node in ast.walk(tree):
+        chain = _chain(node)
+        reached: Any = module if chain and chain[0] == name else None
+        for part in chain[1:]:
+            reached = getattr(reached, part, None)
+        if isinstance(reached, types.FunctionType | type) and reached.__module__ == "__main__":
+            return ".".join(chain)
+    return ""
 
 
 def _chain(node: ast.AST) -> list[str]:

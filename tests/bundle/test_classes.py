@@ -66,6 +66,7 @@ PROMOTED = {
         "from __future__ import annotations\nfrom dataclasses import dataclass\n@dataclass\nclass P:\n    a: int = 4\n"
         "    def of(self, other: int) -> float:\n        return self.a + other\ndef f(x):\n    return P().of(x)\n"
     ),
+    "under another name": "class B:\n    K = 2\nA = B\ndef f(x):\n    return A.K + x\n",
     "in an if": "if True:\n    class A:\n        K = 4\ndef f(x):\n    return A.K + x\n",
 }
 
@@ -98,7 +99,6 @@ REFUSED = {
         f"def make():\n    class A:\n        def g(self):\n            return 1\n    return A\nA = make()\n{USED}",
         r"defined inside 'make\.<locals>'\. Define it at the margin",
     ),
-    "under another name": ("class B:\n    pass\nA = B\ndef f(x):\n    return A\n", "defined as class 'B'"),
     "made by a call": (f"A = type('A', (), {{'g': lambda self: 1}})\n{USED}", "is not to be had as text"),
     "writes a global": (
         f"N = 0\nclass A:\n    def g(self):\n        global N\n        N += 1\n        return N\n{USED}", "changes the global 'N'",

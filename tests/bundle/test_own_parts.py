@@ -328,6 +328,15 @@ def test_the_usual_ports_of_a_bundle_are_not_written_out(names, tmp_path):
     assert ep.promote(served, tmp_path / "c").settings.own == ()
 
 
+def test_a_sample_brings_what_was_unfrozen_too(tmp_path):
+    names = cell("def shift(x, by=1):\n    return x + by\n")
+    runner = ep.CompGraphRunner(ep.CompGraph.from_functions(names["shift"]))
+    runner.unfreeze("by")
+    runner.run(x=1, by=5)
+    bundle = ep.promote(runner, tmp_path / "b", samples=[{"x": 2, "by": 7}])
+    assert (bundle.settings.inputs, verify(bundle.path).samples) == (("x", "by"), 2)
+
+
 def refusals(pipe_or_runner, folder, **more) -> str:
     with pytest.raises(PromotionRefused) as refused:
         ep.promote(pipe_or_runner, folder, **more)
@@ -387,3 +396,26 @@ def test_two_read_bundles_of_one_name_do_not_know_each_other(names, tmp_path):
     one, other = read_bundle(path), read_bundle(path)
     assert one.cg.functions["double"] is not other.cg.functions["double"]
     assert "epypes_bundle_b" not in sys.modules
+
+
+@pytest.mark.notebook
+def test_a_notebook_file_with_classes_gives_the_same_module(promoted, tmp_path):
+    import inspect
+
+    import nbformat
+
+    from epypes.bundle.notebook import promote_notebook
+
+    graph = inspect.getsource(graph_of).replace("names: dict", "names").replace("-> ep.CompGraph", "")
+    last = (
+        "ports = unpack, pack\n"
+        "values = {'lo': 70, 'hi': 200.0, 'method': Method.SOBEL, 'kernel': np.array(KERNEL, np.float32)}\n"
+        "pipe = Inspector('edges', graph_of(globals()), None, None, *ports, values, limit=7)\n"
+        "pipe.attributes['most'] = 90\n_ = pipe.run(image=np.zeros((40, 60, 3), np.uint8))"
+    )
+    kernel = f"KERNEL = {[[0.1, 0.2, 0.1], [0.2, 0.4, 0.2], [0.1, 0.2, 0.1]]}"
+    cells = [nbformat.v4.new_code_cell(source) for source in (CELL, graph, kernel, last)]
+    nbformat.write(nbformat.v4.new_notebook(cells=cells), tmp_path / "n.ipynb")
+    promote_notebook(tmp_path / "n.ipynb", "pipe", tmp_path / "edges")
+    assert (tmp_path / "edges" / "pipeline.py").read_text() == promoted.text
+    assert (tmp_path / "edges" / "pipeline.toml").read_text() == (promoted.bundle.path / "pipeline.toml").read_text()

@@ -279,7 +279,10 @@ def test_a_value_without_an_expression_is_refused_by_name_with_the_way_out(value
 
 
 def test_every_reason_is_given_at_once_with_its_place():
-    names = notebook("a = lambda x: x\nb = functools.partial(pow, 2)\ndef c(x):\n    return p + q\n")
+    cell = (
+        "class C:\n    def m(self, x):\n        return x\n    def __call__(self, *xs):\n        return xs\na = C().m\n"
+    )
+    names = notebook(cell + "b = functools.partial(C(), 2)\ndef c(x):\n    return p + q\n")
     inner = ep.Pipeline("inner", ep.CompGraph({"d": names["a"]}, {"d": (("x",), "y")}))
     functions = {name: names[name] for name in "abc"} | {"i": inner}
     cg = ep.CompGraph(functions, {name: (("x", "k")[:1], f"y{name}") for name in functions})
@@ -289,9 +292,9 @@ def test_every_reason_is_given_at_once_with_its_place():
     assert len(reasons) == 7
     for words in (
         "name='class'",
-        "'a' is a lambda (",
-        "'d' of pipeline 'inner' is a lambda (",
-        "functools.partial",
+        "'a' is a method of",
+        "'d' of pipeline 'inner' is a method of",
+        "The function of function 'b' is an object of class 'C'",
         "'p'",
         "'q'",
     ):
@@ -372,12 +375,11 @@ def test_a_switch_with_several_outputs_is_unpacked_as_the_runner_unpacks_it():
         assert executed(text)(given, None) == {0: None, 1: expected[:1] and expected[0]}.get(len(expected), expected)
 
 
-def test_a_function_called_like_the_whole_is_refused():
-    names = notebook("def f(x):\n    return x\n")
-    cg = ep.CompGraph({"g": names["f"]}, {"g": ("x", "y")})
-    with pytest.raises(SourceRefused, match="uses the name 'f'"):
-        ep.to_source(cg, name="f")
-    assert executed(ep.to_source(cg))(3) == 3
+def test_a_function_called_like_the_whole_gets_the_name_that_it_has_in_the_graph():
+    names = notebook("def f(x):\n    return x + 1\n")
+    text = ep.to_source(ep.CompGraph({"g": names["f"]}, {"g": ("x", "y")}), name="f")
+    assert text.startswith("def g(x):\n    return x + 1\n")
+    assert executed(text, "f")(3) == 4
 
 
 def test_of_our_marks_the_one_that_changes_what_is_computed_stays():

@@ -1,0 +1,143 @@
+"""How does a constant stand in the module, so that people know it from the notebook?
+
+With the comment above or beside it, its numbers spelled as they were; one that was computed says how.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+import types
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from epypes.bundle.cells import Statement, statements_of
+from epypes.bundle.evaluate import UNKNOWN, value_of
+from epypes.bundle.lines import assignment, fits, piece_of
+from epypes.bundle.literal import is_data, is_same_data
+from epypes.bundle.order import Position
+from epypes.bundle.text import is_comment
+from epypes.run.guard import is_plain_array
+
+
+@dataclass(frozen=True, slots=True)
+class Remark:
+    """What the notebook says about a constant.
+
+    Attributes
+    ----------
+    position
+        Cell and line.
+    above, beside
+        Lines of comment.
+    source
+        The expression as people wrote it, if it is as good as the value; else "".
+    """
+
+    position: Position
+    above: tuple[str, ...] = ()
+    beside: str = ""
+    source: str = ""
+
+
+def imported_as(name: str, value: Any, names: Mapping[str, Any], code: types.CodeType) -> tuple[str, str]:
+    """Return the module from which a notebook imported a value, and what it is called there; else empty strings."""
+    for statement in statements_of(name, names, code):
+        node = statement.node
+        if not isinstance(node, ast.ImportFrom) or node.level or not node.module:
+            return "", ""
+        own = next((alias.name for alias in node.names if (alias.asname or alias.name) == name), name)
+        there = getattr(sys.modules.get(node.module), own, UNKNOWN)
+        return (node.module, own) if _is_same(there, value) else ("", "")
+    stars = (statement.node for statement in statements_of("*", names, code))
+    modules = (node.module for node in stars if isinstance(node, ast.ImportFrom) and not node.level)
+    found = (module for module in modules if _is_same(getattr(sys.modules.get(module or ""), name, UNKNOWN), value))
+    return next(((module, name) for module in found if module), ("", ""))
+
+
+def _is_same(one: Any, other: Any) -> bool:
+    return one is other or is_same_data(one, other)
+
+
+def remark_on(name: str, value: Any, source: str, names: Mapping[str, Any], code: types.CodeType) -> Remark | None:
+    """Return what a notebook says where it last gave a name this value; None if it does not say it.
+
+    Parameters
+    ----------
+    name, value, source
+        The constant, and the expression that makes it again.
+    names
+        The notebook's names.
+    code
+        The code of a function that reads it.
+    """
+    for statement in statements_of(name, names, code):
+        given = getattr(statement.node, "value", None)
+        if not isinstance(given, ast.expr):
+            continue
+        written = value_of(given, {}) if _is_assignment_to(name, statement.node) else UNKNOWN
+        if written is UNKNOWN or is_same_data(written, value):
+            return _remark(name, value, source, given, statement, written is not UNKNOWN)
+    return None
+
+
+def _is_assignment_to(name: str, node: ast.stmt) -> bool:
+    """Whether a statement gives one name the value of one expression."""
+    targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+    plain = isinstance(node, ast.Assign | ast.AnnAssign) and len(targets) == 1
+    return plain and isinstance(targets[0], ast.Name) and targets[0].id == name
+
+
+def _remark(name: str, value: Any, source: str, given: ast.expr, statement: Statement, is_known: bool) -> Remark:
+    node, lines = statement.node, statement.lines
+    position = (statement.cell, node.lineno)
+    if not _is_assignment_to(name, node):
+        return Remark(position)
+    first = number = node.lineno - 1
+    while first and is_comment(lines[first - 1], first):
+        first -= 1
+    rest = lines[(node.end_lineno or 1) - 1].encode()[node.end_col_offset :].decode().strip()
+    above = tuple(line.strip() for line in lines[first:number])
+    beside = rest if rest.startswith("#") else ""
+    if is_known:
+        return Remark(position, above, beside, _spelled(given, "\n".join(lines)))
+    is_computed = is_data(value) or is_plain_array(value)
+    if not beside and is_computed and ast.unparse(ast.parse(source)) != ast.unparse(given):
+        beside = f"# {ast.unparse(given)} in the notebook"
+        beside = beside if fits(0, beside) else ""
+    return Remark(position, above, beside)
+
+
+def _spelled(given: ast.expr, text: str) -> str:
+    """Return an expression as it was written, if it is a number or stands on one line without strings."""
+    source = ast.get_source_segment(text, given) or ""
+    has_text = any(isinstance(part, ast.Constant) and isinstance(part.value, str | bytes) for part in ast.walk(given))
+    return "" if has_text or "\n" in source else source
+
+
+def constant_lines(name: str, source: str, remark: Remark | None) -> list[str]:
+    """Return the lines of a constant, with the comments of the notebook."""
+    known = remark or Remark(())
+    spelled = f"{name} = {known.source}"
+    lines = [spelled] if known.source and fits(0, spelled) else assignment([name], True, piece_of(source), 0)
+    above = list(known.above)
+    if known.beside and len(lines) == 1 and fits(0, f"{lines[0]}  {known.beside}"):
+        lines = [f"{lines[0]}  {known.beside}"]
+    elif known.beside:
+        above.append(known.beside)
+    return [*above, *lines]
+
+
+def constants_text(constants: Mapping[str, str], remarks: Mapping[str, Remark]) -> list[str]:
+    """Return the lines of all constants in the order of the notebook, each that has a comment above it set off."""
+    return list(_lines(constants, remarks))
+
+
+def _lines(constants: Mapping[str, str], remarks: Mapping[str, Remark]) -> Iterator[str]:
+    names = sorted(constants, key=lambda name: (name not in remarks, remarks[name].position if name in remarks else ()))
+    for number, name in enumerate(names):
+        lines = constant_lines(name, constants[name], remarks.get(name))
+        if number and lines[0].startswith("#"):
+            yield ""
+        yield from lines

@@ -1,0 +1,213 @@
+"""Notebooks that are known to work where they are written and to fail where they are served."""
+
+from __future__ import annotations
+
+import linecache
+import sys
+import types
+
+import pytest
+
+IMPORTS = """\
+import functools
+import operator
+import re
+from fractions import Fraction
+from math import *
+from math import floor as down
+from operator import itemgetter as take
+
+import cv2
+import numpy as np
+import skimage.filters
+from cv2 import NORM_L1
+
+import epypes as ep
+"""
+
+# By name: a cell, and what of it the graph calls, by its name there. Every function takes an array of 2 x 3 numbers.
+PROMOTED: dict[str, tuple[str, dict[str, str]]] = {
+    "lambda": ("# Doubles.\ndouble = lambda a: 2 * a", {"lambda_": "double"}),
+    "lambda in place": ("", {"in_place": "lambda a, k=3: a * k"}),
+    "two lambdas on one line": ("plus, minus = lambda a: a + 1, lambda a: a - 1", {"plus": "plus", "minus": "minus"}),
+    "the same lambda twice on one line": ("one, other = lambda a: a + 7, lambda a: a + 7", {"one": "one", "two": "other"}),
+    "lambda in a lambda": ("nested = (lambda a: (lambda b: b + 4))(0)", {"nested": "nested"}),
+    "lambdas of a loop": (
+        "powers = {}\nfor power in (2, 3):\n    powers[power] = lambda a, power=power: a ** power",
+        {"squared": "powers[2]", "cubed": "powers[3]"},
+    ),
+    "lambda over lines": ("longer = lambda a: [  # odd\n    a.sum(),\n    2]", {"longer": "longer"}),
+    "lambda that calls itself": ("halve = lambda a: a if a.max() < 1 else halve(a / 2)", {"halve": "halve"}),
+    "partial": ("clip = functools.partial(np.clip, a_min=1, a_max=4)", {"clip": "clip"}),
+    "partial of a partial": (
+        "def scale(by, a, offset=0):\n    return a * by + offset\nthrice = functools.partial(scale, 3)",
+        {"nested_partial": "functools.partial(functools.partial(scale, 3), offset=np.float32(0.5))"},
+    ),
+    "partial that a function calls": ("def use_thrice(a):\n    return thrice(a)", {"use_thrice": "use_thrice"}),
+    "closure": (
+        "def make_adder(k, *, sign=1):\n    shift = k * sign\n    def add(a):\n        return a + shift + k + sign\n"
+        "    return add\nadd_5 = make_adder(5)",
+        {"add_5": "add_5", "subtract": "make_adder(2, sign=-1)"},
+    ),
+    "closure over what was computed": (
+        "def make_filter(size):\n    weights = np.ones(size) / size\n    def smooth(a):\n        return np.convolve(a[0], weights)\n"
+        "    return smooth\nsmooth = make_filter(3)",
+        {"smooth": "smooth"},
+    ),
+    "closure over functions": (
+        "def compose(first, then):\n    return lambda a: then(first(a))",
+        {"composed": "compose(double, np.sqrt)"},
+    ),
+    "closure that calls itself": (
+        "def make_sum():\n    def total(rows):\n        return 0 if len(rows) == 0 else rows[0].sum() + total(rows[1:])\n"
+        "    return total\ntotal = make_sum()",
+        {"total": "total"},
+    ),
+    "recursion": ("def depth(a):\n    return 0 if a.size < 2 else 1 + depth(a.ravel()[1:])", {"depth": "depth"}),
+    "mutual recursion": (
+        "def even(n):\n    return n == 0 or odd(n - 1)\ndef odd(n):\n    return n != 0 and even(n - 1)\n"
+        "def parity(a):\n    return even(a.size)",
+        {"parity": "parity"},
+    ),
+    "several names": (
+        "def root(a):\n    return np.sqrt(a)\nradix = root\ndef roots(a):\n    return root(a) + radix(a)",
+        {"roots": "roots"},
+    ),
+    "old function kept": (
+        "def shade(a):\n    return a / 2\nold_shade = shade\ndef shade(a):\n    return a / 4\n"
+        "def shades(a):\n    return shade(a)",
+        {"old": "old_shade", "new": "shade", "shades": "shades"},
+    ),
+    "redefinition by object": ("def again(a):\n    return a\ndef again(a):\n    return a + 10", {"again": "again"}),
+    "default of a constant": ("GAIN = 3\ndef gain(a, by=GAIN, *, pi=np.pi):\n    return a * by + pi", {"gain": "gain"}),
+    "lru_cache": (
+        "@functools.lru_cache(maxsize=None)\ndef fib(n):\n    return n if n < 2 else fib(n - 1) + fib(n - 2)\n"
+        "def fibs(a):\n    return fib(int(a.max()))",
+        {"fibs": "fibs"},
+    ),
+    "decorator of the notebook": (
+        "def repeated(times):\n    def decorate(f):\n        @functools.wraps(f)\n        def repeat(a):\n"
+        "            for _ in range(times):\n                a = f(a)\n            return a\n        return repeat\n"
+        "    return decorate\n\n# Twice.\n@repeated(2)\n@ep.unguarded\ndef twice(a):\n    return a + SHIFT\nSHIFT = 1.5",
+        {"twice": "twice"},
+    ),
+    "lazy import": ("def lazy(a):\n    import math\n    from fractions import Fraction as F\n    return math.floor(F(7, 2))", {"lazy": "lazy"}),
+    "imports": (
+        "def imported(a):\n    return down(sqrt(16)) + NORM_L1 + len(take(0)(a)) + pi", {"imported": "imported"},
+    ),
+    "submodule": ("def sobel(a):\n    return skimage.filters.sobel(a)", {"sobel": "sobel"}),
+    "C functions": ("", {"ufunc": "np.sqrt", "c_function": "cv2.norm", "builtin": "len", "method": "np.ndarray.sum"}),
+    "objects of operator": ("first_row = take(0)\ndef rowed(a):\n    return first_row(a)", {"rowed": "rowed", "item": "operator.itemgetter(1)"}),
+    "method of a literal": ("", {"looked": '{2: "two", 3: "three"}.get'}),
+    "table of functions": (
+        "TABLE = {'double': double, 'root': np.sqrt}\ndef chosen(a):\n    return TABLE['double'](TABLE['root'](a))",
+        {"chosen": "chosen"},
+    ),
+    "constants of all kinds": (
+        "# found by hand\nLOW = 0x10  # of 255\nSTEPS = 1_000\nNAMES = {'a': (1, 2.5), 'b': {1, 2}}\nEND = float('inf')\n"
+        "WORD = re.compile(r'\\w+', re.I)\nHALF = Fraction(1, 2)\nSPAN = range(2, 9)\nROW = slice(1, None)\nKERNEL = np.eye(2) / 3\n"
+        "def constants(a):\n    return LOW + STEPS + len(NAMES), END, len(WORD.findall('a b')), float(HALF), list(SPAN), KERNEL @ a[ROW, :1].repeat(2, 0)",
+        {"constants": "constants"},
+    ),
+    "function that makes a generator": (
+        "def rows(a):\n    yield from a\ndef listed(a):\n    return list(rows(a))", {"listed": "listed"},
+    ),
+}  # fmt: skip
+
+# By name: a cell, what of it the graph calls, and what the reason says: of which place, and which way out.
+REFUSED: dict[str, tuple[str, str, str]] = {
+    "bound method": ("class C:\n    def m(self, a):\n        return a\nf = C().m", "f", r"a method of an object of class 'C' \(cell \[1\], line 4\)\. Write a plain function"),
+    "method of a library's object": ("f = cv2.ORB_create().detect", "f", r"class 'ORB' \(cell \[1\], line 1\)\. Write a plain"),
+    "callable object": ("class C:\n    def __call__(self, a):\n        return a", "C()", r"'C' \(cell \[1\], line 2\)\. Write a plain"),
+    "magic": ("def f(a):\n    get_ipython().run_line_magic('time', 'a')\n    return a", "f", r"\(cell \[1\], line 2\), the notebook itself, as magics.* Write it in Python"),
+    "display": ("def f(a):\n    display(a)\n    return a", "f", r"'display' \(cell \[1\], line 2\).* Return it as a token"),
+    "input": ("def f(a):\n    return input()", "f", r"\(cell \[1\], line 2\), which asks a person\. Make the answer a token"),
+    "file": ("def f(a):\n    return __file__", "f", r"'__file__' \(cell \[1\], line 2\), which is another one"),
+    "global write": ("N = 0\ndef f(a):\n    global N\n    N += 1\n    return N", "f", r"changes the global 'N' \(cell \[1\], line 4\)\. Return"),
+    "nonlocal": (
+        "def make(n):\n    def f(a):\n        nonlocal n\n        n += 1\n        return n\n    return f\nf = make(0)", "f",
+        r"changes 'n' of the function around it \(cell \[1\], line 3\).*Make it a token",
+    ),
+    "big array": ("K = np.zeros(999)\ndef f(a):\n    return a + K[0]", "f", r"\(cell \[1\], line 3\) and uses 'K' from it, of type ndarray\. Make K a token"),
+    "dict that is written into": ("SEEN = {}\ndef f(a):\n    SEEN[a.size] = 1\n    return a", "f", r"writes into 'SEEN', .*\(cell \[1\], line 3\).* Copy it first"),
+    "list that grows": ("LOG = []\ndef f(a):\n    LOG.append(a)\n    return a", "f", r"writes into 'LOG', .*\(cell \[1\], line 3\)"),
+    "attribute of itself": ("def f(a):\n    f.count = 1\n    return a", "f", r"writes into 'f', .*\(cell \[1\], line 2\)"),
+    "closure that keeps": (
+        "def make():\n    seen = []\n    def f(a):\n        seen.append(a)\n        return a\n    return f\nf = make()", "f",
+        r"writes into 'seen', .*\(cell \[1\], line 4\)",
+    ),
+    "made by exec": ("exec('def f(a):\\n    return a')", "f", r"has no source .*Define it in a cell"),
+    "made by eval": ("f = eval('lambda a: a')", "f", r"has no source .*Define it in a cell"),
+    "async helper": ("async def g(a):\n    return a\ndef f(a):\n    return g(a)", "f", r"'g', .* is asynchronous \(cell \[1\], line 1\).* Write a plain function"),
+    "missing name": ("def f(a):\n    return a + nothing", "f", r"'nothing', which is not defined \(cell \[1\], line 2\)\. Define it"),
+    "replaced code": ("def g(a):\n    return -a\ndef f(a):\n    return a\nf.__code__ = g.__code__.replace(co_name='f', co_firstlineno=3)", "f", r"not what its source says \(cell \[1\], line 3\).* Run it again"),
+    "replaced function of a module": (
+        "import types\nlib = types.ModuleType('lib')\nlib.f = lambda a: a\ndef f(a):\n    return lib.f(a)", "f",
+        r"'lib\.f' \(cell \[1\], line 5\), which the notebook has replaced.* Call yours by a name",
+    ),
+    "decorator without wraps": (
+        "def d(g):\n    def w(a):\n        return g(a)\n    return w\n@d\ndef f(a):\n    return a", "f",
+        r"decorated by @d \(cell \[1\], line 5\).* Use functools\.wraps",
+    ),
+    "decorator that marks": ("def d(g):\n    return g\n@d\ndef f(a):\n    return a", "f", r"decorated by @d \(cell \[1\], line 3\).* Use functools\.wraps"),
+    "decorator that was defined again": (
+        "def d(g):\n    @functools.wraps(g)\n    def w(a):\n        return g(a)\n    return w\n@d\ndef f(a):\n    return a\n"
+        "def d(g):\n    @functools.wraps(g)\n    def w(a):\n        return g(g(a))\n    return w", "f",
+        r"@d \(cell \[1\], line 6\), which makes something else by now\. Run that cell again",
+    ),
+    "decorator whose argument has changed": (
+        "N = 2\ndef d(n):\n    def deco(g):\n        @functools.wraps(g)\n        def w(a):\n            return g(a) * n\n        return w\n"
+        "    return deco\n@d(N)\ndef f(a):\n    return a\nN = 3", "f", r"@d\(N\) \(cell \[1\], line 9\), whose argument 'n' had another value",
+    ),
+    "decorator that counts": (
+        "def d(g):\n    n = 0\n    @functools.wraps(g)\n    def w(a):\n        nonlocal n\n        n += 1\n        return g(a) + n\n    return w\n"
+        "@d\ndef f(a):\n    return a", "f", r"@d \(cell \[1\], line 9\), which counts or keeps something in 'n'",
+    ),
+    "default that has changed": ("K = 1\ndef f(a, k=K):\n    return a + k\nK = 2", "f", r"default 'K' \(cell \[1\], line 2\), which has another value by now\. Define the function again"),
+    "partial of an object": ("f = functools.partial(np.add, object())", "f", r"has a value of type object inside.* Make it a token"),
+    "attributes": ("def f(a):\n    return a\nf.seen = 3", "f", r"attributes that its text does not give it, 'seen' \(cell \[1\], line 1\)"),
+}  # fmt: skip
+
+
+def in_notebook(monkeypatch: pytest.MonkeyPatch, *cells: str, **known: object) -> dict:
+    """Run cells as a notebook does: one after another in ``__main__``, which keeps their text; return its names."""
+    main = types.ModuleType("__main__")
+    monkeypatch.setitem(sys.modules, "__main__", main)
+    names = vars(main)
+    names.update(known, In=[""])
+    for number, source in enumerate(cells, 1):
+        names["In"].append(source)
+        name = f"<hostile cell {id(main)} {number}>"
+        linecache.cache[name] = (len(source), None, source.splitlines(keepends=True), name)
+        exec(compile(source, name, "exec"), names)
+    return names
+
+
+def graph_cell(functions: dict[str, str]) -> str:
+    """Return a cell that makes a runner of functions which all take the same array, and runs it."""
+    listed = "".join(f"    {name!r}: {source},\n" for name, source in functions.items())
+    return (
+        f"functions = {{\n{listed}}}\n"
+        "io = {name: ('a', f'{name}_made') for name in functions}\n"
+        "io |= {'method': ('a', 'method_made'), 'looked': ('k', 'looked_made')} if 'method' in io else {}\n"
+        "runner = ep.CompGraphRunner(ep.CompGraph(functions, io, types=False), {'k': 3} if 'looked' in io else {})\n"
+        "_ = runner.run(a=np.arange(6.0).reshape(2, 3))"
+    )
+
+
+# A notebook as people leave it: magics and shell escapes everywhere between its functions.
+MAGIC = (
+    "%matplotlib inline\n%config InlineBackend.figure_format = 'png'\n!echo hello",
+    "files = !ls /\n%env EPYPES_HOSTILE=1\npwd = %pwd",
+    "%%time\ntotal_time = sum(range(9))",
+    "%%capture shown\nprint('caught')\n# In a cell that is captured.\ndef captured(a):\n    return a + total_time",
+    "%%bash\necho from a shell",
+    "import os\nassert os.environ['EPYPES_HOSTILE'] == '1' and files and pwd",
+    "captured?",
+)
+# What a notebook's own syntax makes of these is no Python that a service has.
+MAGIC_INSIDE = (
+    "def shell(a):\n    !echo hello\n    return a",
+    "def magic(a):\n    %time None\n    return a",
+    "%%time\ndef timed(a):\n    return a",
+)
