@@ -24,3 +24,18 @@ def edge_bundle(tmp_path_factory, photograph):
     runner = ep.CompGraphRunner(cg, {"side": 5, "lo": 70, "hi": 200})
     runner.run(image=photograph)
     return ep.promote(runner, tmp_path_factory.mktemp("bundles") / "edges")
+
+
+@pytest.fixture(scope="module")
+def http(tmp_path_factory, photograph):
+    from epypes.service.http import HttpServer
+    from tests.conftest import EDGE_FUNCTIONS, EDGE_HPARAMS, EDGE_IO
+    from tests.service.stand_in import StandIn
+
+    runner = ep.CompGraphRunner(ep.CompGraph(EDGE_FUNCTIONS, EDGE_IO), EDGE_HPARAMS)
+    runner.run(image=photograph)
+    service = StandIn(runner, tmp_path_factory.mktemp("served"))
+    with HttpServer(service, "127.0.0.1:*") as server:
+        server.token = server.token_file.read_text().strip()
+        server.service = service
+        yield server
