@@ -14,7 +14,9 @@ from epypes.service.http.told import Told
 CONFIG = {
     "checks": {
         "positive_data_acceptance": {"expected-statuses": ["2xx", "401", "403", "404", "409", "422"]},
-        "negative_data_rejection": {"expected-statuses": ["400", "401", "403", "404", "405", "413", "415", "421", "422"]},
+        "negative_data_rejection": {
+            "expected-statuses": ["400", "401", "403", "404", "405", "413", "415", "421", "422"]
+        },
     },
 }
 
