@@ -16,6 +16,7 @@ from epypes.errors import (
     DeployRefused,
     EpypesError,
     FailureNotKept,
+    HyperparameterError,
     MessageError,
     NotComputed,
     ParametersRefused,
@@ -68,6 +69,7 @@ _STATUS: Final[Mapping[type[EpypesError], int]] = {
     RevisionConflict: 409,
     ParametersRefused: 422,
     BundleError: 422,
+    HyperparameterError: 422,
     MessageError: 422,
     ServiceError: 503,
 }

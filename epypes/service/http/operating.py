@@ -57,7 +57,9 @@ async def drain(served: OfRequest, wanted: Annotated[Drain | None, Body()] = Non
 
 
 def _deploy(served: Served, path: str) -> Any:
+    # Unlike Path's own, these take any text.
     if not os.path.isabs(path) or not os.path.isdir(path):
         text = f"{path!r:.300} is no folder on the service's machine. Name a bundle's folder, from the root on."
         raise BundleError(path, text)
-    return served.service.deploy(Path(path))
+    check_seal(Path(path))
+    return served.service.deploy(path)

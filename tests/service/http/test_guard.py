@@ -8,7 +8,7 @@ import httpx
 import pytest
 
 from epypes.service.http import HttpServer
-from tests.service.raw import connection, exchange, received, request, until
+from tests.service.http.raw import connection, exchange, received, request, until
 
 CHANGES = [
     ("PATCH", "/v1/parameters"),

@@ -14,7 +14,7 @@ from epypes.errors import AddressError, KeysError
 from epypes.service.http import HttpServer
 from epypes.service.http.address import listening, url_of
 from epypes.service.http.token import owned_token
-from tests.service.raw import request
+from tests.service.http.raw import request
 
 
 def test_a_token_is_made_once_and_only_its_owner_can_read_it(tmp_path):
