@@ -112,7 +112,9 @@ def refused(entry: Entry, why: str, setting: Setting) -> Result:
 def dead_letter(entry: Entry, ending: str, function: str, setting: Setting) -> Result:
     """Return the result of an event that killed the worker again and again."""
     again = f", and so it was {entry.deaths} times" if entry.deaths > 1 else ""
-    error = ServiceError(setting.bundle, f"{ending} while this event was all that it worked on{again}. It is put aside.")
+    error = ServiceError(
+        setting.bundle, f"{ending} while this event was all that it worked on{again}. It is put aside."
+    )
     return failed_without_worker(entry, error, setting, "killed", function=function, is_dead=True)
 
 

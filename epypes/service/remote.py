@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from epypes.errors import (
     EpypesError,
     HyperparameterError,
+    ParametersRefused,
     PayloadError,
     RevisionConflict,
     ServiceError,
@@ -63,7 +64,7 @@ class RemoteRunner:
         info, known = connection.info(), connection.parameters()
         self.cg = graph_of(connection.url, info["func_io"], known.entries, _rgb(connection, info))
         self._program = Program(self.cg, True)
-        self._runs = RemoteRuns(connection, self._program, known)
+        self._runs = RemoteRuns(connection, self._program, known, info["outputs"])
         self._seen = SeenRuns()
         self._events = events
         self._watchers = Watchers()
@@ -150,6 +151,16 @@ class RemoteRunner:
             A payload was given.
         """
         self._check(values, targets, payload)
+        try:
+            return self._tried_there(values, targets)
+        except ServiceError as error:
+            # Why nothing can be had says more than that it can't.
+            if isinstance(error, ParametersRefused) or not self.notice:
+                raise
+            raise ServiceError(self.connection.url, self.notice) from error
+
+    def _tried_there(self, values: Mapping[str, Any], targets: tuple[str, ...]) -> Run:
+        self._require_there()
         accepted = self._sent(values)
         failed = self._failed if not accepted else None
         if failed is not None and self.last is not None:
@@ -198,9 +209,10 @@ class RemoteRunner:
             )
         return run
 
-    def __setitem__(self, token: str, value: Any) -> None:
-        self._check({token: value}, (), None)
-        self._sent({token: value})
+    def put(self, values: Mapping[str, Any], /) -> None:
+        """Set hyperparameters of the service, but for those that somebody else has changed meanwhile."""
+        self._check(values, (), None)
+        self._sent(values)
 
     def catch_up(self) -> None:
         """Let the panel be told of what others have changed meanwhile."""
@@ -257,7 +269,6 @@ class RemoteRunner:
             left = {n: value for n, value in values.items() if n not in is_theirs and not self._has(n, value)}
             if not left:
                 return set()
-            self._require_there()
             try:
                 self._known = self.connection.set(self._known.revision, **left)
             except RevisionConflict as conflict:
