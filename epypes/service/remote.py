@@ -77,6 +77,7 @@ class RemoteRunner:
         self._state: tuple[str, str] = (str(info["state"]), str(info.get("reason") or ""))
         self._gone = ""
         self._failed: Mapping[str, Any] | None = None
+        self._refused: tuple[object, ParametersRefused] | None = None
         self._tried: tuple[Run, dict[str, Any], bool] | None = None
         self.first_hyperparameters: Mapping[str, Any] = self._told
         self.last: Run | None = self._first_run()
@@ -264,6 +265,8 @@ class RemoteRunner:
     def _sent(self, values: Mapping[str, Any]) -> set[str]:
         """Set what differs, and return the names; what somebody else has changed meanwhile is left out."""
         told = self._told
+        if self._refused is not None and self._refused[0] == (self._known.revision, dict(values)):
+            raise self._refused[1]  # who follows the line would ask again at each event
         for _ in range(_MOST_TRIES):
             is_theirs = {name for name in values if self._told[name] is not told[name]}
             left = {n: value for n, value in values.items() if n not in is_theirs and not self._has(n, value)}
@@ -274,6 +277,9 @@ class RemoteRunner:
             except RevisionConflict as conflict:
                 self._learn(conflict.current)
                 continue
+            except ParametersRefused as refused:
+                self._refused = (self._known.revision, dict(values)), refused
+                raise
             self._failed = None
             return set(left)
         raise ServiceError(
