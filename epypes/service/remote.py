@@ -25,6 +25,7 @@ from epypes.errors import (
 from epypes.run import Run
 from epypes.run.program import Program
 from epypes.run.watchers import Watchers
+from epypes.service.control import parameters_of
 from epypes.service.following import Follower
 from epypes.service.parameters import Parameters
 from epypes.service.remoteruns import RemoteRuns
@@ -330,7 +331,8 @@ class RemoteRunner:
         elif name == "state":
             self._state = str(said.get("state", "")), str(said.get("reason") or "")
         elif name == "parameters":
-            news = self.connection.parameters()
+            is_whole = "parameters" in said
+            news = parameters_of(self.connection.url, said) if is_whole else self.connection.parameters()
             with self._lock:
                 self._news = news
         else:
