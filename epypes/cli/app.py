@@ -6,6 +6,7 @@ import typer
 
 from epypes.cli.call import call
 from epypes.cli.demo import demo
+from epypes.cli.deploy import deploy, rollback
 from epypes.cli.experiment import experiment
 from epypes.cli.lab import lab
 from epypes.cli.play import play
@@ -22,5 +23,5 @@ app = typer.Typer(
     # A traceback's locals would print whole images.
     pretty_exceptions_enable=False,
 )
-for command in (promote, verify, serve, call, record, play, experiment, demo, lab):
+for command in (promote, verify, serve, call, deploy, rollback, record, play, experiment, demo, lab):
     app.command()(command)
