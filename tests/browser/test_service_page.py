@@ -231,7 +231,9 @@ def test_what_somebody_else_changed_is_shown_and_not_overwritten(browser, served
         page.locator("#apply").click()
         page.wait_for_selector("#parameters-note:not([hidden])")
         page.unroute("**/v1/parameters")
-        assert "Somebody else" in page.locator("#parameters-note").text_content()
+        said = page.locator("#parameters-note").text_content()
+        assert "Somebody else" in said
+        assert "canny_lo: 70 → 33; canny_hi: 200 → 150" in said
         assert service.parameters().entries["canny_lo"]["value"] == 33
         assert page.locator("#parameter-canny_lo").input_value() == "90"
         assert page.locator("#parameter-canny_hi").input_value() == "150"
