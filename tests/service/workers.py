@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 import threading
-from collections import Counter
 from contextlib import contextmanager
 from itertools import count
 
@@ -129,7 +128,3 @@ def ready_worker(bundle, tmp_path, *options, **more):
     with worker_of(bundle, tmp_path, *options, **more) as front:
         front.ready, _ = front.receive("ready")
         yield front
-
-
-def counted(values):
-    return Counter(values)
