@@ -338,6 +338,7 @@ def test_a_worker_keeps_no_more_of_large_events_than_the_last_run_of_each_slot(i
         before = rss(process)
         for _ in range(8):
             front.run(image=np.full((5000, 4000), 14, np.uint8))
+            front.ask("svg")
         # An event and its run are 40 MB; the run before it is there until the next one has ended.
         assert rss(process) - before < 110_000_000
         front.run(image=np.full((1, 1), 14, np.uint8))
