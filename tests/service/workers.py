@@ -36,6 +36,7 @@ class Front:
                 message = self.channel.receive()
                 if message[0]["kind"] == kind:
                     return message
+                assert message[0]["kind"] != "refused", message[0]
                 self.waiting.append(message)
         finally:
             watchdog.cancel()
