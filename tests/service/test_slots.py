@@ -167,7 +167,9 @@ def test_parameters_that_a_pipeline_of_its_own_refuses_are_set_in_no_slot(owning
 MEETING = '''
     import os
     import threading
-    
+    import time
+
+
 
     def meet(place):
         """Return when as many have come as are told."""
@@ -205,7 +207,8 @@ def test_slots_work_on_as_many_events_at_once_as_there_are(meeting, tmp_path):
 
 def test_parameters_wait_until_no_slot_works_and_hold_for_all_events_after_them(tmp_path):
     source = """
-        
+        import time
+
 
         def scaled(x, k):
             time.sleep(x / 1000)
@@ -234,7 +237,8 @@ def test_parameters_wait_until_no_slot_works_and_hold_for_all_events_after_them(
 def test_what_is_run_again_for_who_asks_runs_in_no_more_threads_than_there_are_slots(tmp_path):
     source = """
         import threading
-        
+        import time
+
         busy = threading.Lock()
 
 
