@@ -45,7 +45,9 @@ def test_a_frame_that_kills_the_worker_is_put_aside_and_the_others_are_answered_
             peer.send(how if number == 7 else "plain", number)
         answers = peer.take(12)
         assert [answer.correlation_id for answer in answers] == peer.sent
-        assert [answer.parts["out"] for answer in answers if answer.failure is None] == [2 * n for n in range(12) if n != 7]
+        assert [answer.parts["out"] for answer in answers if answer.failure is None] == [
+            2 * n for n in range(12) if n != 7
+        ]
         dead = answers[7].failure
         assert "It is put aside" in dead.message
         until(lambda: service.state == "READY")
@@ -93,7 +95,9 @@ def test_five_deaths_in_a_row_are_a_fault_and_everybody_is_told(acting):
         answers = peer.take(9)
         assert sorted(answer.correlation_id for answer in answers) == sorted(peer.sent)
         until(lambda: service.state == "FAULTED")
-        assert "5 workers ended in a row without an answer. The last: The worker was killed by SIGKILL" in service.reason
+        assert (
+            "5 workers ended in a row without an answer. The last: The worker was killed by SIGKILL" in service.reason
+        )
         counts = service.counts()
         assert (counts["dead_letters"], counts["dropped"]) == (5, 4)
         assert "can't be served" in peer.ask().failure.message, "who comes later is told too"
