@@ -48,6 +48,10 @@ def serve(
         more = f", control at {state.http}" if state.http else ""
         where = f"events at {state.sub}, answers at {state.pub}, failures at {state.failures}{more}"
         out.print(f"READY {bundle}: {where}, process {state.pid}.")
+        if state.http and out.is_terminal:
+            # Not in a log, which others may read.
+            token = Path(state.token_file).read_text(encoding="ascii").strip()
+            out.print(f"Its page, with the token for changes: {state.http}/#token={token}")
 
     counts = serve_bundle(
         bundle,

@@ -102,3 +102,7 @@ def _times(latency: Latency) -> Iterator[Metric]:
     histogram.add_metric([], list(zip(ends, accumulate(latency.counts), strict=True)), latency.total_s)
     yield histogram
     yield CounterMetricFamily("epypes_computing_seconds", "Time that the graph took.", latency.computing_s)
+    spent = CounterMetricFamily("epypes_function_seconds", "Time that a function took.", labels=["function"])
+    for function, spent_s in latency.functions_s.items():
+        spent.add_metric([function], spent_s)
+    yield spent

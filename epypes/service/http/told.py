@@ -12,7 +12,6 @@ import math
 from collections import deque
 from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
-from dataclasses import asdict, is_dataclass
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Final
 
@@ -173,7 +172,5 @@ class Told:
 
 
 def _message(kind: str, data: Any) -> ServerSentEvent:
-    if is_dataclass(data) and not isinstance(data, type):
-        data = written(data) if kind == "parameters" else asdict(data)
     text = json.dumps(json_ready(data), allow_nan=False, separators=(",", ":"))
     return ServerSentEvent(raw_data=text, event=kind)

@@ -108,6 +108,21 @@ def test_pause_and_resume_say_what_they_did(changing):
     assert changing.post("/v1/resume").json()["state"] == "READY"
 
 
+def test_parameters_are_written_back_after_a_look_at_what_would_change(edge_bundle, tmp_path):
+    folder = shutil.copytree(edge_bundle.path, tmp_path / "edges")
+    with Service(folder) as service, HttpServer(service, "127.0.0.1:*") as http:
+        headers = {"Authorization": f"Bearer {http.token_file.read_text().strip()}"}
+        with httpx.Client(base_url=http.url, trust_env=False, timeout=60, headers=headers) as client:
+            client.patch("/v1/parameters", json={"values": {"lo": 64}})
+            would = client.post("/v1/parameters/write-back", json={"dry_run": True}).json()
+            assert "+value = 64" in would["diff"]
+            assert read_bundle(folder).digest == edge_bundle.digest
+            written = client.post("/v1/parameters/write-back", json={"dry_run": False}).json()
+            assert written == would
+            assert read_bundle(folder).digest == written["digest"]
+            assert client.post("/v1/parameters/write-back", json={"dry_run": True}).json()["diff"] == ""
+
+
 # -- another bundle -------------------------------------------------------------------------------------------------
 
 

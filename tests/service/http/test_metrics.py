@@ -56,6 +56,12 @@ def test_the_latency_is_a_whole_histogram(families):
     assert counts[-1] == value(families, "epypes_event_latency_seconds_count")
 
 
+def test_the_time_of_each_function_is_counted(families):
+    spent = {sample.labels["function"]: sample.value for sample in families["epypes_function_seconds"].samples}
+    assert spent.keys() == {"smooth", "canny"}
+    assert 0 < sum(spent.values()) <= value(families, "epypes_computing_seconds_total")
+
+
 def test_the_service_is_in_one_state(families):
     states = {sample.labels["state"]: sample.value for sample in families["epypes_state"].samples}
     assert states == {state: float(state == "READY") for state in states}
