@@ -15,10 +15,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from epypes.bundle.answers import bundle_answer_difference
 from epypes.bundle.compare import differences
 from epypes.bundle.environment import environment
 from epypes.bundle.importwatch import ImportWatch
-from epypes.bundle.load import SAMPLES, Bundle, read_bundle
+from epypes.bundle.load import SAMPLES, Bundle, pipeline_of, read_bundle
 from epypes.bundle.report import Difference, ReplayReport, difference, report_from
 from epypes.bundle.requirements import owner, requirement_lines
 from epypes.errors import BundleError, EpypesError
@@ -94,6 +95,7 @@ def replay(bundle: Bundle) -> ReplayReport:
     found: list[Difference] = []
     unsteady: list[str] = []
     tokens = 0
+    pipeline_of(bundle, None, None)  # what serves it can be made
     for path in bundle.samples:
         inputs, outputs = load_sample(path)
         if (set(inputs), set(outputs)) != (set(bundle.settings.inputs), set(bundle.settings.outputs)):
@@ -106,7 +108,7 @@ def replay(bundle: Bundle) -> ReplayReport:
             again = _run(bundle, inputs)
             differs = (entry.token for entry in differing)
             unsteady += [token for token in differs if next(differences(run[token], again[token]), None)]
-        found += differing
+        found += [*differing, *_differing_answer(bundle, path.stem, run)]
         tokens += len(outputs)
     return ReplayReport(
         len(bundle.samples), tokens, tuple(found), environment=environment(), unsteady=tuple(dict.fromkeys(unsteady))
@@ -124,6 +126,11 @@ def _differing(bundle: Bundle, sample: str, outputs: dict[str, Any], run: Any) -
         for token, expected in outputs.items()
     )
     return [entry for entry in found if entry is not None]
+
+
+def _differing_answer(bundle: Bundle, sample: str, run: Any) -> list[Difference]:
+    text = bundle_answer_difference(bundle, sample, run)
+    return [Difference(sample, ", ".join(bundle.settings.outputs), f"the answer of f_out: {text}")] if text else []
 
 
 def main(arguments: list[str]) -> int:

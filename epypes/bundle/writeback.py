@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from epypes.bundle.answers import ANSWERS, record_answer
 from epypes.bundle.entries import fits, plain, read, written
 from epypes.bundle.exchange import exchange
 from epypes.bundle.load import SETTINGS, read_bundle
@@ -154,6 +155,11 @@ def record_again(folder: Path) -> dict[str, Any]:
         inputs, outputs = load_sample(path)
         run = CompGraphRunner(bundle.cg, settings.hyperparameters).run(**inputs)
         save_sample(path, inputs, {token: run[token] for token in outputs}, rgb=settings.rgb)
+        answer = folder / ANSWERS / path.name
+        if answer.is_file():
+            answer.unlink()
+            again = CompGraphRunner(bundle.cg, settings.hyperparameters).run(**inputs)
+            record_answer(answer, bundle.own["f_out"], settings.name, (run, again), settings.attributes)
     return {"samples": len(bundle.samples)}
 
 
