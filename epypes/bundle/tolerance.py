@@ -17,7 +17,7 @@ from epypes.bundle.compare import Tolerance, Unlike, differences
 from epypes.bundle.nodes import called_by, is_plain_pipeline
 from epypes.bundle.suspects import suspicion, way_out
 from epypes.errors import BundleError
-from epypes.graph import CompGraph
+from epypes.graph import CompGraph, with_defaults
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
@@ -74,7 +74,8 @@ def learn(
     BundleError
         A function fails that did not fail before.
     """
-    runner = CompGraphRunner(apart(cg), hyperparameters)
+    # Without its defaults, so that what was unfrozen is taken from the payload.
+    runner = CompGraphRunner(with_defaults(apart(cg), {}), hyperparameters)
     tolerances: dict[str, Tolerance] = {}
     reasons: list[str] = []
     for number, sample in enumerate(samples, 1):

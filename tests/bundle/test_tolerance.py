@@ -84,6 +84,14 @@ def test_a_seed_that_is_a_token_makes_random_numbers_the_same():
     assert learnt(graph("seeded"), ["seeded"], {"seed": 5})[0].reasons == ()
 
 
+def test_a_default_that_was_unfrozen_is_taken_from_the_payload():
+    cg = ep.CompGraph.from_functions(notebook("def shift(x, by=2.0):\n    return x + by\n")["shift"])
+    runner = ep.CompGraphRunner(cg)
+    runner.unfreeze("by")
+    run = runner.run(x=X, by=5.0)
+    assert learn(cg, runner.hyperparameters, [run], ["shift"], print).reasons == ()
+
+
 def test_noise_is_tolerated_ten_times_as_large_as_it_was():
     found, _ = learnt(graph("total"), ["total"])
     (tolerance,) = found.tolerances.values()
