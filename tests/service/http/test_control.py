@@ -108,6 +108,7 @@ def test_pause_and_resume_say_what_they_did(changing):
     assert changing.post("/v1/resume").json()["state"] == "READY"
 
 
+@pytest.mark.slow
 def test_parameters_are_written_back_after_a_look_at_what_would_change(edge_bundle, tmp_path):
     folder = shutil.copytree(edge_bundle.path, tmp_path / "edges")
     with Service(folder) as service, HttpServer(service, "127.0.0.1:*") as http:
@@ -203,6 +204,7 @@ def test_without_a_service_or_its_token_nothing_is_deployed(epypes, http, edge_b
     assert "token" in said
 
 
+@pytest.mark.slow
 def test_while_a_bundle_is_deployed_another_one_is_refused_and_all_else_is_answered(tmp_path):
     slow = acting_bundle(tmp_path / "slow")
     waiting = acting_bundle(tmp_path / "waiting")
