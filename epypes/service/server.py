@@ -236,7 +236,7 @@ class Service:
     def ready(self) -> str:
         """Return why events would not be answered now; empty if they are."""
         state, reason = self._state()
-        return "" if state == "READY" else f"{state}. {reason}".strip()
+        return "" if state == "READY" else reason or f"It is {state}."
 
     def counts(self) -> dict[str, int]:
         """Return how many events are where.
