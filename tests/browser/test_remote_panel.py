@@ -6,7 +6,7 @@ import queue
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import cv2
 import nbformat
@@ -52,7 +52,7 @@ class Line:
         self.is_paused = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
 
-    def __enter__(self) -> Line:
+    def __enter__(self) -> Self:
         self._subscriber.start()
         self._publisher.start()
         self._thread.start()
