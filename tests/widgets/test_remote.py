@@ -96,6 +96,7 @@ def test_a_value_is_set_with_the_revision_known_and_the_run_with_it_is_shown(
     panel.wait(TIMEOUT_S)
     assert service.asked == [({"threshold": 60}, 0)]
     assert screen.frames[-1]["values"] == {"gain": 2, "threshold": 60}
+    assert set(screen.frames[-1]["stages"].values()) == {"fresh"}  # what was not sent is not missing
     assert panel.result.revision == 1
     np.testing.assert_array_equal(panel.result["mask"], service.runner.trial({}, "mask")["mask"])
     assert panel.code() == "service.set(threshold=60)"

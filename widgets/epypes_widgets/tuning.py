@@ -243,6 +243,8 @@ class Tuning:
 
     def _waits_for_screen(self) -> bool:
         """Whether a newer run is to be fetched only when the picture on its way has been painted."""
+        # In this order: when the frame is painted right now, one of the two threads sees what the other has done.
+        self._is_behind = True
         self._is_behind = self.screen.view.frames.in_flight is not None
         return self._is_behind
 

@@ -96,8 +96,14 @@ def _state(run: Run, token: str, outdated: frozenset[str]) -> State:
     if run.failure is not None and maker == run.failure.function:
         return "failed"
     if not run.tokens.is_computed(token):
-        return "absent"
+        return "fresh" if run.failure is None and _was_in(run, token, maker) else "absent"
     return "stale" if run.tokens.is_stale(token) or maker in outdated else "fresh"
+
+
+def _was_in(run: Run, token: str, maker: str | None) -> bool:
+    """Whether a run had a token whose value is not here: that of a service sends what is looked at."""
+    ran = run.report.ran
+    return any(name in ran for name in ((maker,) if maker else run.cg.digraph.consumers.get(token, ())))
 
 
 def _has_picture(run: Run, token: str) -> bool:
