@@ -8,6 +8,7 @@ import httpx
 import pytest
 
 from epypes.service.http import HttpServer
+from epypes.service.http.connections import MOST_CONNECTIONS
 from tests.service.http.raw import connection, exchange, received, request, until
 
 CHANGES = [
@@ -272,4 +273,5 @@ def test_idle_connections_keep_nobody_out(http):
         for _ in range(300):
             open_ones.enter_context(connection(http.url)).sendall(b"GET / HT")
         assert is_well(http)
+        assert len(http.connections) <= MOST_CONNECTIONS
     until(lambda: len(http.connections) == 0)
