@@ -55,6 +55,7 @@ if TYPE_CHECKING:
         summarize,
     )
     from epypes.run.guard import unguarded
+    from epypes.service.connection import connect
     from epypes.transport import ZMQPublisher, ZMQSubscriber
 
 _HOMES = {
@@ -101,6 +102,7 @@ _HOMES = {
     "Stages": "epypes.pipeline",
     "ZMQPublisher": "epypes.transport",
     "ZMQSubscriber": "epypes.transport",
+    "connect": "epypes.service.connection",
     "load": "epypes.bundle",
     "load_pipeline": "epypes.bundle",
     "promote": "epypes.bundle",
@@ -140,6 +142,7 @@ __all__ = [
     "ZMQPublisher",
     "ZMQSubscriber",
     "camera",
+    "connect",
     "errors",
     "extend",
     "group",

@@ -6,6 +6,7 @@ import typer
 
 from epypes.cli.call import call
 from epypes.cli.demo import demo
+from epypes.cli.deploy import deploy, rollback
 from epypes.cli.doctor import doctor
 from epypes.cli.experiment import experiment
 from epypes.cli.export import export
@@ -24,6 +25,6 @@ app = typer.Typer(
     # A traceback's locals would print whole images.
     pretty_exceptions_enable=False,
 )
-for command in (promote, verify, serve, call, record, play, experiment, demo, lab, doctor):
+for command in (promote, verify, serve, call, deploy, rollback, record, play, experiment, demo, lab, doctor):
     app.command()(command)
 app.add_typer(export, name="export")

@@ -48,6 +48,10 @@ def serve(
         more = f", control at {state.http}" if state.http else ""
         where = f"events at {state.sub}, answers at {state.pub}, failures at {state.failures}{more}"
         out.print(f"READY {bundle}: {where}, process {state.pid}.")
+        if state.http:
+            # A log is read by others than a terminal.
+            token = f"#token={Path(state.token_file).read_text(encoding='utf-8').strip()}" if out.is_terminal else ""
+            out.print(f"Live page: {state.http}/{token} (the token for changes is in {state.token_file})")
 
     counts = serve_bundle(
         bundle,

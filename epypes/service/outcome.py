@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from time import perf_counter_ns, time_ns
 from typing import Any, Final, Literal
 
@@ -18,6 +18,7 @@ from epypes.wire import Envelope
 from epypes.wire.failures import failure_event
 
 FAILURE_TOPIC: Final = "failure"
+_LOG_PAUSE_NS: Final = 5_000_000_000
 Kind = Literal["raised", "killed", "stuck", "dropped"]
 # Called with a kind of happening ("state", "run", "failure", "parameters") and what there is to know of it.
 Listener = Callable[[str, dict[str, Any]], None]
@@ -48,12 +49,15 @@ class Result:
         None, or what is known of its failure.
     revision, total_ns
         Of the run; 0 where there was none.
+    durations_ns
+        By function.
     """
 
     answers: Sequence[Envelope | bytes]
     failure: FailureRecord | None = None
     revision: int = 0
     total_ns: int = 0
+    durations_ns: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def outcome(self) -> Outcome:
@@ -142,6 +146,7 @@ class Desk:
         self._answer, self._report, self._store = answer, report, store
         self._listeners: list[Listener] = []
         self.latency = Stopwatch()
+        self._logged_ns, self._unlogged = -_LOG_PAUSE_NS, 0
 
     def listen(self, callback: Listener) -> Callable[[], None]:
         """Have everything told to a callback; return what ends that."""
@@ -168,13 +173,25 @@ class Desk:
         if result.failure is not None:
             self._settle_failure(entry, result, result.failure)
             return
-        self.latency.observe(perf_counter_ns() - entry.accepted_ns, result.total_ns)
+        self.latency.observe(perf_counter_ns() - entry.accepted_ns, result.total_ns, result.durations_ns)
         if self._listeners:
             told = {"seq": entry.seq, "event_id": event_id(entry.event), "revision": result.revision}
             self.tell("run", {**told, "total_ns": result.total_ns})
 
-    def _settle_failure(self, entry: Entry, result: Result, failure: FailureRecord) -> None:
+    def _log(self, failure: FailureRecord) -> None:
+        if failure.kind == "dropped":
+            # In a storm a line for each would take longer than the answer.
+            self._unlogged += 1
+            now_ns = perf_counter_ns()
+            if now_ns - self._logged_ns < _LOG_PAUSE_NS:
+                return
+            _log.warning("%s; %d events since this was said last", failure.summary, self._unlogged)
+            self._logged_ns, self._unlogged = now_ns, 0
+            return
         _log.warning("event %s failed in %s: %s", failure.event_id or "without id", failure.function, failure.summary)
+
+    def _settle_failure(self, entry: Entry, result: Result, failure: FailureRecord) -> None:
+        self._log(failure)
         for answer in result.answers:
             if isinstance(answer, Envelope) and answer.failure is not None:
                 self._report(answer)

@@ -15,6 +15,7 @@
 - ``hand``: where do the controls stand, and which are held
 - ``screen``: what is the view told
 - ``session``: what has been asked of the runner, and what has it computed
+- ``places``: what can be tuned, and what is otherwise for a running service
 - ``frames``, ``shown``: what goes to the screen, and what does the user want to see
 - ``picture``, ``sender``, ``latency``: how it gets there, when, and how fast
 - ``view``: what runs in the browser
@@ -24,7 +25,7 @@ What is remembered:
 - ``history``, ``historyframe``: at which values did the hand stop
 - ``settings``: how values get into a file, and back
 - ``code``: which line of code does the same
-- ``promotion``: what becomes of a promotion
+- ``promotion``, ``writeback``: what becomes of a promotion, and of values that are written back
 - ``still``, ``static``, ``pictures``: what stays in a saved notebook
 
 What is looked at, and moved:
