@@ -55,6 +55,7 @@ if TYPE_CHECKING:
         summarize,
     )
     from epypes.run.guard import unguarded
+    from epypes.service.reopen import load_failure
     from epypes.transport import ZMQPublisher, ZMQSubscriber
 
 _HOMES = {
@@ -102,6 +103,7 @@ _HOMES = {
     "ZMQPublisher": "epypes.transport",
     "ZMQSubscriber": "epypes.transport",
     "load": "epypes.bundle",
+    "load_failure": "epypes.service.reopen",
     "load_pipeline": "epypes.bundle",
     "promote": "epypes.bundle",
     "to_source": "epypes.bundle",
@@ -144,6 +146,7 @@ __all__ = [
     "extend",
     "group",
     "load",
+    "load_failure",
     "load_pipeline",
     "outputs",
     "promote",

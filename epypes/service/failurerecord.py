@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import re
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from time import time_ns
 from typing import Any, Final
+
+from epypes.bundle.entries import read
 
 # What a person reads of it; more would make a list of failures slow.
 _MOST_CHARACTERS: Final = 2_000
@@ -144,6 +146,14 @@ def record_of(entries: Any) -> FailureRecord:
     if not ID.fullmatch(record.id):
         raise ValueError(f"{record.id!r:.40} is no id of a failure")
     return record
+
+
+def values_of(record: FailureRecord, known: Collection[str]) -> tuple[dict[str, Any], str]:
+    """Return the values of a record's hyperparameters, and what is to be said of those that are not ``known``."""
+    values = {token: read(entry) for token, entry in record.hyperparameters.items()}
+    gone = [token for token in values if token not in known]
+    told = f"{', '.join(map(repr, gone))} are hyperparameters no more" if gone else ""
+    return {token: value for token, value in values.items() if token in known}, told
 
 
 _EMPTY: Final[Mapping[str, Any]] = {each.name: getattr(FailureRecord(), each.name) for each in fields(FailureRecord)}

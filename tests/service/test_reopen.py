@@ -1,0 +1,285 @@
+"""Does an event that failed in a service open again, at the function that failed, and does it fail again?"""
+
+from __future__ import annotations
+
+import shutil
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import epypes as ep
+from epypes.bundle.seal import check_seal
+from epypes.errors import BundleError, FailureNotKept, NotComputed, RemoteFailure, UnknownName
+from epypes.service.failurerecord import FailureRecord
+from epypes.service.failuresource import failures_of, found_by
+from epypes.service.failurestore import FailureStore, failures_folder
+from epypes.service.reproduce import reproduce
+from epypes.wire import Envelope
+
+MODULE = '''
+def brighten(image, by):
+    """Add to every pixel."""
+    return image + by
+
+
+def check(bright, most):
+    """Raise where the picture is too bright; do worse where a test asks for it."""
+    import os
+    import time
+
+    if bright[0, 0] == 7:
+        os.kill(os.getpid(), 9)
+    if bright[0, 0] == 8:
+        import ctypes
+        ctypes.string_at(0)
+    if bright[0, 0] == 9:
+        time.sleep(3_600)
+    if bright[0, 0] == 10:
+        os._exit(5)
+    if bright.max() > most:
+        raise ValueError(f"too bright: {bright.max()}")
+    return bright
+
+
+def half(checked):
+    """Take half of it."""
+    return checked // 2
+'''
+
+
+@pytest.fixture(autouse=True)
+def own_state_folder(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+
+
+@pytest.fixture(scope="session")
+def bright_bundle(tmp_path_factory):
+    """A bundle whose function check fails, kills, crashes or hangs, as the first pixel says."""
+    names = {}
+    folder = tmp_path_factory.mktemp("source")
+    (folder / "bright.py").write_text(MODULE)
+    exec(compile(MODULE, str(folder / "bright.py"), "exec"), names)
+    import linecache
+
+    linecache.getlines(str(folder / "bright.py"))
+    functions = {name: names[name] for name in ("brighten", "check", "half")}
+    cg = ep.CompGraph(
+        functions,
+        {
+            "brighten": (("image", "by"), "bright"),
+            "check": (("bright", "most"), "checked"),
+            "half": ("checked", "halved"),
+        },
+    )
+    runner = ep.CompGraphRunner(cg, {"by": 1, "most": 100})
+    runner.run(image=picture(20))
+    return ep.promote(runner, tmp_path_factory.mktemp("bundles") / "bright").path
+
+
+def picture(value):
+    return np.full((6, 8), value, np.uint8)
+
+
+def request(value):
+    return Envelope("epypes.request", {"image": picture(value)}, id="77")
+
+
+def keep(bundle, event, **told):
+    """Have a failure of a bundle kept, as its service does; return its id."""
+    store = FailureStore(failures_folder(bundle))
+    record = FailureRecord(
+        event_id="77",
+        function="check",
+        exception="ValueError",
+        message="too bright: 200",
+        bundle=str(bundle),
+        digest=check_seal(bundle),
+        hyperparameters={"by": {"value": 1}, "most": {"value": 90}},
+    )
+    kept = store.keep(replace(record, **told), event)
+    assert store.flush()
+    return kept.id
+
+
+def test_a_failure_opens_stopped_at_the_function_that_failed_and_goes_on_from_there(bright_bundle):
+    failure = keep(bright_bundle, request(94))
+    runner = ep.load_failure(failure, bright_bundle)
+    assert runner.last.failure.function == "check"
+    assert isinstance(runner.last.failure.exception, ValueError)
+    assert runner["bright"].max() == 95
+    assert dict(runner.hyperparameters) == {"by": 1, "most": 90}
+    with pytest.raises(NotComputed):
+        runner.last["checked"]
+    assert runner.stale == ("check", "half")
+    run = runner.rerun(most=99)
+    assert run["halved"].max() == 47
+    assert run.report.ran == ("check", "half")
+
+
+def test_the_picture_shows_the_failed_function_in_red_and_the_values_before_it(bright_bundle):
+    runner = ep.load_failure(keep(bright_bundle, request(94)), bright_bundle)
+    shown = runner.last._repr_mimebundle_()["text/html"]
+    assert "too bright: 95" in shown
+    from epypes.display.views.view import view
+
+    states = {function.name: function.state for function in view(runner).functions}
+    assert states == {"brighten": "ran", "check": "failed", "half": "not run"}
+
+
+@pytest.mark.parametrize("kind", ["killed", "stuck"])
+def test_a_function_that_kills_or_hangs_is_not_called_in_the_notebook(bright_bundle, kind):
+    # Called, it would end this process or hang.
+    failure = keep(bright_bundle, request(6 if kind == "killed" else 8), kind=kind, exception="SIGKILL", message="gone")
+    runner = ep.load_failure(failure, bright_bundle)
+    assert runner.last.failure.function == "check"
+    assert isinstance(runner.last.failure.exception, RemoteFailure)
+    assert runner.last.report.ran == ("brighten", "check")
+    assert runner["bright"].max() == (7 if kind == "killed" else 9)
+    assert runner.stale == ("check", "half")
+    assert runner.rerun(by=40)["halved"].max() == (46 if kind == "killed" else 48) // 2
+
+
+def test_where_a_worker_was_killed_is_found_out_in_a_process_of_its_own(bright_bundle):
+    failure = keep(bright_bundle, request(6), kind="killed", function="", exception="SIGKILL", message="")
+    runner = ep.load_failure(failure, bright_bundle)
+    assert runner.last.failure.function == "check"
+    assert "checked" not in runner
+
+
+def test_a_worker_that_was_killed_by_somebody_else_leaves_a_runner_with_the_payload(bright_bundle):
+    failure = keep(bright_bundle, request(20), kind="killed", function="", exception="SIGKILL", message="")
+    with pytest.warns(UserWarning, match="not known in which function, so none was run"):
+        runner = ep.load_failure(failure, bright_bundle)
+    assert runner.last.failure is None
+    assert runner.keys() == ("image", "by", "most")
+    assert runner.rerun("bright")["bright"].max() == 21
+
+
+def test_an_event_that_does_not_fail_here_is_said_to(bright_bundle):
+    failure = keep(bright_bundle, request(20))
+    with pytest.warns(UserWarning, match=r"nothing fails here; there it was 'check' \(ValueError: too bright: 200\)"):
+        runner = ep.load_failure(failure, bright_bundle)
+    assert runner["halved"].max() == 10
+
+
+def test_an_event_that_fails_otherwise_is_said_to(bright_bundle):
+    failure = keep(bright_bundle, request(200), function="half", exception="TypeError", message="x")
+    with pytest.warns(UserWarning, match=r"here 'check' fails \(ValueError\); there it was 'half' \(TypeError: x\)"):
+        ep.load_failure(failure, bright_bundle)
+
+
+def test_an_event_on_which_f_in_fails_raises_what_f_in_raises(bright_bundle):
+    event = Envelope("epypes.request", {"picture": picture(1)})
+    failure = keep(bright_bundle, event, function="f_in", exception="MessageError")
+    with pytest.raises(ep.errors.MessageError, match="must have the parts 'image'") as error:
+        ep.load_failure(failure, bright_bundle)
+    assert "fails on this event, so no function" in error.value.__notes__[-1]
+
+
+def test_a_message_of_2019_reaches_f_in_as_bytes(bright_bundle):
+    failure = keep(bright_bundle, b"\x0a\x01x", function="f_in", exception="MessageError")
+    with pytest.raises(ep.errors.MessageError, match="The event is a bytes"):
+        ep.load_failure(failure, bright_bundle)
+
+
+def test_an_event_that_was_not_kept_says_so(bright_bundle):
+    failure = keep(bright_bundle, None)
+    with pytest.raises(FailureNotKept, match="the service had none to give"):
+        ep.load_failure(failure, bright_bundle)
+
+
+@pytest.fixture
+def copy(bright_bundle, tmp_path):
+    """A bundle of its own, for tests that change it."""
+    return shutil.copytree(bright_bundle, tmp_path / "bright")
+
+
+def changed(bundle):
+    """Put another bundle in its place: most is 60, and 'by' is no hyperparameter any more."""
+    runner = ep.load(bundle)
+    runner.unfreeze("by")
+    runner["most"] = 60
+    runner.run(image=picture(20), by=1)
+    ep.promote(runner, bundle)
+
+
+def test_a_bundle_that_has_changed_since_is_said_to_have(copy):
+    failure = keep(copy, request(94))
+    (copy / "pipeline.toml").write_text((copy / "pipeline.toml").read_text() + "# more\n")
+    from epypes.bundle.seal import seal
+
+    seal(copy)
+    with pytest.warns(UserWarning, match="has changed since"):
+        runner = ep.load_failure(failure, copy)
+    assert runner.last.failure.function == "check"
+    assert runner.hyperparameters["most"] == 90
+
+
+def test_the_bundle_that_failed_is_taken_from_where_it_was_served(copy, bright_bundle, tmp_path):
+    failure = keep(copy, request(94))
+    moved = copy.rename(tmp_path / "moved")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert ep.load_failure(failure, copy, bundle=moved).last.failure.function == "check"
+    with pytest.raises(BundleError, match="does not exist"):
+        ep.load_failure(failure, copy)
+
+
+def test_failures_are_found_by_how_their_id_begins_or_ends_and_by_latest(bright_bundle):
+    first, second = (keep(bright_bundle, request(94)) for _ in range(2))
+    failures = failures_of(bright_bundle)
+    assert found_by(failures, first).id == first
+    assert found_by(failures, second[-5:]).id == second
+    assert found_by(failures, "latest").id == second
+    with pytest.raises(UnknownName, match=first):
+        found_by(failures, first[:4])
+    with pytest.raises(UnknownName, match=f"Did you mean '{first}'"):
+        found_by(failures, first[:-2] + "00")
+    assert found_by(failures_of(), first).id == first
+    assert failures_of().event(first).id == "77"
+
+
+def test_what_is_no_bundle_and_a_bundle_without_failures_are_told_apart(bright_bundle, tmp_path):
+    with pytest.raises(BundleError, match="does not exist"):
+        failures_of(tmp_path / "nothing")
+    with pytest.raises(UnknownName, match="There is none"):
+        found_by(failures_of(bright_bundle), "latest")
+
+
+ENDINGS = [
+    (94, "failed", "ValueError", "too bright: 95"),
+    (20, "fine", "", ""),
+    (6, "killed", "SIGKILL", "the process ended with it"),
+    (7, "killed", "SIGSEGV", "the process ended with it"),
+    (9, "killed", "status 5", "the process ended with it"),
+    (8, "stuck", "TimeoutError", "more than 0.5 s"),
+]
+
+
+@pytest.mark.parametrize(("value", "ending", "exception", "message"), ENDINGS)
+def test_an_event_that_is_run_again_fails_is_fine_kills_or_hangs_and_the_caller_lives(
+    bright_bundle, value, ending, exception, message
+):
+    record = FailureStore(failures_folder(bright_bundle)).keep(
+        FailureRecord(hyperparameters={"most": {"value": 90}, "gone": {"value": 1}})
+    )
+    found = reproduce(record, request(value), bright_bundle, timeout_s=0.5)
+    assert (found.ending, found.exception, found.message) == (ending, exception, message)
+    if ending != "fine":
+        assert found.function == "check"
+    module = (bright_bundle / "pipeline.py").read_text().splitlines()
+    if value in (94, 7, 8):
+        assert module[found.line - 1].strip() == found.code
+        assert found.code.split("(")[0] == {94: "raise ValueError", 7: "ctypes.string_at", 8: "time.sleep"}[value]
+
+
+def test_a_bundle_whose_module_fails_is_no_reproduction(copy):
+    from epypes.bundle.seal import seal
+
+    with (copy / "pipeline.py").open("a") as file:
+        file.write("\nraise RuntimeError('no')\n")
+    seal(copy)
+    with pytest.raises(BundleError, match="fails: RuntimeError: no"):
+        reproduce(FailureRecord(), request(1), copy)
