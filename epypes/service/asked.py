@@ -1,0 +1,275 @@
+"""What is answered to those who look at a worker: its graph, pictures of tokens, values, what runs?
+
+All of it is of the last completed run, of whichever slot. It is answered on a thread of its own, and each picture is
+made once per run, so that a page that asks often costs little.
+"""
+
+from __future__ import annotations
+
+import json
+import queue
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from time import monotonic
+from typing import TYPE_CHECKING, Any, Final
+
+from epypes.errors import EpypesError, MessageError, NotComputed, UnknownName
+from epypes.graph import colour_order
+from epypes.pipeline import Pipeline
+from epypes.run import CompGraphRunner, Run
+from epypes.service.channel import Channel
+from epypes.service.inbox import Inbox, Job
+from epypes.service.packing import BytesLike, pack
+from epypes.service.slots import Completed
+from epypes.wire import Envelope, encode
+
+if TYPE_CHECKING:
+    from epypes.display import Preview
+
+VALUES: Final = "epypes.values"
+# More than any page asks for at once; beyond it, asking is refused.
+_MOST_WAITING: Final = 64
+_MOST_PICTURES: Final = 64
+_SIDES_PX: Final = (16, 2048)
+_MOST_PICTURE_BYTES: Final = 8_000_000
+# A line on which an event came so lately may bring the next one in time: then nothing is run for who asks.
+_ALIVE_S: Final = 0.5
+_MOMENT_S: Final = 0.1
+
+# What is told, and its frames.
+Told = tuple[dict[str, Any], Sequence[BytesLike]]
+
+
+class Refused(Exception):
+    """Something can't be told; ``reason`` is a short word."""
+
+    def __init__(self, reason: str, text: str) -> None:
+        self.reason, self.text = reason, text
+        super().__init__(text)
+
+
+class Latest:
+    """The last completed run, and who waits for another."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self.completed: Completed | None = None
+        self._when_s = 0.0
+
+    def put(self, completed: Completed) -> None:
+        """Make a run the last completed one."""
+        with self._changed:
+            self.completed, self._when_s = completed, monotonic()
+            self._changed.notify_all()
+
+    def of_revision(self, revision: int) -> Completed | None:
+        """Return a run with this revision or a later one, if there is one or it comes within a moment."""
+        moment_s = _MOMENT_S if monotonic() - self._when_s < _ALIVE_S else 0.0
+        with self._changed:
+            self._changed.wait_for(lambda: self._is_of(revision), moment_s)
+            return self.completed if self._is_of(revision) else None
+
+    def _is_of(self, revision: int) -> bool:
+        return self.completed is not None and self.completed.revision >= revision
+
+
+class Asked:
+    """Answers what the front asks.
+
+    Parameters
+    ----------
+    channel
+        Where answers go.
+    inbox
+        Where work is put that runs the user's functions, so that no more of them run at once than there are slots.
+    latest
+        The last completed run.
+    tried
+        A pipeline with the parameters of the slots: it runs a payload again without publishing anything.
+    revision
+        Returns the revision of the parameters.
+    """
+
+    def __init__(
+        self, channel: Channel, inbox: Inbox, latest: Latest, tried: Pipeline, revision: Callable[[], int]
+    ) -> None:
+        self._channel, self._inbox, self._latest = channel, inbox, latest
+        self._tried, self._revision = tried, revision
+        self._asks: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
+        self._again: Completed | None = None
+        self._pictures: tuple[Run | None, dict[Any, Told]] = None, {}
+
+    def start(self) -> None:
+        """Begin to answer."""
+        threading.Thread(target=self._answer_all, name="epypes asked", daemon=True).start()
+
+    def put(self, ask: Mapping[str, Any]) -> None:
+        """Take something that is asked; returns at once."""
+        if self._asks.qsize() >= _MOST_WAITING:
+            self._tell(
+                ask, lambda: _refuse("busy", "The worker has more questions than it can answer. Ask less often.")
+            )
+        else:
+            self._asks.put(ask)
+
+    def _answer_all(self) -> None:
+        while True:
+            ask = self._asks.get()
+            if ask.get("what") == "run":
+                self._answer_run(ask)
+            else:
+                self._tell(ask, lambda: self._told(ask))  # noqa: B023 - called before the next is taken
+            del ask
+
+    def _tell(self, ask: Mapping[str, Any], told: Callable[[], Told]) -> None:
+        """Send what is told, or why it can't be."""
+        header: dict[str, Any] = {"kind": "asked", "ask": ask.get("ask"), "what": ask.get("what")}
+        frames: Sequence[BytesLike] = ()
+        try:
+            content, frames = told()
+            header |= content
+        except BaseException as error:  # previews and values are of anybody's classes
+            header |= _refusal(error)
+        try:
+            self._channel.send(header, frames)
+        except MessageError as error:
+            self._channel.send({**header, **_refusal(error)})
+        except EOFError:
+            return
+
+    # -- of the last completed run ------------------------------------------------------------------------------
+
+    def _told(self, ask: Mapping[str, Any]) -> Told:
+        what = ask.get("what")
+        completed = self._latest.completed
+        run = None if completed is None else completed.run
+        if self._pictures[0] is not run:
+            self._pictures = run, {}
+        key = (what, ask.get("token"), ask.get("max_side_px"))
+        kept = self._pictures[1]
+        if key not in kept:
+            if len(kept) >= _MOST_PICTURES:
+                kept.clear()
+            kept[key] = self._made(ask, run)
+        content, frames = kept[key]
+        return {**content, **_origin(completed)}, frames
+
+    def _made(self, ask: Mapping[str, Any], run: Run | None) -> Told:
+        shown = self._tried.runner if run is None else run
+        match ask.get("what"):
+            case "view":
+                return _view(shown)
+            case "svg":
+                return _svg(shown)
+            case "preview":
+                return _preview(run, self._tried.runner, ask)
+        raise Refused("unknown question", f"A worker can't be asked for {ask.get('what')!r:.40}.")
+
+    # -- values -------------------------------------------------------------------------------------------------
+
+    def _answer_run(self, ask: Mapping[str, Any]) -> None:
+        revision = ask.get("revision")
+        completed = self._latest.completed if revision is None else self._latest.of_revision(revision)
+        if completed is None and revision is not None and self._latest.completed is not None:
+            self._inbox.put(Job(lambda: self._tell(ask, lambda: self._run_again(ask))))
+        else:
+            self._tell(ask, lambda: self._values(completed, ask))
+
+    def _run_again(self, ask: Mapping[str, Any]) -> Told:
+        """Run the last payload with the parameters of now, on a slot's thread."""
+        completed, revision = self._latest.completed, self._revision()
+        if completed is not None and completed.revision >= ask["revision"]:
+            return self._values(completed, ask)
+        if revision < ask["revision"]:
+            raise Refused("unknown revision", f"The parameters have revision {revision}, not {ask['revision']} yet.")
+        again = self._again
+        if completed is None or again is None or (again.event_id, again.revision) != (completed.event_id, revision):
+            again = self._again = self._ran_again(completed, revision)
+        return self._values(again, ask)
+
+    def _ran_again(self, completed: Completed | None, revision: int) -> Completed:
+        if completed is None:
+            raise _nothing_yet()
+        runner = self._tried.runner
+        payload = {token: completed.run[token] for token in runner.free_source_tokens}
+        run = runner.trial({}, payload=payload)
+        if run.failure is not None:
+            raise Refused("failed", str(run.failure))
+        return Completed(run, completed.event_id, revision)
+
+    def _values(self, completed: Completed | None, ask: Mapping[str, Any]) -> Told:
+        if completed is None:
+            raise _nothing_yet()
+        run, tokens = completed.run, ask.get("tokens") or completed.run.cg.sink_tokens
+        for token in tokens:
+            run.cg.require_token(token)
+        values = Envelope(
+            type=VALUES,
+            parts={token: run[token] for token in tokens},
+            correlation_id=completed.event_id,
+            revision=completed.revision,
+            timings=run.report.durations_ns,
+            rgb=[token for token in tokens if colour_order(run.cg, token) == "rgb"],
+        )
+        return _origin(completed), [pack(encode(values))]
+
+
+def _view(shown: Run | CompGraphRunner) -> Told:
+    from epypes.display import view
+    from epypes.display.views.jsonview import to_json
+
+    return {"media_type": "application/json"}, [json.dumps(to_json(view(shown))).encode()]
+
+
+def _svg(shown: Run | CompGraphRunner) -> Told:
+    from epypes.display import to_svg
+
+    return {"media_type": "image/svg+xml"}, [to_svg(shown).encode()]
+
+
+def _preview(run: Run | None, runner: CompGraphRunner, ask: Mapping[str, Any]) -> Told:
+    """Return a token as a picture, or as text."""
+    from epypes.display import scene_of, scene_picture
+    from epypes.display.previews.preview import preview
+
+    token, side_px = ask["token"], min(max(int(ask["max_side_px"]), _SIDES_PX[0]), _SIDES_PX[1])
+    runner.cg.require_token(token)
+    if run is None:
+        if token not in runner.hyperparameters:
+            raise _nothing_yet()
+        return _text(preview(runner.hyperparameters[token]))
+    scene = scene_of(run, token)
+    if scene is None:
+        return _text(preview(run[token], colour_order(run.cg, token)))
+    picture = scene_picture(scene, side_px, _MOST_PICTURE_BYTES)
+    size = {"width": picture.width, "height": picture.height}
+    return {"media_type": picture.media_type, **size}, [picture.data]
+
+
+def _text(shown: Preview) -> Told:
+    lines = [shown.text, *([shown.detail] if shown.detail != shown.text else []), *shown.rows]
+    return {"media_type": "text/plain"}, ["\n".join(lines).encode()]
+
+
+def _origin(completed: Completed | None) -> dict[str, Any]:
+    return {} if completed is None else {"event_id": completed.event_id, "revision": completed.revision}
+
+
+def _nothing_yet() -> Refused:
+    return Refused("not computed", "No event has been completed yet. Send one first.")
+
+
+def _refuse(reason: str, text: str) -> Told:
+    raise Refused(reason, text)
+
+
+def _refusal(error: BaseException) -> dict[str, Any]:
+    """Return what is told in place of an answer."""
+    if isinstance(error, Refused):
+        return {"error": error.text, "reason": error.reason}
+    if isinstance(error, MessageError):
+        return {"error": str(error), "reason": error.reason}
+    reasons: tuple[tuple[type, str], ...] = ((UnknownName, "unknown token"), (NotComputed, "not computed"))
+    reason = next((word for kind, word in reasons if isinstance(error, kind)), "failed")
+    text = str(error) if isinstance(error, EpypesError) else f"{type(error).__name__}: {error!s:.500}"
+    return {"error": text, "reason": reason}

@@ -1,0 +1,102 @@
+"""In which order do the slots of a worker take what comes?
+
+One line of work for all slots: events and jobs are taken by whichever slot is free; a change of parameters waits
+until no slot works, and what came after it waits for the change.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+# As in EventLoop, whose threads ask again and again once everything has ended.
+_ENDED_POLL_S: Final = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Event:
+    """An event as it came: its number, whether it is bytes of a peer of 2019, and its frames."""
+
+    seq: int
+    is_raw: bool
+    frames: list[memoryview]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Job:
+    """Something else that runs the user's functions, so a slot does it; it must not raise."""
+
+    run: Callable[[], object]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Change:
+    """Something that is done while no slot works; it must not raise."""
+
+    apply: Callable[[], object]
+
+
+class Inbox:
+    """What waits for the slots."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition(threading.Lock())
+        self._items: deque[Event | Job | Change] = deque()
+        self._working = 0
+        self._has_ended = False
+
+    def put(self, item: Event | Job | Change) -> None:
+        """Add something to the line."""
+        with self._changed:
+            self._items.append(item)
+            self._changed.notify()
+
+    def take(self) -> Event | Job:
+        """Wait for something to work on; it is under way until `finished` is called.
+
+        Raises
+        ------
+        queue.Empty
+            Everything has ended: nothing waits, and nothing will come.
+        """
+        with self._changed:
+            while True:
+                item = self._next()
+                if item is not None:
+                    self._working += 1
+                    return item
+                if self._has_ended and not self._items:
+                    self._changed.wait(_ENDED_POLL_S)
+                    raise queue.Empty
+                self._changed.wait()
+
+    def _next(self) -> Event | Job | None:
+        """Return what may be worked on now, having made the changes that come before it."""
+        while self._items:
+            item = self._items[0]
+            if isinstance(item, Change):
+                if self._working:
+                    return None
+                self._items.popleft()
+                item.apply()
+            else:
+                return self._items.popleft()
+        return None
+
+    def finished(self) -> None:
+        """Tell that what was taken has been done."""
+        with self._changed:
+            self._working -= 1
+            if not self._working:
+                # A change may have waited for this; then what came after it is for all.
+                self._changed.notify_all()
+
+    def end(self) -> None:
+        """Let slots go once nothing waits any more."""
+        with self._changed:
+            self._has_ended = True
+            self._changed.notify_all()
