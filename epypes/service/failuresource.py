@@ -100,11 +100,27 @@ def failures_of(source: Any = None) -> Failures:
             # A bundle without failures is one all the same; what is no bundle is said.
             check_seal(path)
         return store
-    if isinstance(source, str):
-        from epypes.service.connection import connect
+    return _ByConnection(connected(source))
 
-        source = connect(source)
-    return _ByConnection(source)
+
+def connected(source: Any) -> Connection:
+    """Return the Connection that is meant: itself, or one to the service at a URL.
+
+    Raises
+    ------
+    ServiceError
+        The service can't be reached.
+    TypeError
+        It is neither.
+    """
+    from epypes.service.connection import Connection, connect
+
+    if isinstance(source, str):
+        return connect(source)
+    if not isinstance(source, Connection):
+        text = f"Failures come from a bundle's path, a service's http URL or ep.connect(url), not {source!r:.80}."
+        raise TypeError(text)
+    return source
 
 
 def path_of(source: Any) -> Path | None:

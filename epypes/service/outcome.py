@@ -112,7 +112,9 @@ def refused(entry: Entry, why: str, setting: Setting) -> Result:
 def dead_letter(entry: Entry, ending: str, function: str, setting: Setting) -> Result:
     """Return the result of an event that killed the worker again and again."""
     again = f", and so it was {entry.deaths} times" if entry.deaths > 1 else ""
-    error = ServiceError(setting.bundle, f"{ending} while this event was all that it worked on{again}. It is put aside.")
+    error = ServiceError(
+        setting.bundle, f"{ending} while this event was all that it worked on{again}. It is put aside."
+    )
     return failed_without_worker(entry, error, setting, "killed", function=function, is_dead=True)
 
 
@@ -166,9 +168,11 @@ class Desk:
 
     def _settle_failure(self, entry: Entry, result: Result, failure: FailureRecord) -> None:
         _log.warning("event %s failed in %s: %s", failure.event_id or "without id", failure.function, failure.summary)
-        for answer in result.answers:
-            if isinstance(answer, Envelope) and answer.failure is not None:
-                self._report(answer)
         # In a storm dropped events would fill the store's memory with images of no interest.
         kept = self._store().keep(failure, None if failure.kind == "dropped" else entry.event)
+        # With its id, so that who hears of it can have it run again.
+        more = {"id": kept.id, "kind": kept.kind, "dead_letter": kept.dead_letter, "when_ns": kept.when_ns}
+        for answer in result.answers:
+            if isinstance(answer, Envelope) and answer.failure is not None:
+                self._report(replace(answer, attributes={**answer.attributes, **more}))
         self.tell("failure", asdict(kept))

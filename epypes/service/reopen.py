@@ -82,10 +82,7 @@ def runner_of(bundle: Bundle, record: FailureRecord) -> tuple[CompGraphRunner, s
 
 def _run(runner: CompGraphRunner, bundle: Bundle, record: FailureRecord, event: Any) -> str:
     """Run the event as far as it came; return what is to be said if that is not as far as in the service."""
-    is_dangerous = record.kind in _NOT_AGAIN
-    if is_dangerous and record.function == "f_in":
-        return f"f_in was {record.kind} by this event, so it is not called here, and no function was run"
-    if is_dangerous:
+    if record.kind in _NOT_AGAIN:
         return _stop(runner, bundle, record, event)
     payload = _payload(bundle, event)
     try:
@@ -109,10 +106,12 @@ def _payload(bundle: Bundle, event: Any) -> Mapping[str, Any]:
 
 
 def _stop(runner: CompGraphRunner, bundle: Bundle, record: FailureRecord, event: Any) -> str:
-    payload = _payload(bundle, event)
-    if record.function not in runner.cg.functions:
+    if record.function not in (*runner.cg.functions, "f_in"):
         # The service could not tell where its worker was; another process that may be lost can.
         record = replace(record, function=reproduce(record, event, bundle.path).function)
+    if record.function == "f_in":
+        return f"f_in was {record.kind} by this event, so it is not called here, and no function was run"
+    payload = _payload(bundle, event)
     if record.function not in runner.cg.functions:
         stop_at(runner, payload)
         return (

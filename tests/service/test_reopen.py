@@ -49,11 +49,6 @@ def half(checked):
 '''
 
 
-@pytest.fixture(autouse=True)
-def own_state_folder(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
-
-
 @pytest.fixture(scope="session")
 def bright_bundle(tmp_path_factory):
     """A bundle whose function check fails, kills, crashes or hangs, as the first pixel says."""
