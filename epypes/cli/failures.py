@@ -73,24 +73,31 @@ def _follow(source: str | None, as_json: bool, keys: Path | None, allow: list[Pa
 
 
 def _when(record: FailureRecord) -> str:
-    return f"{datetime.fromtimestamp(record.when_ns / 1e9).astimezone():%Y-%m-%d %H:%M:%S}"
+    when = datetime.fromtimestamp(record.when_ns / 1e9).astimezone()
+    is_today = when.date() == datetime.now().astimezone().date()
+    return f"{when:%H:%M:%S}" if is_today else f"{when:%Y-%m-%d %H:%M}"
 
 
 def _raised(record: FailureRecord) -> str:
-    raised = record.summary if record.kind == "raised" else f"{record.kind}: {record.summary}"
-    return raised[:_MOST_CHARACTERS]
+    summary = record.summary if record.kind == "raised" else f"{record.kind}: {' '.join(record.message.split())}"
+    return summary[:_MOST_CHARACTERS]
 
 
 def _print_table(records: Iterable[FailureRecord]) -> None:
-    from rich.markup import escape
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
+    from rich.text import Text
 
-    table = Table()
-    for column in ("id", "when", "function", "exception", "attempt", "dead letter"):
-        table.add_column(column, overflow="fold", no_wrap=column == "id")
+    # In one line each, whatever the width: the exception gets what the others leave.
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True, expand=True)
+    table.add_column("id", no_wrap=True, min_width=14)
+    table.add_column("when", no_wrap=True, min_width=8)
+    table.add_column("function", no_wrap=True, min_width=8, max_width=24)
+    table.add_column("exception", no_wrap=True, overflow="ellipsis", ratio=1)
+    table.add_column("attempt", justify="right", min_width=7)
+    table.add_column("dead\nletter", min_width=6)
     for record in records:
-        cells = (record.id, _when(record), record.function, _raised(record))
-        no_event = "" if record.has_event else " (event not kept)"
-        dead = ("yes" if record.dead_letter else "") + no_event
-        table.add_row(*map(escape, cells), str(record.attempt), dead)
+        dead = "yes" if record.dead_letter else ""
+        cells = (record.id, _when(record), record.function, _raised(record), str(record.attempt), dead)
+        table.add_row(*map(Text, cells))
     out.print(table)

@@ -94,7 +94,8 @@ def _record(event: Envelope) -> FailureRecord:
         function=failure.function,
         tokens=failure.tokens,
         exception=failure.exception,
-        message=failure.message,
+        # Its notes come after it; they name the function once more.
+        message=failure.message.partition(" | In function ")[0],
         kind=str(more.get("kind", "raised")),
         attempt=failure.attempt,
         dead_letter=bool(more.get("dead_letter", False)),
