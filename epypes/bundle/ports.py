@@ -50,12 +50,12 @@ def in_order(envelope: Envelope, rgb: Collection[str]) -> dict[str, Any]:
 
 
 def answer_with(
-    outputs: Sequence[str], bundle_digest: str, rgb: Collection[str] = ()
+    outputs: Sequence[str], bundle_digest: str, rgb: Collection[str] = (), *, detach: bool = True
 ) -> Callable[[EventView], Envelope]:
     """Return an f_out: an Envelope with the output tokens and the times, which answers the event by its id.
 
     The arrays are copies, since a function may use the memory of its result again for the next event before this one
-    is sent. Images of the tokens named in ``rgb`` are sent as RGB. What can't be sent raises MessageError here, where
+    is sent; ``detach=False`` is for who encodes an answer before the next event. Images of the tokens named in ``rgb`` are sent as RGB. What can't be sent raises MessageError here, where
     it becomes the event's failure.
     """
 
@@ -64,7 +64,7 @@ def answer_with(
 
         answer = Envelope(
             type=RESULT,
-            parts={token: detached(view[token]) for token in outputs},
+            parts={token: detached(view[token]) if detach else view[token] for token in outputs},
             source=view.name,
             correlation_id=view.event.id,
             acquired_ns=view.event.acquired_ns,
@@ -78,6 +78,11 @@ def answer_with(
         return answer
 
     return f_out
+
+
+def is_usual(port: Callable[..., Any]) -> bool:
+    """Whether this is an f_in or f_out that a bundle has without being told."""
+    return getattr(port, "__module__", None) == __name__
 
 
 def detached(value: Any) -> Any:

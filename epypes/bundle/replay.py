@@ -13,6 +13,7 @@ import traceback
 from dataclasses import asdict
 from pathlib import Path
 
+from epypes.bundle.answers import bundle_answer_difference
 from epypes.bundle.compare import Difference, ReplayReport, first_difference
 from epypes.bundle.load import Bundle, read_bundle
 from epypes.bundle.requirements import imported_requirements
@@ -93,6 +94,11 @@ def replay(bundle: Bundle) -> ReplayReport:
             text = first_difference(expected, run[token])
             if text:
                 differences.append(Difference(path.stem, token, text))
+        text = bundle_answer_difference(bundle, path.stem, run)
+        if text:
+            differences.append(
+                Difference(path.stem, ", ".join(bundle.settings.outputs), f"the answer of f_out: {text}")
+            )
     return ReplayReport(len(bundle.samples), tokens, tuple(differences), imported_requirements())
 
 

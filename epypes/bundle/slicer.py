@@ -8,16 +8,20 @@ from __future__ import annotations
 import ast
 import builtins
 import dataclasses
+import sys
 import types
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Annotated, Any, Final, get_origin
 
+from epypes.bundle.classes import ClassDefinition, class_definition, class_names, made_again
 from epypes.bundle.literal import is_data, is_same_data, literal_source
 from epypes.bundle.source import Definition, Importable, Refused, definition, importable
 from epypes.bundle.uses import global_names, in_module, submodules
 from epypes.hints import Param
 from epypes.images import Image
 from epypes.run.guard import is_plain_array
+
+AnyDefinition = Definition | ClassDefinition
 
 _CONSTANT_CHARACTERS: Final = 400
 RESERVED: Final = frozenset({"func_dict", "func_io"})
@@ -47,7 +51,7 @@ class Slice:
         self.reserved = reserved
         self.imports: dict[tuple[str, str], str] = {}
         self.constants: dict[str, str] = {}
-        self.definitions: dict[str, Definition] = {}
+        self.definitions: dict[str, AnyDefinition] = {}
         self.refusals: list[str] = []
         self._meanings: dict[str, tuple[str, object]] = {}
         self._seen: set[int] = set()
@@ -70,7 +74,7 @@ class Slice:
         builtin = ("builtin", top)
         if home.module == "builtins" and self._meanings.setdefault(top, builtin) == builtin:
             return home.qualname
-        return f"{self._module_name(home.module, what)}.{home.qualname}"
+        return f"{self.module_name(home.module, what)}.{home.qualname}"
 
     def is_taken(self, name: str) -> bool:
         """Whether a name means something in the module already."""
@@ -85,27 +89,45 @@ class Slice:
         """Keep a name that is not taken for what is written below the functions."""
         self._claim(name, ("kept", name), f"Function {name!r}")
 
-    def _module_name(self, module: str, what: str) -> str:
+    def module_name(self, module: str, what: str) -> str:
         """Import a module, unless a function has brought it already under a name of its own (``np``)."""
         aliases = [name for name, imported in self.imports if imported == module]
         if not aliases:
             self._import_module(module, what)
         return min(aliases, default=module)
 
-    def _add_definition(self, function: Callable[..., Any], what: str) -> Definition:
-        found = definition(function, what)
+    def add_class(self, kind: type, around: Mapping[str, Any] | None, what: str) -> str:
+        """Add a class, which reads the names ``around`` it if it is the notebook's; return its expression."""
+        home = importable(kind)
+        return self.reference(home, what) if home else self._add_definition(kind, what, around).name
+
+    def _add_definition(
+        self, function: Callable[..., Any], what: str, around: Mapping[str, Any] | None = None
+    ) -> AnyDefinition:
+        found = self._found(function, what, around)
         self._claim(found.name, ("object", id(function)), what)
         if id(function) in self._seen:
             return found
         self._seen.add(id(function))
-        _check_defaults(found, what)
-        for name in global_names(found, what):
+        if isinstance(found, Definition):
+            _check_defaults(found, what)
+        for name in global_names(found, what) if isinstance(found, Definition) else class_names(found):
             try:
                 self._add_name(name, found, what)
             except Refused as refusal:
                 self.refusals.append(str(refusal))
         self.definitions[found.name] = found
         return found
+
+    def _found(self, function: Callable[..., Any], what: str, around: Mapping[str, Any] | None) -> AnyDefinition:
+        if isinstance(function, type):
+            return class_definition(function, self._around(function) if around is None else around, what)
+        return definition(function, what)
+
+    def _around(self, kind: type) -> Mapping[str, Any]:
+        """Return the names of the notebook that has a class."""
+        known = (found.names for found in self.definitions.values())
+        return next((names for names in known if names.get(kind.__name__) is kind), vars(sys.modules["__main__"]))
 
     def _claim(self, name: str, meaning: tuple[str, object], what: str) -> None:
         """Make a name mean one thing in the module."""
@@ -117,9 +139,9 @@ class Slice:
                 "Rename one of the two."
             )
 
-    def _add_name(self, name: str, found: Definition, what: str) -> None:
+    def _add_name(self, name: str, found: AnyDefinition, what: str) -> None:
         """Add what one global name of a function means at the time of promotion."""
-        names = found.function.__globals__
+        names = found.names
         if name not in names:
             if not hasattr(builtins, name):
                 raise Refused(f"{what} uses {name!r}, which is not defined ({found.place}). Define it, or rename.")
@@ -134,10 +156,20 @@ class Slice:
             self._import_from(home, name)
         elif isinstance(value, types.FunctionType):
             self._add_helper(name, value, found, what)
+        elif isinstance(value, type):
+            self._add_notebook_class(name, value, found, what)
         else:
             self._add_constant(name, value, found, what)
 
-    def _add_helper(self, name: str, helper: types.FunctionType, found: Definition, what: str) -> None:
+    def _add_notebook_class(self, name: str, kind: type, found: AnyDefinition, what: str) -> None:
+        if kind.__name__ != name:
+            raise Refused(
+                f"{what} uses {name!r} ({found.place}), which was defined as class {kind.__name__!r}. "
+                "Call it by the name that it was defined with."
+            )
+        self.add_class(kind, found.names, f"Class {name!r}, which {what[0].lower()}{what[1:]} uses,")
+
+    def _add_helper(self, name: str, helper: types.FunctionType, found: AnyDefinition, what: str) -> None:
         if helper.__name__ != name and helper.__name__ != "<lambda>":
             raise Refused(
                 f"{what} calls {name!r} ({found.place}), which was defined as {helper.__name__!r}. "
@@ -145,11 +177,11 @@ class Slice:
             )
         self._add_definition(helper, f"Function {name!r}, which {what[0].lower()}{what[1:]} calls,")
 
-    def _add_constant(self, name: str, value: Any, found: Definition, what: str) -> None:
+    def _add_constant(self, name: str, value: Any, found: AnyDefinition, what: str) -> None:
         if is_plain_array(value):
             source = self.array_source(value, what)
         else:
-            source = self.annotation_source(value, what) or literal_source(value)
+            source = self.annotation_source(value, what) or literal_source(value) or self._made(value, found, what)
         if not source or len(source) > _CONSTANT_CHARACTERS:
             kind = f"the class {name!r}" if isinstance(value, type) else f"of type {type(value).__name__}"
             raise Refused(
@@ -162,6 +194,15 @@ class Slice:
             self._claim(name, ("constant", name), what)
             self.constants[name] = source
 
+    def _made(self, value: Any, found: AnyDefinition, what: str) -> str:
+        """Return the expression that makes a member of an enumeration, or a record of literals, again."""
+
+        def class_of(kind: type) -> str:
+            told = f"Class {kind.__name__!r} of a value that {what[0].lower()}{what[1:]} uses"
+            return self.add_class(kind, found.names, told)
+
+        return made_again(value, lambda part: literal_source(part) or self._made(part, found, what), class_of)
+
     def annotation_source(self, value: Any, what: str) -> str:
         """Return the source of a mark, or of ``Annotated`` with marks, as annotations use them; "" for any other."""
         if isinstance(value, Image | Param):
@@ -170,15 +211,13 @@ class Slice:
             if not all(source for _, source in words):
                 return ""
             listed = ", ".join(f"{name}={source}" for name, source in words)
-            return f"{self._module_name('epypes', what)}.{type(value).__name__}({listed})"
+            return f"{self.module_name('epypes', what)}.{type(value).__name__}({listed})"
         home = importable(value.__origin__) if get_origin(value) is Annotated else None
         parts = [self.annotation_source(mark, what) for mark in value.__metadata__] if home else [""]
         if home is None or not all(parts):
             return ""
-        plain = (
-            home.qualname if home.module == "builtins" else f"{self._module_name(home.module, what)}.{home.qualname}"
-        )
-        return f"{self._module_name('typing', what)}.Annotated[{plain}, {', '.join(parts)}]"
+        plain = home.qualname if home.module == "builtins" else f"{self.module_name(home.module, what)}.{home.qualname}"
+        return f"{self.module_name('typing', what)}.Annotated[{plain}, {', '.join(parts)}]"
 
     def array_source(self, array: Any, what: str) -> str:
         """Return a small array of numbers as source that makes it again, to the last bit; "" for any other."""
@@ -189,9 +228,9 @@ class Slice:
         listed = repr(array.tolist())
         if "nan" in listed or "inf" in listed or np.array(array.tolist(), array.dtype).shape != array.shape:
             return ""
-        return f"{self._module_name('numpy', what)}.array({listed}, dtype={str(array.dtype)!r})".replace("'", '"')
+        return f"{self.module_name('numpy', what)}.array({listed}, dtype={str(array.dtype)!r})".replace("'", '"')
 
-    def _add_module(self, name: str, module: types.ModuleType, found: Definition, what: str) -> None:
+    def _add_module(self, name: str, module: types.ModuleType, found: AnyDefinition, what: str) -> None:
         if module.__name__ == "__main__":
             raise Refused(f"{what} uses the notebook itself as module {name!r} ({found.place}).")
         if name != module.__name__:

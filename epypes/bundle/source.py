@@ -10,7 +10,7 @@ import copy
 import linecache
 import sys
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from inspect import CO_ASYNC_GENERATOR, CO_COROUTINE
@@ -55,6 +55,11 @@ class Definition:
     node: ast.FunctionDef
     place: str
     code: types.CodeType
+
+    @property
+    def names(self) -> Mapping[str, Any]:
+        """The names of the notebook."""
+        return self.function.__globals__
 
 
 def importable(value: Any, *names: str) -> Importable | None:
@@ -181,14 +186,19 @@ def _kind(value: object) -> str:
 
 def place_of(code: types.CodeType) -> str:
     """Return where code stands: the cell's number, if it is from a notebook, and the line."""
-    line = f"line {code.co_firstlineno}"
-    source = "".join(linecache.getlines(code.co_filename)).strip()
+    return place_in(code.co_filename, code.co_firstlineno)
+
+
+def place_in(file: str, number: int) -> str:
+    """Return a place in a file or cell: the cell's number, if it is from a notebook, and the line."""
+    line = f"line {number}"
+    source = "".join(linecache.getlines(file)).strip()
     cells = getattr(sys.modules.get("__main__"), "In", None)
     if isinstance(cells, list) and source:
-        number = max((index for index, cell in enumerate(cells) if str(cell).strip() == source), default=None)
-        if number is not None:
-            return f"cell [{number}], {line}"
-    return f"{code.co_filename}, {line}"
+        cell = max((index for index, cell in enumerate(cells) if str(cell).strip() == source), default=None)
+        if cell is not None:
+            return f"cell [{cell}], {line}"
+    return f"{file}, {line}"
 
 
 def _check_decorators(node: ast.FunctionDef, function: types.FunctionType, what: str, place: str) -> None:
@@ -211,11 +221,11 @@ def _is_our_mark(decorator: ast.expr, names: dict[str, Any]) -> bool:
     if _names_outputs(decorator, names):
         call = decorator
         return not call.keywords and all(isinstance(name, ast.Constant) for name in call.args)
-    return _evaluated(decorator, names) is unguarded
+    return evaluated(decorator, names) is unguarded
 
 
 def _names_outputs(decorator: ast.expr, names: dict[str, Any]) -> TypeGuard[ast.Call]:
-    return isinstance(decorator, ast.Call) and _evaluated(decorator.func, names) is outputs
+    return isinstance(decorator, ast.Call) and evaluated(decorator.func, names) is outputs
 
 
 def _without_outputs(node: ast.FunctionDef, names: dict[str, Any]) -> ast.FunctionDef:
@@ -225,10 +235,10 @@ def _without_outputs(node: ast.FunctionDef, names: dict[str, Any]) -> ast.Functi
     return kept
 
 
-def _evaluated(expression: ast.expr, names: dict[str, Any]) -> Any:
+def evaluated(expression: ast.expr, names: Mapping[str, Any]) -> Any:
     """Look up a dotted name; None for any other expression."""
     if isinstance(expression, ast.Name):
         return names.get(expression.id)
     if isinstance(expression, ast.Attribute):
-        return getattr(_evaluated(expression.value, names), expression.attr, None)
+        return getattr(evaluated(expression.value, names), expression.attr, None)
     return None

@@ -19,7 +19,7 @@ def global_names(found: Definition, what: str) -> Iterator[str]:
         for instruction in dis.get_instructions(code):
             if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
                 raise Refused(f"{what} changes the global {instruction.argval!r} ({found.place}). Return the value.")
-        names.update(dict.fromkeys(_read_from_outside(code)))
+        names.update(dict.fromkeys(names_from_outside(code)))
     arguments = found.node.args
     every = (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs, arguments.vararg, arguments.kwarg)
     outside = [argument.annotation for argument in every if argument] + [found.node.returns]
@@ -31,7 +31,7 @@ def global_names(found: Definition, what: str) -> Iterator[str]:
     return iter(names)
 
 
-def _read_from_outside(code: types.CodeType) -> Iterator[str]:
+def names_from_outside(code: types.CodeType) -> Iterator[str]:
     """Return the names that code reads, but for those that the body of a class has given a meaning before."""
     own = {"__name__"}  # a class reads the module's, whichever that is
     for instruction in dis.get_instructions(code):

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import enum
 import sys
 from typing import Any
 
+from epypes.bundle.classes import made_again
 from epypes.bundle.literal import literal_source
 from epypes.bundle.slicer import Slice
 from epypes.bundle.source import Importable, importable
@@ -53,11 +53,13 @@ def _object(gathered: Slice, value: Any, what: str) -> str:
     if _is_numpy_number(value):
         number = expression(gathered, value.item(), what)
         return f"{gathered.reference(Importable('numpy', type(value).__name__), what)}({number})"
-    if isinstance(value, enum.Enum):
-        home = importable(type(value))
-        return (
-            f"{gathered.reference(home, what)}.{value.name}" if home and value.name in type(value).__members__ else ""
-        )
+    made = made_again(
+        value,
+        lambda part: expression(gathered, part, what),
+        lambda kind: gathered.add_class(kind, None, f"Class {kind.__name__!r} of {what[0].lower()}{what[1:]}"),
+    )
+    if made:
+        return made
     home = importable(value)
     return gathered.reference(home, what) if home else gathered.annotation_source(value, what)
 

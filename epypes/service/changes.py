@@ -71,7 +71,7 @@ class Changes:
             for pipeline, its_values in zip((self._trial, *self._pipelines), (before[0], *before), strict=True):
                 pipeline.runner.set(**its_values)
             token = getattr(error, "token", None)
-            return {name: _said(error) for name in ([token] if token in values else values)}
+            return {name: _said(error) for name in values if token not in values or name == token}
         return {}
 
 

@@ -12,10 +12,8 @@ import io
 import json
 import os
 import socket
-import struct
 import threading
 from collections.abc import Mapping, Sequence
-from time import monotonic
 from typing import Any, Final
 
 from epypes.errors import MessageError
@@ -54,12 +52,11 @@ class Channel:
         self._socket = end
         self._sending, self._receiving = threading.Lock(), threading.Lock()
         self._reader = io.BufferedReader(io.FileIO(end.fileno(), closefd=False), _READ_AHEAD_BYTES)
-        self._timeout_s: float | None = None
 
-    def send(
-        self, header: Mapping[str, Any], frames: Sequence[BytesLike] = (), *, timeout_s: float | None = None
-    ) -> None:
-        """Send a message; from any thread, one after another. When it returns, the frames' memory is free again.
+    def send(self, header: Mapping[str, Any], frames: Sequence[BytesLike] = ()) -> None:
+        """Send a message, from any thread, one after another; wait for as long as the other side does not read.
+
+        When it returns, the frames' memory may be written to again.
 
         Parameters
         ----------
@@ -67,15 +64,11 @@ class Channel:
             What json takes.
         frames
             Contiguous bytes.
-        timeout_s
-            How long may be waited until the other side takes the first byte; for ever without.
 
         Raises
         ------
         EOFError
             The other side is gone.
-        TimeoutError
-            It reads nothing; nothing was sent.
         MessageError
             The header or the frames are larger than what is read; nothing was sent.
         """
@@ -83,48 +76,18 @@ class Channel:
         if len(head) > MOST_HEADER_BYTES:
             raise MessageError("too large", f"A header of {len(head):,} bytes; the limit is {MOST_HEADER_BYTES:,}.")
         parts = [head, *frames]
-        pieces = [piece for part in (table_of(parts, LIMITS), *parts) if len(piece := memoryview(part).cast("B"))]
-        deadline_s = None if timeout_s is None else monotonic() + timeout_s
-        if not self._sending.acquire(timeout=-1 if timeout_s is None else timeout_s):
-            raise TimeoutError("The other side of the channel reads nothing.")
-        try:
-            self._wait_at_most(None if deadline_s is None else max(deadline_s - monotonic(), 0.001))
-            self._send(pieces)
-        finally:
-            self._sending.release()
-
-    def _wait_at_most(self, timeout_s: float | None) -> None:
-        """Bound the next call of sendmsg; the socket's own time-out would bound those of recv too."""
-        if timeout_s != self._timeout_s:
-            micros = 0 if timeout_s is None else round(timeout_s * 1e6)
-            with contextlib.suppress(OSError):  # of a closed one, sendmsg says so
-                value = struct.pack("@ll", *divmod(micros, 1_000_000))
-                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, value)
-            self._timeout_s = timeout_s
-
-    def _send(self, pieces: list[memoryview]) -> None:
-        try:
-            left = _after(pieces, self._sendmsg(pieces))
-        except BlockingIOError:
-            raise TimeoutError("The other side of the channel reads nothing.") from None
-        if not left:
-            return
-        try:
-            self._wait_at_most(None)
-            while left:
-                left = _after(left, self._sendmsg(left))
-        except BaseException:
-            # Half a message is on its way: whatever comes after it could not be understood.
-            self._end()
-            raise
-
-    def _sendmsg(self, pieces: list[memoryview]) -> int:
-        try:
-            return self._socket.sendmsg(pieces[:_MOST_PIECES], (), socket.MSG_NOSIGNAL)
-        except BlockingIOError:
-            raise
-        except OSError as error:
-            raise EOFError("The other side of the channel is gone.") from error
+        left = [piece for part in (table_of(parts, LIMITS), *parts) if len(piece := memoryview(part).cast("B"))]
+        with self._sending:
+            try:
+                while left:
+                    sent = self._socket.sendmsg(left[:_MOST_PIECES], (), socket.MSG_NOSIGNAL)
+                    left = _after(left, sent)
+            except OSError as error:
+                raise EOFError("The other side of the channel is gone.") from error
+            except BaseException:
+                # Half a message may be on its way: whatever came after it could not be understood.
+                self._end()
+                raise
 
     def receive(self) -> tuple[dict[str, Any], list[memoryview]]:
         """Wait for a message, and return its header and its frames, read-only; to be called by one thread.

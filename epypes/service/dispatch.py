@@ -150,9 +150,7 @@ class Dispatcher:
         self.publish()
 
     def _resolve(self, entry: Entry, result: Result) -> None:
-        failure = result.failure
-        outcome = "answered" if failure is None else "dead_letters" if failure.dead_letter else "failed"
-        self.ledger.resolve(entry.seq, outcome, result)  # type: ignore[arg-type] - one of the three
+        self.ledger.resolve(entry.seq, result.outcome, result)
 
     def worker_died(self, ending: str, died_in: Sequence[str]) -> None:
         """Note that the worker died by itself, or of one of its events; they are tried again or put aside."""

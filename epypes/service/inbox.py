@@ -84,7 +84,8 @@ class Inbox:
                 self._items.popleft()
                 item.apply()
             else:
-                return self._items.popleft()
+                del self._items[0]
+                return item
         return None
 
     def finished(self) -> None:

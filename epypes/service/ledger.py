@@ -99,9 +99,9 @@ class Ledger:
 
     def __post_init__(self) -> None:
         if self.policy not in POLICIES:
-            known = ", ".join(POLICIES)
-            why = " A service can't make its peers wait." if self.policy == "block" else ""
-            raise ServiceError(self.policy, f"A service has no mailbox of policy {self.policy!r}.{why} Take {known}.")
+            known = ", ".join(map(repr, POLICIES))
+            text = f"A service has no mailbox of policy {self.policy!r}, and can't make its peers wait. Take {known}."
+            raise ServiceError(self.policy, text)
         if self.size < 1 or (self.policy == "latest" and self.size != 1):
             raise ServiceError(self.size, f"A mailbox with policy {self.policy!r} can't have size {self.size}.")
 
@@ -184,7 +184,8 @@ class Ledger:
 
     def worker_ended(self) -> None:
         """Note that the worker was ended for a reason that its events have no part in: they are tried again."""
-        self._put_back(list(self._running.values()), self._again)
+        # One that is tried alone stays a suspect.
+        self._put_back(list(self._running.values()), self._suspects if self._alone else self._again)
 
     def _put_back(self, entries: list[Entry], to: list[Entry]) -> None:
         for entry in entries:

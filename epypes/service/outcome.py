@@ -13,7 +13,7 @@ from epypes.run import Failure
 from epypes.service.failurerecord import FailureRecord
 from epypes.service.failurestore import FailureStore
 from epypes.service.latency import Stopwatch
-from epypes.service.ledger import Entry
+from epypes.service.ledger import Entry, Outcome
 from epypes.wire import Envelope
 from epypes.wire.failures import failure_event
 
@@ -54,6 +54,13 @@ class Result:
     failure: FailureRecord | None = None
     revision: int = 0
     total_ns: int = 0
+
+    @property
+    def outcome(self) -> Outcome:
+        """What has become of the event."""
+        if self.failure is None:
+            return "answered"
+        return "dead_letters" if self.failure.dead_letter else "failed"
 
 
 def event_id(event: object) -> str:

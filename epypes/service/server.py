@@ -102,11 +102,19 @@ class Service:
         self.http, self.token_file = "", ""
         self.failure_store = FailureStore(failures_folder(served.path))
         ledger = Ledger(mailbox_policy, mailbox_size, threads, retries)
-        self._desk = Desk(lambda item: self._sockets.answer(item), lambda item: self._sockets.report(item), lambda: self.failure_store)
+        self._desk = Desk(
+            lambda item: self._sockets.answer(item), lambda item: self._sockets.report(item), lambda: self.failure_store
+        )
         self._dispatcher = Dispatcher(ledger, self._desk, self._setting)
         self._tuning = Tuning(served, self._dispatcher, self._desk, min(job_timeout_s, _CHANGE_S))
         self._supervisor = Supervisor(
-            self._dispatcher, served, threads, job_timeout_s, self._tuning.for_new_worker, self._look, self._tuning.heard
+            self._dispatcher,
+            served,
+            threads,
+            job_timeout_s,
+            self._tuning.for_new_worker,
+            self._look,
+            self._tuning.heard,
         )
         self._asks = Asks(served.path, lambda: self._dispatcher.link)
         self._sockets = Sockets(sub, pub, failures, self._dispatcher, insecure=insecure, keys=keys, allow=allow)

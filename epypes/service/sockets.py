@@ -47,7 +47,7 @@ class Sockets:
     ) -> None:
         self._given = {"sub": sub, "pub": pub, "failures": failures}
         self._accept = accept
-        self._secured = {"insecure": insecure, "keys": keys, "allow": allow}
+        self._secured: dict[str, Any] = {"insecure": insecure, "keys": keys, "allow": allow}
         self._rejected_before = 0
         # Sent within put, on the thread that puts.
         self._answers, self._failures = Mailbox("drop_oldest", _KEPT_ANSWERS), Mailbox("drop_oldest", _KEPT_ANSWERS)
@@ -111,10 +111,8 @@ class Sockets:
     @property
     def addresses(self) -> dict[str, str]:
         """Where they are, ``connect:`` in front of those that connect; those that are bound once they are."""
-        sockets = {"sub": self.subscriber, "pub": self.publisher, "failures": self.reporter}
-        return {
-            name: given if given.startswith(CONNECT) else sockets[name].address for name, given in self._given.items()
-        }
+        bound = {"sub": self.subscriber.address, "pub": self.publisher.address, "failures": self.reporter.address}
+        return {name: given if given.startswith(CONNECT) else bound[name] for name, given in self._given.items()}
 
     @property
     def rejected(self) -> int:

@@ -83,9 +83,9 @@ class Tuning:
         with self._dispatcher.changed:
             link = self._dispatcher.link
             if link is None:
-                raise ServiceError(self._path, "There is no worker just now that could take them. Try again in a moment.")
+                raise ServiceError(self._path, "There is no worker just now. Try again in a moment.")
             if self._pending is not None:
-                raise ServiceError(self._path, "A change waits for the event that is worked on. Try again in a moment.")
+                raise ServiceError(self._path, "A change is waiting for an event to end. Try again in a moment.")
             self._pending = wanted
             return link
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import ctypes
 import faulthandler
+import io
 import logging
 import os
 import signal
@@ -19,11 +20,10 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NoReturn
 
 from epypes.bundle.load import Bundle, read_bundle
 from epypes.bundle.replay import replay
-from epypes.errors import MessageError
 from epypes.pipeline import Pipeline
 from epypes.service.asked import Asked, Latest
 from epypes.service.changes import Changes
@@ -160,28 +160,44 @@ class _Hearer:
         with self._turn:
             self._worker = worker
             for header, frames in self._early:
-                worker.hear(header, frames)
+                _tell(worker, header, frames)
             self._early.clear()
 
     def hear_all(self) -> None:
         """Read until the other side is gone; the process ends then, whatever it is doing."""
-        try:
-            while True:
-                self._hear(*self._channel.receive())
-        except EOFError:
-            os._exit(FRONT_GONE)
-        except (MessageError, LookupError, TypeError, ValueError) as error:
-            print(f"epypes worker: the front said what can't be understood: {error!r}", file=sys.stderr, flush=True)
-            os._exit(NOT_UNDERSTOOD)
+        while True:
+            try:
+                header, frames = self._channel.receive()
+            except EOFError:
+                os._exit(FRONT_GONE)
+            except BaseException as error:  # a thread that ended here would leave a worker that hears nothing
+                _not_understood(error)
+            self._hear(header, frames)
+            # An event may be large: it shall not live on until another comes.
+            del header, frames
 
     def _hear(self, header: dict[str, Any], frames: list[memoryview]) -> None:
         with self._turn:
             if self._worker is not None:
-                self._worker.hear(header, frames)
-            elif header["kind"] == "end":
+                _tell(self._worker, header, frames)
+            elif header.get("kind") == "end":
                 os._exit(ENDED)
             else:
                 self._early.append((header, frames))
+
+
+def _tell(worker: Worker, header: dict[str, Any], frames: list[memoryview]) -> None:
+    try:
+        worker.hear(header, frames)
+    except EOFError:
+        os._exit(FRONT_GONE)
+    except BaseException as error:  # as above
+        _not_understood(error)
+
+
+def _not_understood(error: BaseException) -> NoReturn:
+    _LOG.error("the front said what can't be understood: %r", error)
+    os._exit(NOT_UNDERSTOOD)
 
 
 def _stay_with_the_front(faults: int | None) -> None:
@@ -191,6 +207,9 @@ def _stay_with_the_front(faults: int | None) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     os.dup2(2, 1)
+    # What is printed shall not wait for a buffer to be full, and be lost when the process is killed.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(line_buffering=True)
     if faults is not None:
         os.set_inheritable(faults, False)
         faulthandler.enable(file=faults)
@@ -220,6 +239,7 @@ def _loaded(channel: Channel, path: Path, threads: int) -> Worker | None:
         "report": str(report),
         "pid": os.getpid(),
         "functions": functions,
+        "func_io": {name: [bundle.cg.func_inputs(name), bundle.cg.func_outputs(name)] for name in functions},
     }
     channel.send(ready)
     return worker

@@ -1,0 +1,602 @@
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+import psutil
+import pytest
+
+from epypes.bundle.seal import seal
+from epypes.display.views.jsonview import from_json
+from epypes.service.channel import channel_pair
+from epypes.service.packing import MARK
+from epypes.wire import Envelope, encode
+from tests.service.bundles import written_bundle
+from tests.service.workers import TIMEOUT_S, ready_worker, worker_of
+
+# What its function does is told by the event.
+SOURCE = '''
+    """A graph whose functions do what they are told."""
+
+    import os
+    import re
+    import signal
+    import subprocess
+    import sys
+    import time
+
+    import numpy as np
+
+
+    def act(what, k):
+        if what in ACTIONS:
+            return ACTIONS[what]()
+        return f"{what} {k}"
+
+
+    def tell(done, k):
+        return f"{done} {k}"
+
+
+    def fail():
+        raise ValueError("not with me")
+
+
+    def deep():
+        return deep()
+
+
+    def interrupt():
+        raise KeyboardInterrupt
+
+
+    def many():
+        raise MemoryError("no room")
+
+
+    def odd():
+        class Odd(Exception):
+            def __str__(self):
+                raise RuntimeError("no text")
+
+            @property
+            def __notes__(self):
+                raise SystemExit(1)
+
+        raise Odd
+
+
+    def say():
+        print("from print")
+        os.write(1, b"from the file descriptor\\n")
+        subprocess.run(["echo", "from a child"], check=True)
+        print("to stderr", file=sys.stderr)
+        return "said"
+
+
+    def hold():
+        open(os.environ["STARTED"], "w").close()
+        while not os.path.exists(os.environ["RELEASE"]):
+            time.sleep(0.002)
+        return "held"
+
+
+    def regex():
+        open(os.environ["STARTED"], "w").close()
+        return re.match(r"(a+)+$", "a" * 60 + "b")
+
+
+    ACTIONS = {
+        "fail": fail,
+        "exit": lambda: sys.exit(3),
+        "interrupt": interrupt,
+        "memory": many,
+        "deep": deep,
+        "odd": odd,
+        "object": object,
+        "say": say,
+        "hold": hold,
+        "regex": regex,
+        "kill": lambda: os.kill(os.getpid(), signal.SIGKILL),
+        "segv": lambda: os.kill(os.getpid(), signal.SIGSEGV),
+        "signals": lambda: [str(signal.getsignal(number)) for number in (signal.SIGINT, signal.SIGTERM)],
+        "pid": os.getpid,
+        "zeros": lambda: np.zeros((400, 400), np.uint8),
+    }
+
+    func_dict = {"act": act, "tell": tell}
+    func_io = {"act": (("what", "k"), "out"), "tell": (("out", "k"), "told")}
+'''
+SAMPLE = {"what": "plain"}, {"out": "plain 2"}
+
+
+@pytest.fixture(scope="module")
+def acting(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bundles") / "acting"
+    return written_bundle(folder, SOURCE, ["what"], ["out"], hyperparameters={"k": 2}, sample=SAMPLE)
+
+
+@pytest.fixture(scope="module")
+def shared(acting, tmp_path_factory):
+    """A worker that many tests use one after another."""
+    with ready_worker(acting, tmp_path_factory.mktemp("shared")) as front:
+        yield front
+        assert front.end() == 0
+
+
+@pytest.fixture
+def own(acting, tmp_path):
+    """A worker of this test alone, with files by which a held function is seen and released."""
+
+    @contextmanager
+    def start(*options):
+        environment = {"STARTED": str(tmp_path / "started"), "RELEASE": str(tmp_path / "release")}
+        with ready_worker(acting, tmp_path, *options, environment=environment) as front:
+            front.started, front.release = (Path(path) for path in environment.values())
+            yield front
+
+    return start
+
+
+def until(condition):
+    """Wait until something is so, and return it."""
+    deadline = time.monotonic() + TIMEOUT_S
+    while not (found := condition()):
+        assert time.monotonic() < deadline, "it did not come to be"
+        threading.Event().wait(0.005)
+    return found
+
+
+# -- ready ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_worker_is_ready_when_the_bundle_computes_what_was_recorded(shared):
+    assert shared.ready["kind"] == "ready"
+    assert shared.ready["report"] == "identical: 1 token of 1 sample"
+    assert shared.ready["functions"] == ["act", "tell"]
+    assert shared.ready["pid"] == shared.process.pid
+    assert len(shared.ready["digest"]) == 64
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda text: text.replace("{what} {k}", "{what}-{k}"), "token 'out': expected 'plain 2', got 'plain-2'"),
+        (lambda text: text + "import no_such_module\n", r"No module named 'no_such_module'"),
+        (lambda text: text + "sys.exit(0)\n", r"failed at pipeline.py, line \d+: sys.exit\(0\): SystemExit: 0"),
+        (lambda text: text + "1 +\n", "SyntaxError"),
+        (lambda text: text.replace("func_io", "func_oi"), "defines no 'func_io'"),
+        (lambda text: text.replace('return f"{what} {k}"', "fail()"), "not with me.*In function 'act'"),
+    ],
+)
+def test_a_bundle_that_does_not_compute_what_was_recorded_is_refused(acting, tmp_path, change, reason):
+    folder = tmp_path / "changed"
+    shutil.copytree(acting, folder)
+    module = folder / "pipeline.py"
+    module.write_text(change(module.read_text()))
+    seal(folder)
+    with worker_of(folder, tmp_path) as front:
+        header, _ = front.receive("refused")
+        assert any(re.search(reason, found) for found in header["reasons"]), header
+        assert front.process.wait(TIMEOUT_S) == 1
+
+
+@pytest.mark.parametrize("name", ["pipeline.py", "pipeline.toml", "samples/run_1.npz"])
+def test_a_bundle_with_a_changed_file_is_refused(acting, tmp_path, name):
+    folder = tmp_path / "changed"
+    shutil.copytree(acting, folder)
+    with (folder / name).open("ab") as file:
+        file.write(b"\n")
+    with worker_of(folder, tmp_path) as front:
+        header, _ = front.receive("refused")
+        assert f"{name} was changed" in header["reasons"][0]
+        assert front.process.wait(TIMEOUT_S) == 1
+
+
+def test_what_comes_before_the_worker_is_ready_is_done_then(acting, tmp_path):
+    with worker_of(acting, tmp_path) as front:
+        front.set(5, k=3)
+        front.send_event(Envelope(type="x", parts={"what": "early"}))
+        assert front.receive("ready")
+        header, (answer,) = front.done()
+        assert (header["revision"], answer.parts["out"]) == (5, "early 3")
+
+
+def test_a_worker_that_is_told_to_end_while_it_loads_ends(acting, tmp_path):
+    with worker_of(acting, tmp_path) as front:
+        assert front.end() == 0
+
+
+# -- events --------------------------------------------------------------------------------------------------------
+
+
+def test_an_event_is_answered_as_the_bundle_computes_it(shared):
+    request = Envelope(type="x", parts={"what": "a"}, acquired_ns=5)
+    seq = shared.send_event(request)
+    header, (answer,) = shared.done()
+    assert (header["seq"], header["failure"]) == (seq, None)
+    assert answer.parts["out"] == "a 2"
+    assert answer.correlation_id == request.id
+    assert answer.bundle_digest == shared.ready["digest"]
+    assert 0 < sum(header["durations_ns"].values()) < header["total_ns"]
+    assert set(header["durations_ns"]) == {"act", "tell"}
+
+
+@pytest.mark.parametrize(
+    ("what", "function", "exception", "message"),
+    [
+        ("fail", "act", "ValueError", "not with me"),
+        ("exit", "act", "SystemExit", "3"),
+        ("interrupt", "act", "KeyboardInterrupt", ""),
+        ("memory", "act", "MemoryError", "no room"),
+        ("deep", "act", "RecursionError", "maximum recursion depth"),
+        ("odd", "act", "Odd", "(its message can't be had)"),
+        ("object", "f_out", "MessageError", "object"),
+    ],
+)
+def test_whatever_a_function_raises_is_the_failure_of_its_event(shared, what, function, exception, message):
+    request = Envelope(type="x", parts={"what": what})
+    seq = shared.send_event(request)
+    header, (answer,) = shared.done()
+    failure = header["failure"]
+    assert header["seq"] == seq
+    assert (failure["function"], failure["exception"], failure["kind"]) == (function, exception, "raised")
+    assert message in failure["message"]
+    assert answer.type == "epypes.failure"
+    assert (answer.correlation_id, answer.failure.function) == (request.id, function)
+    assert shared.run(what="a")[1][0].parts["out"] == "a 2"
+
+
+def test_the_trace_of_a_failure_tells_the_lines_of_the_bundle_and_none_of_ours(shared, acting):
+    header, _ = shared.run(what="fail")
+    failure = header["failure"]
+    assert failure["tokens"] == ["what", "k", "out"]
+    trace = "\n".join(failure["trace"])
+    assert f'File "{acting}/pipeline.py", line ' in trace
+    assert 'raise ValueError("not with me")' in trace
+    assert "In function 'act': (what='fail', k=2) -> (out)" in trace
+    assert "epypes/run" not in trace
+
+
+def test_the_trace_of_an_endless_recursion_is_short(shared):
+    header, _ = shared.run(what="deep")
+    assert len(header["failure"]["trace"]) < 60
+
+
+@pytest.mark.parametrize(
+    ("event", "message"),
+    [
+        (Envelope(type="x", parts={"who": 1}), "The event must have the parts 'what'; it has 'who'"),
+        (Envelope(type="x"), "it has none"),
+        (b"2019", "not an epypes.v1 Envelope"),
+    ],
+)
+def test_an_event_that_f_in_does_not_understand_fails(shared, event, message):
+    shared.send_event(event)
+    header, (answer,) = shared.done()
+    assert header["failure"]["function"] == "f_in"
+    assert message in header["failure"]["message"]
+    assert answer.failure is not None
+
+
+def test_an_event_that_cannot_be_decoded_fails_and_the_worker_goes_on(shared):
+    seq = next(shared.seqs)
+    shared.channel.send({"kind": "event", "seq": seq, "raw": False}, [b"x/", b"\xff\xff"])
+    header, (answer,) = shared.done()
+    assert (header["seq"], header["failure"]["function"]) == (seq, "f_in")
+    assert "no Envelope" in answer.failure.message
+    assert shared.run(what="a")[1][0].parts["out"] == "a 2"
+
+
+def test_what_functions_print_goes_to_stderr_and_never_into_the_channel(shared):
+    assert shared.run(what="say")[1][0].parts["out"] == "said"
+    shared.run(what="a")
+    text = shared.stderr.read_text()
+    for line in ("from print", "from the file descriptor", "from a child", "to stderr"):
+        assert line in text
+
+
+def test_events_are_done_in_their_order_by_one_slot(shared):
+    seqs = [shared.send_event(Envelope(type="x", parts={"what": f"{number}"})) for number in range(50)]
+    done = [shared.done() for _ in seqs]
+    assert [header["seq"] for header, _ in done] == seqs
+    assert [answer.parts["out"] for _, (answer,) in done] == [f"{number} 2" for number in range(50)]
+
+
+# -- parameters ----------------------------------------------------------------------------------------------------
+
+
+def test_parameters_hold_for_the_events_after_them_and_their_revision_is_stamped(own):
+    with own() as front:
+        assert front.run(what="a")[1][0].revision == 0
+        for revision in range(1, 20):
+            front.set(revision, k=revision * 10)
+            front.send_event(Envelope(type="x", parts={"what": "a"}))
+            front.send_event(Envelope(type="x", parts={"what": "fail"}))
+        for revision in range(1, 20):
+            header, (answer,) = front.done()
+            assert (header["revision"], answer.revision) == (revision, revision)
+            assert answer.parts["out"] == f"a {revision * 10}"
+            header, (answer,) = front.done()
+            assert (header["revision"], answer.revision) == (revision, revision)
+            assert front.receive("parameters")[0]["revision"] == revision
+
+
+def test_parameters_are_refused_all_or_none_with_the_reason_of_each(own):
+    with own() as front:
+        front.channel.send(
+            {
+                "kind": "parameters",
+                "revision": 9,
+                "values": {"k": {"value": 7}, "kk": {"value": 1}, "what": {"value": 1}, "out": {}},
+            }
+        )
+        header, _ = front.receive("parameters_refused")
+        assert header["revision"] == 9
+        assert set(header["problems"]) == {"kk", "what", "out"}
+        assert "Did you mean 'k'?" in header["problems"]["kk"]
+        assert "free source token" in header["problems"]["what"]
+        header, (answer,) = front.run(what="a")
+        assert (header["revision"], answer.parts["out"]) == (0, "a 2")
+
+
+def test_a_value_that_an_annotation_does_not_allow_is_refused(tmp_path):
+    source = """
+        from typing import Annotated
+
+        import epypes as ep
+
+
+        def double(x, k: Annotated[int, ep.Param(1, 5)]):
+            return x * k
+
+
+        func_dict = {"double": double}
+        func_io = {"double": (("x", "k"), "y")}
+    """
+    hparams, sample = {"k": 2}, ({"x": 4}, {"y": 8})
+    bundle = written_bundle(tmp_path / "b", source, ["x"], ["y"], hyperparameters=hparams, sample=sample)
+    with ready_worker(bundle, tmp_path, "--threads", "2") as front:
+        front.set(1, k=9)
+        assert "annotation allows" in front.receive("parameters_refused")[0]["problems"]["k"]
+        front.set(2, k=5)
+        assert front.receive("parameters")[0]["revision"] == 2
+        front.set(3, k=0)
+        assert front.receive("parameters_refused")[0]["revision"] == 3
+        assert [front.run(x=1)[1][0].parts["y"] for _ in range(4)] == [5] * 4
+
+
+# -- asking --------------------------------------------------------------------------------------------------------
+
+
+def test_before_an_event_the_graph_is_seen_and_no_value(own):
+    with own() as front:
+        header, (view,) = front.ask("view")
+        assert [function.name for function in from_json(json.loads(view)).functions] == ["act", "tell"]
+        assert front.ask("svg")[1][0].startswith(b"<svg")
+        assert front.ask("preview", token="k", max_side_px=64)[1] == [b"2\nint 2"]
+        for ask in ({"what": "preview", "token": "out", "max_side_px": 64}, {"what": "run", "tokens": ["out"]}):
+            header, frames = front.ask(**ask)
+            assert (header["reason"], frames) == ("not computed", [])
+            assert "No event has been completed yet" in header["error"]
+
+
+def test_what_is_asked_is_of_the_last_completed_run(shared):
+    header, _ = shared.run(what="zeros")
+    shared.run(what="fail")
+    values = shared.values("out", "k", "what")
+    assert values.parts["out"].shape == (400, 400)
+    assert (values.parts["k"], values.parts["what"], values.revision) == (2, "zeros", header["revision"])
+    header, (picture,) = shared.ask("preview", token="out", max_side_px=100)
+    assert header["media_type"].startswith("image/")
+    assert max(header["width"], header["height"]) <= 100
+    assert cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_UNCHANGED).shape[:2] == (
+        header["height"],
+        header["width"],
+    )
+    header, (text,) = shared.ask("preview", token="what", max_side_px=100)
+    assert (header["media_type"], text.decode().partition("\n")[0]) == ("text/plain", "'zeros'")
+    _, (view,) = shared.ask("view")
+    tokens = {token.name: token for token in from_json(json.loads(view)).tokens}
+    assert tokens["out"].preview.picture is not None
+    assert b"<image" in shared.ask("svg")[1][0]
+
+
+@pytest.mark.parametrize(
+    ("ask", "reason", "text"),
+    [
+        ({"what": "preview", "token": "ouut", "max_side_px": 64}, "unknown token", "Did you mean 'out'?"),
+        ({"what": "run", "tokens": ["ouut"]}, "unknown token", "Did you mean 'out'?"),
+        ({"what": "preview"}, "failed", "token"),
+        ({"what": "preview", "token": ["out"], "max_side_px": 64}, "failed", "list"),
+        ({"what": "preview", "token": "out", "max_side_px": None}, "failed", "NoneType"),
+        ({"what": "run", "tokens": 3}, "failed", "int"),
+        ({"what": "everything"}, "unknown question", "everything"),
+    ],
+)
+def test_what_cannot_be_answered_is_told_with_its_reason(shared, ask, reason, text):
+    shared.run(what="a")
+    header, frames = shared.ask(**ask)
+    assert (header["reason"], frames) == (reason, [])
+    assert text in header["error"]
+
+
+def test_a_value_that_cannot_be_sent_is_refused_with_the_reason(shared):
+    shared.run(what="object")
+    header, _ = shared.ask("run", tokens=["out"])
+    assert header["reason"] == "no codec"
+    assert shared.values("told").parts["told"].endswith(" 2")
+
+
+def test_values_of_a_revision_that_no_event_has_had_are_computed_on_the_last_payload_and_not_published(own):
+    with own() as front:
+        front.run(what="a")
+        front.set(4, k=8)
+        values = front.values("out", "told", revision=4)
+        assert (values.parts["told"], values.revision) == ("a 8 8", 4)
+        assert front.values("out").revision == 0, "the last completed run is still the event's"
+        assert front.run(what="b")[1][0].parts["out"] == "b 8"
+        assert front.values("told", revision=4).parts["told"] == "b 8 8"
+        assert not front.waiting or {header["kind"] for header, _ in front.waiting} == {"parameters"}
+
+
+def test_a_function_that_fails_with_new_parameters_is_told_to_who_asked(tmp_path):
+    source = """
+        def divide(x, k):
+            return x // k
+
+
+        func_dict = {"divide": divide}
+        func_io = {"divide": (("x", "k"), "y")}
+    """
+    sample = {"x": 4}, {"y": 2}
+    bundle = written_bundle(tmp_path / "b", source, ["x"], ["y"], hyperparameters={"k": 2}, sample=sample)
+    with ready_worker(bundle, tmp_path) as front:
+        front.run(x=8)
+        front.set(1, k=0)
+        header, _ = front.ask("run", tokens=["y"], revision=1)
+        assert (header["reason"], header["error"][:26]) == ("failed", "divide: ZeroDivisionError:")
+        assert front.ask("run", tokens=["y"], revision=7)[0]["reason"] == "unknown revision"
+
+
+def test_what_runs_is_told_while_a_function_computes(own):
+    with own() as front:
+        seq = front.send_event(Envelope(type="x", parts={"what": "hold"}))
+        until(front.started.exists)
+        header, _ = front.ask("running")
+        assert header["running"] == ["act"]
+        assert [(slot["seq"], slot["functions"]) for slot in header["slots"]] == [(seq, ["act"])]
+        assert b"<svg" in front.ask("svg")[1][0], "others are answered too"
+        front.release.touch()
+        assert front.done()[1][0].parts["out"] == "held"
+        assert front.ask("running")[0]["running"] == []
+
+
+def test_too_many_questions_are_refused_and_none_is_left_without_answer(own):
+    with own() as front:
+        front.run(what="zeros")
+        asks = [front.send_ask("preview", token="out", max_side_px=16 + number) for number in range(300)]
+        answers = [front.receive("asked")[0] for _ in asks]
+        assert sorted(answer["ask"] for answer in answers) == asks
+        assert {answer.get("reason") for answer in answers} <= {None, "busy"}
+
+
+# -- how it ends ---------------------------------------------------------------------------------------------------
+
+
+def test_a_worker_works_off_what_it_has_and_ends_with_0(own):
+    with own() as front:
+        front.send_event(Envelope(type="x", parts={"what": "hold"}))
+        until(front.started.exists)
+        seq = front.send_event(Envelope(type="x", parts={"what": "last"}))
+        front.channel.send({"kind": "end"})
+        front.release.touch()
+        front.done()
+        header, (answer,) = front.done()
+        assert (header["seq"], answer.parts["out"]) == (seq, "last 2")
+        assert front.process.wait(TIMEOUT_S) == 0
+        assert front.stderr.read_text() == ""
+
+
+def test_a_worker_whose_front_goes_ends_at_once_even_while_a_function_computes(own):
+    with own() as front:
+        front.send_event(Envelope(type="x", parts={"what": "hold"}))
+        until(front.started.exists)
+        start = time.monotonic()
+        front.channel.close()
+        assert front.process.wait(TIMEOUT_S) == 3
+        assert time.monotonic() - start < TIMEOUT_S / 2
+
+
+def test_a_worker_ends_with_the_thread_that_started_it_even_while_a_function_holds_the_interpreter(acting, tmp_path):
+    code = """
+import os, subprocess, sys
+channel, started = int(sys.argv[1]), sys.argv[3]
+worker = subprocess.Popen([sys.executable, "-I", "-m", "epypes.service.worker", sys.argv[1], sys.argv[2]],
+                          pass_fds=[channel], env={**os.environ, "STARTED": started})
+print(worker.pid, flush=True)
+sys.stdin.read()
+"""
+    ours, theirs = channel_pair()
+    started = tmp_path / "started"
+    with theirs:
+        parent = subprocess.Popen(
+            [sys.executable, "-I", "-c", code, str(theirs.fileno()), str(acting), str(started)],
+            pass_fds=[theirs.fileno()],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
+    try:
+        worker = psutil.Process(int(parent.stdout.readline()))
+        ours.send({"kind": "event", "seq": 1, "raw": False}, encode(Envelope(type="x", parts={"what": "regex"})))
+        until(started.exists)
+        # Its channel stays open: this is the end of the process that started it, and nothing else.
+        parent.kill()
+        until(lambda: not worker.is_running() or worker.status() == psutil.STATUS_ZOMBIE)
+    finally:
+        parent.kill()
+        parent.communicate()
+        ours.close()
+
+
+def test_a_worker_says_where_it_is_while_a_function_holds_the_interpreter(own):
+    with own() as front:
+        front.send_event(Envelope(type="x", parts={"what": "regex"}))
+        until(front.started.exists)
+        front.process.send_signal(signal.SIGUSR1)
+        text = until(lambda: "in regex" in front.faults.read_text() and front.faults.read_text())
+        assert re.search(r'File ".*/pipeline.py", line \d+ in regex', text)
+        front.process.kill()
+
+
+@pytest.mark.parametrize(("what", "number"), [("kill", signal.SIGKILL), ("segv", signal.SIGSEGV)])
+def test_an_event_that_kills_the_worker_is_the_end_of_the_channel(own, what, number):
+    with own() as front:
+        front.send_event(Envelope(type="x", parts={"what": what}))
+        with pytest.raises(EOFError):
+            front.done()
+        assert front.process.wait(TIMEOUT_S) == -number
+        if what == "segv":
+            assert "Segmentation fault" in front.faults.read_text()
+
+
+def test_signals_for_the_front_do_not_end_its_worker(own):
+    with own() as front:
+        for number in (signal.SIGINT, signal.SIGTERM) * 3:
+            front.process.send_signal(number)
+        assert front.run(what="a")[1][0].parts["out"] == "a 2"
+
+
+@pytest.mark.parametrize("message", [b"garbage " * 9, MARK + b"\xff" * 40], ids=["garbage", "too many"])
+def test_a_worker_that_cannot_understand_its_front_ends_with_2(own, message):
+    with own() as front:
+        front.channel._socket.sendall(message)
+        assert front.process.wait(TIMEOUT_S) == 2
+        assert "can't be understood" in front.stderr.read_text()
+
+
+@pytest.mark.parametrize("header", [{"kind": "nonsense"}, {}, {"kind": "event"}, {"kind": "ask"}])
+def test_a_worker_that_is_told_what_it_does_not_know_ends_with_2(own, header):
+    with own() as front:
+        front.channel.send(header)
+        assert front.process.wait(TIMEOUT_S) == 2
+
+
+def test_a_worker_that_waits_costs_nothing(own):
+    with own("--threads", "3") as front:
+        front.run(what="a")
+        process = psutil.Process(front.process.pid)
+        before = process.num_ctx_switches().voluntary, sum(process.cpu_times()[:2])
+        threading.Event().wait(1.0)
+        assert process.num_ctx_switches().voluntary - before[0] <= 5, "no thread polls"
+        assert sum(process.cpu_times()[:2]) - before[1] <= 0.02
