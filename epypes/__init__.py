@@ -55,6 +55,7 @@ if TYPE_CHECKING:
         summarize,
     )
     from epypes.run.guard import unguarded
+    from epypes.service.connection import connect
     from epypes.service.reopen import load_failure
     from epypes.transport import ZMQPublisher, ZMQSubscriber
 
@@ -102,6 +103,7 @@ _HOMES = {
     "Stages": "epypes.pipeline",
     "ZMQPublisher": "epypes.transport",
     "ZMQSubscriber": "epypes.transport",
+    "connect": "epypes.service.connection",
     "load": "epypes.bundle",
     "load_failure": "epypes.service.reopen",
     "load_pipeline": "epypes.bundle",
@@ -142,6 +144,7 @@ __all__ = [
     "ZMQPublisher",
     "ZMQSubscriber",
     "camera",
+    "connect",
     "errors",
     "extend",
     "group",

@@ -194,6 +194,8 @@ class Connection:
         ParametersRefused
             With a reason for each value that the service does not take.
         """
+        if not values:
+            return self.parameters()
         body = {"revision": revision, "values": {token: _sent(value) for token, value in values.items()}}
         return parameters_of(self.url, self._control.change("PATCH", "/v1/parameters", body))
 

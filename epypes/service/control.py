@@ -20,7 +20,7 @@ _LOOPBACK: Final = ("localhost", "127.0.0.1", "::1")
 # The service tells its counts each second: who hears nothing for so long hears nothing any more.
 SILENCE_S: Final = 5.0
 _DETAIL_CHARACTERS: Final = 2_000
-_NEEDS_TOKEN: Final = (  # noqa: S105 - a sentence
+_HOW_TO_CHANGE: Final = (
     "Give its token: ep.connect(url, token=...), or set EPYPES_TOKEN; it is in the token file that epypes serve names."
 )
 
@@ -140,7 +140,7 @@ class Control:
         if "reasons" in said:
             raise DeployRefused(self.url, said["reasons"])
         if answer.status_code in (401, 403) and not self.has_token:
-            raise ServiceError(self.url, f"{detail} {_NEEDS_TOKEN}")
+            raise ServiceError(self.url, f"{detail} {_HOW_TO_CHANGE}")
         if answer.status_code == 409:
             raise NotComputed("", detail)
         if answer.status_code == 422:

@@ -148,12 +148,30 @@ def record_of(entries: Any) -> FailureRecord:
     return record
 
 
-def values_of(record: FailureRecord, known: Collection[str]) -> tuple[dict[str, Any], str]:
-    """Return the values of a record's hyperparameters, and what is to be said of those that are not ``known``."""
-    values = {token: read(entry) for token, entry in record.hyperparameters.items()}
-    gone = [token for token in values if token not in known]
-    told = f"{', '.join(map(repr, gone))} are hyperparameters no more" if gone else ""
-    return {token: value for token, value in values.items() if token in known}, told
+def values_of(
+    record: FailureRecord, known: Collection[str], enums: Mapping[str, Any] | None = None
+) -> tuple[dict[str, Any], str]:
+    """Return the values of a record's hyperparameters, and what is to be said of those that can't be taken over.
+
+    Parameters
+    ----------
+    known
+        The hyperparameters of the bundle as it is now.
+    enums
+        Its enumerations by name.
+    """
+    values, gone = {}, []
+    for token, entry in record.hyperparameters.items():
+        try:
+            value = read(entry, enums)
+        except (LookupError, TypeError, ValueError):
+            gone.append(token)
+            continue
+        if token in known:
+            values[token] = value
+        else:
+            gone.append(token)
+    return values, f"{', '.join(map(repr, gone))} can't have the value that failed" if gone else ""
 
 
 _EMPTY: Final[Mapping[str, Any]] = {each.name: getattr(FailureRecord(), each.name) for each in fields(FailureRecord)}

@@ -47,7 +47,13 @@ class Follower:
         self._lock = threading.Lock()
         self._stopped = threading.Event()
         self._stream: Stream | None = None
+        self._is_open = False
         self._thread = threading.Thread(target=self._work, name="epypes-follower", daemon=True)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it hears what the service tells, and has caught up."""
+        return self._is_open
 
     def start(self) -> None:
         """Begin to follow."""
@@ -70,6 +76,7 @@ class Follower:
                 with self._events() as stream:
                     self._take(stream)
                     self._back()
+                    self._is_open = True
                     wait_s = _FIRST_WAIT_S
                     for name, said in stream:
                         if self._stopped.is_set():
@@ -81,6 +88,7 @@ class Follower:
                 _LOG.exception("What a service told could not be taken")
                 reason = f"{type(error).__name__}: {error}"
             self._take(None)
+            self._is_open = False
             if not self._stopped.is_set():
                 with suppress(Exception):
                     self._gone(reason)

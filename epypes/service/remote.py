@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from epypes.errors import (
     EpypesError,
     HyperparameterError,
+    ParametersRefused,
     PayloadError,
     RevisionConflict,
     ServiceError,
@@ -63,7 +64,7 @@ class RemoteRunner:
         info, known = connection.info(), connection.parameters()
         self.cg = graph_of(connection.url, info["func_io"], known.entries, _rgb(connection, info))
         self._program = Program(self.cg, True)
-        self._runs = RemoteRuns(connection, self._program, known)
+        self._runs = RemoteRuns(connection, self._program, known, info["outputs"])
         self._seen = SeenRuns()
         self._events = events
         self._watchers = Watchers()
@@ -76,6 +77,7 @@ class RemoteRunner:
         self._state: tuple[str, str] = (str(info["state"]), str(info.get("reason") or ""))
         self._gone = ""
         self._failed: Mapping[str, Any] | None = None
+        self._refused: tuple[object, ParametersRefused] | None = None
         self._tried: tuple[Run, dict[str, Any], bool] | None = None
         self.first_hyperparameters: Mapping[str, Any] = self._told
         self.last: Run | None = self._first_run()
@@ -150,6 +152,16 @@ class RemoteRunner:
             A payload was given.
         """
         self._check(values, targets, payload)
+        try:
+            return self._tried_there(values, targets)
+        except ServiceError as error:
+            # Why nothing can be had says more than that it can't.
+            if isinstance(error, ParametersRefused) or not self.notice:
+                raise
+            raise ServiceError(self.connection.url, self.notice) from error
+
+    def _tried_there(self, values: Mapping[str, Any], targets: tuple[str, ...]) -> Run:
+        self._require_there()
         accepted = self._sent(values)
         failed = self._failed if not accepted else None
         if failed is not None and self.last is not None:
@@ -198,9 +210,10 @@ class RemoteRunner:
             )
         return run
 
-    def __setitem__(self, token: str, value: Any) -> None:
-        self._check({token: value}, (), None)
-        self._sent({token: value})
+    def put(self, values: Mapping[str, Any], /) -> None:
+        """Set hyperparameters of the service, but for those that somebody else has changed meanwhile."""
+        self._check(values, (), None)
+        self._sent(values)
 
     def catch_up(self) -> None:
         """Let the panel be told of what others have changed meanwhile."""
@@ -252,17 +265,21 @@ class RemoteRunner:
     def _sent(self, values: Mapping[str, Any]) -> set[str]:
         """Set what differs, and return the names; what somebody else has changed meanwhile is left out."""
         told = self._told
+        if self._refused is not None and self._refused[0] == (self._known.revision, dict(values)):
+            raise self._refused[1]  # who follows the line would ask again at each event
         for _ in range(_MOST_TRIES):
             is_theirs = {name for name in values if self._told[name] is not told[name]}
             left = {n: value for n, value in values.items() if n not in is_theirs and not self._has(n, value)}
             if not left:
                 return set()
-            self._require_there()
             try:
                 self._known = self.connection.set(self._known.revision, **left)
             except RevisionConflict as conflict:
                 self._learn(conflict.current)
                 continue
+            except ParametersRefused as refused:
+                self._refused = (self._known.revision, dict(values)), refused
+                raise
             self._failed = None
             return set(left)
         raise ServiceError(

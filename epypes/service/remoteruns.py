@@ -36,10 +36,14 @@ class RemoteRuns:
         Its graph.
     first
         Its hyperparameters when it was connected to.
+    outputs
+        The tokens that are fetched in any case.
     """
 
-    def __init__(self, connection: Connection, program: Program, first: Parameters) -> None:
-        self._connection, self._program = connection, program
+    def __init__(
+        self, connection: Connection, program: Program, first: Parameters, outputs: Sequence[str] = ()
+    ) -> None:
+        self._connection, self._program, self._outputs = connection, program, tuple(outputs)
         self._values: dict[tuple[str, str], Any] = {}
         self._by_revision: dict[int, Mapping[str, Any]] = {}
         # What no codec knows, or is too large: asked for once.
@@ -116,7 +120,7 @@ class RemoteRuns:
 
     def _needed(self, targets: Sequence[str]) -> list[str]:
         """Return the tokens to fetch: marks are drawn over the images that they were made from."""
-        wanted = dict.fromkeys(targets or self._program.cg.tokens)
+        wanted = dict.fromkeys((*targets, *self._outputs) if targets else self._program.cg.tokens)
         for target in targets:
             if target not in self._images:
                 wanted.update(dict.fromkeys(self._ancestors(target)))

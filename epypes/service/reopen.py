@@ -75,7 +75,7 @@ def load_failure(id: str, source: Any = None, *, bundle: str | Path | None = Non
 def runner_of(bundle: Bundle, record: FailureRecord) -> tuple[CompGraphRunner, str]:
     """Return a runner with the hyperparameters that failed, and what is to be said of those that are gone."""
     runner = CompGraphRunner(bundle.cg, bundle.settings.hyperparameters)
-    values, left_out = values_of(record, runner.hyperparameters)
+    values, left_out = values_of(record, runner.hyperparameters, bundle.enums)
     runner.set(**values)
     return runner, left_out
 

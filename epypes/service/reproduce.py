@@ -193,9 +193,10 @@ def _pipeline(folder: Path, scratch: Path) -> tuple[FullPipeline, list[Failure]]
     """Return the pipeline that the service runs, with the hyperparameters that failed; and where failures will be."""
     from epypes.bundle.load import pipeline_of, read_bundle
 
-    pipeline = pipeline_of(read_bundle(folder), queue.SimpleQueue(), queue.SimpleQueue())
+    bundle = read_bundle(folder)
+    pipeline = pipeline_of(bundle, queue.SimpleQueue(), queue.SimpleQueue())
     record = record_of(json.loads((scratch / _RECORD).read_bytes()))
-    pipeline.runner.set(**values_of(record, pipeline.runner.hyperparameters)[0])
+    pipeline.runner.set(**values_of(record, pipeline.runner.hyperparameters, bundle.enums)[0])
     failures: list[Failure] = []
     pipeline.on_error = failures.append
     _announce_calls(pipeline, scratch / _CALLS)

@@ -54,7 +54,9 @@ def graph_of(
 
 def param_of(entry: Mapping[str, Any]) -> Param | None:
     """Return the range in an entry; None if it has none, or one that contradicts itself."""
-    said: dict[str, Any] = {key: tuple(entry[key]) if key in _PAIR else entry[key] for key in _RANGE if entry.get(key) is not None}
+    said: dict[str, Any] = {
+        key: tuple(entry[key]) if key in _PAIR else entry[key] for key in _RANGE if entry.get(key) is not None
+    }
     with suppress(ValueError, TypeError):
         return Param(**said) if said else None
     return None

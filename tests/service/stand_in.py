@@ -9,11 +9,10 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from epypes.display.paint.svg import paint_svg
 from epypes.display.show import view as _view  # noqa: F401
-import epypes as ep
 from epypes.display.views.jsonview import to_json
 from epypes.display.views.view import view
-from epypes.display.paint.svg import paint_svg
 from epypes.errors import BundleError, DeployRefused, ParametersRefused, RevisionConflict, UnknownName
 from epypes.service.failurerecord import FailureRecord
 from epypes.service.failurestore import FailureStore

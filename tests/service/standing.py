@@ -24,7 +24,9 @@ class Standing:
     def __init__(self, runner, folder, ranges=None, outputs=("edges",)):
         self.runner, self.folder, self.outputs = runner, folder, outputs
         self.state, self.reason = "READY", ""
-        self.entries = {t: {**written(plain(v)), **(ranges or {}).get(t, {})} for t, v in runner.hyperparameters.items()}
+        self.entries = {
+            t: {**written(plain(v)), **(ranges or {}).get(t, {})} for t, v in runner.hyperparameters.items()
+        }
         self.revision = 0
         self.reruns = 0
         self.asked = []
@@ -46,8 +48,16 @@ class Standing:
             else:
                 failure = run.failure
                 self.tell(
-                    "failure", id="f1", event_id=event_id, function=failure.function, tokens=list(failure.tokens),
-                    exception=failure.kind, message=failure.message, trace=[], kind="raised", revision=self.revision,
+                    "failure",
+                    id="f1",
+                    event_id=event_id,
+                    function=failure.function,
+                    tokens=list(failure.tokens),
+                    exception=failure.kind,
+                    message=failure.message,
+                    trace=[],
+                    kind="raised",
+                    revision=self.revision,
                 )
             return run
 
@@ -55,7 +65,7 @@ class Standing:
         self.state, self.reason = state, reason
         self.tell("state", state=state, reason=reason)
 
-    def tell(self, kind, **data):
+    def tell(self, kind, /, **data):
         for callback in tuple(self.listeners):
             callback(kind, data)
 
@@ -78,7 +88,18 @@ class Standing:
 
     def counts(self):
         return dict.fromkeys(
-            ("received", "answered", "failed", "dropped", "rejected", "retried", "dead_letters", "waiting", "in_flight"), 0
+            (
+                "received",
+                "answered",
+                "failed",
+                "dropped",
+                "rejected",
+                "retried",
+                "dead_letters",
+                "waiting",
+                "in_flight",
+            ),
+            0,
         )
 
     def parameters(self):

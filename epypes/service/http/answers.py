@@ -96,7 +96,10 @@ def _no_such(request: Request, error: HTTPException) -> Response:
     if error.status_code == 404:
         text = f"There is nothing at {path}. Look at / or /openapi.json."
     elif error.status_code == 405:
-        text = f"{path} does not take {method:.20}. Take one of: {(error.headers or {}).get('Allow', 'GET')}."
+        # Starlette names those of the first route of a path alone.
+        allowed = ", ".join(request.app.state.methods(request.url.path))
+        text = f"{path} does not take {method:.20}. Take one of: {allowed}."
+        return refusal(405, text, {"Allow": allowed})
     else:
         text = str(error.detail)
     return refusal(error.status_code, text, error.headers)

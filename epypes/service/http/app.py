@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from fastapi import FastAPI
+from fastapi.routing import APIRoute
 
 import epypes
 from epypes.service.http import events, failures, health, operating, page, parameters, pictures
@@ -28,6 +29,9 @@ _TAGS: Final = [
 ]
 
 
+_ROOMS: Final = (health, pictures, parameters, events, failures, operating, page)
+
+
 def app_of(served: Served) -> FastAPI:
     """Return the application that answers for a service."""
     app = FastAPI(
@@ -42,7 +46,14 @@ def app_of(served: Served) -> FastAPI:
     )
     app.state.served = served
     app.state.registry = registry_of(served.service)
+    app.state.methods = _methods
     answer_errors(app)
-    for room in (health, pictures, parameters, events, failures, operating, page):
+    for room in _ROOMS:
         app.include_router(room.router)
     return app
+
+
+def _methods(path: str) -> list[str]:
+    """Return the methods that a path takes."""
+    routes = [route for room in _ROOMS for route in room.router.routes if isinstance(route, APIRoute)]
+    return sorted({method for route in routes if route.path_regex.match(path) for method in route.methods or ()})

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 MOST_CONNECTIONS: Final = 160
 REQUEST_TIMEOUT_S: Final = 10.0
-_TAKING_TIMEOUT_S: Final = 10.0
+TAKING_TIMEOUT_S: Final = 10.0
 
 
 class Connection:
@@ -52,7 +52,7 @@ class Connection:
 
     def pause_writing(self) -> None:
         """Begin to wait until the caller takes what was written."""
-        self._taking = self._loop.call_later(_TAKING_TIMEOUT_S, self.abort)
+        self._taking = self._loop.call_later(TAKING_TIMEOUT_S, self.abort)
         self._inner.pause_writing()
 
     def resume_writing(self) -> None:
@@ -91,6 +91,9 @@ class Connections:
         own_state = dict(app_state)
         connection = own_state["connection"] = Connection(H11Protocol(app_state=own_state, **given), self)
         return connection
+
+    def __len__(self) -> int:
+        return len(self._open)
 
     def add(self, connection: Connection) -> None:
         """Know a connection, and make room for it."""

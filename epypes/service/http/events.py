@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import AsyncIterable, AsyncIterator
 from time import monotonic
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Depends, Query
 from fastapi.sse import EventSourceResponse, ServerSentEvent
@@ -17,6 +17,12 @@ from epypes.service.http.told import Listener
 router = APIRouter(tags=["service"])
 
 _LONGEST_S: Final = 86_400
+_SENTENCE: Final = {"application/json": {"schema": Refusal.model_json_schema()}}
+# FastAPI would have a model of these in the media type of the events.
+_REFUSALS: Final[dict[int | str, dict[str, Any]]] = {
+    status: {"description": part["description"], "content": _SENTENCE}
+    for status, part in {**REFUSALS, 422: {"description": "The request is not as described here."}}.items()
+}
 
 
 async def _listener(served: OfRequest) -> AsyncIterator[Listener]:
@@ -31,7 +37,7 @@ async def _listener(served: OfRequest) -> AsyncIterator[Listener]:
 @router.get(
     "/v1/events",
     response_class=EventSourceResponse,
-    responses={**REFUSALS, 422: {"model": Refusal, "description": "The request is not as described here."}},
+    responses=_REFUSALS,
 )
 async def events(
     listener: Annotated[Listener, Depends(_listener)],

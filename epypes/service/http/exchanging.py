@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
-from starlette.exceptions import HTTPException
-
+from epypes.errors import DeployRefused
 from epypes.service.http.served import Served
 
 _BUSY: Final = "A bundle is being exchanged already. Wait until that has ended, and look at what is served then."
@@ -17,9 +16,9 @@ async def exchanging(served: Served, function: Callable[..., Any], *arguments: A
 
     Raises
     ------
-    HTTPException
-        409: another such call is under way.
+    DeployRefused
+        Another such call is under way.
     """
     if served.exchanges.is_full:
-        raise HTTPException(409, _BUSY)
+        raise DeployRefused("The bundle", [_BUSY])
     return await served.exchanges(function, *arguments)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Awaitable, Callable, Collection
+from collections.abc import Awaitable, Callable, Collection, Sequence
 from dataclasses import dataclass
 from email.utils import formatdate
 from typing import Any, Final
@@ -18,6 +18,8 @@ from epypes.service.http.connections import REQUEST_TIMEOUT_S
 from epypes.service.http.token import is_bearer
 
 MOST_BODY_BYTES: Final = 64 * 1024
+MOST_HEADER_BYTES: Final = 16 * 1024
+_MOST_ADDRESS_BYTES: Final = 8 * 1024
 _READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 # Pictures are SVG with a style of their own and images inside; nothing of them may run, wherever they are opened.
 _CLOSED: Final = b"default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox; frame-ancestors 'none'"
@@ -77,6 +79,7 @@ class Guard:
     async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         headers = [(name.lower(), value) for name, value in scope["headers"]]
         try:
+            _check_size(scope, headers)
             self._check_host([value for name, value in headers if name == b"host"])
             if scope["method"] not in _READING:
                 self._check_token([value for name, value in headers if name == b"authorization"])
@@ -100,6 +103,15 @@ class Guard:
             raise _Refused(refusal(401, text, {"WWW-Authenticate": 'Bearer realm="epypes"', **_CLOSE}))
         if len(given) != 1 or not is_bearer(given[0], self.token):
             raise _Refused(refusal(403, f"This is not the service's token. {self.token_hint}", _CLOSE))
+
+
+def _check_size(scope: Scope, headers: Sequence[tuple[bytes, bytes]]) -> None:
+    """Refuse what arrived in one piece, and so escaped the limit on what is still incomplete."""
+    if len(scope.get("raw_path", b"")) + len(scope.get("query_string", b"")) > _MOST_ADDRESS_BYTES:
+        text = f"An address may have {_MOST_ADDRESS_BYTES} characters at most. Ask for less at once."
+        raise _Refused(refusal(414, text, _CLOSE))
+    if sum(len(name) + len(value) for name, value in headers) > MOST_HEADER_BYTES:
+        raise _Refused(refusal(431, f"Headers may have {MOST_HEADER_BYTES} bytes at most. Send fewer.", _CLOSE))
 
 
 def _without_port(host: str) -> str:

@@ -97,7 +97,7 @@ class Change(BaseModel):
     """Values for some parameters; all are taken, or none."""
 
     model_config = ConfigDict(
-        extra="forbid", json_schema_extra={"example": {"revision": 3, "values": {"canny_lo": 60}}}
+        extra="forbid", strict=True, json_schema_extra={"example": {"revision": 3, "values": {"canny_lo": 60}}}
     )
     revision: Revision | None = Field(
         default=None,
@@ -109,7 +109,7 @@ class Change(BaseModel):
 class WriteBack(BaseModel):
     """Whether to write the parameters into pipeline.toml, or only to say what would change."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
     dry_run: bool = Field(default=True, description="True to say what would change.")
 
 
@@ -149,12 +149,12 @@ class Failures(BaseModel):
 class Deploy(BaseModel):
     """The bundle to serve from now on."""
 
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"example": {"bundle": "/srv/edges-2"}})
+    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"example": {"bundle": "/srv/edges-2"}})
     bundle: str = Field(min_length=1, max_length=4_096, description="An absolute path on the service's machine.")
 
 
 class Drain(BaseModel):
     """How long to work off what waits."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
     timeout_s: float = Field(default=5.0, gt=0, le=600, description="In seconds.")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Response
 
@@ -11,7 +12,7 @@ from epypes.errors import BundleError
 from epypes.service.http.answers import answer
 from epypes.service.http.exchanging import exchanging
 from epypes.service.http.models import Deploy, DeployRefusal, Drain, Info, Refusal
-from epypes.service.http.served import CHANGE_REFUSALS, NEEDS_TOKEN, OfRequest
+from epypes.service.http.served import CHANGE_REFUSALS, NEEDS_TOKEN, OfRequest, Served
 
 router = APIRouter(prefix="/v1", tags=["operation"], dependencies=[NEEDS_TOKEN])
 
@@ -25,8 +26,7 @@ _INVALID = {422: {"model": Refusal, "description": "The request is not as descri
 @router.post("/deploy", response_model=Info, responses=_EXCHANGE)
 async def deploy(served: OfRequest, wanted: Deploy) -> Response:
     """Serve another bundle, which is replayed beside the one that is served and follows it between two events."""
-    path = _path(wanted.bundle)
-    return answer(await exchanging(served, served.service.deploy, path))
+    return answer(await exchanging(served, _deploy, served, wanted.bundle))
 
 
 @router.post("/rollback", response_model=Info, responses=_EXCHANGE)
@@ -56,9 +56,8 @@ async def drain(served: OfRequest, wanted: Annotated[Drain | None, Body()] = Non
     return answer(await served.asks(served.service.info))
 
 
-def _path(text: str) -> Path:
-    """Return where a bundle may be; BundleError if that can't be."""
-    path = Path(text)
-    if not path.is_absolute() or not text.isprintable():
-        raise BundleError(text, f"{text!r:.300} is no absolute path. Name the bundle's folder from the root on.")
-    return path
+def _deploy(served: Served, path: str) -> Any:
+    if not os.path.isabs(path) or not os.path.isdir(path):
+        text = f"{path!r:.300} is no folder on the service's machine. Name a bundle's folder, from the root on."
+        raise BundleError(path, text)
+    return served.service.deploy(Path(path))

@@ -70,8 +70,10 @@ REFUSALS: Final[dict[int | str, dict[str, Any]]] = {
     400: {"model": Refusal, "description": "The body is not JSON, or is not whole."},
     408: {"model": Refusal, "description": "The body took too long."},
     413: {"model": Refusal, "description": "The body has more than 64 KB."},
+    414: {"model": Refusal, "description": "The address is too long."},
     415: {"model": Refusal, "description": "The body is not said to be JSON."},
     421: {"model": Refusal, "description": "The Host header names another server."},
+    431: {"model": Refusal, "description": "The headers are too long."},
     503: {
         "model": Refusal,
         "description": "The service can't answer just now.",

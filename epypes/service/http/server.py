@@ -29,7 +29,6 @@ _START_TIMEOUT_S: Final = 30.0
 # How long answers may take to get out when the server stops; uvicorn counts in whole seconds what comes after.
 _TAKING_S: Final = 0.5
 _GRACE_S: Final = 2
-_MOST_HEADER_BYTES: Final = 16 * 1024
 
 
 class HttpServer:
@@ -59,7 +58,7 @@ class HttpServer:
         self._server: uvicorn.Server | None = None
         self._thread: threading.Thread | None = None
         self._started = threading.Event()
-        self._connections = Connections()
+        self.connections = Connections()
         self._served: Any = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._error: BaseException | None = None
@@ -95,14 +94,14 @@ class HttpServer:
         import uvicorn
 
         from epypes.service.http.app import app_of
-        from epypes.service.http.guard import Guard
+        from epypes.service.http.guard import MOST_HEADER_BYTES, Guard
         from epypes.service.http.served import Served
         from epypes.service.http.told import Told
 
         self._served = Served(self._service, Told(self._service))
         hint = f"It is in {self.token_file}, which `epypes serve` has named."
         # A class is asked for, but only ever called.
-        protocol: Any = self._connections.protocol
+        protocol: Any = self.connections.protocol
         config = uvicorn.Config(
             Guard(app_of(self._served), token, hint, names_of(listener)),
             http=protocol,
@@ -116,7 +115,7 @@ class HttpServer:
             proxy_headers=False,
             server_header=False,
             date_header=False,
-            h11_max_incomplete_event_size=_MOST_HEADER_BYTES,
+            h11_max_incomplete_event_size=MOST_HEADER_BYTES,
             timeout_graceful_shutdown=_GRACE_S,
             callback_notify=self._on_started,
         )
@@ -146,7 +145,7 @@ class HttpServer:
         thread.join(timeout_s)
         if thread.is_alive():
             server.force_exit = True
-            self._soon(self._connections.abort)
+            self._soon(self.connections.abort)
             thread.join(timeout_s)
 
     def _soon(self, function: Callable[[], None]) -> None:
@@ -157,8 +156,8 @@ class HttpServer:
     def _end(self) -> None:
         """Let all who wait have an answer; those who don't take it lose their connection."""
         self._served.stop()
-        self._connections.abort_idle()
-        asyncio.get_running_loop().call_later(_TAKING_S, self._connections.abort)
+        self.connections.abort_idle()
+        asyncio.get_running_loop().call_later(_TAKING_S, self.connections.abort)
 
     def __enter__(self) -> Self:
         self.start()

@@ -100,6 +100,9 @@ class Told:
         """Tell a listener no more."""
         self._listeners.discard(listener)
 
+    def __len__(self) -> int:
+        return len(self._listeners)
+
     def stop(self) -> None:
         """End what all listeners are told."""
         self._stopped = True
