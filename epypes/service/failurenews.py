@@ -50,11 +50,15 @@ def failures_from_now_on(
 
 
 def _of_connection(source: Any) -> Iterator[FailureRecord | None]:
-    connection = connected(source)
-    yield None
+    is_heard, connection = False, connected(source)
     for kind, data in connection.events():
+        # It tells its counts each second; from the first word on nothing is missed.
+        if not is_heard:
+            is_heard = True
+            yield None
         if kind == "failure":
             yield record_of(data)
+    raise ServiceError(connection.url, f"The service at {connection.url} has ended.")
 
 
 def _of_socket(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from epypes.bundle.seal import check_seal
 from epypes.errors import BundleError, FailureNotKept, UnknownName
-from epypes.service.failurerecord import FailureRecord, record_of
+from epypes.service.failurerecord import ID, FailureRecord, record_of
 from epypes.service.failurestore import FailureStore, failures_folder
 
 if TYPE_CHECKING:
@@ -145,8 +145,8 @@ def found_by(failures: Failures, given: str) -> FailureRecord:
         return meant[0]
     if meant:
         raise UnknownName("single failure", given, [record.id for record in meant], "but several that begin or end so")
-    if given == LATEST:
-        raise UnknownName("failure", given, (), "here")
+    if not ID.fullmatch(given):
+        raise UnknownName("failure", given, [record.id for record in records], "here")
     return failures.record(given)
 
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.errors import BundleError, EpypesError
-from epypes.service.failurerecord import FailureRecord, record_of, values_of
+from epypes.service.failurerecord import FailureRecord, record_of, values_of, with_id
 
 if TYPE_CHECKING:
     from epypes.pipeline import FullPipeline
@@ -95,7 +95,7 @@ def reproduce(
 
     with tempfile.TemporaryDirectory(prefix="epypes-replay-") as name:
         scratch = Path(name)
-        (scratch / _RECORD).write_text(json.dumps(asdict(record), default=str), encoding="utf-8")
+        (scratch / _RECORD).write_text(json.dumps(asdict(with_id(record)), default=str), encoding="utf-8")
         (scratch / _EVENT).write_bytes(pack_event(event))
         status = _run_apart(Path(bundle).resolve(), scratch, timeout_s)
         return _what_became(Path(bundle).resolve(), scratch, status, timeout_s)

@@ -2,104 +2,36 @@
 
 from __future__ import annotations
 
+import queue
 import shutil
 import warnings
-from dataclasses import replace
 
-import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.bundle.seal import check_seal
+from epypes.bundle.seal import seal
+from epypes.display.views.view import view
 from epypes.errors import BundleError, FailureNotKept, NotComputed, RemoteFailure, UnknownName
+from epypes.service import Service
 from epypes.service.failurerecord import FailureRecord
 from epypes.service.failuresource import failures_of, found_by
 from epypes.service.failurestore import FailureStore, failures_folder
+from epypes.service.http import HttpServer
 from epypes.service.reproduce import reproduce
 from epypes.wire import Envelope
+from tests.service.failing import CRASHES, EXITS, FINE, HANGS, KILLS, RAISES, keep, picture, promoted, request
+from tests.transport.peers import wait_until
 
-MODULE = '''
-def brighten(image, by):
-    """Add to every pixel."""
-    return image + by
-
-
-def check(bright, most):
-    """Raise where the picture is too bright; do worse where a test asks for it."""
-    import os
-    import time
-
-    if bright[0, 0] == 7:
-        os.kill(os.getpid(), 9)
-    if bright[0, 0] == 8:
-        import ctypes
-        ctypes.string_at(0)
-    if bright[0, 0] == 9:
-        time.sleep(3_600)
-    if bright[0, 0] == 10:
-        os._exit(5)
-    if bright.max() > most:
-        raise ValueError(f"too bright: {bright.max()}")
-    return bright
-
-
-def half(checked):
-    """Take half of it."""
-    return checked // 2
-'''
+WAIT_S = 20.0
 
 
 @pytest.fixture(scope="session")
 def bright_bundle(tmp_path_factory):
-    """A bundle whose function check fails, kills, crashes or hangs, as the first pixel says."""
-    names = {}
-    folder = tmp_path_factory.mktemp("source")
-    (folder / "bright.py").write_text(MODULE)
-    exec(compile(MODULE, str(folder / "bright.py"), "exec"), names)
-    import linecache
-
-    linecache.getlines(str(folder / "bright.py"))
-    functions = {name: names[name] for name in ("brighten", "check", "half")}
-    cg = ep.CompGraph(
-        functions,
-        {
-            "brighten": (("image", "by"), "bright"),
-            "check": (("bright", "most"), "checked"),
-            "half": ("checked", "halved"),
-        },
-    )
-    runner = ep.CompGraphRunner(cg, {"by": 1, "most": 100})
-    runner.run(image=picture(20))
-    return ep.promote(runner, tmp_path_factory.mktemp("bundles") / "bright").path
-
-
-def picture(value):
-    return np.full((6, 8), value, np.uint8)
-
-
-def request(value):
-    return Envelope("epypes.request", {"image": picture(value)}, id="77")
-
-
-def keep(bundle, event, **told):
-    """Have a failure of a bundle kept, as its service does; return its id."""
-    store = FailureStore(failures_folder(bundle))
-    record = FailureRecord(
-        event_id="77",
-        function="check",
-        exception="ValueError",
-        message="too bright: 200",
-        bundle=str(bundle),
-        digest=check_seal(bundle),
-        hyperparameters={"by": {"value": 1}, "most": {"value": 90}},
-    )
-    kept = store.keep(replace(record, **told), event)
-    assert store.flush()
-    return kept.id
+    return promoted(tmp_path_factory.mktemp("bundles"))
 
 
 def test_a_failure_opens_stopped_at_the_function_that_failed_and_goes_on_from_there(bright_bundle):
-    failure = keep(bright_bundle, request(94))
+    failure = keep(bright_bundle, request(RAISES))
     runner = ep.load_failure(failure, bright_bundle)
     assert runner.last.failure.function == "check"
     assert isinstance(runner.last.failure.exception, ValueError)
@@ -114,11 +46,9 @@ def test_a_failure_opens_stopped_at_the_function_that_failed_and_goes_on_from_th
 
 
 def test_the_picture_shows_the_failed_function_in_red_and_the_values_before_it(bright_bundle):
-    runner = ep.load_failure(keep(bright_bundle, request(94)), bright_bundle)
+    runner = ep.load_failure(keep(bright_bundle, request(RAISES)), bright_bundle)
     shown = runner.last._repr_mimebundle_()["text/html"]
     assert "too bright: 95" in shown
-    from epypes.display.views.view import view
-
     states = {function.name: function.state for function in view(runner).functions}
     assert states == {"brighten": "ran", "check": "failed", "half": "not run"}
 
@@ -126,7 +56,9 @@ def test_the_picture_shows_the_failed_function_in_red_and_the_values_before_it(b
 @pytest.mark.parametrize("kind", ["killed", "stuck"])
 def test_a_function_that_kills_or_hangs_is_not_called_in_the_notebook(bright_bundle, kind):
     # Called, it would end this process or hang.
-    failure = keep(bright_bundle, request(6 if kind == "killed" else 8), kind=kind, exception="SIGKILL", message="gone")
+    failure = keep(
+        bright_bundle, request(KILLS if kind == "killed" else HANGS), kind=kind, exception="SIGKILL", message="gone"
+    )
     runner = ep.load_failure(failure, bright_bundle)
     assert runner.last.failure.function == "check"
     assert isinstance(runner.last.failure.exception, RemoteFailure)
@@ -137,14 +69,14 @@ def test_a_function_that_kills_or_hangs_is_not_called_in_the_notebook(bright_bun
 
 
 def test_where_a_worker_was_killed_is_found_out_in_a_process_of_its_own(bright_bundle):
-    failure = keep(bright_bundle, request(6), kind="killed", function="", exception="SIGKILL", message="")
+    failure = keep(bright_bundle, request(KILLS), kind="killed", function="", exception="SIGKILL", message="")
     runner = ep.load_failure(failure, bright_bundle)
     assert runner.last.failure.function == "check"
     assert "checked" not in runner
 
 
 def test_a_worker_that_was_killed_by_somebody_else_leaves_a_runner_with_the_payload(bright_bundle):
-    failure = keep(bright_bundle, request(20), kind="killed", function="", exception="SIGKILL", message="")
+    failure = keep(bright_bundle, request(FINE), kind="killed", function="", exception="SIGKILL", message="")
     with pytest.warns(UserWarning, match="not known in which function, so none was run"):
         runner = ep.load_failure(failure, bright_bundle)
     assert runner.last.failure is None
@@ -153,8 +85,8 @@ def test_a_worker_that_was_killed_by_somebody_else_leaves_a_runner_with_the_payl
 
 
 def test_an_event_that_does_not_fail_here_is_said_to(bright_bundle):
-    failure = keep(bright_bundle, request(20))
-    with pytest.warns(UserWarning, match=r"nothing fails here; there it was 'check' \(ValueError: too bright: 200\)"):
+    failure = keep(bright_bundle, request(FINE))
+    with pytest.warns(UserWarning, match=r"nothing fails here; there it was 'check' \(ValueError: too bright: 95\)"):
         runner = ep.load_failure(failure, bright_bundle)
     assert runner["halved"].max() == 10
 
@@ -191,20 +123,9 @@ def copy(bright_bundle, tmp_path):
     return shutil.copytree(bright_bundle, tmp_path / "bright")
 
 
-def changed(bundle):
-    """Put another bundle in its place: most is 60, and 'by' is no hyperparameter any more."""
-    runner = ep.load(bundle)
-    runner.unfreeze("by")
-    runner["most"] = 60
-    runner.run(image=picture(20), by=1)
-    ep.promote(runner, bundle)
-
-
 def test_a_bundle_that_has_changed_since_is_said_to_have(copy):
-    failure = keep(copy, request(94))
+    failure = keep(copy, request(RAISES))
     (copy / "pipeline.toml").write_text((copy / "pipeline.toml").read_text() + "# more\n")
-    from epypes.bundle.seal import seal
-
     seal(copy)
     with pytest.warns(UserWarning, match="has changed since"):
         runner = ep.load_failure(failure, copy)
@@ -213,7 +134,7 @@ def test_a_bundle_that_has_changed_since_is_said_to_have(copy):
 
 
 def test_the_bundle_that_failed_is_taken_from_where_it_was_served(copy, bright_bundle, tmp_path):
-    failure = keep(copy, request(94))
+    failure = keep(copy, request(RAISES))
     moved = copy.rename(tmp_path / "moved")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -223,7 +144,7 @@ def test_the_bundle_that_failed_is_taken_from_where_it_was_served(copy, bright_b
 
 
 def test_failures_are_found_by_how_their_id_begins_or_ends_and_by_latest(bright_bundle):
-    first, second = (keep(bright_bundle, request(94)) for _ in range(2))
+    first, second = (keep(bright_bundle, request(RAISES)) for _ in range(2))
     failures = failures_of(bright_bundle)
     assert found_by(failures, first).id == first
     assert found_by(failures, second[-5:]).id == second
@@ -244,12 +165,12 @@ def test_what_is_no_bundle_and_a_bundle_without_failures_are_told_apart(bright_b
 
 
 ENDINGS = [
-    (94, "failed", "ValueError", "too bright: 95"),
-    (20, "fine", "", ""),
-    (6, "killed", "SIGKILL", "the process ended with it"),
-    (7, "killed", "SIGSEGV", "the process ended with it"),
-    (9, "killed", "status 5", "the process ended with it"),
-    (8, "stuck", "TimeoutError", "more than 0.5 s"),
+    (RAISES, "failed", "ValueError", "too bright: 95"),
+    (FINE, "fine", "", ""),
+    (KILLS, "killed", "SIGKILL", "the process ended with it"),
+    (CRASHES, "killed", "SIGSEGV", "the process ended with it"),
+    (EXITS, "killed", "status 5", "the process ended with it"),
+    (HANGS, "stuck", "TimeoutError", "more than 0.5 s"),
 ]
 
 
@@ -265,16 +186,70 @@ def test_an_event_that_is_run_again_fails_is_fine_kills_or_hangs_and_the_caller_
     if ending != "fine":
         assert found.function == "check"
     module = (bright_bundle / "pipeline.py").read_text().splitlines()
-    if value in (94, 7, 8):
+    if value in (RAISES, CRASHES, HANGS):
         assert module[found.line - 1].strip() == found.code
-        assert found.code.split("(")[0] == {94: "raise ValueError", 7: "ctypes.string_at", 8: "time.sleep"}[value]
+        assert (
+            found.code.split("(")[0]
+            == {RAISES: "raise ValueError", CRASHES: "ctypes.string_at", HANGS: "time.sleep"}[value]
+        )
 
 
 def test_a_bundle_whose_module_fails_is_no_reproduction(copy):
-    from epypes.bundle.seal import seal
-
     with (copy / "pipeline.py").open("a") as file:
         file.write("\nraise RuntimeError('no')\n")
     seal(copy)
     with pytest.raises(BundleError, match="fails: RuntimeError: no"):
         reproduce(FailureRecord(), request(1), copy)
+
+
+@pytest.fixture(scope="session")
+def byte_bundle(tmp_path_factory):
+    return promoted(tmp_path_factory.mktemp("bundles"), with_f_in=True)
+
+
+def test_the_bundles_own_f_in_makes_the_payload_of_a_message_of_2019(byte_bundle):
+    failure = keep(byte_bundle, picture(RAISES).tobytes())
+    assert ep.load_failure(failure, byte_bundle)["bright"].max() == 95
+    found = reproduce(FailureRecord(), picture(RAISES).tobytes(), byte_bundle)
+    assert (found.ending, found.function) == ("failed", "check")
+
+
+def test_an_f_in_that_hangs_is_not_called_in_the_notebook(byte_bundle):
+    found = reproduce(FailureRecord(), b"hangs", byte_bundle, timeout_s=0.5)
+    assert (found.ending, found.function) == ("stuck", "f_in")
+    failure = keep(byte_bundle, b"hangs", kind="stuck", function="f_in")
+    with pytest.warns(UserWarning, match="f_in was stuck by this event, so it is not called here"):
+        runner = ep.load_failure(failure, byte_bundle)
+    assert runner.last is None
+
+
+def test_hyperparameters_that_the_bundle_has_no_more_are_said_to_be_gone(bright_bundle):
+    entries = {"most": {"value": 50}, "gone": {"value": 1}, "odd": {"kind": "enum", "enum": "Way"}}
+    failure = keep(bright_bundle, request(RAISES), hyperparameters=entries)
+    with pytest.warns(UserWarning, match="'gone', 'odd' can't have the value that failed"):
+        runner = ep.load_failure(failure, bright_bundle)
+    assert dict(runner.hyperparameters) == {"by": 1, "most": 50}
+
+
+def test_a_failure_is_opened_from_a_running_service_by_its_url_or_connection(bright_bundle):
+    requests = queue.SimpleQueue()
+    with (
+        Service(bright_bundle) as service,
+        HttpServer(service, "127.0.0.1:0") as server,
+        ep.ZMQPublisher(service.service_state.sub, requests, bind=False) as publisher,
+    ):
+        assert publisher.wait_for_subscriber(WAIT_S)
+        for value in (RAISES, KILLS):
+            requests.put(request(value))
+        wait_until(lambda: len(service.failure_records()) == 2, WAIT_S)
+        killed, raised = service.failure_records()
+        assert killed.dead_letter
+        runner = ep.load_failure(raised.id, server.url)
+        assert isinstance(runner.last.failure.exception, ValueError)
+        connection = ep.connect(server.url)
+        runner = ep.load_failure("latest", connection)
+        assert runner.last.failure.function == "check"
+        assert isinstance(runner.last.failure.exception, RemoteFailure)
+        with pytest.raises(UnknownName, match="zzz"):
+            ep.load_failure("zzz", connection)
+        connection.close()
