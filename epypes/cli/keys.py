@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
 from epypes.cli.terminal import out
 from epypes.errors import KeysError
+
+_NAME: Final = re.compile(r"\w[\w-]*")
 
 
 def keys(
