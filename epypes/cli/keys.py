@@ -29,10 +29,9 @@ def keys(
     if listed:
         _show(folder, name)
         return
-    if not name or Path(name).name != name:
-        raise KeysError(
-            name, f"{name!r} is no name for keys. Say whose they are, and where by --to: epypes keys camera"
-        )
+    if not _NAME.fullmatch(name):
+        text = "Letters, digits, - and _ say whose they are, and --to says where: epypes keys camera --to keys"
+        raise KeysError(name, f"{name!r} is no name for keys. {text}")
     made = make_keys(folder / name)
     public, secret = folder / f"{name}.key", folder / f"{name}.key_secret"
     out.print(f"Made the keys of {name}: {made.public}", markup=False)
