@@ -40,6 +40,8 @@ class Dispatcher:
     ----------
     changed
         The lock, and whom to wake up when anything changes.
+    is_unwatched
+        Whether the supervisor wants to be woken up by the next event.
     answered_in_row
         How many events were answered since a worker last died.
     """
@@ -50,6 +52,7 @@ class Dispatcher:
         self._desk, self._setting = desk, setting
         self._link: Link | None = None
         self._holds: set[str] = set()
+        self.is_unwatched, self._waiting = False, 0
         self._why_refused = ""
         self._to_tell: deque[Callable[[], object]] = deque()
         self._publishing, self._publisher = threading.Lock(), 0
@@ -59,14 +62,14 @@ class Dispatcher:
     def put(self, item: Any, *, block: bool = False) -> None:
         """Accept an event; never blocks. Called on the I/O thread."""
         with self.changed:
-            had_none = not self.ledger.running()
             for entry in self.ledger.accept(item, perf_counter_ns()):
                 self._tell_at_once(entry, dropped(entry, self.ledger.policy, self.ledger.size, self._setting()))
             if self._why_refused:
                 self._refuse_waiting(self._why_refused)
             self._assign()
-            if had_none:
-                # Who watches over events that take too long has one to watch now.
+            if self.is_unwatched:
+                # Who watches over events that take too long has one to watch now, for as long as one may take.
+                self.is_unwatched = False
                 self.changed.notify_all()
         if self._to_tell:
             self.publish()
@@ -145,8 +148,7 @@ class Dispatcher:
             self._resolve(entry, result)
             self.answered_in_row += 1
             self._assign()
-            if not self.ledger.running():
-                self.changed.notify_all()
+            self._tell_waiting()
         self.publish()
 
     def _resolve(self, entry: Entry, result: Result) -> None:
@@ -241,8 +243,7 @@ class Dispatcher:
             if found:
                 # Room for others to be done ahead, and the end of a drain.
                 self._assign()
-                if self.ledger.is_empty:
-                    self.changed.notify_all()
+                self._tell_waiting()
             return found
 
     def _released(self) -> list[Callable[[], object]]:
@@ -251,7 +252,16 @@ class Dispatcher:
     def wait_for(self, is_so: Callable[[], bool], timeout_s: float | None) -> bool:
         """Wait until something is so; return whether it is."""
         with self.changed:
-            return self.changed.wait_for(is_so, timeout_s)
+            self._waiting += 1
+            try:
+                return self.changed.wait_for(is_so, timeout_s)
+            finally:
+                self._waiting -= 1
+
+    def _tell_waiting(self) -> None:
+        # Only if somebody waits: the supervisor, which waits too, would be woken up by every event.
+        if self._waiting and not self.ledger.running():
+            self.changed.notify_all()
 
 
 def _result(entry: Entry, header: Mapping[str, Any], frames: Sequence[memoryview], setting: Setting) -> Result:

@@ -107,7 +107,7 @@ class Supervisor:
         self._loading_until_s = 0.0
         self._is_ending = False
         self._thread: threading.Thread | None = None
-        self._watchdog_s = watchdog_s()
+        self._watchdog_s, self._notified_s = watchdog_s(), 0.0
 
     def start(self) -> None:
         """Begin, with a worker of the bundle."""
@@ -161,7 +161,11 @@ class Supervisor:
     def _wait_s(self) -> float | None:
         """Return how long there is nothing to do, if nothing changes; None for ever. With the lock held."""
         now_s = monotonic()
-        waits = [self._watchdog_s, self._dispatcher.due_in_s(self._timeout_ns)]
+        due_in_s = self._dispatcher.due_in_s(self._timeout_ns)
+        self._dispatcher.is_unwatched = due_in_s is None
+        waits = [due_in_s]
+        if self._watchdog_s is not None:
+            waits.append(self._notified_s + self._watchdog_s - now_s)
         if self._restart_s is not None:
             waits.append(self._restart_s - now_s)
         if self.worker is not None and self.worker.status == "loading":
@@ -171,12 +175,12 @@ class Supervisor:
 
     def _next(self) -> Callable[[], object] | None:
         """Return what is to be done now. With the lock held."""
-        if self._watchdog_s is not None:
-            # That it comes here shows that the service is alive: every lock was given back.
-            notify("WATCHDOG=1")
         now_s = monotonic()
         if self._is_ending:
             return _nothing
+        if self._watchdog_s is not None and self._notified_s + self._watchdog_s <= now_s:
+            self._notified_s = now_s
+            return _tell_alive
         if self._to_start:
             return self._start_for_deploy
         if self._restart_s is not None and self._restart_s <= now_s:
@@ -382,6 +386,11 @@ def where_stuck(link: Link, overdue: list[Entry]) -> dict[int, str]:
     names = link.process.functions_by_trace()
     known = [name for name in names if name in link.about.get("functions", ())] or list(names)
     return dict.fromkeys(found, ", ".join(dict.fromkeys(known)))
+
+
+def _tell_alive() -> None:
+    """Tell systemd: that the supervisor comes here shows that no lock is held for ever."""
+    notify("WATCHDOG=1")
 
 
 def _nothing() -> None:

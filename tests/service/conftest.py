@@ -8,6 +8,7 @@ import pytest
 
 import epypes as ep
 from epypes.service.http import HttpServer
+from tests.service.served import acting_bundle
 
 
 @pytest.fixture(autouse=True)
@@ -60,3 +61,9 @@ def changing(http):
     headers = {"Authorization": f"Bearer {http.token}"}
     with httpx.Client(base_url=http.url, trust_env=False, timeout=60, headers=headers) as client:
         yield client
+
+
+@pytest.fixture(scope="session")
+def acting(tmp_path_factory):
+    """A bundle whose function does what an event says, and returns a number times a hyperparameter."""
+    return acting_bundle(tmp_path_factory.mktemp("bundles") / "acting")
