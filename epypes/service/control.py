@@ -20,9 +20,7 @@ _LOOPBACK: Final = ("localhost", "127.0.0.1", "::1")
 # The service tells its counts each second: who hears nothing for so long hears nothing any more.
 SILENCE_S: Final = 5.0
 _DETAIL_CHARACTERS: Final = 2_000
-_HOW_TO_CHANGE: Final = (
-    "Give its token: ep.connect(url, token=...), or set EPYPES_TOKEN; it is in the token file that epypes serve names."
-)
+_HOW_TO_CHANGE: Final = "Give it here: ep.connect(url, token=...), or set EPYPES_TOKEN."
 
 
 class Control:

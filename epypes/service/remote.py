@@ -25,6 +25,7 @@ from epypes.errors import (
 from epypes.run import Run
 from epypes.run.program import Program
 from epypes.run.watchers import Watchers
+from epypes.service.control import parameters_of
 from epypes.service.following import Follower
 from epypes.service.parameters import Parameters
 from epypes.service.remoteruns import RemoteRuns
@@ -74,6 +75,7 @@ class RemoteRunner:
         self._known = known
         self._told: Mapping[str, Any] = MappingProxyType(self._runs.values(known))
         self._news: Parameters | None = None
+        self._process, self._is_anew = _process(info), False
         self._state: tuple[str, str] = (str(info["state"]), str(info.get("reason") or ""))
         self._gone = ""
         self._failed: Mapping[str, Any] | None = None
@@ -219,7 +221,9 @@ class RemoteRunner:
         """Let the panel be told of what others have changed meanwhile."""
         with self._lock:
             news, self._news = self._news, None
-        if news is not None and (news.revision > self._known.revision or news.entries != self._known.entries):
+            is_anew, self._is_anew = self._is_anew, False
+        # What was on its way while a value was set is older than what the service has answered to that.
+        if news is not None and (is_anew or news.revision > self._known.revision):
             self._learn(news)
 
     def watch(self, callback: Callable[[], object], /) -> Callable[[], None]:
@@ -315,6 +319,9 @@ class RemoteRunner:
         info, news = self.connection.info(), self.connection.parameters()
         with self._lock:
             self._news = news
+            # Another process counts revisions from 0 again.
+            process, self._process = self._process, _process(info)
+            self._is_anew = self._is_anew or process != self._process
         self._state, self._gone = (str(info["state"]), str(info.get("reason") or "")), ""
         self._watchers.tell()
 
@@ -330,7 +337,8 @@ class RemoteRunner:
         elif name == "state":
             self._state = str(said.get("state", "")), str(said.get("reason") or "")
         elif name == "parameters":
-            news = self.connection.parameters()
+            is_whole = "parameters" in said
+            news = parameters_of(self.connection.url, said) if is_whole else self.connection.parameters()
             with self._lock:
                 self._news = news
         else:
@@ -343,6 +351,10 @@ class RemoteRunner:
         if follower is not None:
             follower.stop()
         self._gone = ""
+
+
+def _process(info: Mapping[str, Any]) -> tuple[object, object]:
+    return info.get("pid"), info.get("started_ns")
 
 
 def _rgb(connection: Connection, info: Mapping[str, Any]) -> list[str]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.bundle.entries import plain, read
 from epypes.bundle.ports import in_order
-from epypes.errors import EpypesError, MessageError, NotComputed, RemoteFailure, UnknownName
+from epypes.errors import EpypesError, RemoteFailure
 from epypes.graph import colour_order
 from epypes.run import Failure, Run
 from epypes.run.hyperparameters import Hyperparameters
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 _MOST_VALUES: Final = 1_000
 _MOST_REVISIONS: Final = 64
+_MOST_REFUSALS: Final = 3
 # An exception's name may be anybody's text.
 _NAME_CHARACTERS: Final = 100
 
@@ -46,8 +48,8 @@ class RemoteRuns:
         self._connection, self._program, self._outputs = connection, program, tuple(outputs)
         self._values: dict[tuple[str, str], Any] = {}
         self._by_revision: dict[int, Mapping[str, Any]] = {}
-        # What no codec knows, or is too large: asked for once.
-        self._unsendable: set[str] = set()
+        # What no codec knows, or is too large, is not asked for all the time.
+        self._refused: Counter[str] = Counter()
         self._images: set[str] = set()
         self._rgb = [token for token in program.cg.tokens if colour_order(program.cg, token) == "rgb"]
         self._first = self.values(first)
@@ -88,11 +90,11 @@ class RemoteRuns:
         asked = self._needed(targets)
         try:
             envelopes = [self._connection.envelope(asked, parameters.revision)] if asked else []
-        except (NotComputed, MessageError, UnknownName) as error:
+        except EpypesError as error:
             failure = self._failure_told(str(error))
             if failure is not None:
                 return self._run({}, parameters, failure=failure)
-            envelopes = self._one_by_one(asked, parameters.revision, error)
+            envelopes = self._one_by_one(asked, parameters.revision)
         return self._run(self._parts(envelopes), parameters, envelopes[0] if envelopes else None)
 
     def failed(self, last: Run, record: Mapping[str, Any], parameters: Parameters) -> Run:
@@ -124,7 +126,7 @@ class RemoteRuns:
         for target in targets:
             if target not in self._images:
                 wanted.update(dict.fromkeys(self._ancestors(target)))
-        return [token for token in wanted if token not in self._unsendable and token not in self._first]
+        return [token for token in wanted if self._refused[token] < _MOST_REFUSALS and token not in self._first]
 
     def _ancestors(self, token: str) -> Iterable[str]:
         seen, waiting = {token}, [token]
@@ -137,18 +139,14 @@ class RemoteRuns:
                     waiting.append(name)
                     yield name
 
-    def _one_by_one(self, tokens: Sequence[str], revision: int, refusal: EpypesError) -> list[Envelope]:
-        """Fetch what can be, token by token; raise the refusal if nothing can be."""
-        found: list[Envelope] = []
-        for token in tokens:
+    def _one_by_one(self, tokens: Sequence[str], revision: int) -> list[Envelope]:
+        """Fetch what can be, token by token; raise what the first one is refused with, since that may be the rest's."""
+        found = [self._connection.envelope(tokens[:1], revision)]
+        for token in tokens[1:]:
             try:
                 found.append(self._connection.envelope([token], revision))
-            except MessageError:
-                self._unsendable.add(token)
-            except (NotComputed, UnknownName):
-                continue
-        if not found:
-            raise refusal
+            except EpypesError:
+                self._refused[token] += 1
         # An event may have come in between, and a run has the values of one.
         return [envelope for envelope in found if envelope.correlation_id == found[-1].correlation_id]
 

@@ -106,7 +106,7 @@ def _serve_http(
     from epypes.service.http import HttpServer
 
     server = HttpServer(service, address, token_file=token_file, insecure=insecure)
-    service.http = server.start()
+    service.http, service.token_file = server.start(), str(server.token_file)
     control.callback(server.stop)
 
 

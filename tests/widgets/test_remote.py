@@ -216,6 +216,7 @@ def test_what_others_set_under_the_hand_is_told_and_not_overwritten(
 
 
 def test_a_conflict_on_another_parameter_sends_the_value_again(panel: Panel, service: Standing) -> None:
+    is_following(panel)
     service.tell = lambda kind, **said: None  # type: ignore[method-assign]  # nobody hears of it before
     service.set_parameters({"gain": 4}, None)
     panel["threshold"] = 60
@@ -229,6 +230,7 @@ def test_a_conflict_on_another_parameter_sends_the_value_again(panel: Panel, ser
 
 
 def test_a_conflict_on_the_same_parameter_is_told_and_the_other_value_stays(panel: Panel, service: Standing) -> None:
+    is_following(panel)
     service.tell = lambda kind, **said: None  # type: ignore[method-assign]
     service.set_parameters({"threshold": 33}, None)
     panel.set(threshold=60, gain=4)
