@@ -118,7 +118,7 @@ def _stop(runner: CompGraphRunner, bundle: Bundle, record: FailureRecord, event:
             f"the worker was {record.kind}, and it is not known in which function, so none was run. "
             "rerun('token') goes on to a token"
         )
-    why = RemoteFailure(bundle.path, record.function, record.exception or record.kind, record.message)
+    why = RemoteFailure(bundle.path, record.function, record.kind, f"not called here. {record.message}")
     run = stop_at(runner, payload, record.function, why)
     if run.failure is not None and run.failure.exception is not why:
         return f"before {record.function!r}, which was {record.kind}, {run.failure.function!r} fails here"
