@@ -150,7 +150,7 @@ def test_an_event_that_was_not_kept_cannot_be_replayed(epypes, bundle):
     assert "was not kept: the service had none to give" in done.stderr
 
 
-@pytest.mark.parametrize("way", ["socket", "http"])
+@pytest.mark.parametrize("way", ["socket", pytest.param("http", marks=pytest.mark.slow)])
 def test_failures_are_told_as_they_happen_with_the_id_to_replay_them(epypes, bundle, way):
     requests = queue.SimpleQueue()
     with StateLock(bundle) as lock, Service(bundle) as service, HttpServer(service, "127.0.0.1:0") as server:

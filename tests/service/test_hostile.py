@@ -13,7 +13,8 @@ import zmq
 import epypes as ep
 from epypes.errors import MessageError
 from epypes.service import Service
-from epypes.wire import Envelope, Event, decode, encode, serialized
+from epypes.wire import Envelope, Event, Limits, decode, encode, serialized
+from tests.service.bundles import written_bundle
 from tests.transport.peers import wait_until
 from tests.wire.mutants import mutate_bytes, mutate_description, mutate_frames
 
@@ -115,3 +116,36 @@ def test_a_message_beyond_the_limits_is_refused_before_it_is_kept_and_the_next_i
         peer.send_multipart(encode(Envelope("epypes.request", {"image": photograph})))
         assert answers.get(timeout=WAIT_S).failure is None
         assert service.counts()["rejected"] == 2
+
+
+GROWS = """
+    import numpy as np
+
+
+    def grow(size):
+        return np.zeros(size, np.uint8)
+
+
+    func_dict = {"grow": grow}
+    func_io = {"grow": ("size", "grown")}
+"""
+
+
+@pytest.mark.slow
+def test_an_answer_beyond_the_limits_is_a_failure_and_the_next_event_is_answered(tmp_path):
+    sample = {"size": 3}, {"grown": np.zeros(3, np.uint8)}
+    bundle = written_bundle(tmp_path / "grows", GROWS, ["size"], ["grown"], sample=sample)
+    requests, answers = queue.SimpleQueue(), queue.SimpleQueue()
+    with (
+        Service(bundle) as service,
+        ep.ZMQSubscriber(service.service_state.pub, answers) as subscriber,
+        ep.ZMQPublisher(service.service_state.sub, requests, bind=False) as publisher,
+    ):
+        assert subscriber.wait_joined(WAIT_S)
+        assert publisher.wait_for_subscriber(WAIT_S)
+        requests.put(Envelope("epypes.request", {"size": Limits().total_bytes + 1}))
+        failure = answers.get(timeout=WAIT_S).failure
+        assert (failure.function, failure.exception) == ("f_out", "MessageError")
+        requests.put(Envelope("epypes.request", {"size": 5}))
+        assert len(answers.get(timeout=WAIT_S).parts["grown"]) == 5
+        assert service.state == "READY"
