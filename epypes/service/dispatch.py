@@ -17,8 +17,9 @@ from typing import Any
 
 from epypes.errors import EpypesError, ServiceError
 from epypes.service.ledger import Entry, Ledger
-from epypes.service.link import Link, Message
+from epypes.service.link import Link
 from epypes.service.outcome import Desk, Result, Setting, dead_letter, dropped, failed_without_worker, refused, reported
+from epypes.service.stuck import Where
 from epypes.wire import Envelope, decode, encode
 
 _log = logging.getLogger("epypes.service")
@@ -113,7 +114,7 @@ class Dispatcher:
             self._flow()
 
     def refuse(self, why: str) -> None:
-        """Answer every event with a failure that says why it is not worked on; with an empty text work on them again."""
+        """Answer every event with a failure that says why it is not worked on; with an empty text, no more."""
         with self.changed:
             self._why_refused = why
         if why:
@@ -186,22 +187,36 @@ class Dispatcher:
         starts = [entry.started_ns for entry in self.ledger.running()] if self._link is not None else []
         return max(min(starts) + timeout_ns - perf_counter_ns(), 0) / 1e9 if starts else None
 
-    def fail_stuck(self, functions: Mapping[int, str], timeout_s: float) -> list[Entry]:
-        """Report events, by number with the function that each is in, as stuck; return those that still were."""
-        with self.changed:
-            found = [entry for seq in functions if (entry := self.ledger.running_at(seq)) is not None]
-            for entry in found:
-                function = functions[entry.seq]
-                where = f"Function {function!r}" if function else "The worker"
-                error = ServiceError(
-                    self._setting().bundle, f"{where} did not return within {timeout_s:g} s; the worker is replaced."
-                )
-                self._resolve(entry, failed_without_worker(entry, error, self._setting(), "stuck", function=function))
-            if found:
-                # Nothing more for a worker that is about to be killed.
-                self._link = None
-                self.ledger.flowing = False
-        return found
+    def still_stuck(self, where: Where, overdue: Sequence[int], timeout_ns: int) -> list[int] | None:
+        """Return which of some events must be reported as stuck; None if the worker may go on. With the lock held.
+
+        An event may have waited in the worker for a change of parameters: its time begins when it is begun. If the
+        worker works on none of them it is held up by something else, and ended without blaming an event for it.
+        """
+        entries = [entry for seq in overdue if (entry := self.ledger.running_at(seq)) is not None]
+        now_ns, waiting = perf_counter_ns(), where.waiting(overdue)
+        for entry in entries:
+            if entry.seq in waiting:
+                entry.started_ns = now_ns
+            elif entry.seq in where.elapsed_ns:
+                entry.started_ns = now_ns - where.elapsed_ns[entry.seq]
+        late = [entry for entry in entries if now_ns - entry.started_ns >= timeout_ns]
+        if not late:
+            return None
+        is_blamed = not where.has_answered or bool(where.elapsed_ns)
+        return [entry.seq for entry in late if is_blamed or entry.attempts > self.ledger.retries + 1]
+
+    def fail_stuck(self, stuck: Sequence[int], functions: Mapping[int, str], timeout_s: float) -> None:
+        """Report events as stuck, by the function of each; the worker gets nothing more. With the lock held."""
+        setting = self._setting()
+        for entry in [entry for seq in stuck if (entry := self.ledger.running_at(seq)) is not None]:
+            function = functions[entry.seq]
+            where = f"Function {function!r}" if function else "The worker"
+            text = f"{where} did not return within {timeout_s:g} s; the worker is replaced."
+            error = ServiceError(setting.bundle, text)
+            self._resolve(entry, failed_without_worker(entry, error, setting, "stuck", function=function))
+        self._link = None
+        self.ledger.flowing = False
 
     def give_up(self, why: str, functions: Mapping[int, str] | None = None) -> int:
         """Answer everything that is not resolved with a failure that says why; return how many events that were."""

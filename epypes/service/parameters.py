@@ -55,7 +55,15 @@ def read_entries(settings: Path) -> dict[str, dict[str, Any]]:
 
 def _json_ready(entry: Mapping[str, Any]) -> dict[str, Any]:
     """Return an entry without what JSON has no number for: a range that is open at an end."""
-    return {key: part for key, part in entry.items() if not (isinstance(part, float) and not math.isfinite(part))}
+    return {key: part for key, part in entry.items() if not any(map(_has_no_number, _items(part)))}
+
+
+def _items(part: Any) -> Any:
+    return part if isinstance(part, list) else (part,)
+
+
+def _has_no_number(item: Any) -> bool:
+    return isinstance(item, float) and not math.isfinite(item)
 
 
 def changed(entries: Entries, values: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
@@ -104,14 +112,11 @@ def value_of(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 def _check_plain(token: str, given: Any) -> None:
     """Raise ValueError for what is neither a scalar of JSON nor a list of them, or has no number."""
-    for item in given if isinstance(given, list) else (given,):
-        if not isinstance(item, bool | int | float | str | None) or _is_beyond(item):
+    for item in _items(given):
+        is_beyond = isinstance(item, int) and abs(item) >= _MOST_WHOLE
+        if not isinstance(item, bool | int | float | str | None) or is_beyond or _has_no_number(item):
             text = "write a number, text, true, false, null or a list of these"
             raise ValueError(f"{token!r} can't be {_brief(given)}: {text}.")
-
-
-def _is_beyond(item: Any) -> bool:
-    return (isinstance(item, float) and not math.isfinite(item)) or (isinstance(item, int) and abs(item) >= _MOST_WHOLE)
 
 
 def _chosen(token: str, given: Any, entry: Mapping[str, Any]) -> dict[str, Any]:

@@ -77,7 +77,7 @@ def test_a_value_that_cannot_be_is_refused_with_the_reason(token, given, text):
 
 def test_entries_are_json_ready_whatever_the_file_says(tmp_path):
     file = tmp_path / "pipeline.toml"
-    file.write_text("[hyperparameters.k]\nvalue = 1.0\nlow = -inf\nhigh = 3\n")
+    file.write_text("[hyperparameters.k]\nvalue = 1.0\nlow = -inf\nhigh = 3\nsoft = [0, inf]\n")
     assert read_entries(file) == {"k": {"value": 1.0, "high": 3}}
     for text in ("hyperparameters = 3", "[", "[hyperparameters]\nk = 3"):
         file.write_text(text)

@@ -9,8 +9,15 @@ import psutil
 import pytest
 
 from epypes.bundle.seal import seal
-from epypes.errors import BundleError, DeployRefused, NotComputed, ParametersRefused, RevisionConflict, ServiceError
-from epypes.errors import UnknownName
+from epypes.errors import (
+    BundleError,
+    DeployRefused,
+    NotComputed,
+    ParametersRefused,
+    RevisionConflict,
+    ServiceError,
+    UnknownName,
+)
 from epypes.service import Service
 from epypes.service.packing import unpack
 from epypes.wire import decode
@@ -31,7 +38,9 @@ def kill_worker(service):
 # -- what kills the worker ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("how", ["kill", "segv", "exit"])
+@pytest.mark.parametrize(
+    "how", ["kill", pytest.param("segv", marks=pytest.mark.slow), pytest.param("exit", marks=pytest.mark.slow)]
+)
 def test_a_frame_that_kills_the_worker_is_put_aside_and_the_others_are_answered_in_order(acting, how):
     with serving(acting, mailbox_size=100) as (service, peer):
         for number in range(12):
@@ -56,13 +65,14 @@ def test_a_frame_that_kills_the_worker_is_put_aside_and_the_others_are_answered_
         assert service.info()["restarts"] == 2
 
 
+@pytest.mark.slow
 def test_a_worker_killed_from_outside_costs_no_event(acting):
     with serving(acting, mailbox_size=400) as (service, peer):
         for number in range(300):
             peer.send("sleep:0.003", number)
             if number % 100 == 50:
                 # What it works on has not met a death before: twice would be too often.
-                until(lambda: service.counts()["answered"] >= number - 40)
+                until(lambda least=number - 40: service.counts()["answered"] >= least)
                 kill_worker(service)
         answers = peer.take(300)
         assert [answer.correlation_id for answer in answers] == peer.sent
@@ -71,6 +81,7 @@ def test_a_worker_killed_from_outside_costs_no_event(acting):
         assert service.info()["restarts"] == 3
 
 
+@pytest.mark.slow
 def test_with_three_slots_only_the_culprit_is_put_aside(acting):
     with serving(acting, threads=3, mailbox_size=100, retries=0) as (service, peer):
         for number in range(30):
@@ -81,6 +92,7 @@ def test_with_three_slots_only_the_culprit_is_put_aside(acting):
         assert service.counts()["dead_letters"] == 1
 
 
+@pytest.mark.slow
 def test_five_deaths_in_a_row_are_a_fault_and_everybody_is_told(acting):
     with serving(acting, mailbox_size=100, retries=0) as (service, peer):
         for number in range(9):
@@ -127,6 +139,7 @@ def test_a_function_that_does_not_return_is_named_and_the_worker_is_replaced(act
         assert not psutil.pid_exists(first)
 
 
+@pytest.mark.slow
 def test_a_worker_that_was_stopped_is_replaced(acting):
     with serving(acting, job_timeout_s=0.3) as (service, peer):
         os.kill(service.info()["worker_pid"], signal.SIGSTOP)
@@ -135,6 +148,7 @@ def test_a_worker_that_was_stopped_is_replaced(acting):
         assert peer.ask(number=3).parts["out"] == 6
 
 
+@pytest.mark.slow
 def test_what_runs_beside_a_stuck_event_is_tried_again(acting, tmp_path):
     with serving(acting, threads=2, job_timeout_s=0.5) as (service, peer):
         peer.send(f"hold:{tmp_path}", 1)
@@ -148,6 +162,21 @@ def test_what_runs_beside_a_stuck_event_is_tried_again(acting, tmp_path):
         assert stuck.failure is not None
         assert good.parts["out"] == 4
         assert service.counts()["retried"] == 1
+
+
+@pytest.mark.slow
+def test_an_event_that_waits_in_the_worker_for_a_change_has_its_time_from_when_it_is_begun(acting, tmp_path):
+    with serving(acting, threads=2, job_timeout_s=1.0) as (service, peer):
+        peer.send("sleep:0.8", 1)
+        until(lambda: service.counts()["in_flight"] == 1)
+        changing = threading.Thread(target=service.set_parameters, args=({"k": 3},))
+        changing.start()
+        until(lambda: service._tuning._pending is not None)
+        # It is given to the worker now, which begins it when the first is done.
+        peer.send("sleep:0.7", 2)
+        assert [answer.parts["out"] for answer in peer.take(2)] == [2, 6]
+        changing.join()
+        assert service.info()["restarts"] == 0
 
 
 # -- order and load -------------------------------------------------------------------------------------------------
