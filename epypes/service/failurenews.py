@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 # How often it is looked whether the service still runs.
 _LOOK_S: Final = 0.5
-_JOIN_S: Final = 5.0
+_JOIN_S: Final = 10.0
 
 
 def failures_from_now_on(

@@ -21,7 +21,7 @@ from epypes.service.state import StateLock
 from epypes.transport import make_keys, read_keys, recording_info
 from tests.transport.peers import wait_until
 
-WAIT_S = 20.0
+WAIT_S = 60.0
 LOCAL = "tcp://127.0.0.1:*"
 
 
