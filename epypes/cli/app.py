@@ -10,10 +10,13 @@ from epypes.cli.deploy import deploy, rollback
 from epypes.cli.doctor import doctor
 from epypes.cli.experiment import experiment
 from epypes.cli.export import export
+from epypes.cli.failures import failures
+from epypes.cli.keys import keys
 from epypes.cli.lab import lab
 from epypes.cli.play import play
 from epypes.cli.promote import promote
 from epypes.cli.record import record
+from epypes.cli.replay import replay
 from epypes.cli.serve import serve
 from epypes.cli.verify import verify
 
@@ -25,6 +28,11 @@ app = typer.Typer(
     # A traceback's locals would print whole images.
     pretty_exceptions_enable=False,
 )
-for command in (promote, verify, serve, call, deploy, rollback, record, play, experiment, demo, lab, doctor):
+_COMMANDS = (
+    (promote, verify, serve, call)
+    + (deploy, rollback, failures, replay)
+    + (record, play, keys, experiment, demo, lab, doctor)
+)
+for command in _COMMANDS:
     app.command()(command)
 app.add_typer(export, name="export")

@@ -11,7 +11,7 @@ from tests.service.served import acting_bundle
 
 @pytest.fixture(autouse=True)
 def own_runtime_folder(tmp_path_factory, monkeypatch):
-    """State files of these tests stand apart from those of the user's services."""
+    """State files and failures of these tests stand apart from those of the user's services."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("run")))
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
 
