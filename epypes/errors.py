@@ -29,7 +29,11 @@ Everything an error's text mentions is an attribute of it::
     |   +-- ReplayDiffers       a bundle computes something else; .report
     +-- ExperimentError         the paper's experiment can't begin or go on; .name
     +-- ServiceError            a service can't start or can't be called; .path
-        +-- RemoteFailure       a function failed in the service; .function, .message
+    |   +-- RemoteFailure       a function failed in the service; .function, .message
+    |   +-- RevisionConflict    parameters were changed by somebody else meanwhile; .current
+    |   +-- ParametersRefused   a running service does not take new values; .problems
+    |   +-- DeployRefused       a running service does not take a bundle; .reasons
+    +-- FailureNotKept          a failure of a service, or its event, can't be had; .id, .path
 
 The user's own exceptions are never wrapped: they keep their type and traceback and get a note.
 """
@@ -44,6 +48,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from epypes.bundle.compare import ReplayReport
     from epypes.images import Image
+    from epypes.service.parameters import Parameters
 
 
 class EpypesError(Exception):
@@ -333,3 +338,36 @@ class RemoteFailure(ServiceError):
     def __init__(self, path: object, function: str, exception: str, message: str) -> None:
         self.function, self.exception, self.message = function, exception, message
         super().__init__(path, f"Function {function!r} failed in the service: {exception}: {message}")
+
+
+class RevisionConflict(ServiceError):
+    """Parameters of a service that somebody else has changed meanwhile; ``current`` is what they are now."""
+
+    def __init__(self, path: object, current: Parameters) -> None:
+        self.current = current
+        text = f"The parameters have been changed meanwhile: they have revision {current.revision} now."
+        super().__init__(path, f"{text} Look at them, and change them again.")
+
+
+class ParametersRefused(ServiceError):
+    """Values that a running service does not take; none was changed. ``problems`` has a reason by token."""
+
+    def __init__(self, path: object, problems: Mapping[str, str]) -> None:
+        self.problems = dict(problems)
+        super().__init__(path, "Nothing was changed. " + " ".join(self.problems.values()))
+
+
+class DeployRefused(ServiceError):
+    """A bundle that does not take the place of the one that is served, which goes on; ``reasons`` lists all of them."""
+
+    def __init__(self, path: object, reasons: Sequence[str]) -> None:
+        self.reasons = tuple(reasons)
+        super().__init__(path, f"{path} is not deployed: {' '.join(self.reasons)}")
+
+
+class FailureNotKept(EpypesError):
+    """A failure of a service, or the event that failed, can't be had any more, or was never kept."""
+
+    def __init__(self, id: str, path: object, text: str) -> None:  # noqa: A002 - that is what it is called everywhere
+        self.id, self.path = id, str(path)
+        super().__init__(text)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from epypes.cli.terminal import out
+from epypes.cli.terminal import err, out
 
 if TYPE_CHECKING:
     from epypes.service.state import ServiceState
@@ -20,7 +20,24 @@ def serve(
     bundle: Annotated[Path, typer.Argument(help="The folder of the bundle.")],
     sub: Annotated[str, typer.Option(help="Where events come from; connect:ADDRESS connects.")] = _ANY_PORT,
     pub: Annotated[str, typer.Option(help="Where answers go; connect:ADDRESS connects.")] = _ANY_PORT,
+    failures: Annotated[str, typer.Option(help="Where failures go; connect:ADDRESS connects.")] = _ANY_PORT,
+    http: Annotated[str, typer.Option(help="Where it is controlled, as 127.0.0.1:8642; nowhere without.")] = "",
+    threads: Annotated[int, typer.Option(help="How many events are worked on at once, in order.", min=1)] = 1,
+    job_timeout: Annotated[
+        float, typer.Option(help="How long an event may take, in seconds; then the worker is replaced.", min=0.01)
+    ] = 30.0,
+    drain_timeout: Annotated[
+        float, typer.Option(help="How long SIGTERM waits for accepted events, in seconds.", min=0.0)
+    ] = 5.0,
+    retries: Annotated[int, typer.Option(help="How often an event that kills the worker is tried again.", min=0)] = 1,
+    mailbox: Annotated[str, typer.Option(help="What is dropped when too many wait: drop_oldest, latest, fault.")] = (
+        "drop_oldest"
+    ),
+    mailbox_size: Annotated[int, typer.Option(help="How many events wait; 1 for latest.", min=1)] = 8,
     insecure: Annotated[bool, typer.Option(help="Bind addresses that other machines can reach.")] = False,
+    keys: Annotated[Path | None, typer.Option(help="Its own .key_secret file.")] = None,
+    allow: Annotated[Path | None, typer.Option(help="With keys: the .key file, or folder, of who may connect.")] = None,
+    token_file: Annotated[Path | None, typer.Option(help="The token for HTTP; one is made without.")] = None,
 ) -> None:
     """Serve a bundle between a SUB and a PUB socket, until SIGTERM or Ctrl+C."""
     from epypes.service import serve as serve_bundle
@@ -28,7 +45,27 @@ def serve(
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
 
     def on_ready(state: ServiceState) -> None:
-        out.print(f"READY {bundle}: events at {state.sub}, answers at {state.pub}, process {state.pid}.")
+        more = f", control at {state.http}" if state.http else ""
+        where = f"events at {state.sub}, answers at {state.pub}, failures at {state.failures}{more}"
+        out.print(f"READY {bundle}: {where}, process {state.pid}.")
 
-    counts = serve_bundle(bundle, sub, pub, insecure=insecure, on_ready=on_ready)
+    counts = serve_bundle(
+        bundle,
+        sub,
+        pub,
+        failures=failures,
+        http=http,
+        token_file=token_file,
+        threads=threads,
+        job_timeout_s=job_timeout,
+        drain_timeout_s=drain_timeout,
+        retries=retries,
+        mailbox_policy=mailbox,
+        mailbox_size=1 if mailbox == "latest" else mailbox_size,
+        insecure=insecure,
+        keys=keys,
+        allow=allow,
+        on_ready=on_ready,
+        on_fault=lambda reason: err.print(f"FAULTED {bundle}: {reason}"),
+    )
     out.print("STOPPED " + ", ".join(f"{name} {count}" for name, count in counts.items()))

@@ -1,4 +1,4 @@
-"""A bundle as a running process, and how to call it."""
+"""A bundle as running processes, and how to call it."""
 
 from __future__ import annotations
 
@@ -7,11 +7,20 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from epypes.service.client import Answer, Client, call
-    from epypes.service.server import Service, serve
+    from epypes.service.parameters import Parameters
+    from epypes.service.server import Service
+    from epypes.service.serving import serve
 
-__all__ = ["Answer", "Client", "Service", "call", "serve"]
+__all__ = ["Answer", "Client", "Parameters", "Service", "call", "serve"]
 
-_HOME = {"Answer": "client", "Client": "client", "Service": "server", "call": "client", "serve": "server"}
+_HOME = {
+    "Answer": "client",
+    "Client": "client",
+    "Parameters": "parameters",
+    "Service": "server",
+    "call": "client",
+    "serve": "serving",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -1,138 +1,205 @@
-"""How does a bundle run as a service between a SUB and a PUB socket?
-
-One process so far: the I/O thread owns the sockets, the event loop's thread computes.
-"""
+"""What is a service? A bundle between sockets, that stays up whatever its functions do."""
 
 from __future__ import annotations
 
-import contextlib
-import logging
 import os
-import queue
-import signal
+import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from types import FrameType
-from typing import Any, Self
+from time import monotonic, time_ns
+from typing import TYPE_CHECKING, Any, Final, Self
 
-from epypes.bundle.load import pipeline_of, read_bundle
-from epypes.bundle.replay import replay
-from epypes.errors import MessageError, ReplayDiffers, StillRunning
-from epypes.pipeline import Mailbox
-from epypes.run import Failure
-from epypes.service.state import ServiceState, StateLock
-from epypes.transport import ZMQPublisher, ZMQSubscriber
-from epypes.wire.failures import failure_event
+from epypes.service.asks import Asks
+from epypes.service.deploying import Deployer
+from epypes.service.dispatch import Dispatcher
+from epypes.service.failurerecord import FailureRecord
+from epypes.service.failurestore import FailureStore, failures_folder
+from epypes.service.latency import Latency
+from epypes.service.ledger import Ledger, Policy
+from epypes.service.notify import notify
+from epypes.service.outcome import Desk, Listener, Setting
+from epypes.service.parameters import Parameters
+from epypes.service.served import read_served
+from epypes.service.sockets import Sockets
+from epypes.service.state import ServiceState
+from epypes.service.states import Facts, State, state_of
+from epypes.service.supervisor import Supervisor, where_stuck
+from epypes.service.tuning import Tuning
 
-# How many events wait while one is computed; the oldest is dropped, and counted, when another comes.
-MAILBOX_SIZE = 8
-# Answers kept for a subscriber that does not read; images are large, so this bounds the memory that one can cost.
-_KEPT_ANSWERS = 256
-DRAIN_TIMEOUT_S = 5.0
-_DRAIN_SHARE = 0.6
-_CONNECT = "connect:"
+if TYPE_CHECKING:
+    from epypes.transport.keys import Keys, PublicKey
 
-_log = logging.getLogger("epypes.service")
+# How many events wait while one is computed.
+MAILBOX_SIZE: Final = 8
+DRAIN_TIMEOUT_S: Final = 5.0
+JOB_TIMEOUT_S: Final = 30.0
+# What of a drain's time is left for reporting what could not be worked off, and for closing.
+_DRAIN_SHARE: Final = 0.7
+_CHANGE_S: Final = 10.0
+ANY_PORT: Final = "tcp://127.0.0.1:*"
 
 
 class Service:
-    """A bundle's FullPipeline between two sockets.
+    """A bundle's FullPipeline between sockets: the front, which executes none of the bundle's code.
 
     Parameters
     ----------
     path
         The bundle.
-    sub, pub
-        Where events come from and where answers go: an address is bound, ``connect:ADDRESS`` is connected to.
-        ``tcp://127.0.0.1:*`` takes any free port.
-    insecure
-        Whether an address that other machines can reach may be bound.
+    sub, pub, failures
+        Where events come from, where answers go, and where failures are published with the topic ``failure``: an
+        address is bound, ``connect:ADDRESS`` is connected to. ``tcp://127.0.0.1:*`` takes any free port.
+    threads
+        How many events are worked on at once; answers keep the order of the events.
+    job_timeout_s
+        How long an event may take, in seconds. One that takes longer has failed, and the worker is replaced.
+    retries
+        How often an event that killed the worker while it was alone is tried again.
+    drain_timeout_s
+        How long `stop` works off what was accepted, in seconds.
+    mailbox_policy, mailbox_size
+        What happens when more events wait: ``"drop_oldest"``, ``"latest"`` (of size 1) or ``"fault"``, which refuses
+        the new one. Each that is dropped is counted and answered.
+    insecure, keys, allow
+        As for ZMQSubscriber and ZMQPublisher.
+
+    Attributes
+    ----------
+    http, token_file
+        Where it answers over HTTP, and where the token for that is kept; set by who serves it there.
 
     Raises
     ------
     BundleError
         The folder is not the bundle that was promoted.
-    ReplayDiffers
-        It does not compute what was recorded.
     AddressError
-        An address can't be bound, or is not on loopback.
+        An address is not on loopback.
+    ServiceError
+        The mailbox can't be.
     """
 
-    def __init__(self, path: str | Path, sub: str, pub: str, *, insecure: bool = False) -> None:
-        self.bundle = read_bundle(path)
-        report = replay(self.bundle)
-        if not report.identical:
-            raise ReplayDiffers(path, report)
-        self.mailbox = Mailbox("drop_oldest", MAILBOX_SIZE, on_drop=self._refuse)
-        answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self.pipeline = pipeline_of(self.bundle, self.mailbox, answers)
-        self.pipeline.on_error = self._report
-        self._answers = answers
-        self._sub, self._pub = sub, pub
-        self.subscriber = ZMQSubscriber(*_endpoint(sub, self.mailbox), insecure=insecure)
-        self.publisher = ZMQPublisher(*_endpoint(pub, answers), insecure=insecure, high_water_mark=_KEPT_ANSWERS)
-        self._unanswered = 0
+    def __init__(
+        self,
+        path: str | Path,
+        sub: str = ANY_PORT,
+        pub: str = ANY_PORT,
+        *,
+        failures: str = ANY_PORT,
+        threads: int = 1,
+        job_timeout_s: float = JOB_TIMEOUT_S,
+        retries: int = 1,
+        drain_timeout_s: float = DRAIN_TIMEOUT_S,
+        mailbox_policy: Policy = "drop_oldest",
+        mailbox_size: int = MAILBOX_SIZE,
+        insecure: bool = False,
+        keys: Keys | str | Path | None = None,
+        allow: PublicKey | Collection[PublicKey] | None = None,
+    ) -> None:
+        served = read_served(path)
+        self.path, self.threads, self.job_timeout_s = served.path, threads, job_timeout_s
+        self.drain_timeout_s = drain_timeout_s
+        self.http, self.token_file = "", ""
+        self.failure_store = FailureStore(failures_folder(served.path))
+        ledger = Ledger(mailbox_policy, mailbox_size, threads, retries)
+        self._desk = Desk(
+            lambda item: self._sockets.answer(item), lambda item: self._sockets.report(item), lambda: self.failure_store
+        )
+        self._dispatcher = Dispatcher(ledger, self._desk, self._setting)
+        self._tuning = Tuning(served, self._dispatcher, self._desk, min(job_timeout_s, _CHANGE_S))
+        self._supervisor = Supervisor(
+            self._dispatcher,
+            served,
+            threads,
+            job_timeout_s,
+            self._tuning.for_new_worker,
+            self._look,
+            self._tuning.heard,
+        )
+        self._asks = Asks(served.path, lambda: self._dispatcher.link)
+        self._sockets = Sockets(sub, pub, failures, self._dispatcher, insecure=insecure, keys=keys, allow=allow)
+        self._is_running = self._is_draining = self._is_paused = False
+        self._told: tuple[str, str] = ("STOPPED", "")
+        self._started_ns = 0
+        self._deployer = Deployer(self._dispatcher, self._supervisor, self._tuning, job_timeout_s)
+        self._turn = threading.Lock()
+
+    # -- beginning and end ----------------------------------------------------------------------------------------
 
     def start(self) -> ServiceState:
-        """Bind the sockets and begin to answer; return what is to be known of the service."""
-        try:
-            self.publisher.start()
-            self.subscriber.start()
-        except Exception:
-            self.stop()
-            raise
-        self.pipeline.listen()
-        sub, pub = _shown(self._sub, self.subscriber), _shown(self._pub, self.publisher)
-        return ServiceState(os.getpid(), sub, pub, self.bundle.digest)
+        """Bind the sockets, start a worker, wait until it has proved the bundle; return what is to be known of it.
 
-    def stop(self, timeout_s: float = DRAIN_TIMEOUT_S) -> None:
-        """Take no more events, work off those that wait, send the answers; each bounded by ``timeout_s``.
-
-        What could not be worked off in time is answered with a failure.
+        If the bundle can't be served the state is FAULTED, and `reason` says why.
 
         Raises
         ------
-        StillRunning
-            A function did not return; it is named.
+        AddressError
+            An address can't be bound.
         """
-        self.subscriber.stop(timeout_s)
-        try:
-            self._drain(timeout_s)
-        finally:
-            self.publisher.stop(timeout_s)
+        with self._turn:
+            if not self._is_running:
+                self._sockets.start()
+                self._is_running, self._is_draining = True, False
+                self._started_ns = time_ns()
+                self._dispatcher.refuse("")
+                self._supervisor.start()
+                self._changed()
+        self._dispatcher.wait_for(lambda: self.state != "LOADING", None)
+        return self.service_state
 
-    def _drain(self, timeout_s: float) -> None:
-        """Work off what waits for part of the time; then refuse the rest, so that the event under way can end."""
-        if not self.pipeline.loop.drain(timeout_s * _DRAIN_SHARE):
-            with contextlib.suppress(queue.Empty):
-                while True:
-                    self._refuse(self.mailbox.get_nowait(), "the service stops")
-        try:
-            self.pipeline.stop(timeout_s * (1 - _DRAIN_SHARE))
-        except StillRunning as error:
-            self._refuse(self.pipeline.working_on, f"the service stops while it is in {', '.join(error.functions)}")
-            raise StillRunning(error.name, error.functions, timeout_s) from None
+    @property
+    def service_state(self) -> ServiceState:
+        """What is to be known of it, for its state file."""
+        where = self._sockets.addresses
+        digest = self._supervisor.served.digest
+        return ServiceState(
+            os.getpid(), where["sub"], where["pub"], digest, where["failures"], self.http, self.token_file
+        )
 
-    def counts(self) -> dict[str, int]:
-        """Return how many events were received, answered, failed, dropped and rejected."""
-        return {
-            "received": self.subscriber.received,
-            "answered": self.publisher.sent,
-            "failed": self.pipeline.failed,
-            "dropped": self._unanswered,
-            "rejected": sum(self.subscriber.rejected.values()),
-        }
+    def stop(self, timeout_s: float | None = None) -> None:
+        """Take no more events, answer or report those that were accepted, end the worker; bounded by ``timeout_s``.
 
-    def _refuse(self, event: Any, why: str = "it has more events than it can answer") -> None:
-        """Answer an event that is not worked on."""
-        self._unanswered += 1
-        refusal = MessageError("dropped", f"The service dropped this event: {why}. Send it again later.")
-        self._report(Failure("mailbox", (), {}, refusal, getattr(event, "id", "")))
+        Without it, by drain_timeout_s. What could not be worked off in time is answered with a failure.
+        """
+        timeout_s = self.drain_timeout_s if timeout_s is None else timeout_s
+        with self._turn:
+            if not self._is_running:
+                return
+            deadline_s = monotonic() + timeout_s
+            notify("STOPPING=1")
+            self._drain(timeout_s * _DRAIN_SHARE)
+            self._give_up()
+            self._supervisor.stop()
+            self.failure_store.flush(max(deadline_s - monotonic(), 0.1))
+            self._sockets.stop(max(deadline_s - monotonic(), 0.5))
+            self._is_running = self._is_draining = False
+            self._changed()
 
-    def _report(self, failure: Failure) -> None:
-        _log.warning("event %s failed in %s", failure.event_id or "without id", failure)
-        self._answers.put(failure_event(failure, self.pipeline.name, self.bundle.digest))
+    def abandon(self) -> int:
+        """Kill the worker, and report all that was accepted as not finished; return how many events that were."""
+        self._supervisor.abandon()
+        count = self._dispatcher.give_up("The service was stopped at once")
+        self._dispatcher.publish()
+        return count
+
+    def _drain(self, timeout_s: float) -> bool:
+        """Take no more events, and work off what was accepted; return whether that was done in time."""
+        self._is_draining = True
+        # First of all, so that nobody sends more.
+        self._changed()
+        self._sockets.close_subscriber(timeout_s)
+        self._dispatcher.let_go("pause")
+        return self._dispatcher.wait_for(lambda: self._dispatcher.ledger.is_empty, timeout_s)
+
+    def _give_up(self) -> None:
+        """Report what could not be worked off, with the functions that it is in."""
+        link, running = self._dispatcher.link, list(self._dispatcher.ledger.running())
+        functions = where_stuck(link, running) if link is not None and running else {}
+        if running and link is not None:
+            link.is_dismissed = True
+            link.process.kill()
+        self._dispatcher.give_up("the service stops", functions)
+        self._dispatcher.publish()
 
     def __enter__(self) -> Self:
         self.start()
@@ -141,50 +208,205 @@ class Service:
     def __exit__(self, *exception: object) -> None:
         self.stop()
 
+    # -- how it is --------------------------------------------------------------------------------------------------
 
-def _endpoint(address: str, queue_: Any) -> tuple[str, Any, str, bool]:
-    """Return address, queue, topic and bind for a socket."""
-    return address.removeprefix(_CONNECT), queue_, "", not address.startswith(_CONNECT)
+    @property
+    def state(self) -> State:
+        """LOADING, READY, PAUSED, DEGRADED, DRAINING, FAULTED or STOPPED."""
+        return self._state()[0]
 
+    @property
+    def reason(self) -> str:
+        """Why it is in this state; empty if there is nothing to say."""
+        return self._state()[1]
 
-def _shown(given: str, socket: ZMQSubscriber | ZMQPublisher) -> str:
-    return given if given.startswith(_CONNECT) else socket.address
+    def _state(self) -> tuple[State, str]:
+        health = self._supervisor.health
+        has_worker = self._dispatcher.link is not None
+        running, draining = self._is_running, self._is_draining
+        facts = Facts(running, draining, self._is_paused, has_worker, health.was_ready, health.fault, health.trouble)
+        return state_of(facts)
 
+    def alive(self) -> str:
+        """Return why computing is stuck; empty if it is not, however busy it is."""
+        stuck = self._supervisor.health.stuck
+        if stuck:
+            return f"{stuck}."
+        late = self._dispatcher.overdue(int(self.job_timeout_s * 1e9))
+        return f"An event has been worked on for more than {self.job_timeout_s:g} s." if late else ""
 
-def serve(
-    path: str | Path,
-    sub: str,
-    pub: str,
-    *,
-    insecure: bool = False,
-    on_ready: Callable[[ServiceState], None] = lambda state: None,
-) -> dict[str, int]:
-    """Serve a bundle until SIGTERM or SIGINT; return the counts of events.
+    def ready(self) -> str:
+        """Return why events would not be answered now; empty if they are."""
+        state, reason = self._state()
+        return "" if state == "READY" else f"{state}. {reason}".strip()
 
-    Raises
-    ------
-    ServiceError
-        The bundle is being served already.
-    BundleError, ReplayDiffers, AddressError
-        As for Service.
-    StillRunning
-        A function did not return in time after the signal.
-    """
-    stopped = threading.Event()
+    def counts(self) -> dict[str, int]:
+        """Return how many events are where.
 
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        stopped.set()
+        ``received`` is the sum of answered, failed, dropped, dead_letters, waiting and in_flight; ``retried`` is how
+        often events were tried again, ``rejected`` how many messages were no events.
+        """
+        with self._dispatcher.changed:
+            counts = self._dispatcher.ledger.counts()
+        return {**counts, "rejected": self._sockets.rejected}
 
-    before = {number: signal.signal(number, on_signal) for number in (signal.SIGTERM, signal.SIGINT)}
-    try:
-        with StateLock(path) as lock:
-            service = Service(path, sub, pub, insecure=insecure)
-            state = service.start()
-            lock.publish(state)
-            on_ready(state)
-            stopped.wait()
-            service.stop()
-            return service.counts()
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    def latency(self) -> Latency:
+        """Return how long events took, from their acceptance to their answer."""
+        return self._desk.latency.read()
+
+    def info(self) -> dict[str, Any]:
+        """Return what there is to know of it, JSON-ready."""
+        import epypes
+
+        served, state = self._supervisor.served, self._state()
+        link = self._dispatcher.link
+        return {
+            "name": served.settings.name,
+            "bundle": str(served.path),
+            "digest": served.digest,
+            "state": state[0],
+            "reason": state[1],
+            "inputs": list(served.settings.inputs),
+            "outputs": list(served.settings.outputs),
+            "rgb": list(served.settings.rgb),
+            "func_io": {} if link is None else dict(link.about.get("func_io", {})),
+            "threads": self.threads,
+            "revision": self._tuning.current.revision,
+            "addresses": {**self._sockets.addresses, "http": self.http},
+            "pid": os.getpid(),
+            "worker_pid": None if link is None else link.pid,
+            "started_ns": self._started_ns,
+            "restarts": self._supervisor.health.restarts,
+            "versions": {"epypes": epypes.__version__, "python": sys.version.split()[0]},
+        }
+
+    def listen(self, callback: Listener) -> Callable[[], None]:
+        """Have it told to a callback what happens; return what ends that.
+
+        Parameters
+        ----------
+        callback
+            Called on threads of the service with a kind (``"state"``, ``"run"``, ``"failure"``, ``"parameters"``) and
+            what there is to know. It must return at once, and change nothing of the service.
+        """
+        return self._desk.listen(callback)
+
+    def _look(self) -> None:
+        """Tell listeners if the state is another one. With the lock held."""
+        found = self._state()
+        if found == self._told:
+            return
+        self._told = found
+        data = {"state": found[0], "reason": found[1]}
+        self._dispatcher.tell(lambda: self._desk.tell("state", data))
+        self._dispatcher.changed.notify_all()
+        if found[0] == "READY":
+            notify("READY=1")
+
+    def _changed(self) -> None:
+        with self._dispatcher.changed:
+            self._look()
+        self._dispatcher.publish()
+
+    def _setting(self) -> Setting:
+        served, current = self._supervisor.served, self._tuning.current
+        return Setting(served.settings.name, str(served.path), served.digest, current.revision, current.entries)
+
+    # -- what it is told to do --------------------------------------------------------------------------------------
+
+    def pause(self) -> None:
+        """Have events wait in the mailbox."""
+        self._is_paused = True
+        self._dispatcher.hold("pause")
+        self._changed()
+
+    def resume(self) -> None:
+        """Work on events again, also after `pause` and `drain`."""
+        with self._turn:
+            self._is_paused = False
+            self._dispatcher.let_go("pause")
+            if self._is_running and self._is_draining:
+                self._sockets.open_subscriber()
+                self._is_draining = False
+        self._changed()
+
+    def drain(self, timeout_s: float | None = None) -> bool:
+        """Take no more events, until `resume`, and work off those that were accepted; return whether that was done."""
+        with self._turn:
+            return not self._is_running or self._drain(self.drain_timeout_s if timeout_s is None else timeout_s)
+
+    def deploy(self, path: str | Path) -> dict[str, Any]:
+        """Serve another bundle from now on; return what there is to know of the service then.
+
+        A second worker proves it beside the first one, and gets the events when none is worked on. It has its own
+        parameters, with the next revision.
+
+        Raises
+        ------
+        DeployRefused
+            It does not compute what was recorded, or has other ports; the one that is served goes on.
+        ServiceError
+            Another one is being deployed.
+        """
+        self._deployer.deploy(path)
+        return self.info()
+
+    def rollback(self) -> dict[str, Any]:
+        """Serve the bundle again that was served before; return what there is to know of the service then.
+
+        Raises
+        ------
+        DeployRefused
+            There was none, or it is not any more what it was.
+        """
+        self._deployer.rollback()
+        return self.info()
+
+    # -- its parameters ---------------------------------------------------------------------------------------------
+
+    def parameters(self) -> Parameters:
+        """Return the hyperparameters, their ranges and their revision."""
+        return self._tuning.current
+
+    def set_parameters(self, values: Mapping[str, Any], revision: int | None = None) -> Parameters:
+        """Change hyperparameters between two events, all of them or none; return what they are then.
+
+        Parameters
+        ----------
+        values
+            By token, as JSON has them.
+        revision
+            The one that is known to who changes them; None to change them whatever it is.
+
+        Raises
+        ------
+        RevisionConflict
+            They have another revision by now.
+        ParametersRefused
+            There is no such token, or a value is not within its range.
+        ServiceError
+            There is no worker, or it is busy for too long.
+        """
+        return self._tuning.set(values, revision)
+
+    # -- what is seen of it -----------------------------------------------------------------------------------------
+
+    def view(self) -> bytes:
+        """Return the graph with the values of the last completed run, as JSON of a GraphView."""
+        return self._asks.graph("view")
+
+    def graph_svg(self) -> bytes:
+        """Return the graph with the values of the last completed run, as a picture."""
+        return self._asks.graph("svg")
+
+    def preview(self, token: str, max_side_px: int = 512) -> tuple[str, bytes]:
+        """Return the media type and the bytes of a picture or text of a token in the last completed run."""
+        return self._asks.preview(token, max_side_px)
+
+    def run(self, tokens: Sequence[str] = (), revision: int | None = None) -> bytes:
+        """Return tokens of the last completed run, or of one with this revision, as one packed Envelope."""
+        return self._asks.run(tokens, revision)
+
+    def failure_records(self, limit: int | None = None) -> list[FailureRecord]:
+        """Return what is known of failures, the newest first."""
+        return self.failure_store.records(limit)

@@ -36,12 +36,21 @@ class ServiceState:
         Where it takes events and where it answers; ``connect:`` in front where it connects.
     digest
         The bundle's.
+    failures
+        Where failures are published.
+    http
+        Where it answers over HTTP; empty if it does not.
+    token_file
+        Where the token for that is kept.
     """
 
     pid: int
     sub: str
     pub: str
     digest: str
+    failures: str = ""
+    http: str = ""
+    token_file: str = ""
 
 
 def state_file(bundle: str | Path) -> Path:
@@ -109,8 +118,19 @@ class StateLock:
 
 def read_state(bundle: str | Path) -> ServiceState | None:
     """Return the state of the service that runs now, or None if none is ready."""
+    return _read(state_file(bundle))
+
+
+def running_at(http: str) -> ServiceState | None:
+    """Return the state of the service of this user's that answers over HTTP there, or None if none does."""
+    wanted = http.rstrip("/")
+    found = (_read(file) for file in _folder().glob("*.json"))
+    return next((state for state in found if state is not None and state.http.rstrip("/") == wanted), None)
+
+
+def _read(path: Path) -> ServiceState | None:
     try:
-        with state_file(bundle).open(encoding="utf-8") as file:
+        with path.open(encoding="utf-8") as file:
             if _can_lock(file.fileno()):
                 return None
             text = file.read()
@@ -119,9 +139,12 @@ def read_state(bundle: str | Path) -> ServiceState | None:
         return None
 
 
-def _state(entries: dict[str, object]) -> ServiceState:
+def _state(entries: object) -> ServiceState:
     """Return a state; raise TypeError for anything else that somebody may have written into the file."""
-    pid, *texts = (entries.get(key) for key in ("pid", "sub", "pub", "digest"))
+    if not isinstance(entries, dict):
+        raise TypeError
+    needed = [entries.get(key) for key in ("sub", "pub", "digest")]
+    pid, texts = entries.get("pid"), [*needed, *(entries.get(key, "") for key in ("failures", "http", "token_file"))]
     if not isinstance(pid, int) or not all(isinstance(text, str) for text in texts):
         raise TypeError
     return ServiceState(pid, *map(str, texts))

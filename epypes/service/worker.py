@@ -239,6 +239,7 @@ def _loaded(channel: Channel, path: Path, threads: int) -> Worker | None:
         "report": str(report),
         "pid": os.getpid(),
         "functions": functions,
+        "func_io": {name: [bundle.cg.func_inputs(name), bundle.cg.func_outputs(name)] for name in functions},
     }
     channel.send(ready)
     return worker

@@ -6,12 +6,14 @@ import cv2
 import pytest
 
 import epypes as ep
+from tests.service.served import acting_bundle
 
 
 @pytest.fixture(autouse=True)
 def own_runtime_folder(tmp_path_factory, monkeypatch):
     """State files of these tests stand apart from those of the user's services."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("run")))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
 
 
 @pytest.fixture(scope="session")
@@ -24,3 +26,9 @@ def edge_bundle(tmp_path_factory, photograph):
     runner = ep.CompGraphRunner(cg, {"side": 5, "lo": 70, "hi": 200})
     runner.run(image=photograph)
     return ep.promote(runner, tmp_path_factory.mktemp("bundles") / "edges")
+
+
+@pytest.fixture(scope="session")
+def acting(tmp_path_factory):
+    """A bundle whose function does what an event says, and returns a number times a hyperparameter."""
+    return acting_bundle(tmp_path_factory.mktemp("bundles") / "acting")

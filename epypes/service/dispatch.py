@@ -1,0 +1,277 @@
+"""Which event goes to the worker next, and what happens when it is done, or the worker is gone?
+
+The one place where accepted events change hands, under one lock. Nothing is sent, published or told while it is held:
+messages go into the link's outbox, and what is resolved waits for `publish`, which whoever has changed anything calls
+when it has given the lock back.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from time import perf_counter_ns
+from typing import Any
+
+from epypes.errors import EpypesError, ServiceError
+from epypes.service.ledger import Entry, Ledger
+from epypes.service.link import Link, Message
+from epypes.service.outcome import Desk, Result, Setting, dead_letter, dropped, failed_without_worker, refused, reported
+from epypes.wire import Envelope, decode, encode
+
+_log = logging.getLogger("epypes.service")
+
+
+class Dispatcher:
+    """Hands accepted events to the worker, and results to the desk.
+
+    Parameters
+    ----------
+    ledger
+        The events.
+    desk
+        Who publishes.
+    setting
+        Returns what events are worked on with; called with the lock held.
+
+    Attributes
+    ----------
+    changed
+        The lock, and whom to wake up when anything changes.
+    is_unwatched
+        Whether the supervisor wants to be woken up by the next event.
+    answered_in_row
+        How many events were answered since a worker last died.
+    """
+
+    def __init__(self, ledger: Ledger, desk: Desk, setting: Callable[[], Setting]) -> None:
+        self.changed = threading.Condition(threading.RLock())
+        self.ledger, self.answered_in_row = ledger, 0
+        self._desk, self._setting = desk, setting
+        self._link: Link | None = None
+        self._holds: set[str] = set()
+        self.is_unwatched, self._waiting = False, 0
+        self._why_refused = ""
+        self._to_tell: deque[Callable[[], object]] = deque()
+        self._publishing, self._publisher = threading.Lock(), 0
+
+    # -- as the subscriber's queue --------------------------------------------------------------------------------
+
+    def put(self, item: Any, *, block: bool = False) -> None:
+        """Accept an event; never blocks. Called on the I/O thread."""
+        with self.changed:
+            for entry in self.ledger.accept(item, perf_counter_ns()):
+                self._tell_at_once(entry, dropped(entry, self.ledger.policy, self.ledger.size, self._setting()))
+            if self._why_refused:
+                self._refuse_waiting(self._why_refused)
+            self._assign()
+            if self.is_unwatched:
+                # Who watches over events that take too long has one to watch now, for as long as one may take.
+                self.is_unwatched = False
+                self.changed.notify_all()
+        if self._to_tell:
+            self.publish()
+
+    def _tell_at_once(self, entry: Entry, result: Result) -> None:
+        self.tell(lambda: self._desk.settle(entry, result))
+
+    def tell(self, telling: Callable[[], object]) -> None:
+        """Have something told by the next `publish`, after what was resolved before."""
+        self._to_tell += self._released()
+        self._to_tell.append(telling)
+
+    def _refuse_waiting(self, why: str) -> None:
+        waiting, _ = self.ledger.give_up()
+        for entry in waiting:
+            self._tell_at_once(entry, refused(entry, why, self._setting()))
+
+    # -- to the worker --------------------------------------------------------------------------------------------
+
+    @property
+    def link(self) -> Link | None:
+        """The worker that gets events; None while there is none."""
+        return self._link
+
+    def use(self, link: Link | None) -> None:
+        """Give events to this worker from now on; to none, they wait."""
+        with self.changed:
+            self._link = link
+            self._flow()
+
+    def hold(self, why: str) -> None:
+        """Have events wait, for one reason of perhaps several."""
+        with self.changed:
+            self._holds.add(why)
+            self._flow()
+
+    def let_go(self, why: str) -> None:
+        """Have events go on, unless there is another reason why they wait."""
+        with self.changed:
+            self._holds.discard(why)
+            self._flow()
+
+    def refuse(self, why: str) -> None:
+        """Answer every event with a failure that says why it is not worked on; with an empty text work on them again."""
+        with self.changed:
+            self._why_refused = why
+        if why:
+            self.give_up(why)
+
+    def _flow(self) -> None:
+        self.ledger.flowing = self._link is not None and not self._holds
+        self._assign()
+        self.changed.notify_all()
+
+    def _assign(self) -> None:
+        while self._link is not None and (entry := self.ledger.take(perf_counter_ns())) is not None:
+            try:
+                is_raw = not isinstance(entry.event, Envelope)
+                frames: Sequence[Any] = [entry.event] if is_raw else encode(entry.event)
+                self._link.post({"kind": "event", "seq": entry.seq, "raw": is_raw}, frames)
+            except EpypesError as error:
+                self._resolve(entry, failed_without_worker(entry, error, self._setting(), "raised", function="f_in"))
+
+    # -- from the worker ------------------------------------------------------------------------------------------
+
+    def done(self, link: Link, header: Mapping[str, Any], frames: Sequence[memoryview]) -> None:
+        """Take a worker's word that it is done with an event."""
+        with self.changed:
+            entry = self.ledger.running_at(header["seq"]) if link is self._link else None
+            setting = self._setting()
+        if entry is None:
+            # Its time was over, and it has been answered.
+            return
+        result = _result(entry, header, frames, setting)
+        with self.changed:
+            self._resolve(entry, result)
+            self.answered_in_row += 1
+            self._assign()
+            self._tell_waiting()
+        self.publish()
+
+    def _resolve(self, entry: Entry, result: Result) -> None:
+        self.ledger.resolve(entry.seq, result.outcome, result)
+
+    def worker_died(self, ending: str, died_in: Sequence[str]) -> None:
+        """Note that the worker died by itself, or of one of its events; they are tried again or put aside."""
+        with self.changed:
+            self._link = None
+            self.ledger.flowing = False
+            self.answered_in_row = 0
+            for entry in self.ledger.worker_died():
+                function = died_in[0] if died_in else ""
+                self._resolve(entry, dead_letter(entry, ending, function, self._setting()))
+            self.changed.notify_all()
+
+    def worker_ended(self) -> None:
+        """Note that the worker was ended by the front: what it had is tried again."""
+        with self.changed:
+            self._link = None
+            self.ledger.flowing = False
+            self.ledger.worker_ended()
+            self.changed.notify_all()
+
+    # -- what takes too long --------------------------------------------------------------------------------------
+
+    def overdue(self, timeout_ns: int) -> list[Entry]:
+        """Return the events that the worker has had for longer than this."""
+        with self.changed:
+            now_ns = perf_counter_ns()
+            return [entry for entry in self.ledger.running() if now_ns - entry.started_ns >= timeout_ns]
+
+    def due_in_s(self, timeout_ns: int) -> float | None:
+        """Return in how many seconds an event will have taken so long; None if there is none. With the lock held."""
+        starts = [entry.started_ns for entry in self.ledger.running()] if self._link is not None else []
+        return max(min(starts) + timeout_ns - perf_counter_ns(), 0) / 1e9 if starts else None
+
+    def fail_stuck(self, functions: Mapping[int, str], timeout_s: float) -> list[Entry]:
+        """Report events, by number with the function that each is in, as stuck; return those that still were."""
+        with self.changed:
+            found = [entry for seq in functions if (entry := self.ledger.running_at(seq)) is not None]
+            for entry in found:
+                function = functions[entry.seq]
+                where = f"Function {function!r}" if function else "The worker"
+                error = ServiceError(
+                    self._setting().bundle, f"{where} did not return within {timeout_s:g} s; the worker is replaced."
+                )
+                self._resolve(entry, failed_without_worker(entry, error, self._setting(), "stuck", function=function))
+            if found:
+                # Nothing more for a worker that is about to be killed.
+                self._link = None
+                self.ledger.flowing = False
+        return found
+
+    def give_up(self, why: str, functions: Mapping[int, str] | None = None) -> int:
+        """Answer everything that is not resolved with a failure that says why; return how many events that were."""
+        with self.changed:
+            waiting, begun = self.ledger.give_up()
+            for entry in waiting:
+                self._tell_at_once(entry, refused(entry, why, self._setting()))
+            for entry in begun:
+                function = (functions or {}).get(entry.seq, "")
+                where = f" while it is in {function}" if function else ""
+                error = ServiceError(self._setting().bundle, f"{why}{where}, so this event was not finished.")
+                self._resolve(entry, failed_without_worker(entry, error, self._setting(), "killed", function=function))
+            self.changed.notify_all()
+        return len(waiting) + len(begun)
+
+    # -- what is resolved -----------------------------------------------------------------------------------------
+
+    def publish(self) -> None:
+        """Publish what is resolved, in the order of acceptance, and tell what is to be told. Without the lock."""
+        if self._publisher == threading.get_ident():
+            # Somebody who is told changes something again: that is told next.
+            return
+        while True:
+            with self._publishing:
+                self._publisher = threading.get_ident()
+                try:
+                    found = self._found()
+                    for telling in found:
+                        telling()
+                finally:
+                    self._publisher = 0
+            if not found:
+                return
+
+    def _found(self) -> list[Callable[[], object]]:
+        with self.changed:
+            found = [*self._to_tell, *self._released()]
+            self._to_tell.clear()
+            if found:
+                # Room for others to be done ahead, and the end of a drain.
+                self._assign()
+                self._tell_waiting()
+            return found
+
+    def _released(self) -> list[Callable[[], object]]:
+        return [partial(self._desk.settle, entry, entry.outputs) for entry in self.ledger.release()]
+
+    def wait_for(self, is_so: Callable[[], bool], timeout_s: float | None) -> bool:
+        """Wait until something is so; return whether it is."""
+        with self.changed:
+            self._waiting += 1
+            try:
+                return self.changed.wait_for(is_so, timeout_s)
+            finally:
+                self._waiting -= 1
+
+    def _tell_waiting(self) -> None:
+        # Only if somebody waits: the supervisor, which waits too, would be woken up by every event.
+        if self._waiting and not self.ledger.running():
+            self.changed.notify_all()
+
+
+def _result(entry: Entry, header: Mapping[str, Any], frames: Sequence[memoryview], setting: Setting) -> Result:
+    """Return what a worker has made of an event."""
+    answers: list[Envelope | bytes] = []
+    begin = 0
+    for answer in header.get("answers", ()):
+        end = begin + answer["frames"]
+        own, begin = frames[begin:end], end
+        answers.append(bytes(own[0]) if answer["raw"] else decode(own))
+    failure = header.get("failure")
+    record = reported(entry, failure, setting, "raised") if failure else None
+    return Result(answers, record, header.get("revision", 0), header.get("total_ns", 0))

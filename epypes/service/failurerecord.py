@@ -1,0 +1,149 @@
+"""What is known of an event that failed in a service, and under which id?"""
+
+from __future__ import annotations
+
+import os
+import re
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from time import time_ns
+from typing import Any, Final
+
+# What a person reads of it; more would make a list of failures slow.
+_MOST_CHARACTERS: Final = 2_000
+_MOST_LINES: Final = 200
+
+# Without i, l, o and u, which are taken for others or make words.
+_DIGITS: Final = "0123456789abcdefghjkmnpqrstvwxyz"
+_TIME_DIGITS, _RANDOM_DIGITS = 11, 3
+ID: Final = re.compile(f"[{_DIGITS}]{{{_TIME_DIGITS + _RANDOM_DIGITS}}}")
+
+
+@dataclass(frozen=True, slots=True)
+class FailureRecord:
+    """What is known of an event that failed in a service; JSON-ready by ``dataclasses.asdict``.
+
+    Attributes
+    ----------
+    id
+        Its own: short, unique, safe as a file's name, and in the order of time.
+    event_id
+        Id of the event; empty if it has none.
+    function
+        What failed: a function of the graph, ``"f_in"``, ``"f_out"`` or ``"compute"``; where a worker was killed or
+        stuck, the function that was running as far as that is known.
+    tokens
+        Its input and output tokens.
+    exception, message
+        Name and text of what was raised.
+    trace
+        The lines of the traceback.
+    kind
+        ``"raised"``, ``"killed"`` (the worker with it), ``"stuck"`` (it took too long) or ``"dropped"``.
+    attempt
+        Which try of the event it was, from 1.
+    dead_letter
+        Whether the event was put aside since it killed the worker again.
+    when_ns
+        Unix time in nanoseconds.
+    bundle, digest
+        The path of the bundle that was served, and which state of it.
+    revision, hyperparameters
+        What it was computed with: entries by token, as in pipeline.toml.
+    has_event
+        Whether the event was kept.
+    no_event
+        Why it was not.
+    """
+
+    id: str = ""
+    event_id: str = ""
+    function: str = ""
+    tokens: Sequence[str] = ()
+    exception: str = ""
+    message: str = ""
+    trace: Sequence[str] = ()
+    kind: str = "raised"
+    attempt: int = 1
+    dead_letter: bool = False
+    when_ns: int = 0
+    bundle: str = ""
+    digest: str = ""
+    revision: int = 0
+    hyperparameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    has_event: bool = False
+    no_event: str = ""
+
+    @property
+    def cause(self) -> tuple[str, str, str]:
+        """What failures have in common that come of one thing."""
+        return self.kind, self.function, self.exception
+
+    @property
+    def summary(self) -> str:
+        """What failed, in one line."""
+        text = " ".join(self.message.split())
+        return f"{self.exception}: {text}" if text else self.exception
+
+
+class _Ids:
+    """Makes ids that rise within a process, whatever its clock does."""
+
+    def __init__(self) -> None:
+        self._lock, self._last_us = threading.Lock(), 0
+
+    def new(self, when_ns: int) -> str:
+        """Return an id for this moment."""
+        with self._lock:
+            self._last_us = when_us = max(when_ns // 1_000, self._last_us + 1)
+        return _digits(when_us, _TIME_DIGITS) + _digits(int.from_bytes(os.urandom(2)), _RANDOM_DIGITS)
+
+
+def _digits(number: int, count: int) -> str:
+    found = ""
+    for _ in range(count):
+        number, digit = divmod(number, len(_DIGITS))
+        found = _DIGITS[digit] + found
+    return found
+
+
+_ids: Final = _Ids()
+
+
+def with_id(record: FailureRecord) -> FailureRecord:
+    """Return a record with an id and a time, and with texts no longer than they are read."""
+    when_ns = record.when_ns or time_ns()
+    return replace(
+        record,
+        id=record.id if ID.fullmatch(record.id) else _ids.new(when_ns),
+        when_ns=when_ns,
+        message=record.message[:_MOST_CHARACTERS],
+        trace=tuple(line[:_MOST_CHARACTERS] for line in record.trace[-_MOST_LINES:]),
+        tokens=tuple(record.tokens),
+    )
+
+
+def record_of(entries: Any) -> FailureRecord:
+    """Return the record that was written as JSON; what a later version adds is left out.
+
+    Raises
+    ------
+    ValueError
+        An entry has another type than a record's, or there is no id.
+    """
+    if not isinstance(entries, Mapping):
+        raise ValueError(f"a record is an object, not {type(entries).__name__}")
+    given: dict[str, Any] = {}
+    for name, like in _EMPTY.items():
+        value = entries.get(name, like)
+        if not isinstance(value, (list, tuple) if isinstance(like, tuple) else type(like)):
+            raise ValueError(f"{name!r} is {value!r:.40}")
+        given[name] = tuple(map(str, value)) if isinstance(like, tuple) else value
+    record = FailureRecord(**given)
+    if not ID.fullmatch(record.id):
+        raise ValueError(f"{record.id!r:.40} is no id of a failure")
+    return record
+
+
+_EMPTY: Final[Mapping[str, Any]] = {each.name: getattr(FailureRecord(), each.name) for each in fields(FailureRecord)}

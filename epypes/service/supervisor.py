@@ -1,0 +1,397 @@
+"""Who starts workers, watches over them, and replaces those that died or are stuck?
+
+One thread, that lives as long as the service: the system ends a worker with the thread that has started it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from time import monotonic
+from typing import Any, Final
+
+from epypes.bundle.replay import REPLAY_TIMEOUT_S
+from epypes.errors import ServiceError
+from epypes.service.dispatch import Dispatcher
+from epypes.service.ledger import Entry
+from epypes.service.link import Link, Message
+from epypes.service.notify import notify, watchdog_s
+from epypes.service.served import Served
+
+_FIRST_PAUSE_S: Final = 0.1
+_LONGEST_PAUSE_S: Final = 10.0
+# After so many good events the next death is a first one again.
+_GOOD_EVENTS: Final = 5
+_DEATHS_BEFORE_FAULT: Final = 5
+# How long a worker that seems stuck may take to say where it is.
+_ASK_S: Final = 0.5
+_END_S: Final = 2.0
+
+_log = logging.getLogger("epypes.service")
+
+
+@dataclass(slots=True)
+class Health:
+    """How the worker that is served is doing; read and written with the dispatcher's lock held.
+
+    Attributes
+    ----------
+    fault
+        Why there will be no worker any more; empty if that is not so.
+    trouble
+        Why there is none just now.
+    stuck
+        What has not returned in time, until the worker that replaces it is ready.
+    restarts
+        How often a worker was started again.
+    deaths
+        How often in a row one died, without an answer in between.
+    pauses
+        How often in a row it was waited before a start, which is what each wait is twice as long for.
+    """
+
+    fault: str = ""
+    trouble: str = ""
+    stuck: str = ""
+    restarts: int = 0
+    deaths: int = 0
+    pauses: int = 0
+    was_ready: bool = False
+
+
+class Supervisor:
+    """Starts, watches and replaces workers.
+
+    Parameters
+    ----------
+    dispatcher
+        Who gives events to the worker.
+    served
+        The bundle.
+    threads
+        How many events a worker works on at once.
+    job_timeout_s
+        How long an event may take, in seconds.
+    parameters
+        Returns the revision and all values, by token as in pipeline.toml, that a new worker must take; None if those
+        of its bundle will do.
+    on_change
+        Called when the state may be another one.
+    hear
+        Called with what a worker says of parameters.
+    """
+
+    def __init__(
+        self,
+        dispatcher: Dispatcher,
+        served: Served,
+        threads: int,
+        job_timeout_s: float,
+        parameters: Callable[[], tuple[int, Mapping[str, Any]] | None],
+        on_change: Callable[[], None],
+        hear: Callable[[Link, Mapping[str, Any]], None],
+    ) -> None:
+        self.served, self.health = served, Health()
+        self.worker: Link | None = None
+        self._dispatcher, self._threads = dispatcher, threads
+        self._timeout_s, self._timeout_ns = job_timeout_s, int(job_timeout_s * 1e9)
+        self._parameters, self._on_change, self._hear_more = parameters, on_change, hear
+        self._most_deaths = max(_DEATHS_BEFORE_FAULT, dispatcher.ledger.retries + 2)
+        self._changed = dispatcher.changed
+        self._to_start: deque[tuple[Served, list[Link | Exception]]] = deque()
+        self._restart_s: float | None = None
+        self._loading_until_s = 0.0
+        self._is_ending = False
+        self._thread: threading.Thread | None = None
+        self._watchdog_s, self._notified_s = watchdog_s(), 0.0
+
+    def start(self) -> None:
+        """Begin, with a worker of the bundle."""
+        with self._changed:
+            self._is_ending = False
+            self.health = Health()
+            self._restart_s = monotonic()
+            self._thread = threading.Thread(target=self._run, name="epypes supervisor", daemon=True)
+            self._thread.start()
+
+    def stop(self) -> None:
+        """End the workers, and the thread."""
+        with self._changed:
+            self._is_ending = True
+            worker, self.worker = self.worker, None
+            self._dispatcher.use(None)
+            self._changed.notify_all()
+        if worker is not None:
+            worker.dismiss(_END_S)
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            thread.join()
+
+    def abandon(self) -> None:
+        """Kill the worker: what it has is not waited for."""
+        with self._changed:
+            self._is_ending = True
+            worker = self.worker
+            self._changed.notify_all()
+        if worker is not None:
+            worker.is_dismissed = True
+            worker.process.kill()
+
+    # -- the thread -----------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                job = self._next()
+                while job is None:
+                    self._changed.wait(self._wait_s())
+                    job = self._next()
+            if self._is_ending:
+                return
+            try:
+                job()
+            except Exception:
+                _log.exception("the supervisor goes on")
+            self._dispatcher.publish()
+
+    def _wait_s(self) -> float | None:
+        """Return how long there is nothing to do, if nothing changes; None for ever. With the lock held."""
+        now_s = monotonic()
+        due_in_s = self._dispatcher.due_in_s(self._timeout_ns)
+        self._dispatcher.is_unwatched = due_in_s is None
+        waits = [due_in_s]
+        if self._watchdog_s is not None:
+            waits.append(self._notified_s + self._watchdog_s - now_s)
+        if self._restart_s is not None:
+            waits.append(self._restart_s - now_s)
+        if self.worker is not None and self.worker.status == "loading":
+            waits.append(self._loading_until_s - now_s)
+        known = [wait for wait in waits if wait is not None]
+        return max(min(known), 0.0) if known else None
+
+    def _next(self) -> Callable[[], object] | None:
+        """Return what is to be done now. With the lock held."""
+        now_s = monotonic()
+        if self._is_ending:
+            return _nothing
+        if self._watchdog_s is not None and self._notified_s + self._watchdog_s <= now_s:
+            self._notified_s = now_s
+            return _tell_alive
+        if self._to_start:
+            return self._start_for_deploy
+        if self._restart_s is not None and self._restart_s <= now_s:
+            self._restart_s = None
+            return self._start_again
+        due_in_s = self._dispatcher.due_in_s(self._timeout_ns)
+        if self._dispatcher.link is not None and due_in_s is not None and due_in_s <= 0:
+            return self._end_stuck
+        if self.worker is not None and self.worker.status == "loading" and self._loading_until_s <= now_s:
+            return self._end_loading
+        return None
+
+    def _start_again(self) -> None:
+        try:
+            link = Link(self.served, self._threads, self._hear, self._gone)
+        except OSError as error:
+            with self._changed:
+                self._died(f"The worker can't be started: {error.strerror or error}.")
+            return
+        with self._changed:
+            self.worker, self._loading_until_s = link, monotonic() + REPLAY_TIMEOUT_S
+            self.health.restarts += self.health.was_ready
+            # It may have been ready before this thread came here.
+            if link.status == "ready":
+                self._begin(link)
+            elif link.status != "loading":
+                self._over(link)
+
+    def _end_loading(self) -> None:
+        worker = self.worker
+        if worker is not None:
+            _log.error("the worker has not proved its bundle within %g s, so it is killed", REPLAY_TIMEOUT_S)
+            worker.process.kill()
+
+    # -- what a worker says, on its own thread ----------------------------------------------------------------------
+
+    def _hear(self, link: Link, message: Message) -> None:
+        header, frames = message
+        kind = header.get("kind")
+        if kind == "done":
+            self._dispatcher.done(link, header, frames)
+            with self._changed:
+                self.health.deaths = 0
+                if self._dispatcher.answered_in_row >= _GOOD_EVENTS:
+                    self.health.pauses = 0
+        elif kind in ("parameters", "parameters_refused"):
+            self._hear_more(link, header)
+        elif kind == "ready":
+            with self._changed:
+                if link is self.worker:
+                    self._begin(link)
+                self._changed.notify_all()
+            self._dispatcher.publish()
+
+    def _begin(self, link: Link) -> None:
+        """Give events to a worker that is ready. With the lock held."""
+        if link.about.get("digest") != self.served.digest:
+            link.is_dismissed = True
+            link.process.kill()
+            self._fault(f"{self.served.path} is not the bundle any more that is served. Deploy it, or restore it.")
+            return
+        parameters = self._parameters()
+        if parameters is not None:
+            revision, values = parameters
+            link.post({"kind": "parameters", "revision": revision, "values": dict(values)})
+        self.health.was_ready, self.health.trouble, self.health.stuck = True, "", ""
+        self._dispatcher.use(link)
+        self._on_change()
+
+    def _gone(self, link: Link) -> None:
+        with self._changed:
+            if link is self.worker:
+                self._over(link)
+            self._changed.notify_all()
+        self._dispatcher.publish()
+
+    def _over(self, link: Link) -> None:
+        """Note that the worker is gone. With the lock held."""
+        self.worker = None
+        if link.status == "refused":
+            self._dispatcher.worker_ended()
+            self._fault(" ".join(link.reasons))
+        elif link.is_dismissed:
+            self._dispatcher.worker_ended()
+            self._died(self.health.stuck or link.process.ending)
+        else:
+            self._dispatcher.worker_died(link.process.ending, link.process.died_in)
+            self._died(link.process.ending)
+
+    def _died(self, why: str) -> None:
+        """Start another worker after a while, or none any more. With the lock held."""
+        health = self.health
+        if self._is_ending or health.fault:
+            return
+        health.deaths += 1
+        if health.deaths >= self._most_deaths:
+            self._fault(f"{health.deaths} workers ended in a row without an answer. The last: {why}")
+            return
+        pause_s = min(_FIRST_PAUSE_S * 2**health.pauses, _LONGEST_PAUSE_S)
+        health.pauses += 1
+        health.trouble = f"{why}. Another one is started."
+        _log.warning("%s; another one is started in %g s", why, pause_s)
+        self._restart_s = monotonic() + pause_s
+        self._changed.notify_all()
+        self._on_change()
+
+    def _fault(self, why: str) -> None:
+        if self._is_ending:
+            return
+        self.health.fault = why
+        self._restart_s = None
+        _log.error("the bundle is not served any more: %s", why)
+        self._dispatcher.refuse(f"it can't be served: {why[:300]}")
+        self._on_change()
+
+    # -- what takes too long ----------------------------------------------------------------------------------------
+
+    def _end_stuck(self) -> None:
+        link = self._dispatcher.link
+        overdue = self._dispatcher.overdue(self._timeout_ns)
+        if link is None or not overdue:
+            return
+        functions = where_stuck(link, overdue)
+        with self._changed:
+            found = self._dispatcher.fail_stuck(functions, self._timeout_s)
+            if not found:
+                # They were done while it was asked.
+                return
+            named = next((functions[entry.seq] for entry in found if functions[entry.seq]), "")
+            where = f"Function {named!r}" if named else "The worker"
+            how = " The process was stopped." if link.process.is_stopped else ""
+            self.health.stuck = f"{where} did not return within {self._timeout_s:g} s.{how} The worker is replaced"
+            link.is_dismissed = True
+            self._on_change()
+        _log.error("%s", self.health.stuck)
+        link.process.kill()
+
+    # -- another bundle -----------------------------------------------------------------------------------------------
+
+    def load(self, served: Served) -> Link:
+        """Start a worker of another bundle beside the one that is served; return it when it has proved the bundle.
+
+        Raises
+        ------
+        ServiceError
+            It refused the bundle, or died; the text says why.
+        """
+        started: list[Link | Exception] = []
+        with self._changed:
+            self._to_start.append((served, started))
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: started or self._is_ending)
+            link = started[0] if started else ServiceError(served.path, "The service stops.")
+            if not isinstance(link, Link):
+                raise link
+            is_over = self._changed.wait_for(lambda: link.status != "loading" or self._is_ending, REPLAY_TIMEOUT_S)
+        if link.status == "ready" and link.about.get("digest") == served.digest:
+            return link
+        link.is_dismissed = True
+        link.process.kill()
+        if link.status == "ready":
+            why = "it was changed while it was loaded. Deploy it again."
+        elif link.status == "refused":
+            why = " ".join(link.reasons)
+        else:
+            why = link.process.ending or f"it was not loaded {'in time' if not is_over else 'while the service stops'}"
+        raise ServiceError(served.path, why)
+
+    def _start_for_deploy(self) -> None:
+        with self._changed:
+            served, started = self._to_start.popleft()
+        try:
+            made: Link | Exception = Link(served, self._threads, self._hear, self._gone)
+        except OSError as error:
+            made = ServiceError(served.path, f"A worker can't be started: {error.strerror or error}.")
+        with self._changed:
+            started.append(made)
+            self._changed.notify_all()
+
+    def switch(self, link: Link) -> None:
+        """Give events to the worker of another bundle from now on; the one before is ended. With no event in flight."""
+        with self._changed:
+            before, self.worker = self.worker, link
+            self.served, self._restart_s = link.served, None
+            restarts = self.health.restarts
+            self.health = Health(was_ready=True, restarts=restarts)
+            self._dispatcher.refuse("")
+            self._begin(link)
+        if before is not None:
+            threading.Thread(target=before.dismiss, args=(_END_S,), name="epypes last worker", daemon=True).start()
+
+
+def where_stuck(link: Link, overdue: list[Entry]) -> dict[int, str]:
+    """Return the function that each of some events is in, by its number; empty where that can't be known."""
+    found = dict.fromkeys((entry.seq for entry in overdue), "")
+    with contextlib.suppress(ServiceError):
+        header, _ = link.ask("running", _ASK_S)
+        for slot in header.get("slots", ()):
+            if slot["seq"] in found:
+                found[slot["seq"]] = ", ".join(slot["functions"])
+        return found
+    # No thread of it gets on: a function holds the interpreter, or the process is stopped.
+    names = link.process.functions_by_trace()
+    known = [name for name in names if name in link.about.get("functions", ())] or list(names)
+    return dict.fromkeys(found, ", ".join(dict.fromkeys(known)))
+
+
+def _tell_alive() -> None:
+    """Tell systemd: that the supervisor comes here shows that no lock is held for ever."""
+    notify("WATCHDOG=1")
+
+
+def _nothing() -> None:
+    """Do nothing: the thread ends."""

@@ -1,0 +1,330 @@
+"""Are failures kept, whatever the disk, the storm or the neighbour does, and can they be had again?"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, replace
+from time import monotonic, time_ns
+
+import numpy as np
+import pytest
+
+from epypes.errors import FailureNotKept, UnknownName
+from epypes.service.failurefiles import Entry, to_remove
+from epypes.service.failurepace import Waiting
+from epypes.service.failurerecord import ID, FailureRecord, record_of, with_id
+from epypes.service.failurestore import FailureStore, failures_folder
+from epypes.wire import Envelope
+
+FAILED = FailureRecord(
+    event_id="77",
+    function="blur",
+    tokens=("image", "blurred"),
+    exception="ValueError",
+    message="no rows",
+    trace=("Traceback", "ValueError: no rows"),
+    hyperparameters={"k": {"value": 11}, "mask": {"kind": "none"}},
+    digest="ab" * 32,
+    revision=3,
+)
+
+
+@pytest.fixture
+def store(tmp_path):
+    return FailureStore(tmp_path / "failures")
+
+
+def kept(store, *events, record=FAILED):
+    """Keep a failure for each event; return their records."""
+    records = [store.keep(record, event) for event in events]
+    assert store.flush(10)
+    return records
+
+
+def test_a_failure_is_kept_with_its_event_and_had_again_after_a_restart(store):
+    image = np.arange(300, dtype=np.uint8).reshape(10, 10, 3)
+    (record,) = kept(store, Envelope("request", {"image": image}, id="77"))
+    again = FailureStore(store.folder)
+    assert again.record(record.id) == replace(record, has_event=True)
+    assert again.records() == [again.record(record.id)]
+    event = again.event(record.id)
+    assert event.id == "77"
+    assert np.array_equal(event.parts["image"], image)
+
+
+def test_a_message_of_2019_is_kept_as_its_bytes(store):
+    (record,) = kept(store, b"\x0a\x03abc")
+    assert bytes(store.event(record.id)) == b"\x0a\x03abc"
+
+
+def test_records_come_newest_first_and_as_many_as_asked_for(store):
+    records = kept(store, *[b"x"] * 5)
+    ids = [record.id for record in records]
+    assert [record.id for record in store.records()] == ids[::-1]
+    assert [record.id for record in store.records(2)] == ids[:2:-1]
+    assert sorted(ids) == ids
+    assert all(ID.fullmatch(found) for found in ids)
+
+
+def test_ids_of_many_threads_are_unique_and_rise_when_the_clock_goes_back():
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda _: with_id(FAILED).id, range(4_000)))
+    assert len(set(found)) == 4_000
+    later, earlier = with_id(replace(FAILED, when_ns=time_ns())).id, with_id(replace(FAILED, when_ns=1)).id
+    assert later < earlier
+
+
+def test_handing_over_waits_for_no_disk(store):
+    store.folder.parent.mkdir(parents=True, exist_ok=True)
+    # A named pipe in the place of the part of a file: to open it for writing waits until somebody reads.
+    store.folder.mkdir()
+    first = with_id(FAILED)
+    pipe = store.folder / f".{first.id}.event.{os.getpid()}.part"
+    os.mkfifo(pipe)
+    began = monotonic()
+    store.keep(first, b"held")
+    store.keep(FAILED, b"waits")
+    assert monotonic() - began < 5
+    assert not store.flush(0.2), "the disk answers nobody"
+    reader = os.open(pipe, os.O_RDONLY)
+    try:
+        assert store.flush(10)
+    finally:
+        os.close(reader)
+
+
+def test_a_storm_keeps_its_first_failures_and_the_newest_and_counts_the_others(store):
+    records = [store.keep(FAILED, b"%d" % number) for number in range(500)]
+    odd = store.keep(replace(FAILED, kind="killed", exception=""), b"odd")
+    assert store.flush(20)
+    found = [record.id for record in reversed(store.records())]
+    assert found[:10] == [record.id for record in records[:10]]
+    assert found[-2:] == [records[-1].id, odd.id], "another cause is not pushed out"
+    counts = store.counts()
+    assert counts["kept"] == len(found)
+    assert counts["kept"] + counts["skipped"] == 501
+
+
+def test_what_waits_is_bounded_for_any_number_of_causes():
+    waiting, given_way = Waiting(), 0
+    for number in range(1_000):
+        given_way += waiting.add(number % 40, number, 0.0)
+    assert len(waiting) <= 36
+    taken = []
+    while (item := waiting.take(0.0, at_once=True)) is not None:
+        taken.append(item)
+    assert len(taken) + given_way == 1_000
+    assert taken[0] == 0
+    assert 999 in taken
+
+
+def test_the_newest_of_a_storm_is_due_within_a_second():
+    waiting = Waiting(burst=2)
+    for number in range(5):
+        waiting.add("x", number, 0.0)
+    assert [waiting.take(0.0) for _ in range(3)] == [0, 1, None]
+    assert waiting.due_in_s(0.25) == pytest.approx(0.75)
+    assert waiting.take(0.5) is None
+    assert waiting.take(1.01) == 4
+    assert waiting.due_in_s(1.01) is None
+
+
+def test_no_more_are_kept_than_asked_for_and_how_a_storm_began_can_be_seen(tmp_path):
+    store = FailureStore(tmp_path, most=8, burst=50)
+    other = kept(store, b"other", record=replace(FAILED, function="canny"))
+    storm = kept(store, *[b"x"] * 20)
+    found = [record.id for record in reversed(store.records())]
+    assert found == [record.id for record in (*other, *storm[:3], *storm[-4:])]
+    assert store.counts()["removed"] == 13
+
+
+def test_the_folder_takes_no_more_bytes_than_asked_for(tmp_path):
+    store = FailureStore(tmp_path, most_bytes=100_000, burst=50)
+    records = kept(store, *[os.urandom(20_000)] * 10)
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) <= 100_000
+    assert len(store.records()) == 4
+    assert store.records()[0].id == records[-1].id
+
+
+def test_an_event_that_is_too_large_leaves_a_record_that_says_so(tmp_path):
+    store = FailureStore(tmp_path, most_bytes=1_000_000)
+    (record,) = kept(store, bytes(300_000))
+    found = store.record(record.id)
+    assert not found.has_event
+    assert "0.3 MB, more than the 0.2 MB of one event" in found.no_event
+    with pytest.raises(FailureNotKept, match=r"was not kept: it has 0\.3 MB"):
+        store.event(record.id)
+    assert store.counts()["without_event"] == 1
+
+
+def test_a_failure_without_event_says_so(store):
+    (record,) = kept(store, None)
+    with pytest.raises(FailureNotKept, match="the service had none to give") as error:
+        store.event(record.id)
+    assert error.value.id == record.id
+
+
+@pytest.fixture
+def small_disk():
+    """Files of this process can't grow beyond 100 kB, as if the disk were full."""
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    signal.signal(signal.SIGXFSZ, before)
+
+
+def test_on_a_full_disk_the_record_is_kept_without_its_event_and_no_half_of_a_file_stays(store, small_disk):
+    (record,) = kept(store, bytes(1_000_000))
+    assert not store.record(record.id).has_event
+    assert store.record(record.id).no_event == "it could not be written"
+    assert [path.name for path in store.folder.iterdir()] == [f"{record.id}.json"]
+    (record,) = kept(store, bytes(1_000))
+    assert store.record(record.id).has_event
+
+
+def test_a_folder_that_cannot_be_made_is_counted_and_the_next_failure_is_kept_when_it_can(tmp_path):
+    place = tmp_path / "taken"
+    place.write_text("a file")
+    store = FailureStore(place / "failures")
+    kept(store, b"x")
+    assert store.counts()["unwritten"] == 1
+    assert store.records() == []
+    place.unlink()
+    (record,) = kept(store, b"x")
+    assert store.record(record.id).has_event
+
+
+@pytest.mark.skipif(os.getuid() == 0, reason="root writes everywhere")
+def test_a_read_only_folder_is_counted(store):
+    store.folder.mkdir(parents=True)
+    store.folder.chmod(0o500)
+    kept(store, b"x")
+    assert store.counts()["unwritten"] == 1
+
+
+def test_the_folder_is_for_its_owner_alone(store):
+    (record,) = kept(store, b"x")
+    assert store.folder.stat().st_mode & 0o077 == 0
+    assert all(path.stat().st_mode & 0o077 == 0 for path in store.folder.iterdir())
+    assert record.id
+
+
+def test_files_of_others_are_left_alone_and_damaged_ones_are_counted_and_told(tmp_path):
+    store = FailureStore(tmp_path, most=4, burst=50)
+    (good,) = kept(store, b"good")
+    (tmp_path / "notes.json").write_text("mine")
+    (tmp_path / "sub").mkdir()
+    names = [with_id(FAILED).id for _ in range(6)]
+    bad = [
+        b"", b"{", b"[" * 100_000, b"null", b'{"record": {"id": 3}}',
+        json.dumps({"record": asdict(replace(FAILED, id=good.id))}).encode(),
+    ]  # fmt: skip
+    for name, text in zip(names, bad, strict=True):
+        (tmp_path / f"{name}.json").write_bytes(text)
+    assert [record.id for record in store.records()] == [good.id]
+    assert store.counts()["unreadable"] == 6
+    for name in names:
+        with pytest.raises(FailureNotKept, match=f"{name}.json can't be read"):
+            store.record(name)
+    newer = kept(store, b"new", b"new")
+    assert [record.id for record in store.records()] == [newer[1].id, newer[0].id, good.id]
+    assert (tmp_path / "notes.json").read_text() == "mine"
+
+
+@pytest.mark.parametrize("damage", [lambda data: data[:-1], lambda data: data[:-1] + b"?", lambda data: b""])
+def test_an_event_that_was_damaged_is_not_taken_for_the_one_that_failed(store, damage):
+    (record,) = kept(store, b"a frame of 2019")
+    path = store.folder / f"{record.id}.event"
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(FailureNotKept, match=r"\.event can't be read: it"):
+        store.event(record.id)
+
+
+def test_an_id_that_is_none_leads_nowhere_and_the_nearest_is_named(store):
+    (record,) = kept(store, b"x")
+    with pytest.raises(UnknownName, match=f"Did you mean {record.id!r}"):
+        store.record(record.id[:-1] + ("x" if record.id[-1] != "x" else "y"))
+    (store.folder.parent / "secret.json").write_text("{}")
+    for name in ("../secret", "", "x/../y", "\0"):
+        with pytest.raises(UnknownName):
+            store.record(name)
+        with pytest.raises(UnknownName):
+            store.packed_event(name)
+
+
+def test_two_services_share_a_folder(tmp_path):
+    stores = [FailureStore(tmp_path, most=10, burst=100) for _ in range(2)]
+
+    def keep(store):
+        for _ in range(40):
+            store.keep(FAILED, b"x" * 1_000)
+        return store.flush(20)
+
+    with ThreadPoolExecutor(2) as pool:
+        assert all(pool.map(keep, stores))
+    assert sum(store.counts()["unwritten"] for store in stores) == 0
+    (last,) = kept(stores[0], b"x")
+    found = stores[1].records()
+    assert len(found) == 10
+    assert found[0].id == last.id
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_what_a_killed_service_has_begun_is_removed_when_it_is_old(store):
+    kept(store, b"x")
+    name = with_id(FAILED).id
+    old = [store.folder / f".{name}.json.1.part", store.folder / f"{name}.event"]
+    young = store.folder / f".{name}.event.2.part"
+    for path in (*old, young):
+        path.write_bytes(b"x")
+    for path in old:
+        os.utime(path, (1, 1))
+    kept(store, b"x")
+    assert not any(path.exists() for path in old)
+    assert young.exists()
+
+
+def test_no_thread_stays_when_nothing_waits(store):
+    kept(store, b"x")
+    never = threading.Event()
+    deadline = monotonic() + 5
+    while any(thread.name == "epypes failures" for thread in threading.enumerate()):
+        assert monotonic() < deadline
+        never.wait(0.005)
+
+
+def test_the_failures_that_go_first_are_damaged_ones_then_the_middle_of_a_storm_then_the_oldest():
+    present = [Entry(str(number), True, 10) for number in range(8)]
+    causes = dict.fromkeys("0123456", "storm") | {"0": None, "6": "other", "7": "third"}
+    assert list(to_remove(present, causes, 3, 1_000)) == ["0", "4", "5", "1", "2"]
+    assert list(to_remove(present, causes, 10, 65)) == ["0", "4"]
+    assert list(to_remove(present, causes, 10, 0)) == ["0", "4", "5", "1", "2", "3", "6", "7"]
+
+
+def test_a_record_survives_json_and_anything_else_is_refused():
+    record = with_id(replace(FAILED, message="\ud800 half of a pair", trace=("\x00",)))
+    assert record_of(json.loads(json.dumps(asdict(record)))) == record
+    assert record_of({**asdict(record), "of a later version": 1}) == record
+    for wrong in ({"attempt": "1"}, {"tokens": "image"}, {"hyperparameters": []}, {"id": "../../etc"}, {"id": ""}):
+        with pytest.raises(ValueError, match="is"):
+            record_of({**asdict(record), **wrong})
+
+
+def test_long_texts_are_cut():
+    record = with_id(replace(FAILED, message="x" * 10**6, trace=("y" * 10**5,) * 1_000))
+    assert len(json.dumps(asdict(record))) < 500_000
+    assert len(record.trace) == 200
+
+
+def test_each_bundle_has_a_folder_in_the_users_state(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    one, other = failures_folder(tmp_path / "a"), failures_folder(tmp_path / "b")
+    assert one.parent == other.parent == tmp_path / "epypes" / "failures"
+    assert one != other == failures_folder(tmp_path / "a" / ".." / "b")
