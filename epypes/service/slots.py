@@ -93,11 +93,11 @@ class Slot:
         Raises
         ------
         queue.Empty
-            None will come.
+            None will come; without ``block``: there is none now.
         """
         self._finish()
         while True:
-            item = self._inbox.take()
+            item = self._inbox.take(block)
             if not isinstance(item, Event):
                 item.run()
                 self._inbox.finished()

@@ -312,6 +312,7 @@ def rss(process):
     return process.memory_info().rss
 
 
+@pytest.mark.slow
 def test_two_thousand_events_leave_nothing_behind(inverting, tmp_path):
     image, bad = np.full((500, 500), 14, np.uint8), np.full((500, 500), 13, np.uint8)
     with ready_worker(inverting, tmp_path) as front:
@@ -332,6 +333,7 @@ def test_two_thousand_events_leave_nothing_behind(inverting, tmp_path):
         assert process.num_fds() == files
 
 
+@pytest.mark.slow
 def test_a_worker_keeps_no_more_of_large_events_than_the_last_run_of_each_slot(inverting, tmp_path):
     with ready_worker(inverting, tmp_path) as front:
         process = psutil.Process(front.process.pid)
@@ -347,6 +349,7 @@ def test_a_worker_keeps_no_more_of_large_events_than_the_last_run_of_each_slot(i
         assert largest - rss(process) > 30_000_000
 
 
+@pytest.mark.slow
 def test_a_page_that_asks_all_the_time_has_each_picture_made_once_per_run(inverting, tmp_path):
     with ready_worker(inverting, tmp_path) as front:
         front.run(image=np.full((2000, 2000), 14, np.uint8))
@@ -357,3 +360,29 @@ def test_a_page_that_asks_all_the_time_has_each_picture_made_once_per_run(invert
             assert all(front.ask(what, **more)[1] == first for _ in range(100))
             assert sum(process.cpu_times()[:2]) - before < 0.2
     assert Path(front.stderr).read_text() == ""
+
+
+def test_a_pipeline_that_takes_events_in_a_way_of_its_own_is_served_too(owning, tmp_path):
+    body = """
+    def listen(self, timeout_s=0.5):
+        import queue
+        import threading
+        import time
+
+        def take():
+            while True:
+                try:
+                    event = self.q_in.get_nowait() if hasattr(self.q_in, "get_nowait") else self.q_in.get(block=False)
+                except queue.Empty:
+                    time.sleep(0.002)
+                    continue
+                self.handle(event)
+
+        threading.Thread(target=take, daemon=True).start()
+"""
+    with ready_worker(owning(body), tmp_path) as front:
+        for text in ("a", "b"):
+            assert front.run(text=text)[1][0].parts["repeated"] == text * 2
+        front.set(1, times=3)
+        assert front.run(text="c")[1][0].parts["repeated"] == "ccc"
+        assert front.end() == 0
