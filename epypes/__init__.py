@@ -55,6 +55,8 @@ if TYPE_CHECKING:
         summarize,
     )
     from epypes.run.guard import unguarded
+    from epypes.service.connection import connect
+    from epypes.service.reopen import load_failure
     from epypes.transport import ZMQPublisher, ZMQSubscriber
 
 _HOMES = {
@@ -101,7 +103,9 @@ _HOMES = {
     "Stages": "epypes.pipeline",
     "ZMQPublisher": "epypes.transport",
     "ZMQSubscriber": "epypes.transport",
+    "connect": "epypes.service.connection",
     "load": "epypes.bundle",
+    "load_failure": "epypes.service.reopen",
     "load_pipeline": "epypes.bundle",
     "promote": "epypes.bundle",
     "to_source": "epypes.bundle",
@@ -140,10 +144,12 @@ __all__ = [
     "ZMQPublisher",
     "ZMQSubscriber",
     "camera",
+    "connect",
     "errors",
     "extend",
     "group",
     "load",
+    "load_failure",
     "load_pipeline",
     "outputs",
     "promote",

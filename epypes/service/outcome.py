@@ -189,9 +189,11 @@ class Desk:
 
     def _settle_failure(self, entry: Entry, result: Result, failure: FailureRecord) -> None:
         self._log(failure)
-        for answer in result.answers:
-            if isinstance(answer, Envelope) and answer.failure is not None:
-                self._report(answer)
         # In a storm dropped events would fill the store's memory with images of no interest.
         kept = self._store().keep(failure, None if failure.kind == "dropped" else entry.event)
+        # With its id, so that who hears of it can have it run again.
+        more = {"id": kept.id, "kind": kept.kind, "dead_letter": kept.dead_letter, "when_ns": kept.when_ns}
+        for answer in result.answers:
+            if isinstance(answer, Envelope) and answer.failure is not None:
+                self._report(replace(answer, attributes={**answer.attributes, **more}))
         self.tell("failure", asdict(kept))

@@ -24,8 +24,9 @@ def line(
     values: Mapping[str, Any],
     params: Mapping[str, object] | None = None,
     module: str = "cv2",
+    verb: str = "rerun",
 ) -> str:
-    """Return the call of ``rerun`` that leads from the first values to these.
+    """Return the call that leads from the first values to these.
 
     Parameters
     ----------
@@ -38,6 +39,8 @@ def line(
         if the module has a constant of that name and value.
     module
         The module of these constants.
+    verb
+        The method that is called.
 
     Returns
     -------
@@ -59,7 +62,7 @@ def line(
         words.append(f"**{{{', '.join(others)}}}")
     left_out = [repr(name) if "\n" in name else name for name, text in sources.items() if not text]
     comment = f"  # without {listed(left_out)}: no short text makes that value" if left_out else ""
-    return f"{runner_name}.rerun({', '.join(words)}){comment}"
+    return f"{runner_name}.{verb}({', '.join(words)}){comment}"
 
 
 def source(value: Any, param: object = None, module: str = "cv2") -> str:
@@ -68,8 +71,8 @@ def source(value: Any, param: object = None, module: str = "cv2") -> str:
     return text if len(text) <= _MOST_CHARACTERS else ""
 
 
-def name_of(runner: object, namespace: Mapping[str, Any] | None = None) -> str:
-    """Return what a runner is called in a namespace: the first name that was given to it, or ``"runner"`` if none was.
+def name_of(runner: object, namespace: Mapping[str, Any] | None = None, word: str = "runner") -> str:
+    """Return what a runner is called in a namespace: the first name that was given to it, or ``word`` if none was.
 
     Parameters
     ----------
@@ -77,9 +80,11 @@ def name_of(runner: object, namespace: Mapping[str, Any] | None = None) -> str:
         Is looked for by identity.
     namespace
         Objects by name; that of the notebook without.
+    word
+        What it is called otherwise.
     """
     known = dict(_notebook() if namespace is None else namespace)
-    return next((name for name, value in known.items() if value is runner and _is_variable(name)), "runner")
+    return next((name for name, value in known.items() if value is runner and _is_variable(name)), word)
 
 
 def _notebook() -> Mapping[str, Any]:

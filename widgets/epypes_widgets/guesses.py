@@ -10,8 +10,8 @@ from typing import Any, Final
 from epypes.graph import CompGraph, annotated_params, as_switch
 from epypes.hints import Param, Roi, Text, param_from_value
 from epypes.parameters import entry_of, parameter_names, uses, usual
-from epypes.run import CompGraphRunner
 from epypes_widgets.movable import is_integer, is_movable, plain
+from epypes_widgets.places import Tunable
 
 _RECTANGLES: Final = frozenset(("roi", "rect", "rectangle", "crop", "box", "bbox", "window"))
 _THRESHOLDS: Final = frozenset(("thresh", "threshold", "level", "cutoff"))
@@ -50,7 +50,7 @@ def takers(cg: CompGraph, token: str) -> Iterator[Taker]:
         yield Taker(name, cg.functions[name], parameter, tokens)
 
 
-def guess(runner: CompGraphRunner, token: str) -> Param | Roi | Text | None:
+def guess(runner: Tunable, token: str) -> Param | Roi | Text | None:
     """Return what annotations, the table or the value say of a hyperparameter; None if it can only be shown.
 
     What says something that the value does not fit is passed over. Never raises.
@@ -66,7 +66,7 @@ def guess(runner: CompGraphRunner, token: str) -> Param | Roi | Text | None:
     return None
 
 
-def _annotated(runner: CompGraphRunner, token: str, value: Any) -> Param | Roi | None:
+def _annotated(runner: Tunable, token: str, value: Any) -> Param | Roi | None:
     fitting = (param for param in annotated_params(runner.cg, token) if _holds(param, value))
     found = next(fitting, None)
     return None if found is None else _with_tokens(runner, token, found)
@@ -79,7 +79,7 @@ def _holds(param: Param | Roi | Text, value: Any) -> bool:
         return False
 
 
-def _with_tokens(runner: CompGraphRunner, token: str, found: Param | Roi) -> Param | Roi:
+def _with_tokens(runner: Tunable, token: str, found: Param | Roi) -> Param | Roi:
     """Return a hint in which parameters of the function are named by the tokens they get; others are dropped."""
     cg = runner.cg
     tokens = {name: taken for taker in reversed([*takers(cg, token)]) for name, taken in taker.tokens.items()}
@@ -95,7 +95,7 @@ def _with_tokens(runner: CompGraphRunner, token: str, found: Param | Roi) -> Par
     return replace(found, below=below if below in runner.hyperparameters else "", cuts=named(found.cuts))
 
 
-def _selected(runner: CompGraphRunner, token: str, value: Any) -> Param | None:
+def _selected(runner: Tunable, token: str, value: Any) -> Param | None:
     """Return the branches that a hyperparameter chooses among."""
     for taker in takers(runner.cg, token):
         switch = as_switch(taker.function)
@@ -104,7 +104,7 @@ def _selected(runner: CompGraphRunner, token: str, value: Any) -> Param | None:
     return None
 
 
-def _tabled(runner: CompGraphRunner, token: str, value: Any) -> Param | None:
+def _tabled(runner: Tunable, token: str, value: Any) -> Param | None:
     if not is_movable(value) and not isinstance(value, str | bool):
         return None
     found = _by_function(runner, token, value) or _by_name(runner, token, value)
@@ -113,7 +113,7 @@ def _tabled(runner: CompGraphRunner, token: str, value: Any) -> Param | None:
     return _without_negative(found, plain(value))
 
 
-def _by_function(runner: CompGraphRunner, token: str, value: Any) -> Param | None:
+def _by_function(runner: Tunable, token: str, value: Any) -> Param | None:
     for taker in takers(runner.cg, token):
         entry = entry_of(taker.function, taker.parameter)
         image = "" if entry is None else entry.cuts
@@ -128,7 +128,7 @@ def _by_function(runner: CompGraphRunner, token: str, value: Any) -> Param | Non
     return None
 
 
-def _by_name(runner: CompGraphRunner, token: str, value: Any) -> Param | None:
+def _by_name(runner: Tunable, token: str, value: Any) -> Param | None:
     cuts = ""
     names: dict[str, None] = {}
     for taker in takers(runner.cg, token):
@@ -142,7 +142,7 @@ def _by_name(runner: CompGraphRunner, token: str, value: Any) -> Param | None:
     return replace(found, cuts=cuts) if cuts and found.choices is None else found
 
 
-def _cut_by(runner: CompGraphRunner, taker: Taker, token: str) -> str:
+def _cut_by(runner: Tunable, taker: Taker, token: str) -> str:
     """Return the token that a function compares with this one; empty if that is not known."""
     found = uses(taker.function, taker.parameter)
     compared = (_payload(runner, taker.tokens.get(use.cuts, "")) for use in found if use.entry is None)
@@ -155,11 +155,11 @@ def _cut_by(runner: CompGraphRunner, taker: Taker, token: str) -> str:
     return inputs[0] if is_threshold and len(inputs) == 1 and not known else ""
 
 
-def _payload(runner: CompGraphRunner, token: str) -> str:
+def _payload(runner: Tunable, token: str) -> str:
     return "" if token in runner.hyperparameters else token
 
 
-def _valued(runner: CompGraphRunner, token: str, value: Any) -> Param | Roi | Text | None:
+def _valued(runner: Tunable, token: str, value: Any) -> Param | Roi | Text | None:
     if isinstance(value, str):
         return Text()
     if isinstance(value, tuple | list):

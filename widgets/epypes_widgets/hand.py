@@ -32,6 +32,7 @@ class Hand:
         self._lock = threading.RLock()
         self._held: set[str] = set()
         self._waiting: dict[str, Any] = {}
+        self._contested: set[str] = set()
 
     @property
     def values(self) -> dict[str, Any]:
@@ -121,10 +122,29 @@ class Hand:
         return refused
 
     def moved(self, names: Iterable[str]) -> None:
-        """Know that the hand has moved these controls: what waited for them is out of date."""
+        """Know that the hand has moved these controls: what waited for them is out of date, unless it is contested."""
         with self._lock:
             for name in names:
-                self._waiting.pop(name, None)
+                if name not in self._contested:
+                    self._waiting.pop(name, None)
+
+    def contest(self, names: Iterable[str]) -> list[str]:
+        """Know that somebody else has set these: where one is held, the hand sets nothing until it has let go.
+
+        Returns
+        -------
+        list of str
+            Those that are held.
+        """
+        with self._lock:
+            held = [name for name in names if name in self._held]
+            self._contested.update(held)
+            return held
+
+    def uncontested(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the values that the hand may set."""
+        with self._lock:
+            return {name: value for name, value in values.items() if name not in self._contested}
 
     def hold(self, names: Iterable[str]) -> None:
         """Know that these controls are held."""
@@ -143,6 +163,7 @@ class Hand:
         """
         with self._lock:
             self._held.clear()
+            self._contested.clear()
             waiting, self._waiting = self._waiting, {}
             return waiting, self.follow(waiting)
 

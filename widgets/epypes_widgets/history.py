@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any, Final
 from weakref import WeakKeyDictionary
 
 from epypes.display import Picture
-from epypes.run import CompGraphRunner
 from epypes_widgets.looking.films import is_alike
+from epypes_widgets.places import Tunable
 from epypes_widgets.values import differing, said_change
 
 if TYPE_CHECKING:
     from epypes_widgets.historyframe import HistoryFrame
 
 _KEPT: Final = 1_000
-_histories: WeakKeyDictionary[CompGraphRunner, History] = WeakKeyDictionary()
+_histories: WeakKeyDictionary[Tunable, History] = WeakKeyDictionary()
 _lock = threading.Lock()
 
 
@@ -214,7 +214,7 @@ class History:
         return f"It has {self._entries[0].number} to {self._entries[-1].number}."
 
 
-def history_of(runner: CompGraphRunner) -> History:
+def history_of(runner: Tunable) -> History:
     """Return the history of a runner: the same for all its panels, so that a cell that runs again goes on with it."""
     with _lock:
         return _histories.setdefault(runner, History())

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from epypes.errors import EpypesError
+from epypes.run import CompGraphRunner
 from epypes_widgets import settings
 from epypes_widgets.looking.overlay import scene
 from epypes_widgets.looking.probe import probe
@@ -18,6 +19,7 @@ from epypes_widgets.picture import Message
 from epypes_widgets.promotion import Outcome, Promotion
 from epypes_widgets.shown import Comparison
 from epypes_widgets.tuning import Tuning
+from epypes_widgets.writeback import WritingBack, Written
 
 
 class Messages:
@@ -34,6 +36,7 @@ class Messages:
     def __init__(self, tuning: Tuning, save: Callable[[str], Path], load: Callable[[str], None]) -> None:
         self._tuning, self._save_to, self._load_from = tuning, save, load
         self.promotion = Promotion(self._promoted)
+        self.writing_back = WritingBack(self._written)
 
     @property
     def handlers(self) -> dict[str, Callable[[Message], object]]:
@@ -60,11 +63,15 @@ class Messages:
             "save": lambda message: self._file(self._saved, message),
             "load": lambda message: self._file(self._loaded, message),
             "promote": self._promote,
+            "write_back": self._write_back,
+            "seen": lambda _: tuning.seen(),
+            "left": lambda _: tuning.leave(),
         }
 
     def _ready(self, _message: Message) -> None:
         self._tuning.release()  # a page that is loaded anew holds nothing
         self._tuning.screen.ready()
+        self._tuning.come_back()
 
     # -- values -------------------------------------------------------------------------------------------------
 
@@ -75,6 +82,7 @@ class Messages:
 
     def _set(self, values: Mapping[str, Any], *, commit: bool = True) -> None:
         # What the view sets is what the hand holds.
+        values = self._tuning.hand.uncontested(values)
         self._tuning.hand.moved(values)
         try:
             self._tuning.want(values, commit=commit, is_by_hand=True)
@@ -138,7 +146,25 @@ class Messages:
         return f"Loaded {name}."
 
     def _promote(self, message: Message) -> None:
-        self.promotion.start(self._tuning.runner, str(message["to"]))
+        runner, to = self._tuning.runner, str(message["to"])
+        if isinstance(runner, CompGraphRunner):
+            self.promotion.start(runner, to)
+        else:
+            text = (
+                "Not promoted: a running service is a bundle already. Write its values back, or promote the notebook."
+            )
+            self._promoted(Outcome("refused", text, to))
+
+    def _write_back(self, message: Message) -> None:
+        place = self._tuning.session.place
+        if place.is_written_back:
+            self.writing_back.start(place.owner, dry_run=bool(message["dry_run"]))
+        else:
+            self._written(Written("refused", "Not written: a runner has no bundle to write to. Promote it."))
+
+    def _written(self, told: Written) -> None:
+        content = {"state": told.state, "text": told.text, "diff": told.diff}
+        self._tuning.screen.view.tell("written", content)
 
     def _promoted(self, outcome: Outcome) -> None:
         screen = self._tuning.screen

@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import Any, Final, TypeVar
 
 from epypes.hints import Param
-from epypes.run import CompGraphRunner
 from epypes_widgets.guesses import takers, words
 from epypes_widgets.movable import is_integer, is_movable
+from epypes_widgets.places import Tunable
 
 _UPPER: Final = {"lo": "hi", "low": "high", "min": "max", "lower": "upper", "minimum": "maximum"}
 _NUMBERED: Final = frozenset(("threshold", "thresh"))
@@ -17,7 +17,7 @@ _NUMBERED: Final = frozenset(("threshold", "thresh"))
 _R = TypeVar("_R")
 
 
-def paired(runner: CompGraphRunner, found: Mapping[str, _R], given: Container[str]) -> dict[str, _R]:
+def paired(runner: Tunable, found: Mapping[str, _R], given: Container[str]) -> dict[str, _R]:
     """Return ranges in which the lower one of two tokens says so.
 
     A hint's ``below`` is kept. Else two tokens are a pair if they go into one function, neither has a hint, their names
@@ -41,7 +41,7 @@ def paired(runner: CompGraphRunner, found: Mapping[str, _R], given: Container[st
 
 
 def _check(
-    runner: CompGraphRunner, token: str, high: str, ranges: dict[str, Any], given: Container[str], taken: set[str]
+    runner: Tunable, token: str, high: str, ranges: dict[str, Any], given: Container[str], taken: set[str]
 ) -> None:
     fits = token != high and not {token, high} & taken and _is_pair(runner.hyperparameters, token, high, ranges)
     if fits:
@@ -64,7 +64,7 @@ def _is_pair(values: Mapping[str, Any], low: str, high: str, ranges: Mapping[str
     return is_integer(values[low]) == is_integer(values[high]) and bool(values[low] <= values[high])
 
 
-def _named_pairs(runner: CompGraphRunner, tokens: list[str]) -> Iterator[tuple[str, str]]:
+def _named_pairs(runner: Tunable, tokens: list[str]) -> Iterator[tuple[str, str]]:
     """Give the tokens whose names differ by low and high, and those whose parameters do."""
     for token in tokens:
         for taker in takers(runner.cg, token):

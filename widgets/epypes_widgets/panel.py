@@ -1,8 +1,8 @@
-"""How does a user see, move and read a runner's hyperparameters?"""
+"""How does a user see, move and read the hyperparameters of a runner, or of a running service?"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,9 +17,10 @@ from epypes_widgets.controls import column, controls
 from epypes_widgets.hand import Hand
 from epypes_widgets.history import history_of
 from epypes_widgets.latency import Latency, latency_of
-from epypes_widgets.looking.films import payloads
+from epypes_widgets.looking.films import Payload, payloads
 from epypes_widgets.messages import Messages
 from epypes_widgets.picture import PictureView
+from epypes_widgets.places import Tunable, tunable
 from epypes_widgets.plain import plain_values
 from epypes_widgets.promotion import proposal
 from epypes_widgets.route import listen_beside_cells
@@ -30,20 +31,28 @@ from epypes_widgets.still import Still
 from epypes_widgets.tuning import Tuning
 
 if TYPE_CHECKING:
+    from epypes.service.connection import Connection
     from epypes_widgets.historyframe import HistoryFrame
 
 
 def tune(
-    runner: CompGraphRunner, /, *, images: Iterable[Any] | None = None, token: str | None = None, **hints: Any
+    tuned: CompGraphRunner | Connection,
+    /,
+    *,
+    images: Iterable[Any] | None = None,
+    token: str | None = None,
+    **hints: Any,
 ) -> Panel:
-    """Show controls for a runner's hyperparameters, and the picture that they make.
+    """Show controls for the hyperparameters of a runner or a running service, and the picture that they make.
 
     Parameters
     ----------
-    runner
-        Has been run, so that there is a payload, unless ``images`` are given.
+    tuned
+        A runner that has been run, so that there is a payload, unless ``images`` are given. Or what ``ep.connect``
+        has returned: then the picture follows the service's own events, values are set there, with their revision, and
+        what somebody else sets at the same time is never overwritten unseen.
     images
-        Test images to switch between: values of the one free source token, or dicts by token.
+        Test images to switch between: values of the one free source token, or dicts by token. A service has none.
     token
         The token whose picture is shown at first; without, the last sink token that is an image, else the last
         image.
@@ -62,13 +71,16 @@ def tune(
     Raises
     ------
     PayloadError
-        The runner has not been run and there are no images, or they don't fit its free source tokens.
+        The runner has not been run and there are no images, or they don't fit its free source tokens; or there are
+        images for a service.
     Exception
         Whatever a function raises on the first image, if the runner has not been run.
     UnknownName
         A hint is for no hyperparameter of the runner, or ``token`` is not in its graph.
     TypeError, ValueError
         A hint can't be read, or the hyperparameter's value lies outside of it.
+    ServiceError
+        The service is gone.
 
     Examples
     --------
@@ -83,20 +95,25 @@ def tune(
     >>> panel.code()
     'runner.rerun(y=5)'
     """
-    if not isinstance(runner, CompGraphRunner):
-        kind = type(runner).__name__
-        raise TypeError(f"tune() takes a CompGraphRunner, not {kind!r}: tune(CompGraphRunner(cg, hparams)).")
+    runner = tunable(tuned)
     if token is not None:
         runner.cg.require_token(token)
     given = () if images is None else payloads(runner, images)
+    session = Session(runner, given)
+    if not session.place.is_shared:
+        _require_payload(runner, given)
+    elif given:
+        runner.trial({}, payload=given[0].values)  # refuses it
+    hand = Hand(controls(runner, hints))
+    session.begin()
+    return Panel(hand, session, token)
+
+
+def _require_payload(runner: Tunable, given: Sequence[Payload]) -> None:
     if runner.last is None and not given:
         free = runner.free_source_tokens
         text = f"Nothing has been run yet, so there is nothing to tune on. Call {run_call(free)} first."
         raise PayloadError(free, text)
-    hand = Hand(controls(runner, hints))
-    if runner.last is None:
-        runner.run(**given[0].values)
-    return Panel(hand, Session(runner, given), token)
 
 
 class Panel:
@@ -171,8 +188,9 @@ class Panel:
 
     def code(self) -> str:
         """Return the line that leads from the runner's first hyperparameters to those of the panel."""
-        first = self._runner.first_hyperparameters
-        return code.line(code.name_of(self._runner), first, {**first, **self._hand.values}, self._hand.params)
+        first, place = self._runner.first_hyperparameters, self._session.place
+        name = code.name_of(place.owner, word=place.word)
+        return code.line(name, first, {**first, **self._hand.values}, self._hand.params, verb=place.verb)
 
     # -- results ------------------------------------------------------------------------------------------------
 
@@ -331,6 +349,7 @@ class Panel:
                 if isinstance(param, Roi)
             ],
             "promote_to": proposal(self.token),
+            "writes_back": self._session.place.is_written_back,
             "settings": list(settings.names(".")),
         }
         return content, [film.thumbnail for film in films]

@@ -4,13 +4,13 @@ Every message has a ``kind``; those of the kernel that replace one another a ``s
 twice or in another order than they were sent.
 
 - To the view: ``setup`` (what there is: rows, folders, stages, images), ``frame`` (pictures, with their bytes),
-  ``reference`` (a picture to compare with), ``error``, ``latency``, ``history``, ``probe``, ``settings``, ``promoted``,
-  ``log``.
+  ``reference`` (a picture to compare with), ``error``, ``note`` (a sentence that is no error), ``latency``,
+  ``history``, ``probe``, ``settings``, ``promoted``, ``written``, ``log``.
 - To the kernel: ``ready`` and ``closed`` (a view is mounted or removed), ``painted`` (a frame has come, and the one
   before is on the screen; what was moved meanwhile goes with it), ``move`` (what is under the hand at the moment),
   ``set`` (what it has stopped at), ``hold`` and ``release`` (of a control), ``reset``, ``undo``, ``redo``, ``goto``,
-  ``save``, ``load``, ``promote``, ``stage``, ``pin``, ``compare``, ``histogram``, ``probe``, ``image``, ``live`` and
-  ``run``.
+  ``save``, ``load``, ``promote``, ``write_back``, ``stage``, ``pin``, ``compare``, ``histogram``, ``probe``,
+  ``image``, ``live`` and ``run``.
 
 Pictures travel as one binary message per frame, never in a trait: traits are kept, compared and saved.
 """
@@ -43,7 +43,8 @@ class PictureView(anywidget.AnyWidget):
         Is called with a word, a delay in seconds and a function, which is to be called once after it; a later call with
         the same word replaces an earlier one.
     handlers
-        By kind of message, what is called with it on the thread that answers the front end.
+        By kind of message, what is called with it on the thread that answers the front end; by ``"seen"`` when a frame
+        has been painted, by ``"left"`` when the last view is gone.
     failed
         Is called with what a handler has raised.
     """
@@ -88,12 +89,16 @@ class PictureView(anywidget.AnyWidget):
     def _closed(self, message: Message) -> None:
         self.frames.closed()
         self._handlers["release"](message)
+        if self.frames.left:
+            self._handlers["left"](message)
 
     def _painted(self, message: Message) -> None:
         frame = self.frames.painted(int(message.get("seq", 0)))
         if "move" in message:
             self._answer(None, {**message["move"], "kind": "move"}, ())
-        # The first frame of a panel shows values that nobody moved, so it has no time to the screen.
+        if frame is not None:
+            self._handlers["seen"](message)
+        # A frame with values that nobody moved has no time to the screen.
         if frame is None or not frame.changed_ns:
             return
         # What a picture takes in the browser after it has come is known of the one before.

@@ -12,15 +12,15 @@ from typing import Any
 
 from epypes.errors import UnknownName
 from epypes.hints import Param, Roi, Text, as_param, param_from_value
-from epypes.run import CompGraphRunner
 from epypes_widgets.guesses import guess
 from epypes_widgets.movable import is_movable, plain
 from epypes_widgets.pairs import paired
+from epypes_widgets.places import Tunable
 
 Range = Param | Roi | Text | None
 
 
-def ranges(runner: CompGraphRunner, hints: Mapping[str, Any]) -> dict[str, Range]:
+def ranges(runner: Tunable, hints: Mapping[str, Any]) -> dict[str, Range]:
     """Return the range of every hyperparameter, in graph order; None for one that can only be shown.
 
     Parameters
@@ -106,7 +106,7 @@ def closed(param: Range, value: Any) -> Range:
     return replace(param, soft=(low, high))
 
 
-def _read(runner: CompGraphRunner, name: str, hint: Any) -> Param | Roi:
+def _read(runner: Tunable, name: str, hint: Any) -> Param | Roi:
     value = runner.hyperparameters[name]
     try:
         param = as_param(hint)

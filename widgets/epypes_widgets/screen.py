@@ -76,6 +76,7 @@ class Screen:
         self._lock = threading.Lock()
         self._seq = count(1).__next__
         self._failure: dict[str, Any] | None = None
+        self._noted = ""
         self._reference: tuple[dict[str, Any], tuple[bytes, ...]] | None = None
         self._referred: tuple[object, tuple[Any, ...]] = (None, ())
         self._told: set[int] = set()
@@ -138,6 +139,12 @@ class Screen:
         self.error = text = text[:_ERROR_CHARACTERS]
         self._failure = {"seq": self._seq(), "text": text, "function": function, "names": list(names)}
         self.view.tell("error", self._failure)
+
+    def note(self, text: str) -> None:
+        """Say something that is no failure; it stays until something else is said, or nothing."""
+        if text != self._noted:
+            self._noted = text
+            self.view.tell("note", {"text": text})
 
     def refers_to(self, key: object, payload: Sequence[Any]) -> bool:
         """Whether the picture is compared with this, computed from the very values of this payload."""
@@ -212,6 +219,8 @@ class Screen:
         if self._log:
             self.view.tell("log", {"lines": self._log})
         self.view.frames.ready()
+        if self._noted:
+            self.view.tell("note", {"text": self._noted})
         if self._failure is not None:
             self.view.tell("error", self._failure)
 

@@ -11,8 +11,9 @@ from collections.abc import Callable, Mapping, Sequence
 from operator import is_, is_not
 from typing import Any
 
-from epypes.run import CompGraphRunner, Run
+from epypes.run import Run
 from epypes_widgets.looking.films import Payload, is_alike
+from epypes_widgets.places import Tunable, place_of
 
 
 class Session:
@@ -31,10 +32,13 @@ class Session:
         The last run that completed; None before the first.
     image
         The index of the payload that it was computed from; None for one that is not among them.
+    place
+        Where its functions run.
     """
 
-    def __init__(self, runner: CompGraphRunner, payloads: Sequence[Payload] = ()) -> None:
+    def __init__(self, runner: Tunable, payloads: Sequence[Payload] = ()) -> None:
         self.runner, self.payloads = runner, tuple(payloads)
+        self.place = place_of(runner)
         self.result: Run | None = None
         self.image = self._image_of(runner.last, is_alike)
         self._lock = threading.Lock()
@@ -42,6 +46,16 @@ class Session:
         self._image_wanted: int | None = None
         self._seen = dict(runner.hyperparameters)
         self._is_closed = False
+
+    def begin(self) -> None:
+        """Have the first payload run if nothing has been; what a function raises on it is raised."""
+        if self.runner.last is not None or not self.payloads:
+            return
+        run = self.runner.trial({}, payload=self.payloads[0].values)
+        self.runner.adopt(run)
+        if run.failure is not None:
+            raise run.failure.exception
+        self.image = 0
 
     # -- from any thread ----------------------------------------------------------------------------------------
 
@@ -68,11 +82,15 @@ class Session:
         return () if run is None else tuple(run.tokens.values[run.tokens.program.slots[token]] for token in free)
 
     def want(self, values: Mapping[str, Any]) -> None:
-        """Ask for values of hyperparameters; they are newer than what anybody has set on the runner until now."""
+        """Ask for values of hyperparameters; they are newer than what a cell has set on the runner until now.
+
+        What somebody else has set at the same time is not overwritten: see ``changes_of_others``.
+        """
         now = self.runner.hyperparameters
         with self._lock:
             self._wanted.update(values)
-            self._seen.update({name: now[name] for name in values if name in now})
+            if not self.place.is_shared:
+                self._seen.update({name: now[name] for name in values if name in now})
 
     def close(self) -> None:
         """Change the runner no more."""
@@ -91,6 +109,7 @@ class Session:
         They count from then on: what was asked for these tokens before is dropped, and so is what was asked for a token
         that is no hyperparameter any more.
         """
+        self.place.catch_up()
         now = dict(self.runner.hyperparameters)
         with self._lock:
             changed = {name: value for name, value in now.items() if self._seen.get(name, self) is not value}
@@ -132,13 +151,18 @@ class Session:
         """Set what is wanted on a runner that is changed all the time; its next run has it."""
         with self._lock:
             wanted, self._wanted = self._wanted, {}
-        for name, value in wanted.items():
-            self.runner[name] = value
+        self.place.put(wanted)
 
     def tried(self, values: Mapping[str, Any], targets: Sequence[str]) -> Run:
-        """Return a run with these hyperparameters on the present payload; nothing is changed by it."""
+        """Return a run with these hyperparameters, on the present payload if it can be had; nothing is changed by it.
+
+        Raises
+        ------
+        LookupError
+            It can't be had at all.
+        """
         known = self.runner.hyperparameters
-        return self.runner.trial({name: value for name, value in values.items() if name in known}, *targets)
+        return self.place.compared({name: value for name, value in values.items() if name in known}, *targets)
 
     def _image_of(self, run: Run | None, is_one: Callable[[Any, Any], bool] = is_) -> int | None:
         """Return the index of the payload that a run was computed from."""

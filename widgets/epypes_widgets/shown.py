@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
-from epypes.run import CompGraphRunner, Run
+from epypes.run import Run
 from epypes_widgets.looking.stages import Stage, best_stage
+from epypes_widgets.places import Tunable
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,14 +81,14 @@ class Shown:
 
 
 # A cell that is run again makes a new panel, in which the hand goes on where it was.
-_last: WeakKeyDictionary[CompGraphRunner, Shown] = WeakKeyDictionary()
+_last: WeakKeyDictionary[Tunable, Shown] = WeakKeyDictionary()
 
 
-def remember_shown(runner: CompGraphRunner, shown: Shown) -> None:
+def remember_shown(runner: Tunable, shown: Shown) -> None:
     """Keep what is shown of a runner for its next panel."""
     _last[runner] = shown
 
 
-def shown_before(runner: CompGraphRunner) -> Shown:
+def shown_before(runner: Tunable) -> Shown:
     """Return what the last panel of a runner has shown; nothing of one that had none."""
     return _last.get(runner, Shown())

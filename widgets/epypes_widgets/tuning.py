@@ -15,13 +15,15 @@ from typing import Any, Final
 from epypes.display import Picture
 from epypes.errors import StillRunning
 from epypes.graph import CompGraph
-from epypes.run import CompGraphRunner, Failure, Run
+from epypes.run import Failure, Run
 from epypes_widgets.hand import Hand
 from epypes_widgets.history import Entry, History
 from epypes_widgets.pictures import thumbnail
+from epypes_widgets.places import Tunable
 from epypes_widgets.screen import Screen
 from epypes_widgets.session import Session
 from epypes_widgets.shown import Comparison
+from epypes_widgets.values import is_same, said
 from epypes_widgets.worker import Worker
 
 _LOG: Final = logging.getLogger(__name__)
@@ -54,14 +56,14 @@ class Tuning:
 
     def __init__(self, hand: Hand, session: Session, history: History, settled: Callable[[], None]) -> None:
         self.hand, self.session, self.history = hand, session, history
-        self.runner: CompGraphRunner = session.runner
+        self.runner: Tunable = session.runner
         self.is_live = True
         self.worker = Worker(self._compute, self.report)
         self._settled = settled
         self._lock = threading.Lock()
         self._commits = False
-        self._is_forced = self._has_looked = False
-        self._forget = self.runner.watch(self._runner_changed)
+        self._is_forced = self._has_looked = self._is_behind = self._is_unwell = False
+        self._forget: Callable[[], None] | None = self.runner.watch(self._runner_changed)
         for control in hand.controls:
             control.on_change(self._moved)
 
@@ -79,7 +81,7 @@ class Tuning:
 
     def close(self, timeout_s: float) -> None:
         """Follow nothing any more; StillRunning names the functions that have not returned in time."""
-        self._forget()
+        self._unwatch()
         self.session.close()
         try:
             self.worker.close(timeout_s)
@@ -90,8 +92,10 @@ class Tuning:
 
     def want(self, values: Mapping[str, Any], *, commit: bool = True, is_by_hand: bool = False) -> None:
         """Move controls to values and have them computed; ValueError, and nothing is done, if one is out of range."""
+        values = self.hand.uncontested(values)
         with self._lock:  # of two threads the one whose value stands is wanted last
             self.session.want(self.hand.set(values, is_by_hand=is_by_hand))
+        self.screen.note("")
         if commit:
             self._commits = True
         else:
@@ -143,6 +147,22 @@ class Tuning:
         self.screen.tell_history()
         return True
 
+    def leave(self) -> None:
+        """Know that no view is left: a service that nobody looks at is not listened to."""
+        if self.session.place.is_shared:
+            self._unwatch()
+
+    def come_back(self) -> None:
+        """Know that there is a view, and show what has happened meanwhile."""
+        if self._forget is None and not self.worker.closed:
+            self._forget = self.runner.watch(self._runner_changed)
+            self.worker.ask()
+
+    def seen(self) -> None:
+        """Know that a frame has been painted: what came meanwhile is next."""
+        if self._is_behind:
+            self.worker.ask()
+
     def report(self, exception: BaseException) -> None:
         """Tell of something that failed in the panel itself, in its log and in that of the process."""
         _LOG.error("The panel has failed", exc_info=exception)
@@ -150,9 +170,13 @@ class Tuning:
 
     def _moved(self, values: Mapping[str, Any]) -> None:
         """Take values from the hand, on the thread that answers the front end."""
+        values = self.hand.uncontested(values)
+        if not values:
+            return
         with self._lock:
             self.hand.moved(values)
             self.session.want({name: self.hand.control(name).read()[name] for name in values})
+        self.screen.note("")
         self._commit_later(REST_S)
         self.worker.ask()
 
@@ -160,6 +184,11 @@ class Tuning:
         if not self.worker.is_current:
             self.screen.refer_anew()
             self.worker.ask()
+
+    def _unwatch(self) -> None:
+        forget, self._forget = self._forget, None
+        if forget is not None:
+            forget()
 
     def _commit_later(self, delay_s: float) -> None:
         self.worker.later("commit", delay_s, self._commit, is_work=True)
@@ -172,24 +201,33 @@ class Tuning:
 
     def _compute(self, changed_ns: int) -> None:
         """Bring the screen up to date with all that is wanted."""
-        self._follow_others()
+        is_changed = self._follow_others()
         is_wanted = self.is_live or self._is_forced or self.session.result is None
-        is_asked = self._is_forced or self._has_looked
+        is_asked = self._is_forced or self._has_looked or self._is_unwell
         self._is_forced = self._has_looked = False
         if not (is_wanted or is_asked):
+            self._tell_of_place()
             return
-        if self.screen.view.frames.left and not (is_asked or self.session.is_wanting):
+        is_moved = is_asked or self.session.is_wanting
+        if self.screen.view.frames.left and not is_moved:
             return  # the cell was run again, and another panel looks at this runner now
+        is_moved = is_moved or is_changed or self._has_run
+        if is_moved or not self._waits_for_screen():
+            self._show_run(is_wanted, changed_ns if is_moved else 0)
+
+    def _show_run(self, is_wanted: bool, changed_ns: int) -> None:
         try:
             run, is_settled = self._tried(is_wanted)
         except Exception as error:  # what is wanted can't be run: a placeholder, a branch that is not there
-            self.screen.fail(str(error))
+            self._is_unwell = bool(self.session.place.notice())
+            self.screen.fail(str(error), names=tuple(getattr(error, "problems", ())))
             return
         if run.failure is not None:
             self._fail(run, run.failure)
             return
         self.screen.follow(run)
         self.screen.show(run, changed_ns)
+        self._tell_of_place()
         if not is_settled:
             self.session.insist()
             self._commit_later(REST_S)
@@ -197,6 +235,23 @@ class Tuning:
             self._commits = False
             self._commit(is_final=True)
         self._compare()
+
+    @property
+    def _has_run(self) -> bool:
+        """Whether somebody has run the runner since its run was shown."""
+        return self.runner.last is not self.session.result
+
+    def _waits_for_screen(self) -> bool:
+        """Whether a newer run is to be fetched only when the picture on its way has been painted."""
+        self._is_behind = self.screen.view.frames.in_flight is not None
+        return self._is_behind
+
+    def _tell_of_place(self) -> None:
+        """Say what is wrong with the place where the functions run: the picture may not be the newest."""
+        notice = self.session.place.notice()
+        self._is_unwell = bool(notice)
+        if notice and notice != self.screen.error:
+            self.screen.fail(notice)
 
     def _tried(self, is_wanted: bool) -> tuple[Run, bool]:
         for _ in range(_MOST_ATTEMPTS):
@@ -206,12 +261,29 @@ class Tuning:
             self._follow_others()
         return run, is_settled
 
-    def _follow_others(self) -> None:
-        """Move the controls to what cells have set."""
+    def _follow_others(self) -> bool:
+        """Move the controls to what others have set; return whether they have set anything."""
+        wanted = self.session.wanted
         changed = self.session.changes_of_others()
         if changed:
+            self._tell_conflict(wanted, changed)
             self._log(self.hand.follow(changed))
             self._commit_later(REST_S)
+        return bool(changed)
+
+    def _tell_conflict(self, wanted: Mapping[str, Any], changed: Mapping[str, Any]) -> None:
+        """Say which values of the hand are not set, since somebody else has set them at the same time."""
+        if not self.session.place.is_shared:
+            return
+        held = self.hand.contest(changed)
+        lost = [
+            name for name in changed if name in held or (name in wanted and not is_same(wanted[name], changed[name]))
+        ]
+        for name in lost:
+            mine = f"{said(wanted[name])} was not set" if name in wanted else "it stays so"
+            sentence = f"Somebody else has set {name} to {said(changed[name])}; {mine}. Move it again to change it."
+            self.screen.log(sentence)
+            self.screen.note(sentence)
 
     def _fail(self, run: Run, failure: Failure) -> None:
         good = self.session.result
@@ -221,6 +293,8 @@ class Tuning:
 
     def _at_fault(self, run: Run, function: str) -> list[str]:
         """Return what was set and goes into a function, or into what it is given; if nothing was, all that it takes."""
+        if function not in self.runner.cg.functions:
+            return []  # f_in or f_out of a service
         wanted, takes = self.session.wanted, self.runner.cg.func_inputs(function)
         given = [name for name in takes if name in wanted]
         behind = (name for name in _behind(self.runner.cg, function) if name in wanted)
@@ -255,11 +329,12 @@ class Tuning:
             return
         try:
             values, label = self._compared(comparison)
+            run = self.session.tried(values, (token,))
         except LookupError as error:
             self.screen.log(str(error))
+            self.screen.note(str(error))
             self.screen.change(comparison=None)
             return
-        run = self.session.tried(values, (token,))
         if run.failure is not None:
             self.screen.log(f"Nothing to compare with: with these values {run.failure}.")
         else:

@@ -7,7 +7,6 @@ from typing import Any
 
 from epypes.graph import CompGraph, as_switch
 from epypes.hints import Param, Roi, Text
-from epypes.run import CompGraphRunner
 from epypes_widgets.controls.choices import choice, index_of
 from epypes_widgets.controls.control import Control
 from epypes_widgets.controls.look import Look
@@ -17,13 +16,14 @@ from epypes_widgets.controls.scale import Scale, scale
 from epypes_widgets.controls.shown import shown
 from epypes_widgets.controls.sliders import slider
 from epypes_widgets.controls.text import text
+from epypes_widgets.places import Tunable
 from epypes_widgets.ranges import ranges
 from epypes_widgets.tips import tip
 
 Kind = Param | Roi | Text | None
 
 
-def controls(runner: CompGraphRunner, hints: Mapping[str, Any]) -> tuple[Control, ...]:
+def controls(runner: Tunable, hints: Mapping[str, Any]) -> tuple[Control, ...]:
     """Return the controls of a runner's hyperparameters, in graph order; a pair stands where its first token does.
 
     Raises
@@ -42,7 +42,7 @@ def controls(runner: CompGraphRunner, hints: Mapping[str, Any]) -> tuple[Control
 class _Bench:
     """What is needed to make controls that belong together."""
 
-    def __init__(self, runner: CompGraphRunner, params: Mapping[str, Kind]) -> None:
+    def __init__(self, runner: Tunable, params: Mapping[str, Kind]) -> None:
         self._cg, self._params, self._look = runner.cg, params, Look()
         self._values, self._first = runner.hyperparameters, runner.first_hyperparameters
 

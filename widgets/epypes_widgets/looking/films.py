@@ -16,7 +16,7 @@ from epypes.display.previews.looking import silent_numpy
 from epypes.display.previews.raster import encode_small, pillow_image
 from epypes.errors import PayloadError, UnknownName
 from epypes.graph import colour_order
-from epypes.run import CompGraphRunner
+from epypes_widgets.places import Tunable
 
 _THUMBNAIL_PX: Final = 96
 _TITLE_CHARACTERS: Final = 40
@@ -41,7 +41,7 @@ class Payload:
     thumbnail: bytes = field(default=b"", repr=False)
 
 
-def payloads(runner: CompGraphRunner, images: Iterable[Any]) -> tuple[Payload, ...]:
+def payloads(runner: Tunable, images: Iterable[Any]) -> tuple[Payload, ...]:
     """Return what ``tune(runner, images=...)`` was given as payloads.
 
     Parameters
@@ -89,7 +89,7 @@ def _listed(images: Any) -> list[Any]:
     return listed
 
 
-def _values(runner: CompGraphRunner, free: tuple[str, ...], item: Any, where: str) -> dict[str, Any]:
+def _values(runner: Tunable, free: tuple[str, ...], item: Any, where: str) -> dict[str, Any]:
     if not free:
         raise PayloadError((), "The graph has no free source token to give images to. Leave images out.")
     if not isinstance(item, Mapping):
@@ -123,7 +123,7 @@ def _title(payload: Mapping[str, Any], place: int) -> str:
     return name[-_TITLE_CHARACTERS:] or f"{next(iter(payload))} {place + 1}"
 
 
-def _thumbnail(runner: CompGraphRunner, payload: Mapping[str, Any]) -> bytes:
+def _thumbnail(runner: Tunable, payload: Mapping[str, Any]) -> bytes:
     token = next((token for token, value in payload.items() if is_image(value)), None)
     if token is None:
         return b""

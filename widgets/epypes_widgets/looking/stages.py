@@ -8,8 +8,9 @@ from typing import Any, Literal
 
 from epypes.display import is_image, scene_of
 from epypes.display.previews.arrays import is_strip
-from epypes.run import CompGraphRunner, Run
+from epypes.run import Run
 from epypes.run.guard import ARRAYLESS
+from epypes_widgets.places import Tunable
 
 State = Literal["fresh", "stale", "failed", "absent"]
 
@@ -76,16 +77,17 @@ def best_stage(run: Run, stages: Iterable[Stage]) -> str | None:
     return None if best is None else offered[best].token
 
 
-def states(looked_at: Run | CompGraphRunner, stages: Iterable[Stage]) -> dict[str, State]:
+def states(looked_at: Run | Tunable, stages: Iterable[Stage]) -> dict[str, State]:
     """Return the state of every stage.
 
     ``"failed"`` is what the function that failed would have made, ``"absent"`` what was not computed; of a runner, a
     value is stale, too, if a hyperparameter has changed since its last run.
     """
-    if isinstance(looked_at, CompGraphRunner):
-        run, outdated = looked_at.last, frozenset(looked_at.stale)
+    run: Run | None
+    if isinstance(looked_at, Run):
+        run, outdated = looked_at, frozenset[str]()
     else:
-        run, outdated = looked_at, frozenset()
+        run, outdated = looked_at.last, frozenset(looked_at.stale)
     return {stage.token: "absent" if run is None else _state(run, stage.token, outdated) for stage in stages}
 
 

@@ -1,5 +1,6 @@
 // What is kept of the values: a line of code, named settings, a promoted graph, and a log of the panel?
 import { element, iconButton, note, say, textButton } from "./elements.js";
+import { writeBackPart } from "./writeback.js";
 
 const COPIED_MS = 1500;
 
@@ -31,6 +32,8 @@ export function footPart(panel) {
   const to = element("input", "epypes-input epypes-target", { type: "text", "aria-label": "Promote to", placeholder: "folder", spellcheck: "false" });
   const promote = textButton("Promote", onPromote, "epypes-promote", "Write the graph with these values as a folder of plain text, and check it");
   const outcome = element("span", "epypes-outcome", { role: "status" });
+  const promoting = element("div", "epypes-foot-line", {}, element("span", "epypes-with", {}, to, promote), outcome);
+  const back = writeBackPart(panel);
   const lines = element("ol", "epypes-lines");
   const summary = element("summary", "");
   const log = element("details", "epypes-log", { hidden: "" }, summary, lines);
@@ -40,7 +43,9 @@ export function footPart(panel) {
     {},
     element("div", "epypes-foot-line epypes-code-line", {}, code, copied, copyButton),
     element("div", "epypes-foot-line", {}, element("span", "epypes-with", {}, list, name, save, load), said),
-    element("div", "epypes-foot-line", {}, element("span", "epypes-with", {}, to, promote), outcome),
+    promoting,
+    back.line,
+    back.diff,
     log,
   );
 
@@ -88,6 +93,8 @@ export function footPart(panel) {
       tellCode(message.code);
       offer(message.settings ?? []);
       if (!to.value) to.value = message.promote_to ?? "";
+      promoting.hidden = Boolean(message.writes_back);
+      back.setup(message);
     },
     history: (message) => message.code !== undefined && tellCode(message.code),
     settings(message) {
@@ -99,6 +106,7 @@ export function footPart(panel) {
       promote.disabled = isRunning;
       tell(outcome, isRunning ? message.text || "Promoting…" : message.text, message.state !== "refused");
     },
+    written: back.written,
     log(message) {
       log.hidden = message.lines.length === 0;
       say(summary, `Log of the panel (${message.lines.length})`);

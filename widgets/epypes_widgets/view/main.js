@@ -132,6 +132,8 @@ function render({ model, el }) {
     probe: probe.message,
     settings: foot.settings,
     promoted: foot.promoted,
+    written: foot.written,
+    note: (message) => header.tell(message.text),
     log: foot.log,
   };
   const onMessage = (message, buffers) => handlers[message.kind]?.(message, buffers ?? []);

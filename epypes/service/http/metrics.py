@@ -1,0 +1,116 @@
+"""What does Prometheus read of a running service?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from prometheus_client import CollectorRegistry
+    from prometheus_client.core import Metric
+
+_STATES: Final = ("LOADING", "READY", "PAUSED", "DEGRADED", "DRAINING", "FAULTED", "STOPPED")
+_NS_PER_S: Final = 1e9
+# How an event may end, as it is counted.
+_OUTCOMES: Final = ("answered", "failed", "dropped", "dead_letters")
+_COUNTED: Final = {
+    "received": ("epypes_events_received", "Events that were accepted."),
+    "retried": ("epypes_events_retried", "Further tries of events whose worker was killed."),
+    "rejected": ("epypes_messages_rejected", "Messages that were no events."),
+}
+_HELD: Final = {
+    "waiting": ("epypes_events_waiting", "Events in the mailbox."),
+    "in_flight": ("epypes_events_in_flight", "Events that are being computed."),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Collector:
+    """Reads a service whenever it is asked; nothing is kept here."""
+
+    service: Any
+
+    def collect(self) -> Iterator[Metric]:
+        """Give all metrics."""
+        info = self.service.info()
+        yield from _identity(info)
+        yield from _events(self.service.counts())
+        yield _state(self.service.state)
+        yield from _times(self.service.latency())
+
+
+def registry_of(service: Any) -> CollectorRegistry:
+    """Return a registry with this service's metrics alone."""
+    from prometheus_client import CollectorRegistry
+
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(Collector(service))
+    return registry
+
+
+def exposed(registry: CollectorRegistry, accept: str) -> tuple[str, bytes]:
+    """Return media type and text of a registry's metrics in the format that an Accept header asks for."""
+    from prometheus_client.exposition import choose_encoder
+
+    encode, media_type = choose_encoder(accept)
+    return media_type, encode(registry)
+
+
+def _identity(info: Mapping[str, Any]) -> Iterator[Metric]:
+    from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
+
+    named = {"name": info["name"], "digest": info["digest"], **info["versions"]}
+    yield InfoMetricFamily("epypes_service", "What is served.", {key: str(value) for key, value in named.items()})
+    yield CounterMetricFamily("epypes_worker_restarts", "Workers that were started anew.", info["restarts"])
+    yield GaugeMetricFamily("epypes_parameters_revision", "Revision of the parameters.", info["revision"])
+    started = info["started_ns"] / _NS_PER_S
+    yield GaugeMetricFamily("epypes_start_time_seconds", "When the service was started, in Unix time.", started)
+
+
+def _events(counts: Mapping[str, int]) -> Iterator[Metric]:
+    from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+    for count, (name, about) in _COUNTED.items():
+        yield CounterMetricFamily(name, about, counts.get(count, 0))
+    resolved = CounterMetricFamily("epypes_events_resolved", "Events by how they ended.", labels=["outcome"])
+    for outcome in _OUTCOMES:
+        resolved.add_metric([outcome.removesuffix("s")], counts.get(outcome, 0))
+    yield resolved
+    for count, (name, about) in _HELD.items():
+        yield GaugeMetricFamily(name, about, counts.get(count, 0))
+
+
+def _state(state: str) -> Metric:
+    from prometheus_client.core import GaugeMetricFamily
+
+    metric = GaugeMetricFamily("epypes_state", "1 for the state that the service is in.", labels=["state"])
+    for each in _STATES:
+        metric.add_metric([each], float(each == state))
+    return metric
+
+
+def _times(latency: Any) -> Iterator[Metric]:
+    from prometheus_client.core import CounterMetricFamily, HistogramMetricFamily
+
+    total_s = latency.total_ns / _NS_PER_S
+    histogram = HistogramMetricFamily("epypes_event_latency_seconds", "From the acceptance of an event to its answer.")
+    histogram.add_metric([], _cumulative(latency.buckets), total_s)
+    yield histogram
+    spent = CounterMetricFamily("epypes_function_seconds", "Time that a function took.", labels=["function"])
+    for function, total_ns in latency.functions.items():
+        spent.add_metric([function], total_ns / _NS_PER_S)
+    yield spent
+
+
+def _cumulative(buckets: Mapping[int, int]) -> list[tuple[str, float]]:
+    """Return counts of events that took at most so long; the keys are nanoseconds, the last one stands for more."""
+    from prometheus_client.utils import floatToGoString
+
+    found, total = [], 0
+    *_, longest = buckets
+    for upper_ns, count in buckets.items():
+        total += count
+        upper = "+Inf" if upper_ns == longest else floatToGoString(upper_ns / _NS_PER_S)
+        found.append((upper, float(total)))
+    return found

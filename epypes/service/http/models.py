@@ -1,0 +1,160 @@
+"""What do requests and answers look like? These records make up the description at /openapi.json."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue
+
+Sentence = Annotated[str, Field(description="What is wrong, and the way out.")]
+Revision = Annotated[int, Field(ge=0, description="It rises with every change of the parameters.", examples=[3])]
+Entry = Annotated[dict[str, Any], Field(examples=[{"value": 70, "low": 0, "high": 255}])]
+Entries = Annotated[
+    dict[str, Entry], Field(description="By token: the value, and what it may be, as in pipeline.toml.")
+]
+
+
+class Refusal(BaseModel):
+    """A request that was refused."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"example": {"detail": "No token 'edgs' in this graph. Did you mean 'edges'?"}}
+    )
+    detail: Sentence
+
+
+class Invalid(Refusal):
+    """A request that is not as described, or values that a parameter can't have."""
+
+    problems: dict[str, str] = Field(
+        default_factory=dict,
+        description="Reasons, by token or by place.",
+        examples=[{"canny_lo": "It is 300; at most 255."}],
+    )
+
+
+class Conflict(Refusal):
+    """Somebody else changed the parameters meanwhile."""
+
+    revision: Revision
+    parameters: Entries
+
+
+class DeployRefusal(Refusal):
+    """A bundle that is not served; the one before goes on."""
+
+    reasons: list[str] = Field(default_factory=list, description="What differs, or what else is wrong.")
+
+
+class Alive(BaseModel):
+    """Whether the service does its work; if not, it should be started anew."""
+
+    alive: bool
+    reason: str = Field(description="Why not; empty if it is.", examples=[""])
+
+
+class Ready(BaseModel):
+    """Whether events are answered."""
+
+    ready: bool
+    state: str = Field(
+        description="LOADING, READY, PAUSED, DEGRADED, DRAINING, FAULTED or STOPPED.", examples=["READY"]
+    )
+    reason: str
+
+
+class Info(BaseModel):
+    """What is served, by which processes, at which addresses."""
+
+    model_config = ConfigDict(extra="allow")
+    name: str
+    bundle: str = Field(description="The folder that is served.", examples=["/srv/edges"])
+    digest: str = Field(description="SHA-256 of its manifest.")
+    state: str
+    reason: str
+    inputs: list[str]
+    outputs: list[str]
+    func_io: dict[str, Any] = Field(description="Input and output tokens by function.")
+    rgb: list[str]
+    threads: int
+    revision: Revision
+    addresses: dict[str, str] = Field(description="sub, pub, failures and http.")
+    pid: int
+    worker_pid: int | None
+    started_ns: int
+    restarts: int
+    versions: dict[str, str]
+
+
+class Parameters(BaseModel):
+    """The parameters of one revision."""
+
+    revision: Revision
+    parameters: Entries
+
+
+class Change(BaseModel):
+    """Values for some parameters; all are taken, or none."""
+
+    model_config = ConfigDict(
+        extra="forbid", strict=True, json_schema_extra={"example": {"revision": 3, "values": {"canny_lo": 60}}}
+    )
+    revision: Revision | None = Field(
+        default=None,
+        description="The one that was read before; another one now is a conflict. Null to change whatever is.",
+    )
+    values: dict[str, JsonValue] = Field(min_length=1, max_length=1_000, description="New values by token.")
+
+
+class WriteBack(BaseModel):
+    """Whether to write the parameters into pipeline.toml, or only to say what would change."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    dry_run: bool = Field(default=True, description="True to say what would change.")
+
+
+class WrittenBack(BaseModel):
+    """What changed, or would change, in pipeline.toml."""
+
+    diff: str = Field(description="A unified diff; empty if nothing changes.")
+    digest: str = Field(description="That of the bundle afterwards.")
+
+
+class Failure(BaseModel):
+    """An event that failed."""
+
+    model_config = ConfigDict(extra="allow")
+    id: str
+    event_id: str
+    function: str
+    tokens: list[str]
+    exception: str
+    message: str
+    trace: list[str]
+    kind: str = Field(description="raised, killed, stuck or dropped.", examples=["raised"])
+    attempt: int
+    dead_letter: bool
+    when_ns: int
+    revision: int
+    hyperparameters: Entries
+    has_event: bool = Field(description="Whether the event was kept.")
+
+
+class Failures(BaseModel):
+    """Events that failed, the last one first."""
+
+    failures: list[Failure]
+
+
+class Deploy(BaseModel):
+    """The bundle to serve from now on."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"example": {"bundle": "/srv/edges-2"}})
+    bundle: str = Field(min_length=1, max_length=4_096, description="An absolute path on the service's machine.")
+
+
+class Drain(BaseModel):
+    """How long to work off what waits."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    timeout_s: float = Field(default=5.0, gt=0, le=600, description="In seconds.")

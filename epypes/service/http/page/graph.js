@@ -1,0 +1,143 @@
+// How does the picture of the graph follow the runs?
+import { part } from "./server.js";
+
+// A picture costs the worker some milliseconds; more of them could not be looked at.
+const LEAST_MS = 400;
+const TOKEN = "token-";
+const STYLE = /<style>([^<]*)<\/style>/;
+const LEAST_WIDTH = / style="min-width:([\d.]+px)"/;
+const style = new CSSStyleSheet();
+
+let isWanted = false;
+let isAsked = false;
+let looked = "";
+
+/** Have the picture drawn anew: one request is in flight, and the latest wish wins. */
+export function redraw() {
+  isWanted = true;
+  if (!isAsked && !document.hidden) void follow();
+}
+
+/** Draw when somebody looks, and look closer at what is chosen. */
+export function watchGraph() {
+  document.adoptedStyleSheets = [...document.adoptedStyleSheets, style];
+  document.addEventListener("visibilitychange", () => isWanted && redraw());
+  const graph = part("graph");
+  graph.addEventListener("click", (/** @type {Event} */ event) => look(vertexOf(event)));
+  graph.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => {
+    const vertex = event.key === "Enter" || event.key === " " ? vertexOf(event) : null;
+    if (vertex) event.preventDefault();
+    look(vertex);
+  });
+  part("look").addEventListener("close", () => (looked = ""));
+}
+
+async function follow() {
+  isAsked = true;
+  while (isWanted && !document.hidden) {
+    isWanted = false;
+    const start = performance.now();
+    await draw();
+    if (looked) await show(looked);
+    const took = performance.now() - start;
+    await new Promise((resolve) => setTimeout(resolve, Math.max(LEAST_MS, 2 * took) - took));
+  }
+  isAsked = false;
+}
+
+async function draw() {
+  try {
+    const answer = await fetch("v1/graph.svg");
+    if (!answer.ok) throw new Error(String((await answer.json()).detail));
+    await swap(await answer.text());
+    part("graph").classList.remove("old");
+    part("graph-note").textContent = "Choose a token to see it larger.";
+  } catch (error) {
+    part("graph").classList.add("old");
+    part("graph-note").textContent = part("graph").firstChild ? "This picture is old: the service gives no newer one." : message(error);
+  }
+}
+
+/** The picture takes the place of the one before once its images are decoded, so that nothing flickers. @param {string} text */
+async function swap(text) {
+  const svg = new DOMParser().parseFromString(withoutStyle(text), "image/svg+xml").documentElement;
+  if (svg.nodeName !== "svg") throw new Error("The service sent no picture.");
+  const images = [...svg.querySelectorAll("image")].map((image) => decoded(image.getAttribute("href") ?? ""));
+  await Promise.all(images);
+  const least = LEAST_WIDTH.exec(text)?.[1];
+  const shown = /** @type {SVGElement} */ (document.importNode(/** @type {any} */ (svg), true));
+  if (least) shown.style.minWidth = `min(${least}, 100vw)`;
+  for (const vertex of shown.querySelectorAll(`[id^=${TOKEN}]`)) {
+    vertex.setAttribute("tabindex", "0");
+    vertex.setAttribute("role", "button");
+  }
+  const focused = document.activeElement?.closest?.(`#graph [id^=${TOKEN}]`)?.id;
+  part("graph").replaceChildren(shown);
+  if (focused) document.getElementById(focused)?.focus();
+}
+
+/** @param {string} source */
+async function decoded(source) {
+  const image = new Image();
+  image.src = source;
+  await image.decode().catch(() => undefined);
+}
+
+/** The page's policy knows no styles inside a document, so those of the picture become a sheet of the page. @param {string} text */
+function withoutStyle(text) {
+  const inside = STYLE.exec(text);
+  if (inside) style.replaceSync(inside[1]);
+  return text.replace(STYLE, "").replace(LEAST_WIDTH, "");
+}
+
+/** @param {Event} event @returns {Element | null} */
+function vertexOf(event) {
+  return /** @type {Element} */ (event.target)?.closest?.(`[id^=${TOKEN}]`) ?? null;
+}
+
+/** Return the name in an id, where signs stand as ":2e:". @param {string} id */
+const named = (id) => id.replace(/:([0-9a-f]+):/g, (_, code) => String.fromCodePoint(parseInt(code, 16)));
+
+/** @param {Element | null} vertex */
+function look(vertex) {
+  if (!vertex) return;
+  looked = named(vertex.id.slice(TOKEN.length));
+  part("look-title").textContent = looked;
+  part("look-body").replaceChildren();
+  part("look").showModal();
+  void show(looked);
+}
+
+/** @param {string} token */
+async function show(token) {
+  const body = part("look-body");
+  try {
+    const answer = await fetch(`v1/tokens/${encodeURIComponent(token)}/preview?max_side_px=1024`);
+    if (!answer.ok) throw new Error(String((await answer.json()).detail));
+    const isText = (answer.headers.get("Content-Type") ?? "").startsWith("text/");
+    const next = isText ? preformatted(await answer.text()) : await pictured(await answer.blob(), token);
+    if (looked === token) body.replaceChildren(next);
+  } catch (error) {
+    if (looked === token) body.replaceChildren(preformatted(message(error)));
+  }
+}
+
+/** @param {string} text */
+function preformatted(text) {
+  const shown = document.createElement("pre");
+  shown.textContent = text;
+  return shown;
+}
+
+/** @param {Blob} blob @param {string} token */
+async function pictured(blob, token) {
+  const image = new Image();
+  image.src = URL.createObjectURL(blob);
+  image.alt = `The value of ${token} in the latest run`;
+  await image.decode().catch(() => undefined);
+  URL.revokeObjectURL(image.src);
+  return image;
+}
+
+/** @param {unknown} error */
+const message = (error) => (error instanceof TypeError ? "The service can't be reached." : String(/** @type {Error} */ (error).message));

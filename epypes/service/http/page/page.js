@@ -1,0 +1,127 @@
+// What does the live page show, and what is done from it?
+import { loadFailures, sawFailure } from "./failures.js";
+import { redraw, watchGraph } from "./graph.js";
+import { sawParameters, showButtons, watchParameters } from "./parameters.js";
+import { sawCounts, sawRun } from "./rates.js";
+import { ask, confirmed, hasToken, hear, keepToken, make, part, Refused, say, takeToken } from "./server.js";
+
+/** @type {Record<string, string>} */
+const TONES = { READY: "good", LOADING: "warn", PAUSED: "warn", DRAINING: "warn", DEGRADED: "error", FAULTED: "error" };
+const DIGITS = 12;
+
+let state = "";
+
+/** @param {{state: string, reason: string}} now */
+function sawState(now) {
+  state = now.state;
+  const badge = part("state");
+  badge.textContent = now.state;
+  badge.className = `badge ${TONES[now.state] ?? ""}`;
+  part("reason").textContent = now.reason;
+  showOperations();
+  void loadInfo();
+  redraw();
+}
+
+async function loadInfo() {
+  const info = await ask("v1/info").catch(() => null);
+  if (!info) return;
+  part("name").textContent = info.name;
+  document.title = `${info.name}: ${info.state}`;
+  const facts = {
+    bundle: info.bundle,
+    digest: info.digest.slice(0, DIGITS),
+    worker: info.worker_pid === null ? "none" : `process ${info.worker_pid}`,
+    restarts: String(info.restarts),
+    threads: String(info.threads),
+    "events at": info.addresses.sub,
+    "answers at": info.addresses.pub,
+  };
+  part("facts").replaceChildren(...Object.entries(facts).map(([name, text]) => make("div", {}, make("dt", {}, name), make("dd", {}, text))));
+}
+
+function showOperations() {
+  const isPaused = state === "PAUSED";
+  part("pause").disabled = !hasToken() || state !== "READY";
+  part("resume").disabled = !hasToken() || !isPaused;
+  part("drain").disabled = !hasToken() || !["READY", "PAUSED", "DEGRADED"].includes(state);
+}
+
+/** @param {string} path @param {unknown} [body] */
+async function operate(path, body = undefined) {
+  try {
+    await ask(path, "POST", body);
+    say("notice", "");
+  } catch (error) {
+    say("notice", /** @type {Error} */ (error).message);
+    if (error instanceof Refused && error.status === 403) dropToken();
+  }
+}
+
+async function drain() {
+  const text = make("p", {}, "The service takes no more events, and works off those that wait. Its clients get no answers after that.");
+  if (await confirmed("Drain the service?", text, "Drain")) await operate("v1/drain", {});
+}
+
+function dropToken() {
+  keepToken("");
+  showToken();
+}
+
+function showToken() {
+  part("token-hint").textContent = hasToken() ? "Changes are allowed in this tab." : "From the file that epypes serve names. It is kept until this tab is closed.";
+  part("token-form").querySelector("button").textContent = hasToken() ? "Forget" : "Use";
+  part("token").hidden = hasToken();
+  part("token-form").querySelector("label").hidden = hasToken();
+  showOperations();
+  showButtons();
+}
+
+/** @param {boolean} isHeard */
+function onHeard(isHeard) {
+  say("notice", isHeard ? "" : "The service can't be reached; it is asked again. What is shown may be old.");
+  if (isHeard) {
+    void loadFailures().catch(() => undefined);
+    redraw();
+  } else {
+    part("state").className = "badge";
+    part("graph").classList.add("old");
+  }
+}
+
+takeToken();
+watchGraph();
+watchParameters();
+showToken();
+addEventListener("hashchange", () => {
+  takeToken();
+  showToken();
+});
+part("token-form").addEventListener("submit", (/** @type {Event} */ event) => {
+  event.preventDefault();
+  keepToken(hasToken() ? "" : part("token").value);
+  part("token").value = "";
+  showToken();
+});
+part("pause").addEventListener("click", () => void operate("v1/pause"));
+part("resume").addEventListener("click", () => void operate("v1/resume"));
+part("drain").addEventListener("click", () => void drain());
+hear(
+  {
+    state: sawState,
+    counts: sawCounts,
+    parameters: (now) => {
+      sawParameters(now);
+      redraw();
+    },
+    run: (run) => {
+      sawRun(run);
+      redraw();
+    },
+    failure: (failure) => {
+      sawFailure(failure);
+      redraw();
+    },
+  },
+  onHeard,
+);

@@ -1,0 +1,118 @@
+// How does the page ask the service, and hear of it?
+
+const TOKEN = "epypes-token";
+const AGAIN_MS = 2000;
+
+/** What the service refused: a sentence, the status, and what came with it. */
+export class Refused extends Error {
+  /** @param {number} status @param {Record<string, any>} data */
+  constructor(status, data) {
+    super(String(data.detail ?? `The service answered ${status}.`));
+    this.status = status;
+    this.data = data;
+  }
+}
+
+/** Take the token from the address, where `epypes serve` prints it, and hide it there. */
+export function takeToken() {
+  const given = new URLSearchParams(location.hash.slice(1)).get("token");
+  if (!given) return;
+  keepToken(given);
+  history.replaceState(null, "", location.pathname + location.search);
+}
+
+/** @param {string} token */
+export function keepToken(token) {
+  if (token) sessionStorage.setItem(TOKEN, token.trim());
+  else sessionStorage.removeItem(TOKEN);
+}
+
+export const hasToken = () => sessionStorage.getItem(TOKEN) !== null;
+
+/**
+ * Ask for JSON; throws Refused.
+ * @param {string} path @param {string} [method] @param {unknown} [body]
+ * @returns {Promise<any>}
+ */
+export async function ask(path, method = "GET", body = undefined) {
+  /** @type {Record<string, string>} */
+  const headers = {};
+  if (body !== undefined) headers["Content-Type"] = "application/json";
+  if (method !== "GET" && hasToken()) headers.Authorization = `Bearer ${sessionStorage.getItem(TOKEN)}`;
+  let answer;
+  try {
+    answer = await fetch(path, { method, headers, body: body === undefined ? undefined : JSON.stringify(body) });
+  } catch {
+    throw new Refused(0, { detail: "The service can't be reached. Is it still running?" });
+  }
+  const data = await answer.json().catch(() => ({}));
+  if (!answer.ok) throw new Refused(answer.status, data);
+  return data;
+}
+
+/**
+ * Hear of the service as long as the page is open; it is asked again when it has gone away.
+ * @param {Record<string, (data: any) => void>} on by kind of event
+ * @param {(isHeard: boolean) => void} onChange
+ */
+export function hear(on, onChange) {
+  const source = new EventSource("v1/events");
+  source.onopen = () => onChange(true);
+  source.onerror = () => {
+    onChange(false);
+    if (source.readyState === EventSource.CLOSED) setTimeout(() => hear(on, onChange), AGAIN_MS);
+  };
+  for (const [kind, listener] of Object.entries(on)) {
+    source.addEventListener(kind, (event) => listener(JSON.parse(event.data)));
+  }
+}
+
+/**
+ * Make an element.
+ * @param {string} tag @param {Record<string, string>} [attributes] @param {...(Node | string)} inside
+ */
+export function make(tag, attributes = {}, ...inside) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  made.append(...inside);
+  return made;
+}
+
+/** @param {string} id @returns {any} */
+export const part = (id) => document.getElementById(id);
+
+/**
+ * Say something, or nothing, in a notice.
+ * @param {string} id @param {string} text @param {boolean} [isError]
+ */
+export function say(id, text, isError = true) {
+  const notice = part(id);
+  notice.textContent = text;
+  notice.hidden = !text;
+  notice.classList.toggle("error", isError);
+}
+
+/**
+ * Ask the user; resolves to whether it is to be done.
+ * @param {string} title @param {Node} body @param {string} yes
+ * @returns {Promise<boolean>}
+ */
+export function confirmed(title, body, yes) {
+  const dialog = part("ask");
+  part("ask-title").textContent = title;
+  part("ask-body").replaceChildren(body);
+  part("ask-yes").textContent = yes;
+  part("ask-yes").hidden = !yes;
+  part("ask-no").textContent = yes ? "Cancel" : "Close";
+  dialog.showModal();
+  return new Promise((resolve) => {
+    const end = (/** @type {boolean} */ wanted) => {
+      dialog.onclose = null;
+      dialog.close();
+      resolve(wanted);
+    };
+    part("ask-yes").onclick = () => end(true);
+    part("ask-no").onclick = () => end(false);
+    dialog.onclose = () => end(false);
+  });
+}

@@ -1,0 +1,167 @@
+"""How is a running service watched and controlled over HTTP?
+
+uvicorn runs on a thread of its own beside the service's threads. It knows no signals, writes no log of requests, and
+ends in bounded time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from epypes.errors import ServiceError
+from epypes.service.http.address import listening, names_of, url_of
+from epypes.service.http.connections import Connections
+from epypes.service.http.token import owned_token
+from epypes.service.state import state_file
+
+if TYPE_CHECKING:
+    import socket
+
+    import uvicorn
+
+STOP_TIMEOUT_S: Final = 3.0
+_START_TIMEOUT_S: Final = 30.0
+# How long answers may take to get out when the server stops; uvicorn counts in whole seconds what comes after.
+_TAKING_S: Final = 0.5
+_GRACE_S: Final = 2
+
+
+class HttpServer:
+    """The control of one service over HTTP; use it in a ``with`` statement, or start and stop it.
+
+    Parameters
+    ----------
+    service
+        A ``Service``.
+    address
+        ``"127.0.0.1:8642"``, a port, or a URL; port 0 or ``*`` takes a free one.
+    token_file
+        Holds the token that changes need; it is made, readable by its owner alone, if it isn't there. Where services
+        leave their state, if not given.
+    insecure
+        Whether an address that other machines can reach may be taken; HTTP has no encryption.
+    """
+
+    def __init__(
+        self, service: Any, address: str, *, token_file: str | Path | None = None, insecure: bool = False
+    ) -> None:
+        self.address, self.insecure = address, insecure
+        self.url = ""
+        self._service = service
+        bundle = service.info()["bundle"]
+        self.token_file = Path(token_file) if token_file else state_file(bundle).with_suffix(".token")
+        self._server: uvicorn.Server | None = None
+        self._thread: threading.Thread | None = None
+        self._started = threading.Event()
+        self.connections = Connections()
+        self._served: Any = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._error: BaseException | None = None
+
+    def start(self) -> str:
+        """Listen; return the URL.
+
+        Raises
+        ------
+        AddressError
+            The address can't be taken, or is not on loopback and not ``insecure``.
+        KeysError
+            The token's file can't be used.
+        ServiceError
+            The server did not start.
+        """
+        token = owned_token(self.token_file)
+        listener = listening(self.address, insecure=self.insecure)
+        try:
+            self._server = self._made(token, listener)
+            self.url = url_of(listener)
+            self._thread = threading.Thread(target=self._run, args=(listener,), name="epypes-http", daemon=True)
+            self._thread.start()
+            if not self._started.wait(_START_TIMEOUT_S) or self._error is not None:
+                raise ServiceError(self.address, f"HTTP did not start: {self._error or 'no answer'}.")
+        except BaseException:
+            self.stop()
+            listener.close()
+            raise
+        return self.url
+
+    def _made(self, token: str, listener: socket.socket) -> uvicorn.Server:
+        import uvicorn
+
+        from epypes.service.http.app import app_of
+        from epypes.service.http.guard import MOST_HEADER_BYTES, Guard
+        from epypes.service.http.served import Served
+        from epypes.service.http.told import Told
+
+        self._served = Served(self._service, Told(self._service))
+        hint = f"It is in {self.token_file}, which `epypes serve` has named."
+        # A class is asked for, but only ever called.
+        protocol: Any = self.connections.protocol
+        config = uvicorn.Config(
+            Guard(app_of(self._served), token, hint, names_of(listener)),
+            http=protocol,
+            ws="none",
+            loop="asyncio",
+            lifespan="off",
+            interface="asgi3",
+            log_config=None,
+            log_level="error",
+            access_log=False,
+            proxy_headers=False,
+            server_header=False,
+            date_header=False,
+            h11_max_incomplete_event_size=MOST_HEADER_BYTES,
+            timeout_graceful_shutdown=_GRACE_S,
+            callback_notify=self._on_started,
+        )
+        return uvicorn.Server(config)
+
+    async def _on_started(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._started.set()
+
+    def _run(self, listener: socket.socket) -> None:
+        try:
+            if self._server is not None:
+                self._server.run(sockets=[listener])
+        except BaseException as error:
+            self._error = error
+        finally:
+            listener.close()
+            self._started.set()
+
+    def stop(self, timeout_s: float = STOP_TIMEOUT_S) -> None:
+        """Answer what is being asked, drop all connections and end the thread; from any thread, also twice."""
+        server, thread = self._server, self._thread
+        if server is None or thread is None:
+            return
+        server.should_exit = True
+        self._soon(self._end)
+        thread.join(timeout_s)
+        if thread.is_alive():
+            server.force_exit = True
+            self._soon(self.connections.abort)
+            thread.join(timeout_s)
+
+    def _soon(self, function: Callable[[], None]) -> None:
+        if self._loop is not None:
+            with suppress(RuntimeError):  # it has ended
+                self._loop.call_soon_threadsafe(function)
+
+    def _end(self) -> None:
+        """Let all who wait have an answer; those who don't take it lose their connection."""
+        self._served.stop()
+        self.connections.abort_idle()
+        asyncio.get_running_loop().call_later(_TAKING_S, self.connections.abort)
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.stop()

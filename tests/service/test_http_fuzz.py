@@ -1,0 +1,43 @@
+"""Does the server keep to its own description, whatever it is asked?"""
+
+from __future__ import annotations
+
+import schemathesis
+from hypothesis import HealthCheck, settings
+from schemathesis.config import SchemathesisConfig
+
+from epypes.service.http.app import app_of
+from epypes.service.http.served import Served
+from epypes.service.http.told import Told
+
+# What is as described may still be refused for what the service knows: no such token, a value beyond its range.
+CONFIG = {
+    "checks": {
+        "positive_data_acceptance": {"expected-statuses": ["2xx", "401", "403", "404", "409", "422"]},
+        "negative_data_rejection": {
+            "expected-statuses": ["400", "401", "403", "404", "405", "413", "415", "421", "422"]
+        },
+    },
+}
+
+schema = schemathesis.openapi.from_dict(
+    app_of(Served(None, Told(None))).openapi(), config=SchemathesisConfig.from_dict(CONFIG)
+)
+
+
+@schema.parametrize()
+@settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True, database=None)
+def test_every_operation_keeps_to_its_description(case, http):
+    if case.operation.path == "/v1/events" and _lasts(case.query.get("for_s")):
+        case.query["for_s"] = 0.01
+    case.call_and_validate(base_url=http.url, headers={"Authorization": f"Bearer {http.token}"}, timeout=20)
+
+
+def _lasts(for_s):
+    """Whether a listener would listen on and on."""
+    if for_s is None:
+        return True
+    try:
+        return 0.01 < float(for_s) <= 86_400
+    except (TypeError, ValueError):
+        return False

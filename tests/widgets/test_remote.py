@@ -1,0 +1,396 @@
+"""Is a running service tuned by a panel as a runner is, with its line going on and others at it too?"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from time import monotonic
+from typing import Any
+
+import numpy as np
+import pytest
+
+import epypes as ep
+from epypes.errors import PayloadError, ServiceError
+from epypes.service.connection import Connection
+from epypes_widgets import Panel, tune
+from tests.service.standing import Standing, standing
+from tests.widgets.frontend import FrontEnd
+
+TIMEOUT_S = 20.0
+
+
+class Changes:
+    """Wakes who waits for something that another thread does."""
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        deadline = monotonic() + TIMEOUT_S
+        wait = threading.Event()
+        while not condition():
+            assert monotonic() < deadline, "it did not happen"
+            wait.wait(0.01)
+
+
+until = Changes().until
+
+
+@pytest.fixture
+def service(runner: ep.CompGraphRunner, image: Any, tmp_path: Any) -> Standing:
+    ranges = {"gain": {"low": 1, "high": 5}, "threshold": {"low": 0, "high": 255}}
+    service = Standing(runner, tmp_path, ranges, outputs=("mask",))
+    service.event(image=image)
+    return service
+
+
+@pytest.fixture
+def url(service: Standing) -> Iterator[str]:
+    with standing(service) as server:
+        yield f"{server.url}#token={server.token}"
+
+
+@pytest.fixture
+def connection(url: str) -> Iterator[Connection]:
+    with ep.connect(url) as connection:
+        yield connection
+
+
+@pytest.fixture
+def panel(connection: Connection) -> Iterator[Panel]:
+    panel = tune(connection)
+    panel.wait(TIMEOUT_S)
+    yield panel
+    panel.close(TIMEOUT_S)
+
+
+@pytest.fixture
+def screen(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> FrontEnd:
+    return FrontEnd(panel, monkeypatch)
+
+
+def followers() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name == "epypes-follower"]
+
+
+def is_following(panel: Panel) -> None:
+    """Return when the panel hears what the service tells, and has taken what it has heard."""
+    until(lambda: panel._runner._follower is not None and panel._runner._follower.is_open)
+    panel.wait(TIMEOUT_S)
+
+
+def test_a_panel_has_the_parameters_ranges_and_tokens_of_the_service(panel: Panel, screen: FrontEnd) -> None:
+    setup = screen.last("setup")
+    assert {name for row in setup["rows"] for name in row["names"]} == {"gain", "threshold"}
+    assert [(row["low"], row["high"]) for row in setup["rows"]] == [([1], [5]), ([0], [255])]
+    assert [(s["token"], s["is_picture"]) for s in setup["stages"]] == [
+        ("image", True), ("image_bright", True), ("mask", True),
+    ]  # fmt: skip
+    assert (panel.token, setup["images"], setup["writes_back"]) == ("mask", [], True)
+    assert screen.frames[-1]["values"] == {"gain": 2, "threshold": 100}
+    assert set(screen.frames[-1]["times_ms"]) == {"brighten", "above"}
+
+
+def test_a_value_is_set_with_the_revision_known_and_the_run_with_it_is_shown(
+    panel: Panel, screen: FrontEnd, service: Standing
+) -> None:
+    panel["threshold"] = 60
+    panel.wait(TIMEOUT_S)
+    assert service.asked == [({"threshold": 60}, 0)]
+    assert screen.frames[-1]["values"] == {"gain": 2, "threshold": 60}
+    assert panel.result.revision == 1
+    np.testing.assert_array_equal(panel.result["mask"], service.runner.trial({}, "mask")["mask"])
+    assert panel.code() == "service.set(threshold=60)"
+    assert panel.latency.frames > 0
+    panel["gain"] = 3
+    panel.wait(TIMEOUT_S)
+    assert service.asked[1:] == [({"gain": 3}, 1)]
+
+
+def test_of_many_values_the_last_is_set_and_few_are_asked_for(panel: Panel, service: Standing) -> None:
+    with service.lock:  # the first of them hangs
+        for value in range(60, 100):
+            panel["threshold"] = value
+    panel.wait(TIMEOUT_S)
+    assert service.entries["threshold"]["value"] == panel.result.hyperparameters["threshold"] == 99
+    assert len(service.asked) < 10
+
+
+def test_undo_redo_save_and_load_work(panel: Panel, service: Standing, tmp_path: Any) -> None:
+    panel["threshold"] = 60
+    panel.wait(TIMEOUT_S)
+    panel.save(tmp_path / "good")
+    assert panel.undo()
+    panel.wait(TIMEOUT_S)
+    assert (panel["threshold"], service.entries["threshold"]["value"]) == (100, 100)
+    panel.load(tmp_path / "good")
+    panel.wait(TIMEOUT_S)
+    assert (panel["threshold"], service.entries["threshold"]["value"]) == (60, 60)
+    assert list(panel.history["threshold"])[:2] == [100, 60]
+
+
+def test_the_picture_follows_the_line_when_nobody_moves_anything(
+    panel: Panel, screen: FrontEnd, service: Standing, image: Any
+) -> None:
+    is_following(panel)
+    before = len(screen.frames)
+    service.event(image=255 - image)
+    until(lambda: len(screen.frames) > before)
+    panel.wait(TIMEOUT_S)
+    np.testing.assert_array_equal(panel.result["mask"], service.completed[0]["mask"])
+    assert panel.latency.frames == 0  # nobody has moved anything
+    assert len(panel.history) == 1
+
+
+def test_no_more_runs_are_fetched_than_frames_are_painted(
+    panel: Panel, service: Standing, image: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers: list[Callable[[], None]] = []
+    is_slow = threading.Event()
+
+    def up(deliver: Callable[[], None]) -> None:
+        answers.append(deliver) if is_slow.is_set() else deliver()
+
+    screen = FrontEnd(panel, monkeypatch, up=up)
+    is_following(panel)
+    panel.wait(TIMEOUT_S)
+    is_slow.set()
+    before = len(screen.frames)
+    for number in range(20):
+        service.event(image=np.full_like(image, number))
+        panel.wait(TIMEOUT_S)
+    until(lambda: len(answers) == 1)
+    assert len(screen.frames) == before + 1
+    is_slow.clear()
+    answers.pop()()
+    until(lambda: len(screen.frames) > before + 1)
+    panel.wait(TIMEOUT_S)
+    np.testing.assert_array_equal(panel.result["image"] if "image" in panel.result else panel.result["mask"],
+                                  service.completed[0]["image" if "image" in panel.result else "mask"])  # fmt: skip
+
+
+def test_with_live_off_neither_events_nor_values_move_the_picture(
+    panel: Panel, screen: FrontEnd, service: Standing, image: Any
+) -> None:
+    is_following(panel)
+    screen.tell("live", on=False)
+    panel.wait(TIMEOUT_S)
+    before = len(screen.frames)
+    service.event(image=255 - image)
+    panel["threshold"] = 60
+    panel.wait(TIMEOUT_S)
+    assert (len(screen.frames), service.asked) == (before, [])
+    screen.tell("run")
+    panel.wait(TIMEOUT_S)
+    assert screen.frames[-1]["values"]["threshold"] == service.entries["threshold"]["value"] == 60
+
+
+def test_a_control_follows_what_somebody_else_sets(panel: Panel, screen: FrontEnd, service: Standing) -> None:
+    is_following(panel)
+    service.set_parameters({"threshold": 33}, None)
+    until(lambda: panel["threshold"] == 33)
+    panel.wait(TIMEOUT_S)
+    assert screen.frames[-1]["values"]["threshold"] == 33
+    panel["threshold"] = 34
+    panel.wait(TIMEOUT_S)
+    assert (service.entries["threshold"]["value"], service.asked[-1][1]) == (34, 1)
+
+
+def test_what_others_set_under_the_hand_is_told_and_not_overwritten(
+    panel: Panel, screen: FrontEnd, service: Standing
+) -> None:
+    is_following(panel)
+    screen.tell("hold", names=["threshold"])
+    panel._hand.control("threshold").widget.value = 61
+    panel.wait(TIMEOUT_S)
+    service.set_parameters({"threshold": 33}, None)
+    until(lambda: any("Somebody else has set threshold to 33" in line for line in panel.log))
+    panel._hand.control("threshold").widget.value = 62
+    panel.wait(TIMEOUT_S)
+    assert service.entries["threshold"]["value"] == 33
+    assert "Somebody else has set threshold to 33" in screen.last("note")["text"]
+    screen.tell("release")
+    panel.wait(TIMEOUT_S)
+    assert (panel["threshold"], service.entries["threshold"]["value"]) == (33, 33)
+    panel._hand.control("threshold").widget.value = 63
+    panel.wait(TIMEOUT_S)
+    assert (service.entries["threshold"]["value"], screen.last("note")["text"]) == (63, "")
+
+
+def test_a_conflict_on_another_parameter_sends_the_value_again(panel: Panel, service: Standing) -> None:
+    is_following(panel)
+    service.tell = lambda kind, **said: None  # type: ignore[method-assign]  # nobody hears of it before
+    service.set_parameters({"gain": 4}, None)
+    panel["threshold"] = 60
+    panel.wait(TIMEOUT_S)
+    assert {token: entry["value"] for token, entry in service.entries.items()} == {"gain": 4, "threshold": 60}
+    assert service.asked[1:] == [({"threshold": 60}, 0), ({"threshold": 60}, 1)]
+    panel.wait(TIMEOUT_S)
+    panel.token = "image_bright"
+    panel.wait(TIMEOUT_S)
+    assert panel.values == {"gain": 4, "threshold": 60}
+
+
+def test_a_conflict_on_the_same_parameter_is_told_and_the_other_value_stays(panel: Panel, service: Standing) -> None:
+    is_following(panel)
+    service.tell = lambda kind, **said: None  # type: ignore[method-assign]
+    service.set_parameters({"threshold": 33}, None)
+    panel.set(threshold=60, gain=4)
+    panel.wait(TIMEOUT_S)
+    assert {token: entry["value"] for token, entry in service.entries.items()} == {"gain": 4, "threshold": 33}
+    assert panel.values == {"gain": 4, "threshold": 33}
+    assert any("60 was not set" in line for line in panel.log)
+
+
+def test_a_failure_on_the_line_marks_its_function_until_an_event_completes(
+    panel: Panel, screen: FrontEnd, service: Standing, image: Any
+) -> None:
+    is_following(panel)
+    picture = panel.result
+    service.event(image="no image")
+    until(lambda: bool(panel.error))
+    error = screen.last("error")
+    assert error["function"] == "brighten"
+    assert error["text"].startswith("brighten: AttributeError: 'str' object has no")
+    assert (screen.frames[-1]["stale"], screen.frames[-1]["stages"]["image_bright"]) == (True, "failed")
+    assert panel.result is picture
+    service.event(image=image)
+    until(lambda: not panel.error)
+
+
+def test_a_value_with_which_a_function_fails_is_told_as_such(panel: Panel, screen: FrontEnd, service: Standing) -> None:
+    panel["threshold"] = 13
+    panel.wait(TIMEOUT_S)
+    assert panel.error == screen.last("error")["text"] == "above: ValueError: 13 is not a threshold"
+    assert (screen.last("error")["function"], screen.last("error")["names"]) == ("above", ["threshold"])
+    panel["threshold"] = 14
+    panel.wait(TIMEOUT_S)
+    assert (panel.error, panel.result.hyperparameters["threshold"]) == ("", 14)
+
+
+def test_a_value_that_the_service_does_not_take_marks_its_control(connection: Connection, service: Standing) -> None:
+    panel = tune(connection, threshold=(0, 1000))
+    panel["threshold"] = 900
+    panel.wait(TIMEOUT_S)
+    assert "threshold" in panel.error
+    assert service.revision == 0
+    asked = len(service.asked)
+    panel.token = "image_bright"
+    panel.wait(TIMEOUT_S)
+    assert len(service.asked) == asked  # what was refused is not asked for again
+    panel["threshold"] = 90
+    panel.wait(TIMEOUT_S)
+    assert (panel.error, service.entries["threshold"]["value"]) == ("", 90)
+    panel.close(TIMEOUT_S)
+
+
+def test_a_service_that_is_gone_leaves_the_last_picture_and_is_found_again(
+    service: Standing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with standing(service) as server:
+        address, token = server.url, server.token
+        connection = ep.connect(address, token=token)
+        panel = tune(connection)
+        screen = FrontEnd(panel, monkeypatch)
+        is_following(panel)
+        panel.wait(TIMEOUT_S)
+        picture = panel.result
+    until(lambda: "The picture is the last one" in panel.error)
+    assert panel.result is picture
+    panel["threshold"] = 60
+    panel.wait(TIMEOUT_S)
+    assert "It is tried again" in screen.last("error")["text"]
+    with standing(service, address):
+        until(lambda: not panel.error)
+        panel.wait(TIMEOUT_S)
+        assert screen.frames[-1]["values"]["threshold"] == service.entries["threshold"]["value"] == 60
+        panel.close(TIMEOUT_S)
+        connection.close()
+
+
+def test_a_worker_that_starts_again_is_told(panel: Panel, screen: FrontEnd, service: Standing) -> None:
+    is_following(panel)
+    service.become("LOADING", "The worker was killed by signal 9")
+    until(lambda: "LOADING: The worker was killed by signal 9" in panel.error)
+    panel["threshold"] = 60
+    panel.wait(TIMEOUT_S)
+    assert "LOADING" in panel.error
+    service.become("READY")
+    until(lambda: not panel.error)
+    panel.wait(TIMEOUT_S)
+    assert screen.frames[-1]["values"]["threshold"] == 60
+
+
+def test_a_service_without_any_event_yet_shows_its_first_one(
+    runner: ep.CompGraphRunner, image: Any, tmp_path: Any
+) -> None:
+    service = Standing(runner, tmp_path, outputs=("mask",))
+    with standing(service) as server, ep.connect(server.url, token=server.token) as connection:
+        panel = tune(connection)
+        panel.wait(TIMEOUT_S)
+        assert "No event has been completed yet" in panel.error
+        is_following(panel)
+        service.event(image=image)
+        until(lambda: panel.token == "mask")
+        panel.wait(TIMEOUT_S)
+        assert (panel.error, panel.result["mask"].shape) == ("", image.shape)
+        panel.close(TIMEOUT_S)
+
+
+def test_a_panel_that_is_closed_leaves_no_thread(panel: Panel, service: Standing) -> None:
+    is_following(panel)
+    assert len(followers()) == 1
+    panel.close(TIMEOUT_S)
+    assert followers() == []
+
+
+def test_a_panel_that_is_replaced_listens_no_more_and_shares_its_history(
+    connection: Connection, panel: Panel, screen: FrontEnd, service: Standing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    panel["threshold"] = 60
+    panel.wait(TIMEOUT_S)
+    again = tune(connection)
+    FrontEnd(again, monkeypatch)
+    screen.tell("closed")
+    assert list(again.history["threshold"]) == [100, 60]
+    assert len(followers()) == 1
+    again.close(TIMEOUT_S)
+    assert followers() == []
+    screen.tell("ready")
+    assert len(followers()) == 1
+
+
+def test_the_picture_is_compared_with_what_was_shown(panel: Panel, screen: FrontEnd, service: Standing) -> None:
+    panel["threshold"] = 60
+    panel.wait(TIMEOUT_S)
+    asked = len(service.asked)
+    screen.tell("compare", **{"with": {"kind": "default"}})
+    panel.wait(TIMEOUT_S)
+    assert (screen.last("reference")["label"], len(service.asked)) == ("default", asked)
+    panel.token = "image_bright"
+    panel.wait(TIMEOUT_S)
+    panel["gain"] = 4
+    panel.wait(TIMEOUT_S)
+    screen.tell("stage", token="image")
+    screen.tell("compare", **{"with": {"kind": "history", "number": 2}})
+    panel.wait(TIMEOUT_S)
+    assert any("has not shown image with these values" in line for line in panel.log)
+    assert service.entries["gain"]["value"] == 4  # nothing was set to find out
+
+
+def test_what_a_service_can_not_do_is_said(connection: Connection, panel: Panel, screen: FrontEnd, image: Any) -> None:
+    with pytest.raises(PayloadError, match="takes its events from its own line"):
+        tune(connection, images=[image])
+    screen.tell("promote", to="somewhere")
+    assert "a running service is a bundle already" in screen.last("promoted")["text"]
+    with pytest.raises(ServiceError, match="Function 'above' runs in the service at"):
+        panel.result.cg.functions["above"](image, 3)
+    with pytest.raises(TypeError, match="tune\\(\\) takes a CompGraphRunner or a connection to a service, not 'str'"):
+        tune("http://127.0.0.1:8642")  # type: ignore[arg-type]
+
+
+def test_writing_back_is_asked_of_a_service_alone(runner: ep.CompGraphRunner, monkeypatch: pytest.MonkeyPatch) -> None:
+    panel = tune(runner)
+    screen = FrontEnd(panel, monkeypatch)
+    screen.tell("write_back", dry_run=True)
+    assert screen.last("setup")["writes_back"] is False
+    assert screen.last("written")["text"] == "Not written: a runner has no bundle to write to. Promote it."
+    panel.close(TIMEOUT_S)
