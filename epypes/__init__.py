@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     )
     from epypes.run.guard import unguarded
     from epypes.service.connection import connect
+    from epypes.service.reopen import load_failure
     from epypes.transport import ZMQPublisher, ZMQSubscriber
 
 _HOMES = {
@@ -104,6 +105,7 @@ _HOMES = {
     "ZMQSubscriber": "epypes.transport",
     "connect": "epypes.service.connection",
     "load": "epypes.bundle",
+    "load_failure": "epypes.service.reopen",
     "load_pipeline": "epypes.bundle",
     "promote": "epypes.bundle",
     "to_source": "epypes.bundle",
@@ -147,6 +149,7 @@ __all__ = [
     "extend",
     "group",
     "load",
+    "load_failure",
     "load_pipeline",
     "outputs",
     "promote",

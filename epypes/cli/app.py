@@ -7,10 +7,13 @@ import typer
 from epypes.cli.call import call
 from epypes.cli.demo import demo
 from epypes.cli.experiment import experiment
+from epypes.cli.failures import failures
+from epypes.cli.keys import keys
 from epypes.cli.lab import lab
 from epypes.cli.play import play
 from epypes.cli.promote import promote
 from epypes.cli.record import record
+from epypes.cli.replay import replay
 from epypes.cli.serve import serve
 from epypes.cli.verify import verify
 
@@ -22,5 +25,5 @@ app = typer.Typer(
     # A traceback's locals would print whole images.
     pretty_exceptions_enable=False,
 )
-for command in (promote, verify, serve, call, record, play, experiment, demo, lab):
+for command in (promote, verify, serve, call, failures, replay, record, play, keys, experiment, demo, lab):
     app.command()(command)

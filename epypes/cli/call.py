@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from epypes.cli.options import Allow, Keys
 from epypes.cli.terminal import out, print_answer
 from epypes.errors import ServiceError, UnknownName
 from epypes.images import Order
@@ -24,6 +25,8 @@ def call(
     timeout: Annotated[float, typer.Option(help="How long to wait for the answer, in seconds.", min=0.001)] = 10.0,
     count: Annotated[int, typer.Option(help="How often to send it; the times are those of the fastest.", min=1)] = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print the times as JSON, in nanoseconds.")] = False,
+    keys: Keys = None,
+    allow: Allow = None,
 ) -> None:
     """Send one image to the service of a bundle, write what comes back to files and print the rest."""
     from epypes.acquisition import read_image
@@ -38,7 +41,7 @@ def call(
     files = by_token(images, settings.inputs, "input")
     targets = by_token(out_file or [], settings.outputs, "output")
     payload = {token: read_image(file, settings.order(token)) for token, file in files.items()}
-    with Client(bundle, timeout_s=timeout) as client:
+    with Client(bundle, timeout_s=timeout, keys=keys, allow=allow) as client:
         answers = [client.call(payload) for _ in range(count)]
     answer = min(answers, key=lambda answer: answer.round_trip_ns)
     for token, file in targets.items():

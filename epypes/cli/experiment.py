@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from epypes.cli.options import Allow, Keys
 from epypes.cli.terminal import err, out, progress
 from epypes.errors import ExperimentError
 
@@ -40,6 +41,8 @@ def experiment(
     unsafe_pickle: Annotated[
         bool, typer.Option("--unsafe-pickle", help="Send and read pickled contents, as in 2019.")
     ] = False,
+    keys: Keys = None,
+    allow: Allow = None,
     to: Annotated[
         Path | None, typer.Option("--out", help="A folder for requests.csv and Figures 14, 15 and 16 as SVG.")
     ] = None,
@@ -60,6 +63,8 @@ def experiment(
             progress=on_request,
             cameras=[_source(text) for text in camera or ()],
             timeout_s=timeout,
+            keys=keys,
+            allow=allow,
         )
     _print_table(results)
     _print_problems(results)

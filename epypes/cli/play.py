@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from epypes.cli.ending import Ending
+from epypes.cli.options import Allow, Keys
 from epypes.cli.terminal import out
 from epypes.errors import RecordingError
 from epypes.wording import counted
@@ -29,6 +30,8 @@ def play(
     loop: Annotated[int, typer.Option(help="How often; 0 is until Ctrl+C.", min=0)] = 1,
     wait: Annotated[bool, typer.Option(help="Wait for a subscriber before the first message.")] = True,
     insecure: Annotated[bool, typer.Option(help="Bind an address that other machines can reach.")] = False,
+    keys: Keys = None,
+    allow: Allow = None,
     only_info: Annotated[bool, typer.Option("--info", help="Send nothing; print what is in the file.")] = False,
 ) -> None:
     """Publish the messages of a file as they came, at the same distances in time."""
@@ -43,7 +46,16 @@ def play(
     bind = not address.startswith(_CONNECT)
     with Ending() as ending:
         player = Player(
-            file, place, bind, speed=speed, loop=loop, wait=wait, insecure=insecure, on_end=ending.now
+            file,
+            place,
+            bind,
+            speed=speed,
+            loop=loop,
+            wait=wait,
+            insecure=insecure,
+            keys=keys,
+            allow=allow,
+            on_end=ending.now,
         ).start()
         try:
             out.print(f"PLAYING {file} at {player.address}. Ctrl+C ends it.", markup=False)

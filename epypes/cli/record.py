@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from epypes.cli.ending import Ending
+from epypes.cli.options import Allow, Keys
 from epypes.cli.terminal import out
 from epypes.errors import RecordingError
 
@@ -27,6 +28,8 @@ def record(
     messages: Annotated[int | None, typer.Option(help="Stop after so many messages.", min=1)] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file if it is there.")] = False,
     insecure: Annotated[bool, typer.Option(help="Bind an address that other machines can reach.")] = False,
+    keys: Keys = None,
+    allow: Allow = None,
 ) -> None:
     """Write every message that is published into a file, until SIGTERM or Ctrl+C."""
     from epypes.transport import Recorder
@@ -38,7 +41,16 @@ def record(
     place = address.removeprefix(_BIND)
     with Ending() as ending:
         recorder = Recorder(
-            place, file, topic, bind, force=force, messages=messages, insecure=insecure, on_end=ending.now
+            place,
+            file,
+            topic,
+            bind,
+            force=force,
+            messages=messages,
+            insecure=insecure,
+            keys=keys,
+            allow=allow,
+            on_end=ending.now,
         )
         recorder.start()
         try:

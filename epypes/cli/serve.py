@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from epypes.cli.options import Allow, Keys
 from epypes.cli.terminal import err, out
 
 if TYPE_CHECKING:
@@ -35,8 +36,8 @@ def serve(
     ),
     mailbox_size: Annotated[int, typer.Option(help="How many events wait; 1 for latest.", min=1)] = 8,
     insecure: Annotated[bool, typer.Option(help="Bind addresses that other machines can reach.")] = False,
-    keys: Annotated[Path | None, typer.Option(help="Its own .key_secret file.")] = None,
-    allow: Annotated[Path | None, typer.Option(help="With keys: the .key file, or folder, of who may connect.")] = None,
+    keys: Keys = None,
+    allow: Allow = None,
     token_file: Annotated[Path | None, typer.Option(help="The token for HTTP; one is made without.")] = None,
 ) -> None:
     """Serve a bundle between a SUB and a PUB socket, until SIGTERM or Ctrl+C."""
@@ -48,6 +49,10 @@ def serve(
         more = f", control at {state.http}" if state.http else ""
         where = f"events at {state.sub}, answers at {state.pub}, failures at {state.failures}{more}"
         out.print(f"READY {bundle}: {where}, process {state.pid}.")
+        if state.http:
+            # A log is read by others than a terminal.
+            token = f"#token={Path(state.token_file).read_text(encoding='utf-8').strip()}" if out.is_terminal else ""
+            out.print(f"Live page: {state.http}/{token} (the token for changes is in {state.token_file})")
 
     counts = serve_bundle(
         bundle,

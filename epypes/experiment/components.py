@@ -46,12 +46,18 @@ class Settings:
         How many functions of the graph may run at once.
     unsafe_pickle
         Whether the contents of answers are pickled, for a peer of 2019.
+    keys
+        The .key_secret file of the pair that all nodes have in common; empty for none.
+    allow
+        The .key files, or folders of them, of who else may connect.
     """
 
     cameras: tuple[str | int, ...] = ()
     fps: float = 5.0
     workers: int = 1
     unsafe_pickle: bool = False
+    keys: str = ""
+    allow: tuple[str, ...] = ()
 
 
 class Component(FullPipeline):

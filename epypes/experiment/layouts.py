@@ -16,7 +16,7 @@ from typing import Any, Final
 from epypes.errors import ExperimentError
 from epypes.experiment.components import Settings
 from epypes.experiment.process import ChildStation
-from epypes.experiment.station import KEPT, START_TIMEOUT_S, Station, address_for
+from epypes.experiment.station import KEPT, START_TIMEOUT_S, Station, address_for, guard_of
 from epypes.pipeline import Mailbox
 from epypes.transport import ZMQPublisher, ZMQSubscriber
 
@@ -87,7 +87,8 @@ def running(layout: Layout, settings: Settings) -> Iterator[System]:
     requests = Mailbox("drop_oldest", KEPT)
     inbox: Any = queue.SimpleQueue()
     with ExitStack() as stack:
-        publisher = stack.enter_context(ZMQPublisher(address_for(layout.scheme), requests))
+        guard = guard_of(settings, bind=True)
+        publisher = stack.enter_context(ZMQPublisher(address_for(layout.scheme), requests, **guard))
         stations: list[Station | ChildStation] = []
         for names in layout.processes:
             station = (
@@ -104,7 +105,7 @@ def running(layout: Layout, settings: Settings) -> Iterator[System]:
             source = addresses["answers"]
             heard.append(addresses["failures"])
         for address in (source, *heard):
-            subscriber = stack.enter_context(ZMQSubscriber(address, inbox))
+            subscriber = stack.enter_context(ZMQSubscriber(address, inbox, **guard_of(settings, bind=False)))
             if not subscriber.wait_joined(START_TIMEOUT_S):
                 raise ExperimentError("robot", f"Nobody publishes at {address}.")
         yield System(requests, inbox, tuple(stations))

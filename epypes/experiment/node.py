@@ -71,7 +71,8 @@ def main() -> None:
     asked = json.loads(parent.line() or "null")
     if asked is None:
         return
-    settings = Settings(**{**asked["settings"], "cameras": tuple(asked["settings"]["cameras"])})
+    told = asked["settings"]
+    settings = Settings(**{**told, "cameras": tuple(told["cameras"]), "allow": tuple(told["allow"])})
     station = Station(asked["nodes"], settings, "tcp")
     try:
         told = {"addresses": station.start(asked["source"]), "nodes": station.described()}

@@ -86,6 +86,11 @@ class ChildStation:
             self._watcher.join()
             raise self._ended()
         self._told = json.loads(line)
+        return self.addresses
+
+    @property
+    def addresses(self) -> dict[str, str]:
+        """The addresses of answers and of failures, once it is started."""
         return dict(self._told["addresses"])
 
     def described(self) -> dict[str, Mapping[str, Any]]:

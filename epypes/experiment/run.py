@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from epypes.acquisition.cameras import LAST_DEVICE
-from epypes.errors import ExperimentError
+from epypes.errors import ExperimentError, KeysError
 from epypes.experiment.components import Settings
 from epypes.experiment.layouts import LAYOUTS, running
 from epypes.experiment.results import Results, row_of, table_of
 from epypes.experiment.robot import Robot
+from epypes.transport import read_keys
+from epypes.transport.keys import public_keys
 
 # Requests that come first and are not counted: they fill caches, and from its fourth run on a graph is compiled.
 _WARM_UP: Final = 5
@@ -35,6 +37,8 @@ def run_experiment(
     progress: Progress | None = None,
     cameras: Sequence[str | Path | int] = (),
     timeout_s: float = 5.0,
+    keys: str | Path | None = None,
+    allow: Sequence[str | Path] | None = None,
 ) -> Results:
     """Run the paper's experiment: a robot asks, acquisition finds the images, vision finds the keypoints.
 
@@ -61,6 +65,10 @@ def run_experiment(
         comes with scikit-image.
     timeout_s
         Longest wait for one answer.
+    keys
+        The .key_secret file of the pair that all nodes have in common; anybody on this machine may connect without.
+    allow
+        With keys: the .key files, or folders of them, of who else may connect to look on.
 
     Returns
     -------
@@ -71,6 +79,8 @@ def run_experiment(
     ------
     ExperimentError
         An option makes no sense, a process has ended, or there are no answers any more.
+    KeysError
+        Keys can't be read, or are not given.
 
     Notes
     -----
@@ -81,7 +91,8 @@ def run_experiment(
     _check(layout, requests=requests, experiments=experiments, workers=workers)
     _check_number("fps", fps)
     _check_number("timeout_s", timeout_s, threading.TIMEOUT_MAX)
-    settings = Settings(_checked_cameras(cameras), float(fps), workers, bool(unsafe_pickle))
+    guarded = _checked_keys(keys, allow)
+    settings = Settings(_checked_cameras(cameras), float(fps), workers, bool(unsafe_pickle), *guarded)
     rows: list[dict[str, Any]] = []
     counts: Counter[str] = Counter()
 
@@ -131,6 +142,17 @@ def _check_number(name: str, number: float, most: float = math.inf) -> None:
         raise ExperimentError(name, f"{name} must be a number above 0, not {number!r}.")
     if number > most:
         raise ExperimentError(name, f"{name} must be at most {most:.0f}, not {number!r}.")
+
+
+def _checked_keys(keys: str | Path | None, allow: Sequence[str | Path] | None) -> tuple[str, tuple[str, ...]]:
+    """Return the files of keys as they can be told to another process."""
+    if keys is None:
+        if allow:
+            raise KeysError("", "allow= was given, but no keys. Give keys= as well: epypes keys makes them.")
+        return "", ()
+    read_keys(keys)
+    public_keys(allow or ())
+    return str(Path(keys).absolute()), tuple(str(Path(path).absolute()) for path in allow or ())
 
 
 def _checked_cameras(cameras: Sequence[str | Path | int]) -> tuple[str | int, ...]:

@@ -16,7 +16,7 @@ from epypes.errors import ExperimentError
 from epypes.experiment.components import NODES, Component, Settings
 from epypes.experiment.messages import Request, envelope_of, pair_of
 from epypes.pipeline import Mailbox
-from epypes.transport import ZMQPublisher, ZMQSubscriber
+from epypes.transport import ZMQPublisher, ZMQSubscriber, read_keys
 
 START_TIMEOUT_S: Final = 30.0
 # What waits to be sent while a publisher is not there: more than ever does, since the robot asks one thing at a time.
@@ -52,7 +52,7 @@ class Station:
     """
 
     def __init__(self, names: Sequence[str], settings: Settings, scheme: str) -> None:
-        self._scheme = scheme
+        self._scheme, self._settings = scheme, settings
         self._running = ExitStack()
         self._q_in: Any = queue.SimpleQueue()
         # Mailboxes, whose items are sent by the thread that puts them: no other one has to wake up for that.
@@ -77,14 +77,15 @@ class Station:
             A camera gives no frame, or nobody answers at the address.
         """
         enter = self._running.enter_context
-        answers = enter(ZMQPublisher(address_for(self._scheme), self._q_out))
-        failures = enter(ZMQPublisher(address_for(self._scheme), self._q_failures, topic="failures"))
+        bound, joined = guard_of(self._settings, bind=True), guard_of(self._settings, bind=False)
+        answers = enter(ZMQPublisher(address_for(self._scheme), self._q_out, **bound))
+        failures = enter(ZMQPublisher(address_for(self._scheme), self._q_failures, topic="failures", **bound))
         for node in reversed(self.nodes):
             enter(node)
         for node in self.nodes:
             if not node.wait_until_ready(START_TIMEOUT_S):
                 raise ExperimentError(node.name, f"The {node.name} node has no images after {START_TIMEOUT_S:g} s.")
-        subscriber = enter(ZMQSubscriber(source, self._entrance))
+        subscriber = enter(ZMQSubscriber(source, self._entrance, **joined))
         if not subscriber.wait_joined(START_TIMEOUT_S):
             raise ExperimentError(self.nodes[0].name, f"Nobody publishes at {source}.")
         return {"answers": answers.address, "failures": failures.address}
@@ -110,6 +111,20 @@ def described(node: Component) -> Mapping[str, Any]:
 
 def _place(function: Any) -> str:
     return f"{function.__module__}.{function.__qualname__}"
+
+
+def guard_of(settings: Settings, *, bind: bool) -> dict[str, Any]:
+    """Return ``keys`` and ``allow`` for a socket of a node: all nodes have one pair, and know each other by it.
+
+    Raises
+    ------
+    KeysError
+        The keys can't be read.
+    """
+    if not settings.keys:
+        return {}
+    own = read_keys(settings.keys)
+    return {"keys": own, "allow": [own, *settings.allow] if bind else own}
 
 
 def address_for(scheme: str) -> str:

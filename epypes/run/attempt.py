@@ -111,8 +111,8 @@ class Attempts:
             else:
                 one_by_one(draft, wanted, durations_ns)
         except StepFailed as failed:
-            return _ended(draft, failed, wanted, durations_ns, start_ns, side_by_side)
-        outcome = _ended(draft, None, wanted, durations_ns, start_ns, side_by_side)
+            return ended(draft, failed, wanted, durations_ns, start_ns, side_by_side)
+        outcome = ended(draft, None, wanted, durations_ns, start_ns, side_by_side)
         if gain is not None:
             gain.learn(durations_ns, outcome[2][3], side_by_side)
         return outcome
@@ -131,7 +131,7 @@ class Attempts:
         draft.revisions = revisions
         for place in failed.done_ns:
             draft.dirty[place] = 0
-        return _ended(draft, failed, wanted, failed.done_ns, start_ns, False)
+        return ended(draft, failed, wanted, failed.done_ns, start_ns, False)
 
     def rerun_broken_off(self, values: list[Any], failed: StepFailed, changed: Iterable[str], start_ns: int) -> Outcome:
         """Return what is left of a compiled rerun in which a function failed."""
@@ -140,7 +140,7 @@ class Attempts:
         dirty = bytearray(
             failed.done_ns.get(step.place, -1) < 0 and not new.isdisjoint(step.inputs) for step in program.steps
         )
-        return _ended(Draft(program, values, dirty, True), failed, None, failed.done_ns, start_ns, False)
+        return ended(Draft(program, values, dirty, True), failed, None, failed.done_ns, start_ns, False)
 
 
 class AttemptsByKind(dict[frozenset[str], Attempts]):
@@ -157,7 +157,7 @@ class AttemptsByKind(dict[frozenset[str], Attempts]):
         return made
 
 
-def _ended(
+def ended(
     draft: Draft,
     failed: StepFailed | None,
     wanted: bytes | None,
@@ -165,6 +165,7 @@ def _ended(
     start_ns: int,
     side_by_side: bool,
 ) -> Outcome:
+    """Return what is left of a run that came this far: to its end, or to a step that failed."""
     failure, failed_at = None, -1
     if failed is not None:
         failed_at = failed.place

@@ -9,9 +9,10 @@ from __future__ import annotations
 import json
 import queue
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Final
+from weakref import ref
 
 from epypes.errors import EpypesError, MessageError, NotComputed, UnknownName
 from epypes.graph import colour_order
@@ -24,12 +25,13 @@ from epypes.service.slots import Completed
 from epypes.wire import Envelope, encode
 
 if TYPE_CHECKING:
-    from epypes.display import Preview
+    from epypes.display import Figure, Preview
 
 VALUES: Final = "epypes.values"
 # More than any page asks for at once; beyond it, asking is refused.
 _MOST_WAITING: Final = 64
-_MOST_PICTURES: Final = 64
+# Pictures of one run.
+_MOST_KEPT: Final = 64
 _SIDES_PX: Final = (16, 2048)
 _MOST_PICTURE_BYTES: Final = 8_000_000
 # A line on which an event came so lately may bring the next one in time: then nothing is run for who asks.
@@ -49,18 +51,33 @@ class Refused(Exception):
 
 
 class Latest:
-    """The last completed run, and who waits for another."""
+    """The last completed run, and who waits for another.
+
+    Attributes
+    ----------
+    completed
+        The run of an event; None as long as none has completed.
+    again
+        Its payload run again with other parameters, for who asked; None if nobody has.
+    """
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self.completed: Completed | None = None
+        self.again: Completed | None = None
         self._when_s = 0.0
 
     def put(self, completed: Completed) -> None:
         """Make a run the last completed one."""
         with self._changed:
-            self.completed, self._when_s = completed, monotonic()
+            self.completed, self.again, self._when_s = completed, None, monotonic()
             self._changed.notify_all()
+
+    def keep_again(self, again: Completed, of: Completed | None) -> None:
+        """Keep a run of the last payload with other parameters until an event comes."""
+        with self._changed:
+            if self.completed is of:
+                self.again = again
 
     def of_revision(self, revision: int) -> Completed | None:
         """Return a run with this revision or a later one, if there is one or it comes within a moment."""
@@ -96,8 +113,7 @@ class Asked:
         self._channel, self._inbox, self._latest = channel, inbox, latest
         self._tried, self._revision = tried, revision
         self._asks: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
-        self._again: Completed | None = None
-        self._pictures: tuple[Run | None, dict[Any, Told]] = None, {}
+        self._made_of_run: tuple[Callable[[], Run | None], dict[Hashable, Any]] = lambda: None, {}
 
     def start(self) -> None:
         """Begin to answer."""
@@ -143,27 +159,32 @@ class Asked:
         what = ask.get("what")
         completed = self._latest.completed
         run = None if completed is None else completed.run
-        if self._pictures[0] is not run:
-            self._pictures = run, {}
-        key = (what, ask.get("token"), ask.get("max_side_px"))
-        kept = self._pictures[1]
-        if key not in kept:
-            if len(kept) >= _MOST_PICTURES:
-                kept.clear()
-            kept[key] = self._made(ask, run)
-        content, frames = kept[key]
+        if self._made_of_run[0]() is not run or run is None:
+            # The run itself is large, and not kept for those who might ask again.
+            self._made_of_run = (lambda: None) if run is None else ref(run), {}
+        key = what, ask.get("token"), ask.get("max_side_px")
+        content, frames = self._kept(key, lambda: self._made(ask, run))
         return {**content, **_origin(completed)}, frames
 
+    def _kept(self, key: Hashable, make: Callable[[], Any]) -> Any:
+        """Return what was made for this run before, or make it."""
+        kept = self._made_of_run[1]
+        if key not in kept:
+            if len(kept) >= _MOST_KEPT:
+                kept.clear()
+            kept[key] = make()
+        return kept[key]
+
     def _made(self, ask: Mapping[str, Any], run: Run | None) -> Told:
-        shown = self._tried.runner if run is None else run
-        match ask.get("what"):
-            case "view":
-                return _view(shown)
-            case "svg":
-                return _svg(shown)
-            case "preview":
-                return _preview(run, self._tried.runner, ask)
-        raise Refused("unknown question", f"A worker can't be asked for {ask.get('what')!r:.40}.")
+        what, runner = ask.get("what"), self._tried.runner
+        if what == "preview":
+            return _preview(run, runner, ask)
+        if what not in ("view", "svg"):
+            raise Refused("unknown question", f"A worker can't be asked for {what!r:.40}.")
+        figure = self._kept("figure", lambda: _figure(runner if run is None else run))
+        if what == "svg":
+            return {"media_type": "image/svg+xml"}, [figure.svg.encode()]
+        return {"media_type": "application/json"}, [_json_of(figure)]
 
     # -- values -------------------------------------------------------------------------------------------------
 
@@ -182,9 +203,10 @@ class Asked:
             return self._values(completed, ask)
         if revision < ask["revision"]:
             raise Refused("unknown revision", f"The parameters have revision {revision}, not {ask['revision']} yet.")
-        again = self._again
-        if completed is None or again is None or (again.event_id, again.revision) != (completed.event_id, revision):
-            again = self._again = self._ran_again(completed, revision)
+        again = self._latest.again
+        if again is None or again.revision != revision:
+            again = self._ran_again(completed, revision)
+            self._latest.keep_again(again, completed)
         return self._values(again, ask)
 
     def _ran_again(self, completed: Completed | None, revision: int) -> Completed:
@@ -214,17 +236,16 @@ class Asked:
         return _origin(completed), [pack(encode(values))]
 
 
-def _view(shown: Run | CompGraphRunner) -> Told:
-    from epypes.display import view
+def _figure(shown: Run | CompGraphRunner) -> Figure:
+    from epypes.display import show
+
+    return show(shown)
+
+
+def _json_of(figure: Figure) -> bytes:
     from epypes.display.views.jsonview import to_json
 
-    return {"media_type": "application/json"}, [json.dumps(to_json(view(shown))).encode()]
-
-
-def _svg(shown: Run | CompGraphRunner) -> Told:
-    from epypes.display import to_svg
-
-    return {"media_type": "image/svg+xml"}, [to_svg(shown).encode()]
+    return json.dumps(to_json(figure.view)).encode()
 
 
 def _preview(run: Run | None, runner: CompGraphRunner, ask: Mapping[str, Any]) -> Told:

@@ -28,7 +28,7 @@ class Asks:
         self._known: OrderedDict[tuple[Any, ...], Message] = OrderedDict()
 
     def graph(self, what: str) -> bytes:
-        """Return the graph with the values of the last completed run: as JSON (``"view"``) or as a picture (``"svg"``)."""
+        """Return the graph with the values of the last completed run, as JSON (``"view"``) or drawn (``"svg"``)."""
         return bytes(self._ask(what)[1][0])
 
     def preview(self, token: str, max_side_px: int) -> tuple[str, bytes]:

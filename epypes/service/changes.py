@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from epypes.bundle.entries import read
+from epypes.bundle.entries import Member, read
 from epypes.pipeline import Pipeline
 from epypes.run import Failure
 
@@ -19,6 +19,8 @@ class Changes:
         A pipeline of the same graph that answers no events: values are tried on it first.
     pipelines
         Those of the slots.
+    enums
+        The bundle's enumerations, whose members may be values.
 
     Attributes
     ----------
@@ -26,8 +28,8 @@ class Changes:
         That of the last change; 0 as long as the bundle's own values hold.
     """
 
-    def __init__(self, trial: Pipeline, pipelines: Sequence[Pipeline]) -> None:
-        self._trial, self._pipelines = trial, pipelines
+    def __init__(self, trial: Pipeline, pipelines: Sequence[Pipeline], enums: Mapping[str, Any]) -> None:
+        self._trial, self._pipelines, self._enums = trial, pipelines, enums
         self.revision = 0
 
     def apply(self, revision: int, entries: Mapping[str, Any]) -> dict[str, str]:
@@ -42,7 +44,7 @@ class Changes:
         entries
             Values by token, written as in pipeline.toml.
         """
-        values, problems = _values(entries)
+        values, problems = _values(entries, self._enums)
         problems |= self._tried(values)
         if not problems:
             problems = self._set(values)
@@ -75,13 +77,16 @@ class Changes:
         return {}
 
 
-def _values(entries: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+def _values(entries: Mapping[str, Any], enums: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
     values, problems = {}, {}
     for token, entry in entries.items():
         try:
-            values[token] = read(entry)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            problems[token] = f"The value can't be read: {_said(error)}."
+            values[token] = read(entry, enums)
+        except Exception as error:  # an entry of a kind may fail in the making of a value of that kind
+            problems[token] = f"This value can't be read: {_said(error)}."
+            continue
+        if isinstance(values[token], Member):
+            problems[token] = f"The bundle has no enumeration {values[token].enum!r}."
     return values, problems
 
 

@@ -19,6 +19,8 @@ from epypes.service.state import ServiceState, read_state
 from epypes.transport import ZMQPublisher, ZMQSubscriber
 
 if TYPE_CHECKING:
+    from epypes.transport import Keys
+    from epypes.transport.keys import PublicKey
     from epypes.wire import Envelope
 
 # How often it is looked, while an answer is awaited, whether the service still lives.
@@ -57,22 +59,36 @@ class Client:
         The bundle's folder.
     timeout_s
         How long connecting, and each call, may take, in seconds.
+    keys
+        The caller's own pair of CURVE keys, or the path of its .key_secret file, where the service has keys.
+    allow
+        With keys: the service's public key, or its .key file.
 
     Raises
     ------
     ServiceError
         No service runs, or it can't be reached.
+    KeysError
+        If keys can't be read, or the service's is not given.
     """
 
-    def __init__(self, path: str | Path, *, timeout_s: float = 10.0) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        timeout_s: float = 10.0,
+        keys: Keys | str | Path | None = None,
+        allow: PublicKey | Collection[PublicKey] | None = None,
+    ) -> None:
         self.path, self.timeout_s = path, timeout_s
+        self._has_keys = keys is not None
         self._turn = threading.Lock()
         state = _running(path)
         self._rgb = read_settings(Path(path) / SETTINGS).rgb
         self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._subscriber = ZMQSubscriber(state.pub, self._answers)
-        self._publisher = ZMQPublisher(state.sub, self._requests, bind=False)
+        self._subscriber = ZMQSubscriber(state.pub, self._answers, keys=keys, allow=allow)
+        self._publisher = ZMQPublisher(state.sub, self._requests, bind=False, keys=keys, allow=allow)
 
     def __enter__(self) -> Self:
         deadline = monotonic() + self.timeout_s
@@ -82,7 +98,7 @@ class Client:
             joined = self._subscriber.wait_joined(self.timeout_s)
             if not joined or not self._publisher.wait_for_subscriber(max(deadline - monotonic(), 0)):
                 text = f"The service of {self.path} can't be reached within {self.timeout_s:g} s."
-                raise ServiceError(self.path, text)
+                raise ServiceError(self.path, f"{text} {why_unreachable(self._has_keys)}")
         except BaseException:
             self.__exit__()
             raise
@@ -140,10 +156,27 @@ class Client:
             raise ServiceError(self.path, f"The service of {self.path} ended before it answered. Look at its log.")
 
 
-def call(path: str | Path, payload: Mapping[str, Any], *, timeout_s: float = 10.0) -> Answer:
+def call(
+    path: str | Path,
+    payload: Mapping[str, Any],
+    *,
+    timeout_s: float = 10.0,
+    keys: Keys | str | Path | None = None,
+    allow: PublicKey | Collection[PublicKey] | None = None,
+) -> Answer:
     """Send one event to the service of a bundle and wait for its answer; see Client."""
-    with Client(path, timeout_s=timeout_s) as client:
+    with Client(path, timeout_s=timeout_s, keys=keys, allow=allow) as client:
         return client.call(payload)
+
+
+def why_unreachable(has_keys: bool) -> str:
+    """Return what may keep a peer from one that runs, since that refuses a key it does not know without a word."""
+    if has_keys:
+        return (
+            "It may have been started without this side's .key file under --allow, or without --keys; "
+            "or --allow here may not be its .key file."
+        )
+    return "If it was started with --keys, give --keys and --allow here too: epypes keys makes them."
 
 
 def _running(path: str | Path) -> ServiceState:

@@ -99,13 +99,14 @@ class Deployer:
         """Let the worker of the other bundle take over when no event is in flight."""
         with self._dispatcher.changed:
             ended = self._dispatcher.wait_for(lambda: not self._dispatcher.ledger.running(), self._timeout_s)
-            if ended and link.status == "ready":
-                # What is done with the one before is published before anything is done with this one.
+            if ended and self._supervisor.can_switch(link):
                 self._tuning.take_over(link.served.entries)
                 self._supervisor.switch(link)
                 return
+        why = f"The event that is worked on has not ended within {self._timeout_s:g} s."
+        if ended:
+            why = link.process.ending or "The service stops."
         link.dismiss(0.0)
-        why = link.process.ending or f"The event that is worked on has not ended within {self._timeout_s:g} s."
         raise DeployRefused(link.served.path, [why])
 
 

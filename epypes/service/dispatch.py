@@ -17,8 +17,9 @@ from typing import Any
 
 from epypes.errors import EpypesError, ServiceError
 from epypes.service.ledger import Entry, Ledger
-from epypes.service.link import Link, Message
+from epypes.service.link import Link
 from epypes.service.outcome import Desk, Result, Setting, dead_letter, dropped, failed_without_worker, refused, reported
+from epypes.service.stuck import Where
 from epypes.wire import Envelope, decode, encode
 
 _log = logging.getLogger("epypes.service")
@@ -40,6 +41,8 @@ class Dispatcher:
     ----------
     changed
         The lock, and whom to wake up when anything changes.
+    is_unwatched
+        Whether the supervisor wants to be woken up by the next event.
     answered_in_row
         How many events were answered since a worker last died.
     """
@@ -50,6 +53,7 @@ class Dispatcher:
         self._desk, self._setting = desk, setting
         self._link: Link | None = None
         self._holds: set[str] = set()
+        self.is_unwatched, self._waiting = False, 0
         self._why_refused = ""
         self._to_tell: deque[Callable[[], object]] = deque()
         self._publishing, self._publisher = threading.Lock(), 0
@@ -59,14 +63,14 @@ class Dispatcher:
     def put(self, item: Any, *, block: bool = False) -> None:
         """Accept an event; never blocks. Called on the I/O thread."""
         with self.changed:
-            had_none = not self.ledger.running()
             for entry in self.ledger.accept(item, perf_counter_ns()):
                 self._tell_at_once(entry, dropped(entry, self.ledger.policy, self.ledger.size, self._setting()))
             if self._why_refused:
                 self._refuse_waiting(self._why_refused)
             self._assign()
-            if had_none:
-                # Who watches over events that take too long has one to watch now.
+            if self.is_unwatched:
+                # Who watches over events that take too long has one to watch now, for as long as one may take.
+                self.is_unwatched = False
                 self.changed.notify_all()
         if self._to_tell:
             self.publish()
@@ -110,7 +114,7 @@ class Dispatcher:
             self._flow()
 
     def refuse(self, why: str) -> None:
-        """Answer every event with a failure that says why it is not worked on; with an empty text work on them again."""
+        """Answer every event with a failure that says why it is not worked on; with an empty text, no more."""
         with self.changed:
             self._why_refused = why
         if why:
@@ -145,8 +149,7 @@ class Dispatcher:
             self._resolve(entry, result)
             self.answered_in_row += 1
             self._assign()
-            if not self.ledger.running():
-                self.changed.notify_all()
+            self._tell_waiting()
         self.publish()
 
     def _resolve(self, entry: Entry, result: Result) -> None:
@@ -184,22 +187,36 @@ class Dispatcher:
         starts = [entry.started_ns for entry in self.ledger.running()] if self._link is not None else []
         return max(min(starts) + timeout_ns - perf_counter_ns(), 0) / 1e9 if starts else None
 
-    def fail_stuck(self, functions: Mapping[int, str], timeout_s: float) -> list[Entry]:
-        """Report events, by number with the function that each is in, as stuck; return those that still were."""
-        with self.changed:
-            found = [entry for seq in functions if (entry := self.ledger.running_at(seq)) is not None]
-            for entry in found:
-                function = functions[entry.seq]
-                where = f"Function {function!r}" if function else "The worker"
-                error = ServiceError(
-                    self._setting().bundle, f"{where} did not return within {timeout_s:g} s; the worker is replaced."
-                )
-                self._resolve(entry, failed_without_worker(entry, error, self._setting(), "stuck", function=function))
-            if found:
-                # Nothing more for a worker that is about to be killed.
-                self._link = None
-                self.ledger.flowing = False
-        return found
+    def still_stuck(self, where: Where, overdue: Sequence[int], timeout_ns: int) -> list[int] | None:
+        """Return which of some events must be reported as stuck; None if the worker may go on. With the lock held.
+
+        An event may have waited in the worker for a change of parameters: its time begins when it is begun. If the
+        worker works on none of them it is held up by something else, and ended without blaming an event for it.
+        """
+        entries = [entry for seq in overdue if (entry := self.ledger.running_at(seq)) is not None]
+        now_ns, waiting = perf_counter_ns(), where.waiting(overdue)
+        for entry in entries:
+            if entry.seq in waiting:
+                entry.started_ns = now_ns
+            elif entry.seq in where.elapsed_ns:
+                entry.started_ns = now_ns - where.elapsed_ns[entry.seq]
+        late = [entry for entry in entries if now_ns - entry.started_ns >= timeout_ns]
+        if not late:
+            return None
+        is_blamed = not where.has_answered or bool(where.elapsed_ns)
+        return [entry.seq for entry in late if is_blamed or entry.attempts > self.ledger.retries + 1]
+
+    def fail_stuck(self, stuck: Sequence[int], functions: Mapping[int, str], timeout_s: float) -> None:
+        """Report events as stuck, by the function of each; the worker gets nothing more. With the lock held."""
+        setting = self._setting()
+        for entry in [entry for seq in stuck if (entry := self.ledger.running_at(seq)) is not None]:
+            function = functions[entry.seq]
+            where = f"Function {function!r}" if function else "The worker"
+            text = f"{where} did not return within {timeout_s:g} s; the worker is replaced."
+            error = ServiceError(setting.bundle, text)
+            self._resolve(entry, failed_without_worker(entry, error, setting, "stuck", function=function))
+        self._link = None
+        self.ledger.flowing = False
 
     def give_up(self, why: str, functions: Mapping[int, str] | None = None) -> int:
         """Answer everything that is not resolved with a failure that says why; return how many events that were."""
@@ -241,8 +258,7 @@ class Dispatcher:
             if found:
                 # Room for others to be done ahead, and the end of a drain.
                 self._assign()
-                if self.ledger.is_empty:
-                    self.changed.notify_all()
+                self._tell_waiting()
             return found
 
     def _released(self) -> list[Callable[[], object]]:
@@ -251,7 +267,16 @@ class Dispatcher:
     def wait_for(self, is_so: Callable[[], bool], timeout_s: float | None) -> bool:
         """Wait until something is so; return whether it is."""
         with self.changed:
-            return self.changed.wait_for(is_so, timeout_s)
+            self._waiting += 1
+            try:
+                return self.changed.wait_for(is_so, timeout_s)
+            finally:
+                self._waiting -= 1
+
+    def _tell_waiting(self) -> None:
+        # Only if somebody waits: the supervisor, which waits too, would be woken up by every event.
+        if self._waiting and not self.ledger.running():
+            self.changed.notify_all()
 
 
 def _result(entry: Entry, header: Mapping[str, Any], frames: Sequence[memoryview], setting: Setting) -> Result:

@@ -52,7 +52,7 @@ class Waiting:
         account = self._accounts.setdefault(cause, _Account(self._burst, now_s))
         self._accounts.move_to_end(cause)
         account.fill(now_s, self._burst)
-        if account.left >= 1 and account.latest is None and len(self._first) < _MOST_WAITING:
+        if account.left >= 1 and len(self._first) < _MOST_WAITING:
             account.left -= 1
             self._first.append(item)
             return given_way

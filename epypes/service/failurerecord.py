@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import re
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from time import time_ns
 from typing import Any, Final
+
+from epypes.bundle.entries import read
 
 # What a person reads of it; more would make a list of failures slow.
 _MOST_CHARACTERS: Final = 2_000
@@ -144,6 +146,32 @@ def record_of(entries: Any) -> FailureRecord:
     if not ID.fullmatch(record.id):
         raise ValueError(f"{record.id!r:.40} is no id of a failure")
     return record
+
+
+def values_of(
+    record: FailureRecord, known: Collection[str], enums: Mapping[str, Any] | None = None
+) -> tuple[dict[str, Any], str]:
+    """Return the values of a record's hyperparameters, and what is to be said of those that can't be taken over.
+
+    Parameters
+    ----------
+    known
+        The hyperparameters of the bundle as it is now.
+    enums
+        Its enumerations by name.
+    """
+    values, gone = {}, []
+    for token, entry in record.hyperparameters.items():
+        try:
+            value = read(entry, enums)
+        except (LookupError, TypeError, ValueError):
+            gone.append(token)
+            continue
+        if token in known:
+            values[token] = value
+        else:
+            gone.append(token)
+    return values, f"{', '.join(map(repr, gone))} can't have the value that failed" if gone else ""
 
 
 _EMPTY: Final[Mapping[str, Any]] = {each.name: getattr(FailureRecord(), each.name) for each in fields(FailureRecord)}

@@ -55,13 +55,13 @@ class Inbox:
             self._items.append(item)
             self._changed.notify()
 
-    def take(self) -> Event | Job:
+    def take(self, block: bool = True) -> Event | Job:
         """Wait for something to work on; it is under way until `finished` is called.
 
         Raises
         ------
         queue.Empty
-            Everything has ended: nothing waits, and nothing will come.
+            Everything has ended: nothing waits, and nothing will come. Without ``block``: nothing waits now.
         """
         with self._changed:
             while True:
@@ -69,6 +69,8 @@ class Inbox:
                 if item is not None:
                     self._working += 1
                     return item
+                if not block:
+                    raise queue.Empty
                 if self._has_ended and not self._items:
                     self._changed.wait(_ENDED_POLL_S)
                     raise queue.Empty

@@ -13,6 +13,7 @@ from typing import Final
 
 SOCKET: Final = "NOTIFY_SOCKET"
 WATCHDOG: Final = "WATCHDOG_USEC"
+_TIMEOUT_S: Final = 1.0
 WATCHDOG_PID: Final = "WATCHDOG_PID"
 # Not for the worker, which is no service of its own.
 VARIABLES: Final = (SOCKET, WATCHDOG, WATCHDOG_PID)
@@ -33,8 +34,8 @@ def notify(*lines: str) -> bool:
     target = f"\0{address[1:]}" if address.startswith("@") else address
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
-            # Who does not read its datagrams must not hold the service up.
-            sender.setblocking(False)
+            # Who does not read its datagrams must not hold the service up for long.
+            sender.settimeout(_TIMEOUT_S)
             sender.sendto("\n".join(lines).encode(), target)
     except OSError:
         return False

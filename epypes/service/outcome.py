@@ -18,6 +18,7 @@ from epypes.wire import Envelope
 from epypes.wire.failures import failure_event
 
 FAILURE_TOPIC: Final = "failure"
+_LOG_PAUSE_NS: Final = 5_000_000_000
 Kind = Literal["raised", "killed", "stuck", "dropped"]
 # Called with a kind of happening ("state", "run", "failure", "parameters") and what there is to know of it.
 Listener = Callable[[str, dict[str, Any]], None]
@@ -142,6 +143,7 @@ class Desk:
         self._answer, self._report, self._store = answer, report, store
         self._listeners: list[Listener] = []
         self.latency = Stopwatch()
+        self._logged_ns, self._unlogged = -_LOG_PAUSE_NS, 0
 
     def listen(self, callback: Listener) -> Callable[[], None]:
         """Have everything told to a callback; return what ends that."""
@@ -173,11 +175,25 @@ class Desk:
             told = {"seq": entry.seq, "event_id": event_id(entry.event), "revision": result.revision}
             self.tell("run", {**told, "total_ns": result.total_ns})
 
-    def _settle_failure(self, entry: Entry, result: Result, failure: FailureRecord) -> None:
+    def _log(self, failure: FailureRecord) -> None:
+        if failure.kind == "dropped":
+            # In a storm a line for each would take longer than the answer.
+            self._unlogged += 1
+            now_ns = perf_counter_ns()
+            if now_ns - self._logged_ns < _LOG_PAUSE_NS:
+                return
+            _log.warning("%s; %d events since this was said last", failure.summary, self._unlogged)
+            self._logged_ns, self._unlogged = now_ns, 0
+            return
         _log.warning("event %s failed in %s: %s", failure.event_id or "without id", failure.function, failure.summary)
-        for answer in result.answers:
-            if isinstance(answer, Envelope) and answer.failure is not None:
-                self._report(answer)
+
+    def _settle_failure(self, entry: Entry, result: Result, failure: FailureRecord) -> None:
+        self._log(failure)
         # In a storm dropped events would fill the store's memory with images of no interest.
         kept = self._store().keep(failure, None if failure.kind == "dropped" else entry.event)
+        # With its id, so that who hears of it can have it run again.
+        more = {"id": kept.id, "kind": kept.kind, "dead_letter": kept.dead_letter, "when_ns": kept.when_ns}
+        for answer in result.answers:
+            if isinstance(answer, Envelope) and answer.failure is not None:
+                self._report(replace(answer, attributes={**answer.attributes, **more}))
         self.tell("failure", asdict(kept))

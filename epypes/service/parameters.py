@@ -9,12 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from epypes.bundle.entries import fits, read, written
+from epypes.bundle.entries import written
 from epypes.errors import BundleError, UnknownName
 
 Entries = Mapping[str, Mapping[str, Any]]
 # Of one step; a float that was typed or sent as text is not on a step to the last bit.
 _STEP_TOLERANCE: Final = 1e-6
+# What may be given anew as JSON has it: the kinds of `epypes.bundle.entries` that are a number, a text or a flat list.
+_KINDS: Final = (None, "none", "tuple", "numpy", "enum")
+_VALUE_KEYS: Final = ("value", "kind", "dtype", "enum", "shape")
+# What TOML has no whole number for.
+_MOST_WHOLE: Final = 2**63
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +55,15 @@ def read_entries(settings: Path) -> dict[str, dict[str, Any]]:
 
 def _json_ready(entry: Mapping[str, Any]) -> dict[str, Any]:
     """Return an entry without what JSON has no number for: a range that is open at an end."""
-    return {key: part for key, part in entry.items() if not (isinstance(part, float) and not math.isfinite(part))}
+    return {key: part for key, part in entry.items() if not any(map(_has_no_number, _items(part)))}
+
+
+def _items(part: Any) -> Any:
+    return part if isinstance(part, list) else (part,)
+
+
+def _has_no_number(item: Any) -> bool:
+    return isinstance(item, float) and not math.isfinite(item)
 
 
 def changed(entries: Entries, values: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
@@ -77,51 +90,69 @@ def _with_value(entries: Entries, token: str, given: Any) -> dict[str, Any]:
     if token not in entries:
         raise UnknownName("hyperparameter", token, entries, "in this service")
     entry = entries[token]
+    if entry.get("kind") not in _KINDS or isinstance(entry.get("value"), dict):
+        what = entry.get("kind", "table")
+        raise ValueError(f"{token!r} is of kind {what!r}, which can't be changed while it is served. Promote it anew.")
+    _check_plain(token, given)
+    rest = {key: part for key, part in entry.items() if key not in _VALUE_KEYS}
+    if entry.get("choices") is not None:
+        return {**_chosen(token, given, entry), **rest}
+    if "value" not in entry:
+        # It was None, which says nothing of what else it may be.
+        return {**written(tuple(given) if isinstance(given, list) else given), **rest}
     value = _converted(token, given, entry)
     _check_range(token, value, entry)
-    rest = {key: part for key, part in entry.items() if key not in ("value", "kind")}
-    return {**written(value), **rest}
+    return {**value_of(entry), "value": value, **rest}
+
+
+def value_of(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what of an entry is its value, without its range."""
+    return {key: entry[key] for key in _VALUE_KEYS if key in entry}
+
+
+def _check_plain(token: str, given: Any) -> None:
+    """Raise ValueError for what is neither a scalar of JSON nor a list of them, or has no number."""
+    for item in _items(given):
+        is_beyond = isinstance(item, int) and abs(item) >= _MOST_WHOLE
+        if not isinstance(item, bool | int | float | str | None) or is_beyond or _has_no_number(item):
+            text = "write a number, text, true, false, null or a list of these"
+            raise ValueError(f"{token!r} can't be {_brief(given)}: {text}.")
+
+
+def _chosen(token: str, given: Any, entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entry of the choice that was meant."""
+    choices = entry["choices"]
+    for choice in choices:
+        has_kind = isinstance(choice, dict) and "kind" in choice
+        if _is_same(given, choice["value"] if has_kind and "value" in choice else choice):
+            return dict(choice) if has_kind else {**value_of(entry), "value": choice}
+    raise ValueError(f"{token!r} can't be {_brief(given)}. There are: {', '.join(map(_brief, choices))}.")
 
 
 def _converted(token: str, given: Any, entry: Mapping[str, Any]) -> Any:
     """Return a value of JSON as the kind that the hyperparameter has."""
-    before = read(entry)
-    value = tuple(given) if isinstance(given, list) and type(before) is not list else given
-    if not fits(value) or _has_no_number(value):
-        raise ValueError(f"{token!r} can't be {_brief(given)}: write a number, text, true, false, null or a list.")
-    if entry.get("choices") is not None:
-        return value
-    if type(before) is float and type(value) is int:
-        return float(value)
-    if type(before) is int and type(value) is float:
-        return _whole(token, value, entry)
-    if before is not None and type(value) is not type(before):
-        raise ValueError(f"{token!r} is {_kind(before)}, and {_brief(given)} is {_kind(value)}.")
-    if isinstance(before, tuple | list) and len(before) != len(value):
-        raise ValueError(f"{token!r} has {len(before)} items, and {_brief(given)} has {len(value)}.")
-    return value
+    before, is_float = entry["value"], str(entry.get("dtype", "")).startswith("float")
+    if type(given) is int and (type(before) is float or is_float):
+        return float(given)
+    if type(given) is float and type(before) is int and not is_float:
+        return _whole(token, given, entry)
+    if type(given) is not type(before) and not (is_float and type(given) is float):
+        raise ValueError(f"{token!r} is {_kind(before)}, and {_brief(given)} is {_kind(given)}.")
+    if isinstance(before, list) and len(before) != len(given):
+        raise ValueError(f"{token!r} has {len(before)} items, and {_brief(given)} has {len(given)}.")
+    return given
 
 
 def _whole(token: str, value: float, entry: Mapping[str, Any]) -> int | float:
     """Return a number without a fraction as an int, unless its range says that it may have one."""
-    if any(type(entry.get(key)) is float for key in ("low", "high", "step")):
+    if "dtype" not in entry and any(type(entry.get(key)) is float for key in ("low", "high", "step")):
         return value
     if not value.is_integer():
         raise ValueError(f"{token!r} is a whole number, and {value} is none.")
     return int(value)
 
 
-def _has_no_number(value: Any) -> bool:
-    items = value if isinstance(value, tuple | list) else (value,)
-    return any(isinstance(item, float) and not math.isfinite(item) for item in items)
-
-
 def _check_range(token: str, value: Any, entry: Mapping[str, Any]) -> None:
-    choices = entry.get("choices")
-    if choices is not None:
-        if not any(_is_same(value, choice) for choice in choices):
-            raise ValueError(f"{token!r} can't be {_brief(value)}. There are: {', '.join(map(repr, choices))}.")
-        return
     if isinstance(value, bool) or not isinstance(value, int | float):
         return
     low, high = entry.get("low"), entry.get("high")
@@ -141,11 +172,9 @@ def _check_step(token: str, value: float, step: float | None, begin: float) -> N
         raise ValueError(f"{token!r} goes in steps of {step} from {begin}, and {value} is between two.")
 
 
-def _is_same(value: Any, choice: Any) -> bool:
-    if isinstance(value, tuple) and isinstance(choice, list):
-        choice = tuple(choice)
+def _is_same(given: Any, choice: Any) -> bool:
     # True is not 1.
-    return value == choice and isinstance(value, bool) == isinstance(choice, bool)
+    return bool(given == choice) and isinstance(given, bool) == isinstance(choice, bool)
 
 
 def _kind(value: Any) -> str:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import sys
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from time import monotonic, time_ns
 from typing import TYPE_CHECKING, Any, Final, Self
 
+from epypes.service.about import about
 from epypes.service.asks import Asks
 from epypes.service.deploying import Deployer
 from epypes.service.dispatch import Dispatcher
@@ -24,7 +24,8 @@ from epypes.service.served import read_served
 from epypes.service.sockets import Sockets
 from epypes.service.state import ServiceState
 from epypes.service.states import Facts, State, state_of
-from epypes.service.supervisor import Supervisor, where_stuck
+from epypes.service.stuck import whereabouts
+from epypes.service.supervisor import Supervisor
 from epypes.service.tuning import Tuning
 
 if TYPE_CHECKING:
@@ -193,8 +194,8 @@ class Service:
 
     def _give_up(self) -> None:
         """Report what could not be worked off, with the functions that it is in."""
-        link, running = self._dispatcher.link, list(self._dispatcher.ledger.running())
-        functions = where_stuck(link, running) if link is not None and running else {}
+        link, running = self._dispatcher.link, [entry.seq for entry in self._dispatcher.ledger.running()]
+        functions = whereabouts(link, running).functions if link is not None and running else {}
         if running and link is not None:
             link.is_dismissed = True
             link.process.kill()
@@ -221,16 +222,13 @@ class Service:
         return self._state()[1]
 
     def _state(self) -> tuple[State, str]:
-        health = self._supervisor.health
-        has_worker = self._dispatcher.link is not None
-        running, draining = self._is_running, self._is_draining
-        facts = Facts(running, draining, self._is_paused, has_worker, health.was_ready, health.fault, health.trouble)
-        return state_of(facts)
+        health, has_worker = self._supervisor.health, self._dispatcher.link is not None
+        is_so = self._is_running, self._is_draining, self._is_paused
+        return state_of(Facts(*is_so, has_worker, health.was_ready, health.fault, health.trouble))
 
     def alive(self) -> str:
         """Return why computing is stuck; empty if it is not, however busy it is."""
-        stuck = self._supervisor.health.stuck
-        if stuck:
+        if stuck := self._supervisor.health.stuck:
             return f"{stuck}."
         late = self._dispatcher.overdue(int(self.job_timeout_s * 1e9))
         return f"An event has been worked on for more than {self.job_timeout_s:g} s." if late else ""
@@ -238,7 +236,7 @@ class Service:
     def ready(self) -> str:
         """Return why events would not be answered now; empty if they are."""
         state, reason = self._state()
-        return "" if state == "READY" else f"{state}. {reason}".strip()
+        return "" if state == "READY" else reason or f"It is {state}."
 
     def counts(self) -> dict[str, int]:
         """Return how many events are where.
@@ -256,28 +254,16 @@ class Service:
 
     def info(self) -> dict[str, Any]:
         """Return what there is to know of it, JSON-ready."""
-        import epypes
-
-        served, state = self._supervisor.served, self._state()
-        link = self._dispatcher.link
+        state, reason = self._state()
         return {
-            "name": served.settings.name,
-            "bundle": str(served.path),
-            "digest": served.digest,
-            "state": state[0],
-            "reason": state[1],
-            "inputs": list(served.settings.inputs),
-            "outputs": list(served.settings.outputs),
-            "rgb": list(served.settings.rgb),
-            "func_io": {} if link is None else dict(link.about.get("func_io", {})),
+            **about(self._supervisor.served, self._dispatcher.link),
+            "state": state,
+            "reason": reason,
             "threads": self.threads,
             "revision": self._tuning.current.revision,
             "addresses": {**self._sockets.addresses, "http": self.http},
-            "pid": os.getpid(),
-            "worker_pid": None if link is None else link.pid,
             "started_ns": self._started_ns,
             "restarts": self._supervisor.health.restarts,
-            "versions": {"epypes": epypes.__version__, "python": sys.version.split()[0]},
         }
 
     def listen(self, callback: Listener) -> Callable[[], None]:
@@ -301,7 +287,7 @@ class Service:
         self._dispatcher.tell(lambda: self._desk.tell("state", data))
         self._dispatcher.changed.notify_all()
         if found[0] == "READY":
-            notify("READY=1")
+            self._dispatcher.tell(lambda: notify("READY=1"))
 
     def _changed(self) -> None:
         with self._dispatcher.changed:

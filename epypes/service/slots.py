@@ -66,7 +66,7 @@ class Slot:
         self._inbox, self._channel, self._revision, self._on_completed = inbox, channel, revision, on_completed
         self._digest = bundle.digest
         self._work: _Work | None = None
-        self.pipeline: FullPipeline = pipeline_of(bundle, self, self)
+        self.pipeline: FullPipeline = pipeline_of(bundle, self, self, detach=False)
         self.pipeline.on_error = self._failed
         # What handle itself raises, where a subclass has one of its own.
         self.pipeline.loop.on_error = lambda event, error: self._failed(Failure("handle", (), {}, error, _id_of(event)))
@@ -93,11 +93,11 @@ class Slot:
         Raises
         ------
         queue.Empty
-            None will come.
+            None will come; without ``block``: there is none now.
         """
         self._finish()
         while True:
-            item = self._inbox.take()
+            item = self._inbox.take(block)
             if not isinstance(item, Event):
                 item.run()
                 self._inbox.finished()

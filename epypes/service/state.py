@@ -139,8 +139,10 @@ def _read(path: Path) -> ServiceState | None:
         return None
 
 
-def _state(entries: dict[str, object]) -> ServiceState:
+def _state(entries: object) -> ServiceState:
     """Return a state; raise TypeError for anything else that somebody may have written into the file."""
+    if not isinstance(entries, dict):
+        raise TypeError
     needed = [entries.get(key) for key in ("sub", "pub", "digest")]
     pid, texts = entries.get("pid"), [*needed, *(entries.get(key, "") for key in ("failures", "http", "token_file"))]
     if not isinstance(pid, int) or not all(isinstance(text, str) for text in texts):

@@ -5,7 +5,6 @@ One thread, that lives as long as the service: the system ends a worker with the
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import threading
 from collections import deque
@@ -17,18 +16,16 @@ from typing import Any, Final
 from epypes.bundle.replay import REPLAY_TIMEOUT_S
 from epypes.errors import ServiceError
 from epypes.service.dispatch import Dispatcher
-from epypes.service.ledger import Entry
 from epypes.service.link import Link, Message
 from epypes.service.notify import notify, watchdog_s
 from epypes.service.served import Served
+from epypes.service.stuck import whereabouts
 
 _FIRST_PAUSE_S: Final = 0.1
 _LONGEST_PAUSE_S: Final = 10.0
 # After so many good events the next death is a first one again.
 _GOOD_EVENTS: Final = 5
 _DEATHS_BEFORE_FAULT: Final = 5
-# How long a worker that seems stuck may take to say where it is.
-_ASK_S: Final = 0.5
 _END_S: Final = 2.0
 
 _log = logging.getLogger("epypes.service")
@@ -107,7 +104,7 @@ class Supervisor:
         self._loading_until_s = 0.0
         self._is_ending = False
         self._thread: threading.Thread | None = None
-        self._watchdog_s = watchdog_s()
+        self._watchdog_s, self._notified_s = watchdog_s(), 0.0
 
     def start(self) -> None:
         """Begin, with a worker of the bundle."""
@@ -161,7 +158,11 @@ class Supervisor:
     def _wait_s(self) -> float | None:
         """Return how long there is nothing to do, if nothing changes; None for ever. With the lock held."""
         now_s = monotonic()
-        waits = [self._watchdog_s, self._dispatcher.due_in_s(self._timeout_ns)]
+        due_in_s = self._dispatcher.due_in_s(self._timeout_ns)
+        self._dispatcher.is_unwatched = due_in_s is None
+        waits = [due_in_s]
+        if self._watchdog_s is not None:
+            waits.append(self._notified_s + self._watchdog_s - now_s)
         if self._restart_s is not None:
             waits.append(self._restart_s - now_s)
         if self.worker is not None and self.worker.status == "loading":
@@ -171,12 +172,12 @@ class Supervisor:
 
     def _next(self) -> Callable[[], object] | None:
         """Return what is to be done now. With the lock held."""
-        if self._watchdog_s is not None:
-            # That it comes here shows that the service is alive: every lock was given back.
-            notify("WATCHDOG=1")
         now_s = monotonic()
         if self._is_ending:
             return _nothing
+        if self._watchdog_s is not None and self._notified_s + self._watchdog_s <= now_s:
+            self._notified_s = now_s
+            return _tell_alive
         if self._to_start:
             return self._start_for_deploy
         if self._restart_s is not None and self._restart_s <= now_s:
@@ -296,19 +297,20 @@ class Supervisor:
 
     def _end_stuck(self) -> None:
         link = self._dispatcher.link
-        overdue = self._dispatcher.overdue(self._timeout_ns)
+        overdue = [entry.seq for entry in self._dispatcher.overdue(self._timeout_ns)]
         if link is None or not overdue:
             return
-        functions = where_stuck(link, overdue)
+        where = whereabouts(link, overdue)
         with self._changed:
-            found = self._dispatcher.fail_stuck(functions, self._timeout_s)
-            if not found:
-                # They were done while it was asked.
+            stuck = self._dispatcher.still_stuck(where, overdue, self._timeout_ns)
+            if stuck is None:
+                # They were done, or have not taken so long, and the worker goes on.
                 return
-            named = next((functions[entry.seq] for entry in found if functions[entry.seq]), "")
-            where = f"Function {named!r}" if named else "The worker"
+            self._dispatcher.fail_stuck(stuck, where.functions, self._timeout_s)
+            named = next((name for seq in stuck if (name := where.functions[seq])), "")
+            told = f"Function {named!r}" if named else "The worker"
             how = " The process was stopped." if link.process.is_stopped else ""
-            self.health.stuck = f"{where} did not return within {self._timeout_s:g} s.{how} The worker is replaced"
+            self.health.stuck = f"{told} did not return within {self._timeout_s:g} s.{how} The worker is replaced"
             link.is_dismissed = True
             self._on_change()
         _log.error("%s", self.health.stuck)
@@ -356,6 +358,10 @@ class Supervisor:
             started.append(made)
             self._changed.notify_all()
 
+    def can_switch(self, link: Link) -> bool:
+        """Whether a worker can take over: it has not ended meanwhile, and neither has the service."""
+        return not self._is_ending and link.status == "ready"
+
     def switch(self, link: Link) -> None:
         """Give events to the worker of another bundle from now on; the one before is ended. With no event in flight."""
         with self._changed:
@@ -369,19 +375,9 @@ class Supervisor:
             threading.Thread(target=before.dismiss, args=(_END_S,), name="epypes last worker", daemon=True).start()
 
 
-def where_stuck(link: Link, overdue: list[Entry]) -> dict[int, str]:
-    """Return the function that each of some events is in, by its number; empty where that can't be known."""
-    found = dict.fromkeys((entry.seq for entry in overdue), "")
-    with contextlib.suppress(ServiceError):
-        header, _ = link.ask("running", _ASK_S)
-        for slot in header.get("slots", ()):
-            if slot["seq"] in found:
-                found[slot["seq"]] = ", ".join(slot["functions"])
-        return found
-    # No thread of it gets on: a function holds the interpreter, or the process is stopped.
-    names = link.process.functions_by_trace()
-    known = [name for name in names if name in link.about.get("functions", ())] or list(names)
-    return dict.fromkeys(found, ", ".join(dict.fromkeys(known)))
+def _tell_alive() -> None:
+    """Tell systemd: that the supervisor comes here shows that no lock is held for ever."""
+    notify("WATCHDOG=1")
 
 
 def _nothing() -> None:

@@ -11,7 +11,7 @@ from epypes.errors import ParametersRefused, RevisionConflict, ServiceError
 from epypes.service.dispatch import Dispatcher
 from epypes.service.link import Link
 from epypes.service.outcome import Desk
-from epypes.service.parameters import Entries, Parameters, changed
+from epypes.service.parameters import Entries, Parameters, changed, value_of
 from epypes.service.served import Served
 
 _log = logging.getLogger("epypes.service")
@@ -66,7 +66,7 @@ class Tuning:
         after, problems = changed(before.entries, values)
         if problems:
             raise ParametersRefused(self._path, problems)
-        sent = {token: _value_of(after[token]) for token in values if after[token] != before.entries[token]}
+        sent = {token: value_of(after[token]) for token in values if after[token] != before.entries[token]}
         if not sent:
             return before
         wanted = Parameters(before.revision + 1, after)
@@ -114,13 +114,9 @@ class Tuning:
         self._pending = None
         if not self.current.revision:
             return None
-        return self.current.revision, {token: _value_of(entry) for token, entry in self.current.entries.items()}
+        return self.current.revision, {token: value_of(entry) for token, entry in self.current.entries.items()}
 
     def take_over(self, entries: Entries) -> None:
         """Begin anew with the parameters of another bundle. With the lock held."""
         self._pending = None
         self._change(Parameters(self.current.revision + 1, entries))
-
-
-def _value_of(entry: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: entry[key] for key in ("value", "kind") if key in entry}

@@ -59,10 +59,10 @@ class Worker:
     def __init__(self, channel: Channel, bundle: Bundle, threads: int) -> None:
         self._channel, self._bundle = channel, bundle
         self._inbox, self._latest = Inbox(), Latest()
-        trial = Pipeline(bundle.settings.name, bundle.cg, bundle.settings.hyperparameters)
+        self._trial = trial = Pipeline(bundle.settings.name, bundle.cg, bundle.settings.hyperparameters)
         revision: Callable[[], int] = lambda: self._changes.revision  # noqa: E731
         self._slots = [Slot(bundle, self._inbox, channel, revision, self._latest.put) for _ in range(threads)]
-        self._changes = Changes(trial, [slot.pipeline for slot in self._slots])
+        self._changes = Changes(trial, [slot.pipeline for slot in self._slots], bundle.enums)
         self._asked = Asked(channel, self._inbox, self._latest, trial, revision)
         self.ending = threading.Event()
 
@@ -112,7 +112,7 @@ class Worker:
         if header["what"] == "running":
             # At once: this is asked when something takes too long, which may be what others asked for.
             slots = [found for slot in self._slots if (found := slot.under_way)]
-            running = [name for found in slots for name in found["functions"]]
+            running = [*(name for found in slots for name in found["functions"]), *self._trial.runner.running]
             self._channel.send({"kind": "asked", "ask": header["ask"], "running": running, "slots": slots})
         else:
             self._asked.put(header)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import queue
 import signal
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from epypes.experiment.process import ChildStation
 from epypes.experiment.robot import Robot
 from epypes.experiment.station import described
 from epypes.pipeline import FullPipeline
+from epypes.transport import ZMQSubscriber, make_keys
 
 TIMEOUT_S = 20.0
 IN_CHILDREN = pytest.mark.slow
@@ -57,6 +59,27 @@ def test_the_layouts_are_those_of_the_paper_and_the_two_beside_it():
 def test_a_layout_says_nothing_but_which_process_a_node_is_in():
     assert set(LAYOUTS["paper"].__slots__) == {"processes", "in_children"}
     assert all(name in NODES for layout in LAYOUTS.values() for names in layout.processes for name in names)
+
+
+@IN_CHILDREN
+def test_nodes_with_keys_know_each_other_and_nobody_else(images, tmp_path):
+    own, watcher = make_keys(tmp_path / "own"), make_keys(tmp_path / "watcher")
+    settings = Settings(images, fps=50.0, keys=str(tmp_path / "own"), allow=(str(tmp_path / "watcher.key"),))
+    with running(LAYOUTS["three"], settings) as system:
+        assert not robot_of(system).ask().is_missing
+        answers = system.stations[1].addresses["answers"]
+        with (
+            ZMQSubscriber(answers, queue.SimpleQueue()) as stranger,
+            ZMQSubscriber(answers, queue.SimpleQueue(), keys=watcher, allow=own) as known,
+        ):
+            assert known.wait_joined(TIMEOUT_S)
+            assert not stranger.wait_joined(0.1)
+
+
+def test_nodes_of_one_process_take_keys_too(images, tmp_path):
+    make_keys(tmp_path / "own")
+    with running(LAYOUTS["one"], Settings(images, fps=50.0, keys=str(tmp_path / "own"))) as system:
+        assert not robot_of(system).ask().is_missing
 
 
 def test_in_one_process_a_request_is_answered(images):

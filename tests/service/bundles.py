@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import textwrap
 
-from epypes.bundle.load import read_bundle
 from epypes.bundle.seal import seal
 from epypes.wire import save_sample
 
@@ -15,18 +14,20 @@ def toml(value):
     return repr(value) if not isinstance(value, str) else f'"{value}"'
 
 
-def written_bundle(folder, source, inputs, outputs, *, hyperparameters=(), sample):
+def written_bundle(folder, source, inputs, outputs, *, hyperparameters=(), sample, own=()):
     """Write a bundle whose module is this source; ``sample`` is the inputs and outputs of one run."""
     (folder / "samples").mkdir(parents=True)
     (folder / "pipeline.py").write_text(textwrap.dedent(source))
     settings = [
         "[bundle]",
-        "format = 1",
+        f"format = {2 if own else 1}",
         f'name = "{folder.name}"',
         "[ports]",
         f"inputs = {list(inputs)!r}".replace("'", '"'),
         f"outputs = {list(outputs)!r}".replace("'", '"'),
     ]
+    if own:
+        settings.append(f"own = {list(own)!r}".replace("'", '"'))
     for token, value in dict(hyperparameters).items():
         settings += [f"[hyperparameters.{token}]", f"value = {toml(value)}"]
     (folder / "pipeline.toml").write_text("\n".join(settings) + "\n")
@@ -34,8 +35,3 @@ def written_bundle(folder, source, inputs, outputs, *, hyperparameters=(), sampl
     save_sample(folder / "samples" / "run_1.npz", *sample)
     seal(folder)
     return folder
-
-
-def same_bundle(folder):
-    """Return a bundle as it is read, to look at its digest."""
-    return read_bundle(folder)

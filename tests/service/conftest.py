@@ -8,12 +8,14 @@ import pytest
 
 import epypes as ep
 from epypes.service.http import HttpServer
+from tests.service.served import acting_bundle
 
 
 @pytest.fixture(autouse=True)
 def own_runtime_folder(tmp_path_factory, monkeypatch):
-    """State files of these tests stand apart from those of the user's services."""
+    """State files and failures of these tests stand apart from those of the user's services."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("run")))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
 
 
 @pytest.fixture(scope="session")
@@ -59,3 +61,9 @@ def changing(http):
     headers = {"Authorization": f"Bearer {http.token}"}
     with httpx.Client(base_url=http.url, trust_env=False, timeout=60, headers=headers) as client:
         yield client
+
+
+@pytest.fixture(scope="session")
+def acting(tmp_path_factory):
+    """A bundle whose function does what an event says, and returns a number times a hyperparameter."""
+    return acting_bundle(tmp_path_factory.mktemp("bundles") / "acting")

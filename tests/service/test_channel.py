@@ -3,11 +3,13 @@ from __future__ import annotations
 import json
 import os
 import random
+import signal
 import socket
 import struct
 import subprocess
 import sys
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -95,6 +97,21 @@ def test_more_frames_than_the_system_takes_at_once_arrive_whole(ends):
     _, got = ends[1].receive()
     send()
     assert [bytes(frame) for frame in got] == frames
+
+
+def test_a_message_arrives_whole_although_signals_interrupt_who_sends_it(ends):
+    frames = [bytes([number]) * 1_000_000 for number in range(30)]
+    counted = []
+    before = signal.signal(signal.SIGALRM, lambda number, frame: counted.append(number))
+    signal.setitimer(signal.ITIMER_REAL, 0.001, 0.001)
+    try:
+        receive = in_thread(lambda: [bytes(frame) for frame in (time.sleep(0.05), ends[1].receive())[1][1]])
+        ends[0].send({}, frames)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    assert receive() == frames
+    assert counted
 
 
 def test_what_was_sent_may_be_written_to_again(ends):

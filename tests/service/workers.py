@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 import threading
-from collections import Counter
 from contextlib import contextmanager
 from itertools import count
 
@@ -37,6 +36,7 @@ class Front:
                 message = self.channel.receive()
                 if message[0]["kind"] == kind:
                     return message
+                assert message[0]["kind"] != "refused", message[0]
                 self.waiting.append(message)
         finally:
             watchdog.cancel()
@@ -129,7 +129,3 @@ def ready_worker(bundle, tmp_path, *options, **more):
     with worker_of(bundle, tmp_path, *options, **more) as front:
         front.ready, _ = front.receive("ready")
         yield front
-
-
-def counted(values):
-    return Counter(values)

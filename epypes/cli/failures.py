@@ -1,0 +1,103 @@
+"""``epypes failures``: what failed in a service, and where."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from epypes.cli.options import Allow, Keys
+from epypes.cli.terminal import err, out
+from epypes.errors import ServiceError
+
+if TYPE_CHECKING:
+    from epypes.service.failurerecord import FailureRecord
+
+_MOST_CHARACTERS: Final = 200
+
+
+def failures(
+    source: Annotated[
+        str | None,
+        typer.Argument(help="The bundle, or the http URL of its service; without it all failures of this machine."),
+    ] = None,
+    limit: Annotated[int, typer.Option(help="How many, the newest first.", min=1)] = 20,
+    as_json: Annotated[bool, typer.Option("--json", help="Print each failure as a line of JSON.")] = False,
+    follow: Annotated[bool, typer.Option("--follow", help="Tell of each that happens from now on, until Ctrl+C.")] = (
+        False
+    ),
+    keys: Keys = None,
+    allow: Allow = None,
+) -> None:
+    """List the failures that were kept; epypes replay ID runs one again."""
+    from epypes.service.failuresource import failures_of
+
+    if follow:
+        _follow(source, as_json, keys, allow)
+        return
+    found = failures_of(source).records(limit)
+    if as_json:
+        for record in found:
+            out.print(json.dumps(asdict(record)), markup=False)
+    elif found:
+        _print_table(found)
+        out.print(f"Again, in a process of its own: epypes replay {found[0].id}", markup=False)
+        out.print(f"In a notebook: ep.load_failure({found[0].id!r})", markup=False)
+    else:
+        out.print(f"No failures of {source} were kept." if source else "No failures were kept.", markup=False)
+
+
+def _follow(source: str | None, as_json: bool, keys: Path | None, allow: list[Path] | None) -> None:
+    """Print a line for each failure as it happens."""
+    from epypes.service.failurenews import failures_from_now_on
+
+    if source is None:
+        raise ServiceError("", "Whose failures? Say: epypes failures --follow BUNDLE, or the http URL of its service.")
+    try:
+        for record in failures_from_now_on(source, keys=keys, allow=allow):
+            if record is None:
+                err.print(f"Listening for failures of {source}. Ctrl+C ends it.", markup=False)
+            elif as_json:
+                out.print(json.dumps(asdict(record)), markup=False)
+            else:
+                dead = ", dead letter" if record.dead_letter else ""
+                told = f"{record.function}: {_raised(record)} (attempt {record.attempt}{dead})"
+                out.print(f"{record.id} {_when(record)} {told}", markup=False)
+    except KeyboardInterrupt:
+        return
+
+
+def _when(record: FailureRecord) -> str:
+    when = datetime.fromtimestamp(record.when_ns / 1e9).astimezone()
+    is_today = when.date() == datetime.now().astimezone().date()
+    return f"{when:%H:%M:%S}" if is_today else f"{when:%Y-%m-%d %H:%M}"
+
+
+def _raised(record: FailureRecord) -> str:
+    summary = record.summary if record.kind == "raised" else f"{record.kind}: {' '.join(record.message.split())}"
+    return summary[:_MOST_CHARACTERS]
+
+
+def _print_table(records: Iterable[FailureRecord]) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+    from rich.text import Text
+
+    # In one line each, whatever the width: the exception gets what the others leave.
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True, expand=True)
+    table.add_column("id", no_wrap=True, min_width=14)
+    table.add_column("when", no_wrap=True, min_width=8)
+    table.add_column("function", no_wrap=True, min_width=8, max_width=24)
+    table.add_column("exception", no_wrap=True, overflow="ellipsis", ratio=1)
+    table.add_column("attempt", justify="right", min_width=7)
+    table.add_column("dead\nletter", min_width=6)
+    for record in records:
+        dead = "yes" if record.dead_letter else ""
+        cells = (record.id, _when(record), record.function, _raised(record), str(record.attempt), dead)
+        table.add_row(*map(Text, cells))
+    out.print(table)

@@ -1,0 +1,109 @@
+"""Which failures does a service tell of from now on?"""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from epypes.errors import ServiceError
+from epypes.service.client import why_unreachable
+from epypes.service.failurerecord import FailureRecord, record_of
+from epypes.service.failuresource import connected, path_of
+from epypes.service.outcome import FAILURE_TOPIC
+from epypes.service.state import read_state
+from epypes.transport import ZMQSubscriber
+from epypes.wire import Envelope
+
+if TYPE_CHECKING:
+    from epypes.transport import Keys
+    from epypes.transport.keys import PublicKey
+
+# How often it is looked whether the service still runs.
+_LOOK_S: Final = 0.5
+_JOIN_S: Final = 10.0
+
+
+def failures_from_now_on(
+    source: Any,
+    *,
+    keys: Keys | str | Path | None = None,
+    allow: PublicKey | Collection[PublicKey] | None = None,
+) -> Iterator[FailureRecord | None]:
+    """Yield None when it is listened, and then the record of each failure as it happens; goes on without end.
+
+    Parameters
+    ----------
+    source
+        The path of the bundle that is served: then the failures' socket is heard; or the http URL of the service.
+    keys, allow
+        As for ZMQSubscriber, where the service has keys.
+
+    Raises
+    ------
+    ServiceError
+        No service runs, it can't be reached, or it has ended.
+    """
+    path = path_of(source)
+    return _of_connection(source) if path is None else _of_socket(path, keys, allow)
+
+
+def _of_connection(source: Any) -> Iterator[FailureRecord | None]:
+    is_heard, connection = False, connected(source)
+    for kind, data in connection.events():
+        # It tells its counts each second; from the first word on nothing is missed.
+        if not is_heard:
+            is_heard = True
+            yield None
+        if kind == "failure":
+            yield record_of(data)
+    raise ServiceError(connection.url, f"The service at {connection.url} has ended.")
+
+
+def _of_socket(
+    path: Path, keys: Keys | str | Path | None, allow: PublicKey | Collection[PublicKey] | None
+) -> Iterator[FailureRecord | None]:
+    state = read_state(path)
+    if state is None:
+        raise ServiceError(path, f"No service runs for {path}. Start one: epypes serve {path}")
+    if state.failures.startswith("connect:"):
+        where = state.failures.removeprefix("connect:")
+        raise ServiceError(path, f"The service of {path} sends its failures to {where}; listen there.")
+    found: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    with ZMQSubscriber(state.failures, found, FAILURE_TOPIC, keys=keys, allow=allow) as subscriber:
+        if not subscriber.wait_joined(_JOIN_S):
+            text = f"The failures of {path} can't be reached at {state.failures} within {_JOIN_S:g} s."
+            raise ServiceError(path, f"{text} {why_unreachable(keys is not None)}")
+        yield None
+        while True:
+            try:
+                event = found.get(timeout=_LOOK_S)
+            except queue.Empty:
+                if read_state(path) is None:
+                    raise ServiceError(path, f"The service of {path} has ended.") from None
+                continue
+            if isinstance(event, Envelope) and event.failure is not None:
+                yield _record(event)
+
+
+def _record(event: Envelope) -> FailureRecord:
+    """Return what a failure event says; the rest of the record is in the store, under its id."""
+    failure, more = event.failure, event.attributes
+    if failure is None:
+        return FailureRecord()
+    return FailureRecord(
+        id=str(more.get("id", "")),
+        event_id=failure.input_id,
+        function=failure.function,
+        tokens=failure.tokens,
+        exception=failure.exception,
+        # Its notes come after it; they name the function once more.
+        message=failure.message.partition(" | In function ")[0],
+        kind=str(more.get("kind", "raised")),
+        attempt=failure.attempt,
+        dead_letter=bool(more.get("dead_letter", False)),
+        when_ns=int(more.get("when_ns", 0)) or event.published_ns,
+        digest=event.bundle_digest,
+        revision=event.revision,
+    )

@@ -1,0 +1,140 @@
+"""How does an event that failed in a service open again, at the function that failed?"""
+
+from __future__ import annotations
+
+import queue
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from epypes.bundle.load import Bundle, pipeline_of, read_bundle
+from epypes.errors import RemoteFailure
+from epypes.run import CompGraphRunner
+from epypes.run.stopped import stop_at
+from epypes.service.failurerecord import FailureRecord, values_of
+from epypes.service.failuresource import bundle_of, failures_of, found_by, path_of
+from epypes.service.reproduce import reproduce
+
+_NOT_AGAIN = ("killed", "stuck")
+
+
+def load_failure(id: str, source: Any = None, *, bundle: str | Path | None = None) -> CompGraphRunner:  # noqa: A002
+    """Return a runner whose last run is the one that failed in a service, stopped at the function that failed.
+
+    The event is run again here: with the bundle's f_in, the hyperparameters of that time, and all functions up to the
+    one that failed. A function that killed the worker or never returned is not called; ``rerun`` would call it.
+
+    Parameters
+    ----------
+    id
+        The failure's id, the first or last characters of it, or ``"latest"``.
+    source
+        The path of the bundle that was served, the http URL of its service, or a Connection; without, all failures of
+        this machine.
+    bundle
+        Where the bundle is on this machine, if it was served from another place.
+
+    Returns
+    -------
+    CompGraphRunner
+        Its ``last`` shows the failed function in red and the values before it; ``rerun(threshold=90)`` goes on from
+        there.
+
+    Raises
+    ------
+    UnknownName
+        There is no such failure.
+    FailureNotKept
+        Its event was not kept, or can't be read.
+    BundleError
+        The bundle that failed is not there.
+    ServiceError
+        The service can't be reached.
+    Exception
+        What f_in raises, where it is f_in that fails.
+
+    Warns
+    -----
+    UserWarning
+        If the bundle has changed since, or the event does not fail here as it did there.
+    """
+    failures = failures_of(source)
+    record = found_by(failures, id)
+    event = failures.event(record.id)
+    folder, changed = bundle_of(record, bundle or path_of(source))
+    opened = read_bundle(folder)
+    runner, left_out = runner_of(opened, record)
+    notes = [changed, left_out, _run(runner, opened, record, event)]
+    for note in filter(None, notes):
+        warnings.warn(f"Failure {record.id}: {note}.", stacklevel=2)
+    return runner
+
+
+def runner_of(bundle: Bundle, record: FailureRecord) -> tuple[CompGraphRunner, str]:
+    """Return a runner with the hyperparameters that failed, and what is to be said of those that are gone."""
+    runner = CompGraphRunner(bundle.cg, bundle.settings.hyperparameters)
+    values, left_out = values_of(record, runner.hyperparameters, bundle.enums)
+    runner.set(**values)
+    return runner, left_out
+
+
+def _run(runner: CompGraphRunner, bundle: Bundle, record: FailureRecord, event: Any) -> str:
+    """Run the event as far as it came; return what is to be said if that is not as far as in the service."""
+    if record.kind in _NOT_AGAIN:
+        return _stop(runner, bundle, record, event)
+    payload = _payload(bundle, event)
+    try:
+        runner.run_on(payload)
+    except KeyboardInterrupt:
+        raise
+    except BaseException:  # whatever the user's function raises is in the failed run
+        if runner.last is None:
+            raise
+    return _told(runner, record)
+
+
+def _payload(bundle: Bundle, event: Any) -> Mapping[str, Any]:
+    pipeline = pipeline_of(bundle, queue.SimpleQueue(), queue.SimpleQueue())
+    try:
+        payload: Mapping[str, Any] = pipeline.f_in(event)
+    except Exception as error:
+        error.add_note(f"f_in of {bundle.path} fails on this event, so no function of the graph was run.")
+        raise
+    return payload
+
+
+def _stop(runner: CompGraphRunner, bundle: Bundle, record: FailureRecord, event: Any) -> str:
+    if record.function not in (*runner.cg.functions, "f_in"):
+        # The service could not tell where its worker was; another process that may be lost can.
+        record = replace(record, function=reproduce(record, event, bundle.path).function)
+    if record.function == "f_in":
+        return f"f_in was {record.kind} by this event, so it is not called here, and no function was run"
+    payload = _payload(bundle, event)
+    if record.function not in runner.cg.functions:
+        stop_at(runner, payload)
+        return (
+            f"the worker was {record.kind}, and it is not known in which function, so none was run. "
+            "rerun('token') goes on to a token"
+        )
+    why = RemoteFailure(bundle.path, record.function, record.kind, f"not called here. {record.message}")
+    run = stop_at(runner, payload, record.function, why)
+    if run.failure is not None and run.failure.exception is not why:
+        return f"before {record.function!r}, which was {record.kind}, {run.failure.function!r} fails here"
+    return ""
+
+
+def _told(runner: CompGraphRunner, record: FailureRecord) -> str:
+    """Return what differs from what was recorded; nothing if the same function failed in the same way."""
+    failure = runner.last.failure if runner.last is not None else None
+    there = f"there it was {record.function!r} ({record.summary})"
+    if record.kind == "dropped":
+        return "this event was dropped before any function was called"
+    if failure is None and record.function not in runner.cg.functions:
+        return f"no function fails; {there}"
+    if failure is None:
+        return f"nothing fails here; {there}"
+    if (failure.function, failure.kind) != (record.function, record.exception):
+        return f"here {failure.function!r} fails ({failure.kind}); {there}"
+    return ""

@@ -1,0 +1,250 @@
+"""Does an event that failed in a service fail again, in a fresh process that may be killed or stuck?
+
+Run as a program (``python -I -m epypes.service.reproduce BUNDLE FOLDER SECONDS``) it is that process.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import json
+import os
+import queue
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from epypes.errors import BundleError, EpypesError
+from epypes.service.failurerecord import FailureRecord, record_of, values_of, with_id
+
+if TYPE_CHECKING:
+    from epypes.pipeline import FullPipeline
+    from epypes.run import Failure
+    from epypes.wire import Envelope
+
+TIMEOUT_S: Final = 30.0
+# To start Python, to import what the bundle imports, and to end.
+_BESIDE_S: Final = 60.0
+_RECORD, _EVENT, _OUTCOME, _CALLS, _DUMP = "record.json", "event", "outcome.json", "calls", "dump"
+# What functions print comes before the lines of a process that ends.
+_MOST_DUMP_BYTES: Final = 256 * 1024
+_DUMP_LINE: Final = re.compile(r'^  File "([^"\n]*)", line (\d+) in (\S+)', re.MULTILINE)
+
+Ending = Literal["failed", "fine", "killed", "stuck"]
+
+
+@dataclass(frozen=True, slots=True)
+class Reproduction:
+    """What became of an event that was run again.
+
+    Attributes
+    ----------
+    ending
+        ``"failed"``: it was raised again, or something else was; ``"fine"``; ``"killed"``: the process ended with it;
+        ``"stuck"``: it took longer than it was given.
+    function
+        Where that was: a function of the graph, f_in, f_out, compute; empty if it is not known.
+    exception, message, trace
+        What was raised; or how the process ended.
+    line, code
+        The last line of the bundle's module that was come to: its number, from 1, 0 if it is not known; and its text.
+    """
+
+    ending: Ending
+    function: str = ""
+    exception: str = ""
+    message: str = ""
+    trace: tuple[str, ...] = ()
+    line: int = 0
+    code: str = ""
+
+    @property
+    def place(self) -> str:
+        """Where it failed, as a part of a sentence."""
+        where = f"in {self.function!r}" if self.function else "in a function that is not known"
+        return f"{where}, pipeline.py, line {self.line}: {self.code}" if self.line else where
+
+
+def reproduce(
+    record: FailureRecord, event: Envelope | bytes, bundle: str | Path, *, timeout_s: float = TIMEOUT_S
+) -> Reproduction:
+    """Run an event once more, alone in a new interpreter that sees neither the environment nor the current folder.
+
+    Parameters
+    ----------
+    record
+        Its hyperparameters are taken, as far as the bundle has them.
+    bundle
+        The folder of the bundle.
+    timeout_s
+        How long the event may take, in seconds.
+
+    Raises
+    ------
+    BundleError
+        The bundle is not what was promoted, or its module fails.
+    """
+    from epypes.service.packing import pack_event
+
+    with tempfile.TemporaryDirectory(prefix="epypes-replay-") as name:
+        scratch = Path(name)
+        (scratch / _RECORD).write_text(json.dumps(asdict(with_id(record)), default=str), encoding="utf-8")
+        (scratch / _EVENT).write_bytes(pack_event(event))
+        status = _run_apart(Path(bundle).resolve(), scratch, timeout_s)
+        return _what_became(Path(bundle).resolve(), scratch, status, timeout_s)
+
+
+def _run_apart(folder: Path, scratch: Path, timeout_s: float) -> int | None:
+    """Return the exit status of the process; None if it had to be killed."""
+    command = [sys.executable, "-I", "-m", "epypes.service.reproduce", str(folder), str(scratch), f"{timeout_s:g}"]
+    with (scratch / _DUMP).open("wb") as dump:
+        process = subprocess.Popen(  # noqa: S603 - this interpreter, this module
+            command,
+            cwd=scratch,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=dump,
+            # All that a function has started can be ended with its group; and Ctrl+C does not reach it.
+            start_new_session=True,
+        )
+        try:
+            return process.wait(timeout_s + _BESIDE_S)
+        except subprocess.TimeoutExpired:
+            return None
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def _what_became(folder: Path, scratch: Path, status: int | None, timeout_s: float) -> Reproduction:
+    """Read what the process has left."""
+    with (scratch / _DUMP).open("rb") as file:
+        file.seek(max(0, file.seek(0, os.SEEK_END) - _MOST_DUMP_BYTES))
+        dump = file.read().decode(errors="replace")
+    if (scratch / _OUTCOME).is_file():
+        told = json.loads((scratch / _OUTCOME).read_text(encoding="utf-8"))
+        if "refused" in told:
+            raise BundleError(folder, told["refused"])
+        return Reproduction(**{**told, "trace": tuple(told["trace"])})
+    if not (scratch / _CALLS).is_file():
+        last = dump.strip().splitlines()[-1:] or ["no message"]
+        raise BundleError(folder, f"{folder} can't be loaded for a replay: {last[0]}")
+    calls = (scratch / _CALLS).read_text(encoding="utf-8").splitlines()
+    function = calls[-1] if calls else ""
+    line, code = _line_in(dump, folder)
+    if status is None or (status == 1 and "Timeout (" in dump):
+        return Reproduction("stuck", function, "TimeoutError", f"more than {timeout_s:g} s", (), line, code)
+    ended = f"status {status}" if status >= 0 else _signal_name(-status)
+    return Reproduction("killed", function, ended, "the process ended with it", (), line, code)
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+def _line_in(dump: str, folder: Path) -> tuple[int, str]:
+    """Return the innermost line of the bundle that a dump of all threads names, and its text."""
+    for file, line, _ in _DUMP_LINE.findall(dump):
+        if Path(file).parent == folder:
+            return int(line), _text_of(Path(file), int(line))
+    return 0, ""
+
+
+def _text_of(file: Path, line: int) -> str:
+    with suppress(OSError, UnicodeDecodeError, IndexError):
+        return file.read_text(encoding="utf-8").splitlines()[line - 1].strip()
+    return ""
+
+
+# -- in the process of its own ----------------------------------------------------------------------------------------
+
+
+def main(arguments: list[str]) -> int:
+    """Run the event in the folder that is named second on the bundle that is named first; leave there what became."""
+    folder, scratch, timeout_s = Path(arguments[0]), Path(arguments[1]), float(arguments[2])
+    faulthandler.enable()
+    try:
+        pipeline, failures = _pipeline(folder, scratch)
+    except Exception as error:
+        told = str(error) if isinstance(error, EpypesError) else f"{folder} fails: {type(error).__name__}: {error}"
+        _leave(scratch, {"refused": told})
+        return 1
+    event = _event(scratch)
+    # Its thread needs no lock of the interpreter: it tells the line also of a C function that holds that.
+    faulthandler.dump_traceback_later(timeout_s, exit=True)
+    pipeline.handle(event)
+    faulthandler.cancel_dump_traceback_later()
+    _leave(scratch, asdict(_told(failures[-1], folder) if failures else Reproduction("fine")))
+    return 0
+
+
+def _pipeline(folder: Path, scratch: Path) -> tuple[FullPipeline, list[Failure]]:
+    """Return the pipeline that the service runs, with the hyperparameters that failed; and where failures will be."""
+    from epypes.bundle.load import pipeline_of, read_bundle
+
+    bundle = read_bundle(folder)
+    pipeline = pipeline_of(bundle, queue.SimpleQueue(), queue.SimpleQueue())
+    record = record_of(json.loads((scratch / _RECORD).read_bytes()))
+    pipeline.runner.set(**values_of(record, pipeline.runner.hyperparameters, bundle.enums)[0])
+    failures: list[Failure] = []
+    pipeline.on_error = failures.append
+    _announce_calls(pipeline, scratch / _CALLS)
+    return pipeline, failures
+
+
+def _event(scratch: Path) -> Envelope | bytes:
+    from epypes.service.packing import unpack_event
+
+    return unpack_event((scratch / _EVENT).read_bytes())
+
+
+def _announce_calls(pipeline: FullPipeline, file: Path) -> None:
+    """Have the name of every function written before it is called: what was written outlives the process."""
+    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+
+    def announced(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any) -> Any:
+            os.write(descriptor, f"{name}\n".encode())
+            return function(*args)
+
+        return call
+
+    pipeline.f_in, pipeline.f_out = announced("f_in", pipeline.f_in), announced("f_out", pipeline.f_out)
+    for name, node in pipeline.network.nodes.items():
+        node.compute = announced(name, node.compute)  # type: ignore[method-assign]
+
+
+def _told(failure: Failure, folder: Path) -> Reproduction:
+    exception = failure.exception
+    own = [frame for frame in traceback.extract_tb(exception.__traceback__) if Path(frame.filename).parent == folder]
+    trace = "".join(traceback.format_exception(exception)).splitlines()
+    return Reproduction(
+        "failed",
+        failure.function,
+        failure.kind,
+        failure.message,
+        tuple(trace[-100:]),
+        (own[-1].lineno or 0) if own else 0,
+        (own[-1].line or "") if own else "",
+    )
+
+
+def _leave(scratch: Path, told: dict[str, Any]) -> None:
+    part = scratch / f"{_OUTCOME}.part"
+    part.write_text(json.dumps(told), encoding="utf-8")
+    part.replace(scratch / _OUTCOME)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,388 @@
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from epypes.wire import Envelope, JustBytes
+from tests.service.bundles import written_bundle
+from tests.service.workers import ready_worker
+
+OWN_PIPELINE = """
+    import epypes as ep
+    from epypes.wire import Envelope, JustBytes, parsed
+
+
+    def repeat(text, times):
+        return text * times
+
+
+    class {name}(ep.FullPipeline):
+{body}
+
+
+    def f_in(event):
+        if isinstance(event, bytes):
+            return {{"text": parsed(JustBytes, event).contents.decode()}}
+        return event.parts
+
+
+    def f_out(view):
+        if isinstance(view.event, bytes):
+            return JustBytes(contents=view["repeated"].encode())
+        return Envelope("own", {{"repeated": view["repeated"]}}, correlation_id=view.event.id)
+
+
+    def make_pipeline(cg, q_in, q_out, f_in, f_out, hparams):
+        return {name}("own", cg, q_in, q_out, f_in, f_out, hparams)
+
+
+    func_dict = {{"repeat": repeat}}
+    func_io = {{"repeat": (("text", "times"), "repeated")}}
+"""
+
+
+@pytest.fixture
+def owning(tmp_path):
+    """Return a function that makes a bundle with a pipeline class of this body."""
+
+    def make(body, name="Own"):
+        lines = "\n".join(f"    {line}" for line in body.splitlines())
+        source = OWN_PIPELINE.format(name=name, body=lines)
+        sample = {"text": "ab"}, {"repeated": "abab"}
+        ports = {"inputs": ["text"], "outputs": ["repeated"], "own": ["f_in", "f_out", "make_pipeline"]}
+        return written_bundle(tmp_path / "own", source, **ports, hyperparameters={"times": 2}, sample=sample)
+
+    return make
+
+
+def test_a_bundle_with_ports_of_its_own_answers_2019_messages_in_their_kind(owning, tmp_path):
+    with ready_worker(owning("    pass"), tmp_path) as front:
+        front.send_event(JustBytes(contents=b"xy").SerializeToString())
+        header, (answer,) = front.done()
+        assert header["failure"] is None
+        assert JustBytes.FromString(answer).contents == b"xyxy"
+        front.send_event(b"\xff\xff")
+        header, (answer,) = front.done()
+        assert header["failure"]["function"] == "f_in"
+        assert answer.failure.exception == "MessageError"
+        front.set(3, times=1)
+        _, (answer,) = front.run(text="z")
+        assert (answer.type, answer.parts["repeated"], answer.revision) == ("own", "z", 3)
+
+
+@pytest.mark.parametrize(("count", "answers"), [(0, []), (1, ["abab"]), (3, ["abab0", "abab1", "abab2"])])
+def test_a_pipeline_may_answer_an_event_as_often_as_it_likes_and_it_is_done_once(owning, tmp_path, count, answers):
+    body = f"""
+    def put(self, answer, view):
+        for number in range({count}):
+            text = answer.parts["repeated"] + (str(number) if {count} > 1 else "")
+            super().put(Envelope("own", {{"repeated": text}}), view)
+"""
+    with ready_worker(owning(body), tmp_path) as front:
+        for _ in range(3):
+            header, got = front.run(text="ab")
+            assert header["failure"] is None
+            assert [answer.parts["repeated"] for answer in got] == answers
+
+
+def test_what_was_put_before_an_event_failed_is_answered_with_the_failure_after_it(owning, tmp_path):
+    body = """
+    def put(self, answer, view):
+        super().put(answer, view)
+        if view["text"] == "bad":
+            raise ValueError("too late")
+"""
+    with ready_worker(owning(body), tmp_path) as front:
+        header, (first, failure) = front.run(text="bad")
+        assert (header["failure"]["function"], header["failure"]["message"]) == ("f_out", "too late")
+        assert (first.parts["repeated"], failure.failure.message) == ("badbad", "too late")
+        assert front.run(text="a")[1][0].parts["repeated"] == "aa"
+
+
+@pytest.mark.parametrize("method", ["handle(self, event)", "emit(self, event, run)", "compute(self, *args)"])
+def test_a_hook_that_raises_is_the_failure_of_its_event(owning, tmp_path, method):
+    with ready_worker(owning(f"    def {method}:\n        raise SystemExit('own hook')"), tmp_path) as front:
+        for _ in range(3):
+            header, answers = front.run(text="ab")
+            assert header["failure"]["message"] == "own hook"
+            assert len(answers) == 1
+
+
+def test_an_answer_of_a_pipeline_that_goes_on_after_it_is_a_copy(owning, tmp_path):
+    body = """
+    def put(self, answer, view):
+        import numpy as np
+
+        memory = np.zeros(50_000, np.uint8)
+        for number in range(3):
+            memory[:] = number
+            super().put(Envelope("own", {"memory": memory}), view)
+"""
+    with ready_worker(owning(body), tmp_path) as front:
+        _, answers = front.run(text="ab")
+        assert [set(answer.parts["memory"]) for answer in answers] == [{0}, {1}, {2}]
+
+
+def test_an_answer_that_cannot_be_sent_is_the_failure_of_its_event(owning, tmp_path):
+    body = """
+    def put(self, answer, view):
+        super().put(view["text"] if view["text"] != "ok" else answer, view)
+"""
+    with ready_worker(owning(body), tmp_path) as front:
+        header, _ = front.run(text="no")
+        assert header["failure"]["function"] == "f_out"
+        assert "not str. Let f_out return one of these" in header["failure"]["message"]
+        assert front.run(text="ok")[0]["failure"] is None
+
+
+def test_parameters_that_a_pipeline_of_its_own_refuses_are_set_in_no_slot(owning, tmp_path):
+    body = """
+    count = 0
+
+    def __init__(self, *args):
+        super().__init__(*args)
+        Own.count += 1
+        self.number = Own.count
+
+    def set(self, **values):
+        super().set(**values)
+        if self.number == 3 and values["times"] > 5:
+            raise ValueError("the third does not")
+"""
+    with ready_worker(owning(body), tmp_path, "--threads", "3") as front:
+        front.set(1, times=9)
+        assert front.receive("parameters_refused")[0]["problems"] == {"times": "the third does not"}
+        assert {front.run(text="a")[1][0].parts["repeated"] for _ in range(9)} == {"aa"}
+        front.set(2, times=3)
+        assert front.receive("parameters")
+        assert {front.run(text="a")[1][0].parts["repeated"] for _ in range(9)} == {"aaa"}
+
+
+# -- side by side --------------------------------------------------------------------------------------------------
+
+MEETING = '''
+    import os
+    import threading
+    import time
+
+
+
+    def meet(place):
+        """Return when as many have come as are told."""
+        folder, name, count = place.split("|")
+        open(os.path.join(folder, name), "w").close()
+        while len(os.listdir(folder)) < int(count):
+            time.sleep(0.002)
+        return threading.current_thread().name
+
+
+    func_dict = {"meet": meet}
+    func_io = {"meet": ("place", "thread")}
+'''
+
+
+@pytest.fixture
+def meeting(tmp_path):
+    place = tmp_path / "sample"
+    place.mkdir()
+    sample = {"place": f"{place}|a|1"}, {"thread": "MainThread"}
+    return written_bundle(tmp_path / "meeting", MEETING, ["place"], ["thread"], sample=sample)
+
+
+def test_slots_work_on_as_many_events_at_once_as_there_are(meeting, tmp_path):
+    with ready_worker(meeting, tmp_path, "--threads", "3") as front:
+        for turn in range(3):
+            folder = tmp_path / f"turn{turn}"
+            folder.mkdir()
+            for number in range(3):
+                front.send_event(Envelope(type="x", parts={"place": f"{folder}|{number}|3"}))
+            done = [front.done() for _ in range(3)]
+            assert {header["seq"] for header, _ in done} == {turn * 3 + 1, turn * 3 + 2, turn * 3 + 3}
+            assert all(header["failure"] is None for header, _ in done)
+
+
+def test_parameters_wait_until_no_slot_works_and_hold_for_all_events_after_them(tmp_path):
+    source = """
+        import time
+
+
+        def scaled(x, k):
+            time.sleep(x / 1000)
+            return k
+
+
+        func_dict = {"scaled": scaled}
+        func_io = {"scaled": (("x", "k"), "y")}
+    """
+    sample = {"x": 0}, {"y": 1}
+    bundle = written_bundle(tmp_path / "b", source, ["x"], ["y"], hyperparameters={"k": 1}, sample=sample)
+    with ready_worker(bundle, tmp_path, "--threads", "3") as front:
+        expected = {}
+        for revision in range(1, 30):
+            front.set(revision, k=revision * 100)
+            for number in range(revision % 5):
+                seq = front.send_event(Envelope(type="x", parts={"x": (revision * 7 + number * 3) % 11}))
+                expected[seq] = revision
+        for _ in range(len(expected)):
+            header, (answer,) = front.done()
+            revision = expected.pop(header["seq"])
+            assert (header["revision"], answer.revision, answer.parts["y"]) == (revision, revision, revision * 100)
+        assert not expected
+
+
+def test_what_is_run_again_for_who_asks_runs_in_no_more_threads_than_there_are_slots(tmp_path):
+    source = """
+        import threading
+        import time
+
+        busy = threading.Lock()
+
+
+        def alone(x, k):
+            if not busy.acquire(blocking=False):
+                raise RuntimeError("two at once")
+            try:
+                time.sleep(0.002)
+                return x * k
+            finally:
+                busy.release()
+
+
+        func_dict = {"alone": alone}
+        func_io = {"alone": (("x", "k"), "y")}
+    """
+    sample = {"x": 2}, {"y": 4}
+    bundle = written_bundle(tmp_path / "b", source, ["x"], ["y"], hyperparameters={"k": 2}, sample=sample)
+    with ready_worker(bundle, tmp_path) as front:
+        front.run(x=1)
+        asks = set()
+        for revision in range(1, 40):
+            front.set(revision, k=revision)
+            asks.add(front.send_ask("run", tokens=["y"], revision=revision))
+            front.send_event(Envelope(type="x", parts={"x": 3}))
+        for _ in range(1, 40):
+            assert front.done()[0]["failure"] is None
+        answers = [front.receive("asked")[0] for _ in asks]
+        assert {answer["ask"] for answer in answers} == asks
+        assert not [answer for answer in answers if "error" in answer]
+
+
+# -- what a worker keeps -------------------------------------------------------------------------------------------
+
+IMAGES = """
+    import numpy as np
+
+
+    def invert(image):
+        if image[0, 0] == 13:
+            raise ValueError("unlucky")
+        return 255 - image
+
+
+    func_dict = {"invert": invert}
+    func_io = {"invert": ("image", "inverted")}
+"""
+
+
+@pytest.fixture
+def inverting(tmp_path):
+    image = np.arange(100, dtype=np.uint8).reshape(10, 10)
+    sample = {"image": image}, {"inverted": 255 - image}
+    return written_bundle(tmp_path / "inverting", IMAGES, ["image"], ["inverted"], sample=sample)
+
+
+def test_large_images_go_through_a_worker_unchanged_one_after_another(inverting, tmp_path):
+    rng = np.random.default_rng(5)
+    images = [rng.integers(14, 256, (side, side), np.uint8) for side in (1, 90, 91, 1000, 3000, 90)]
+    sums = [hashlib.sha256((255 - image).tobytes()).hexdigest() for image in images]
+    with ready_worker(inverting, tmp_path, "--threads", "2") as front:
+        expected = {}
+        for image, value in zip(images * 3, sums * 3, strict=True):
+            expected[front.send_event(Envelope(type="x", parts={"image": image}))] = value
+            if len(expected) == 4:
+                header, (answer,) = front.done()
+                assert hashlib.sha256(answer.parts["inverted"].tobytes()).hexdigest() == expected.pop(header["seq"])
+
+
+def rss(process):
+    return process.memory_info().rss
+
+
+@pytest.mark.slow
+def test_two_thousand_events_leave_nothing_behind(inverting, tmp_path):
+    image, bad = np.full((500, 500), 14, np.uint8), np.full((500, 500), 13, np.uint8)
+    with ready_worker(inverting, tmp_path) as front:
+        process = psutil.Process(front.process.pid)
+
+        def some(count):
+            for number in range(count):
+                front.run(image=bad if number % 4 == 3 else image)
+                if number % 50 == 0:
+                    front.ask("svg")
+                    front.values("image", "inverted")
+
+        some(400)
+        before, files = rss(process), process.num_fds()
+        some(2_000)
+        # Each event has 0.5 MB of images: were one in fifty kept, this would be 20 MB.
+        assert rss(process) - before < 10_000_000
+        assert process.num_fds() == files
+
+
+@pytest.mark.slow
+def test_a_worker_keeps_no_more_of_large_events_than_the_last_run_of_each_slot(inverting, tmp_path):
+    with ready_worker(inverting, tmp_path) as front:
+        process = psutil.Process(front.process.pid)
+        before = rss(process)
+        for _ in range(8):
+            front.run(image=np.full((5000, 4000), 14, np.uint8))
+            front.ask("svg")
+        # An event and its run are 40 MB; the run before it is there until the next one has ended.
+        largest = rss(process)
+        assert largest - before < 120_000_000
+        for _ in range(3):
+            front.run(image=np.full((1, 1), 14, np.uint8))
+        assert largest - rss(process) > 30_000_000
+
+
+@pytest.mark.slow
+def test_a_page_that_asks_all_the_time_has_each_picture_made_once_per_run(inverting, tmp_path):
+    with ready_worker(inverting, tmp_path) as front:
+        front.run(image=np.full((2000, 2000), 14, np.uint8))
+        process = psutil.Process(front.process.pid)
+        for what, more in (("svg", {}), ("view", {}), ("preview", {"token": "inverted", "max_side_px": 512})):
+            first = front.ask(what, **more)[1]
+            before = sum(process.cpu_times()[:2])
+            assert all(front.ask(what, **more)[1] == first for _ in range(100))
+            assert sum(process.cpu_times()[:2]) - before < 0.2
+    assert Path(front.stderr).read_text() == ""
+
+
+def test_a_pipeline_that_takes_events_in_a_way_of_its_own_is_served_too(owning, tmp_path):
+    body = """
+    def listen(self, timeout_s=0.5):
+        import queue
+        import threading
+        import time
+
+        def take():
+            while True:
+                try:
+                    event = self.q_in.get_nowait() if hasattr(self.q_in, "get_nowait") else self.q_in.get(block=False)
+                except queue.Empty:
+                    time.sleep(0.002)
+                    continue
+                self.handle(event)
+
+        threading.Thread(target=take, daemon=True).start()
+"""
+    with ready_worker(owning(body), tmp_path) as front:
+        for text in ("a", "b"):
+            assert front.run(text=text)[1][0].parts["repeated"] == text * 2
+        front.set(1, times=3)
+        assert front.run(text="c")[1][0].parts["repeated"] == "ccc"
+        assert front.end() == 0

@@ -1,0 +1,414 @@
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import threading
+
+import psutil
+import pytest
+
+from epypes.bundle.seal import seal
+from epypes.errors import (
+    BundleError,
+    DeployRefused,
+    NotComputed,
+    ParametersRefused,
+    RevisionConflict,
+    ServiceError,
+    UnknownName,
+)
+from epypes.service import Service
+from epypes.service.packing import unpack
+from epypes.wire import decode
+from tests.service.served import SOURCE, TIMEOUT_S, acting_bundle, check_counts, peer_of, serving, until
+
+
+def started(folder):
+    until((folder / "started").exists)
+
+
+def kill_worker(service):
+    """Kill the worker, and wait for the next."""
+    before = service.info()["restarts"]
+    os.kill(service.info()["worker_pid"], signal.SIGKILL)
+    until(lambda: service.info()["restarts"] == before + 1 and service.state == "READY")
+
+
+# -- what kills the worker ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "how", ["kill", pytest.param("segv", marks=pytest.mark.slow), pytest.param("exit", marks=pytest.mark.slow)]
+)
+def test_a_frame_that_kills_the_worker_is_put_aside_and_the_others_are_answered_in_order(acting, how):
+    with serving(acting, mailbox_size=100) as (service, peer):
+        for number in range(12):
+            peer.send(how if number == 7 else "plain", number)
+        answers = peer.take(12)
+        assert [answer.correlation_id for answer in answers] == peer.sent
+        assert [answer.parts["out"] for answer in answers if answer.failure is None] == [
+            2 * n for n in range(12) if n != 7
+        ]
+        dead = answers[7].failure
+        assert "It is put aside" in dead.message
+        until(lambda: service.state == "READY")
+        counts = service.counts()
+        assert (counts["answered"], counts["dead_letters"], counts["retried"]) == (11, 1, 1)
+        reported = peer.failures.get(timeout=TIMEOUT_S)
+        assert reported.correlation_id == peer.sent[7]
+        assert service.failure_store.flush()
+        (record,) = service.failure_records()
+        assert (record.kind, record.dead_letter, record.attempt, record.event_id) == ("killed", True, 2, peer.sent[7])
+        assert record.function == ("act" if how == "segv" else "worker")
+        assert service.failure_store.event(record.id).parts["what"] == how
+        assert service.info()["restarts"] == 2
+
+
+@pytest.mark.slow
+def test_a_worker_killed_from_outside_costs_no_event(acting):
+    with serving(acting, mailbox_size=400) as (service, peer):
+        for number in range(300):
+            peer.send("sleep:0.003", number)
+            if number % 100 == 50:
+                # What it works on has not met a death before: twice would be too often.
+                until(lambda least=number - 40: service.counts()["answered"] >= least)
+                kill_worker(service)
+        answers = peer.take(300)
+        assert [answer.correlation_id for answer in answers] == peer.sent
+        assert [answer.parts["out"] for answer in answers] == [2 * number for number in range(300)]
+        assert service.counts()["answered"] == 300
+        assert service.info()["restarts"] == 3
+
+
+@pytest.mark.slow
+def test_with_three_slots_only_the_culprit_is_put_aside(acting):
+    with serving(acting, threads=3, mailbox_size=100, retries=0) as (service, peer):
+        for number in range(30):
+            peer.send("kill" if number == 11 else "sleep:0.01", number)
+        answers = peer.take(30)
+        assert [answer.correlation_id for answer in answers] == peer.sent
+        assert [n for n, answer in enumerate(answers) if answer.failure] == [11]
+        assert service.counts()["dead_letters"] == 1
+
+
+@pytest.mark.slow
+def test_five_deaths_in_a_row_are_a_fault_and_everybody_is_told(acting):
+    with serving(acting, mailbox_size=100, retries=0) as (service, peer):
+        for number in range(9):
+            peer.send("kill", number)
+        answers = peer.take(9)
+        assert sorted(answer.correlation_id for answer in answers) == sorted(peer.sent)
+        until(lambda: service.state == "FAULTED")
+        assert (
+            "5 workers ended in a row without an answer. The last: The worker was killed by SIGKILL" in service.reason
+        )
+        counts = service.counts()
+        assert (counts["dead_letters"], counts["dropped"]) == (5, 4)
+        assert "can't be served" in peer.ask().failure.message, "who comes later is told too"
+        service.deploy(acting)
+        assert service.state == "READY"
+        assert peer.ask(number=4).parts["out"] == 8
+
+
+# -- what does not return -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("how", ["hold", "regex"])
+def test_a_function_that_does_not_return_is_named_and_the_worker_is_replaced(acting, tmp_path, how):
+    """A catastrophic regular expression holds the interpreter; the front answers all the same."""
+    heard = []
+    with serving(acting, job_timeout_s=0.4) as (service, peer):
+        service.listen(lambda kind, data: heard.append(service.alive()))
+        first = service.info()["worker_pid"]
+        peer.send(f"{how}:{tmp_path}", 1)
+        peer.send("plain", 2)
+        until(lambda: service.counts()["in_flight"] == 1)
+        assert service.alive() == "", "it is merely busy"
+        until(lambda: service.alive())
+        until(lambda: service.counts()["answered"] == 1)
+        stuck, good = peer.take(2)
+        assert stuck.failure.function == "act"
+        assert "Function 'act' did not return within 0.4 s" in stuck.failure.message
+        assert good.parts["out"] == 4
+        assert service.alive() == ""
+        assert any("Function 'act' did not return within 0.4 s" in text for text in heard)
+        assert service.failure_store.flush()
+        assert [record.kind for record in service.failure_records()] == ["stuck"]
+        assert service.counts()["failed"] == 1
+        assert not psutil.pid_exists(first)
+
+
+@pytest.mark.slow
+def test_a_worker_that_was_stopped_is_replaced(acting):
+    with serving(acting, job_timeout_s=0.3) as (service, peer):
+        os.kill(service.info()["worker_pid"], signal.SIGSTOP)
+        failure = peer.ask().failure
+        assert "did not return within 0.3 s" in failure.message
+        assert peer.ask(number=3).parts["out"] == 6
+
+
+@pytest.mark.slow
+def test_what_runs_beside_a_stuck_event_is_tried_again(acting, tmp_path):
+    with serving(acting, threads=2, job_timeout_s=0.5) as (service, peer):
+        peer.send(f"hold:{tmp_path}", 1)
+        started(tmp_path)
+        until(lambda: service.counts()["in_flight"] == 1)
+        late = threading.Event()
+        # It begins when the other has waited for most of its time already.
+        late.wait(0.35)
+        peer.send("sleep:0.3", 2)
+        stuck, good = peer.take(2)
+        assert stuck.failure is not None
+        assert good.parts["out"] == 4
+        assert service.counts()["retried"] == 1
+
+
+@pytest.mark.slow
+def test_an_event_that_waits_in_the_worker_for_a_change_has_its_time_from_when_it_is_begun(acting, tmp_path):
+    with serving(acting, threads=2, job_timeout_s=1.0) as (service, peer):
+        peer.send("sleep:0.8", 1)
+        until(lambda: service.counts()["in_flight"] == 1)
+        changing = threading.Thread(target=service.set_parameters, args=({"k": 3},))
+        changing.start()
+        until(lambda: service._tuning._pending is not None)
+        # It is given to the worker now, which begins it when the first is done.
+        peer.send("sleep:0.7", 2)
+        assert [answer.parts["out"] for answer in peer.take(2)] == [2, 6]
+        changing.join()
+        assert service.info()["restarts"] == 0
+
+
+# -- order and load -------------------------------------------------------------------------------------------------
+
+
+def test_answers_keep_the_order_of_events_though_slots_differ_in_speed(acting):
+    with serving(acting, threads=3, mailbox_size=100) as (service, peer):
+        for number in range(40):
+            peer.send(("sleep:0.03", "plain", "sleep:0.005", "fail:odd")[number % 4], number)
+        answers = peer.take(40)
+        assert [answer.correlation_id for answer in answers] == peer.sent
+        assert service.counts()["failed"] == 10
+        check_counts(service.counts())
+
+
+def test_a_failed_event_is_told_on_both_sockets_and_its_trace_is_kept(acting):
+    with serving(acting) as (service, peer):
+        heard = []
+        forget = service.listen(lambda kind, data: heard.append((kind, data)))
+        answer = peer.ask("fail:oh no")
+        assert (answer.failure.function, answer.failure.exception) == ("act", "ValueError")
+        assert peer.failures.get(timeout=TIMEOUT_S).failure == answer.failure
+        until(lambda: heard)
+        forget()
+        kind, record = heard[0]
+        assert (kind, record["event_id"], record["message"]) == ("failure", answer.correlation_id, "oh no")
+        assert any("raise ValueError(text)" in line for line in record["trace"])
+        peer.ask()
+        assert len(heard) == 1
+
+
+def test_events_that_come_while_it_loads_wait_in_the_mailbox(acting):
+    service = Service(acting)
+    thread = threading.Thread(target=service.start)
+    thread.start()
+    try:
+        until(lambda: not service.service_state.failures.endswith("*"))
+        with peer_of(service) as peer:
+            assert peer.ask(number=5).parts["out"] == 10
+    finally:
+        thread.join()
+        service.stop()
+
+
+def test_a_paused_service_keeps_events_and_goes_on_with_them(acting):
+    with serving(acting, mailbox_size=3) as (service, peer):
+        service.pause()
+        assert service.state == "PAUSED"
+        for number in range(5):
+            peer.send(number=number)
+        dropped = peer.take(2)
+        assert [answer.correlation_id for answer in dropped] == peer.sent[:2]
+        assert service.counts()["waiting"] == 3
+        assert "Events wait" in service.ready()
+        service.resume()
+        assert [answer.parts["out"] for answer in peer.take(3)] == [4, 6, 8]
+
+
+def test_a_drained_service_takes_no_more_until_it_resumes(acting):
+    with serving(acting) as (service, peer):
+        sub = service.service_state.sub
+        peer.send(number=1)
+        until(lambda: service.counts()["received"] == 1)
+        assert service.drain()
+        assert service.state == "DRAINING"
+        assert peer.take()[0].parts["out"] == 2
+        service.resume()
+        assert service.state == "READY"
+        assert service.service_state.sub == sub
+        with peer_of(service) as other:
+            assert other.ask(number=2).parts["out"] == 4
+
+
+# -- its parameters -------------------------------------------------------------------------------------------------
+
+
+def test_every_output_is_computed_with_the_parameters_of_its_revision(acting):
+    with serving(acting, threads=2, mailbox_size=1000) as (service, peer):
+        values = {0: 2}
+
+        def flip():
+            for k in range(10, 30):
+                values[service.set_parameters({"k": k}).revision] = k
+
+        flipping = threading.Thread(target=flip)
+        flipping.start()
+        sent = 0
+        while flipping.is_alive():
+            peer.send(number=1)
+            sent += 1
+            until(lambda: service.counts()["waiting"] < 50)
+        flipping.join()
+        answers = peer.take(sent)
+        assert all(answer.parts["out"] == values[answer.revision] for answer in answers)
+        revisions = [answer.revision for answer in answers]
+        assert revisions == sorted(revisions)
+        assert len(set(revisions)) > 3
+
+
+def test_parameters_outlive_the_worker(acting):
+    with serving(acting) as (service, peer):
+        assert service.set_parameters({"k": 7}, revision=0).revision == 1
+        os.kill(service.info()["worker_pid"], signal.SIGKILL)
+        answer = peer.ask(number=3)
+        assert (answer.parts["out"], answer.revision) == (21, 1)
+
+
+def test_a_change_that_cannot_be_made_changes_nothing_and_says_why(acting):
+    with serving(acting) as (service, peer):
+        with pytest.raises(ParametersRefused) as refused:
+            service.set_parameters({"k": 5, "kk": 1, "n": 2})
+        assert set(refused.value.problems) == {"kk", "n"}
+        assert "Did you mean 'k'?" in refused.value.problems["kk"]
+        with pytest.raises(ParametersRefused, match="'k' is a whole number, and 'two' is a text"):
+            service.set_parameters({"k": "two"})
+        assert service.parameters().revision == 0
+        service.set_parameters({"k": 3})
+        with pytest.raises(RevisionConflict) as conflict:
+            service.set_parameters({"k": 4}, revision=0)
+        assert conflict.value.current.entries["k"]["value"] == 3
+        assert peer.ask(number=1).parts["out"] == 3
+
+
+# -- what is seen of it ---------------------------------------------------------------------------------------------
+
+
+def test_the_last_run_can_be_looked_at_also_when_there_is_no_worker(acting):
+    with serving(acting) as (service, peer):
+        with pytest.raises(NotComputed):
+            service.preview("out")
+        sent = peer.ask(number=4).correlation_id
+        assert service.preview("out")[1].splitlines()[0] == b"8"
+        with pytest.raises(UnknownName, match="Did you mean 'out'"):
+            service.preview("outt")
+        values = decode(unpack(service.run(["out", "number"])))
+        assert (dict(values.parts), values.correlation_id) == ({"out": 8, "number": 4}, sent)
+        revision = service.set_parameters({"k": 10}).revision
+        again = decode(unpack(service.run(["out"], revision=revision)))
+        assert (again.parts["out"], again.revision) == (40, 1)
+        assert service.graph_svg().startswith(b"<svg")
+        view = service.view()
+        assert b'"act"' in view
+        assert service.info()["func_io"] == {"act": [["what", "number", "k"], ["out"]]}
+        service._dispatcher.use(None)
+        assert service.view() == view
+        with pytest.raises(ServiceError):
+            service.run(["out"])
+
+
+# -- other bundles --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def better(tmp_path):
+    return acting_bundle(tmp_path / "better", k=100, expected=300)
+
+
+def test_a_good_bundle_takes_over_under_load_and_can_be_rolled_back(acting, better):
+    with serving(acting, threads=2, mailbox_size=10_000) as (service, peer):
+        stop, sent = threading.Event(), []
+
+        def load():
+            while not stop.is_set():
+                sent.append(peer.send("sleep:0.001", 1))
+                until(lambda: service.counts()["waiting"] < 20)
+
+        loading = threading.Thread(target=load)
+        loading.start()
+        first = service.info()["digest"]
+        info = service.deploy(better)
+        assert (info["revision"], info["digest"] != first, info["bundle"]) == (1, True, str(better))
+        assert service.rollback()["digest"] == first
+        stop.set()
+        loading.join()
+        answers = peer.take(len(sent))
+        assert [answer.correlation_id for answer in answers] == sent
+        by_revision = {0: 2, 1: 100, 2: 2}
+        assert all(answer.parts["out"] == by_revision[answer.revision] for answer in answers)
+        assert {answer.bundle_digest for answer in answers if answer.revision != 1} == {first}
+        assert service.counts()["answered"] == len(sent)
+
+
+def test_a_bundle_that_is_not_good_leaves_the_other_one_serving(acting, tmp_path):
+    wrong = acting_bundle(tmp_path / "wrong", expected=7)
+    torn = acting_bundle(tmp_path / "torn")
+    (torn / "pipeline.py").write_text("x = 1\n")
+    other = acting_bundle(
+        tmp_path / "other", inputs=("what", "number", "more"), source=SOURCE.replace("(what, number, k)", "(what, number, k, more)")
+        .replace('("what", "number", "k")', '("what", "number", "k", "more")'),
+    )  # fmt: skip
+    killer = acting_bundle(tmp_path / "killer", source=SOURCE + "\n    os._exit(4)\n")
+    with serving(acting) as (service, peer):
+        before = service.info()
+        for path, why in [
+            (wrong, "'out'"), (torn, "pipeline.py was changed"), (other, "other ports"), (killer, "ended with status 4"),
+            (tmp_path / "none", "does not exist"),
+        ]:  # fmt: skip
+            with pytest.raises(DeployRefused, match=why):
+                service.deploy(path)
+            assert peer.ask(number=2).parts["out"] == 4
+        with pytest.raises(DeployRefused, match="No bundle was served before"):
+            service.rollback()
+        after = service.info()
+        assert {key for key in before if before[key] != after[key]} == set()
+
+
+def test_a_bundle_whose_replay_differs_is_never_ready_and_says_why(tmp_path):
+    with Service(acting_bundle(tmp_path / "wrong", expected=7)) as service:
+        assert service.state == "FAULTED"
+        assert "'out'" in service.reason
+        assert service.ready() == service.reason
+        service.deploy(acting_bundle(tmp_path / "good"))
+        assert service.state == "READY"
+
+
+def test_a_bundle_that_was_changed_is_not_served(acting, tmp_path):
+    copy = shutil.copytree(acting, tmp_path / "copy")
+    with (copy / "pipeline.toml").open("a") as file:
+        file.write(" ")
+    with pytest.raises(BundleError, match=r"pipeline\.toml was changed"):
+        Service(copy)
+
+
+def test_a_bundle_that_was_exchanged_behind_its_back_is_not_served_unasked(acting, tmp_path):
+    copy = shutil.copytree(acting, tmp_path / "copy")
+    with serving(copy) as (service, peer):
+        settings = copy / "pipeline.toml"
+        settings.write_text(settings.read_text() + "\n")
+        seal(copy)
+        assert peer.ask(number=2).parts["out"] == 4
+        os.kill(service.info()["worker_pid"], signal.SIGKILL)
+        until(lambda: service.state == "FAULTED")
+        assert "Deploy it" in service.reason
+        service.deploy(copy)
+        assert peer.ask(number=2).parts["out"] == 4
