@@ -46,7 +46,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from epypes.bundle.compare import ReplayReport
+    from epypes.bundle.report import ReplayReport
     from epypes.images import Image
     from epypes.service.parameters import Parameters
 

@@ -5,7 +5,7 @@ Recorded beside a sample, where two runs made the same answer: an Envelope with 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,6 +13,7 @@ from epypes.bundle.compare import first_difference
 from epypes.bundle.load import Bundle
 from epypes.errors import MessageError
 from epypes.pipeline import EventView
+from epypes.pipeline.answering import FOut
 from epypes.pipeline.stamps import Stamps
 from epypes.run import Run
 
@@ -21,9 +22,7 @@ _BYTES: Final = "bytes"
 _Parts = Mapping[str, Any]
 
 
-def record_answer(
-    path: Path, f_out: Callable[[EventView], Any], name: str, runs: tuple[Run, Run], attributes: _Parts
-) -> bool:
+def record_answer(path: Path, f_out: FOut, name: str, runs: tuple[Run, Run], attributes: _Parts) -> bool:
     """Write what f_out makes of a run, if it makes the same of another one of the same payload.
 
     Parameters
@@ -65,7 +64,7 @@ def bundle_answer_difference(bundle: Bundle, sample: str, run: Run) -> str | Non
     return "f_out makes no answer" if got is None else first_difference(expected, dict(got))
 
 
-def _answer(f_out: Callable[[EventView], Any], name: str, run: Run, attributes: _Parts) -> Any:
+def _answer(f_out: FOut, name: str, run: Run, attributes: _Parts) -> Any:
     """Return what f_out makes of a run; None if it needs the event, which is not known."""
     from epypes.wire import Envelope
 

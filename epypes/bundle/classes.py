@@ -81,9 +81,8 @@ def class_definition(kind: type, around: Mapping[str, Any], what: str) -> ClassD
             if not problem:
                 return _definition(kind, around, what, file, lines, node)
             why = why or f"{problem} ({_place(file, node)})"
-    raise Refused(
-        f"{what} is not to be had as text: {why or 'it has no source'}. Define it in a cell again, and what was made of it."
-    )
+    text = f"{what} is not to be had as text: {why or 'it has no source'}."
+    raise Refused(f"{text} Define it in a cell again, and what was made of it.")
 
 
 def _definition(

@@ -1,99 +1,227 @@
-"""Do two values agree to the last bit, and if not, where do they first differ?"""
+"""Do two values agree, to the last bit or within a tolerance, and if not, where do they first differ?"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
-from epypes.wording import counted
+from epypes.wire.codecs import set_order
+from epypes.wire.records import FIELDS, record_fields, record_type
+from epypes.wire.tables import is_table, table_parts
 
-
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """The first place where a token is not what was recorded."""
-
-    sample: str
-    token: str
-    text: str
-
-    def __str__(self) -> str:
-        return f"sample {self.sample}, token {self.token!r}: {self.text}"
+_ADDRESS: Final = re.compile(r"0x[0-9a-fA-F]+")
 
 
 @dataclass(frozen=True, slots=True)
-class ReplayReport:
-    """What a replay found.
+class Tolerance:
+    """How far floating-point numbers of a token may be from what was recorded; both bounds hold.
 
     Attributes
     ----------
-    samples
-        How many samples were replayed.
-    tokens
-        How many tokens were compared.
-    differences
-        The first difference of each token that differs.
-    requirements
-        What the replay imported, pinned, one requirement per entry.
+    absolute
+        The largest difference.
+    relative
+        The largest difference, as a part of the largest magnitude in the array (or of the number).
     """
 
-    samples: int
-    tokens: int
-    differences: tuple[Difference, ...]
-    requirements: tuple[str, ...]
-
-    @property
-    def identical(self) -> bool:
-        """Whether every token was what had been recorded, and there was one."""
-        return self.tokens > 0 and not self.differences
-
-    def __str__(self) -> str:
-        if self.identical:
-            return f"identical: {counted(self.tokens, 'token')} of {counted(self.samples, 'sample')}"
-        return "\n".join(map(str, self.differences)) or "nothing was compared: the bundle has no samples"
+    absolute: float
+    relative: float
 
 
-def first_difference(expected: Any, got: Any, where: str = "") -> str | None:
+@dataclass(frozen=True, slots=True)
+class Unlike:
+    """One number, text or array that is not what was expected.
+
+    Attributes
+    ----------
+    where
+        The indices and keys that lead to it, and into it: ``[2]['size']``, ``[17, 4]``.
+    text
+        What differs, with the values.
+    expected, got
+        The first values that differ, as text.
+    count, size
+        How many values differ, of how many.
+    largest
+        The largest difference; None if they are no numbers.
+    scale
+        The largest magnitude of what was expected; 0.0 for what is no floating-point number.
+    epsilon
+        The distance of neighbouring numbers at 1.0, if these are floating-point numbers that differ as such: no NaN or
+        infinity has come or gone. 0.0 for everything else.
+    """
+
+    where: str
+    text: str
+    expected: str
+    got: str
+    count: int = 1
+    size: int = 1
+    largest: float | None = None
+    scale: float = 0.0
+    epsilon: float = 0.0
+
+
+def first_difference(expected: Any, got: Any, tolerance: Tolerance | None = None) -> str | None:
     """Return where two values first differ, as text, or None if they agree in type and to the last bit."""
+    return next((unlike.text for unlike in differences(expected, got, tolerance)), None)
+
+
+def differences(expected: Any, got: Any, tolerance: Tolerance | None = None, where: str = "") -> Iterator[Unlike]:
+    """Yield every place where two values differ, in order; none if they agree in type and to the last bit.
+
+    Parameters
+    ----------
+    expected, got
+        Values of any type. Objects that neither numpy, OpenCV nor pandas made are compared by their repr, without
+        addresses.
+    tolerance
+        How far floating-point numbers may be apart.
+    where
+        What leads to the values.
+    """
     if type(expected) is not type(got):
-        return f"{where}expected type {type(expected).__name__}, got {type(got).__name__}"
-    if hasattr(expected, "dtype") and hasattr(expected, "shape"):
-        return _array_difference(expected, got, where)
-    if isinstance(expected, Mapping):
-        return _mapping_difference(expected, got, where)
-    if isinstance(expected, list | tuple):
-        return _sequence_difference(expected, got, where)
-    # repr tells -0.0 from 0.0 and makes NaN agree with itself.
-    return None if repr(expected) == repr(got) else f"{where}expected {expected!r:.60}, got {got!r:.60}"
+        yield _named(where, f"type {type(expected).__name__}", type(got).__name__)
+    elif hasattr(expected, "dtype") and hasattr(expected, "shape") and not is_table(expected):
+        yield from _in_arrays(expected, got, tolerance, where)
+    else:
+        inside = next((inside for is_kind, inside in _INSIDE if is_kind(expected)), _in_others)
+        yield from inside(expected, got, tolerance, where)
 
 
-def _mapping_difference(expected: Mapping[Any, Any], got: Mapping[Any, Any], where: str) -> str | None:
+def _named(where: str, expected: str, got: str) -> Unlike:
+    return Unlike(where.replace(" ", ""), f"{where}expected {expected}, got {got}", expected, got)
+
+
+def _in_mappings(
+    expected: Mapping[Any, Any], got: Mapping[Any, Any], tolerance: Tolerance | None, where: str
+) -> Iterator[Unlike]:
     if list(expected) != list(got):
-        return f"{where}expected the keys {list(expected)!r:.80}, got {list(got)!r:.80}"
-    pairs = ((expected[key], got[key], f"{where}[{key!r}] ") for key in expected)
-    return next((found for pair in pairs if (found := first_difference(*pair))), None)
+        yield _named(where, f"the keys {list(expected)!r:.80}", f"{list(got)!r:.80}")
+        return
+    for key in expected:
+        yield from differences(expected[key], got[key], tolerance, f"{where}[{key!r}] ")
 
 
-def _sequence_difference(expected: Any, got: Any, where: str) -> str | None:
+def _in_sequences(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:
     if len(expected) != len(got):
-        return f"{where}expected {len(expected)} items, got {len(got)}"
-    items = enumerate(zip(expected, got, strict=True))
-    found = (first_difference(left, right, f"{where}[{index}] ") for index, (left, right) in items)
-    return next((text for text in found if text), None)
+        yield _named(where, f"{len(expected)} items", f"{len(got)}")
+        return
+    for index, (left, right) in enumerate(zip(expected, got, strict=True)):
+        yield from differences(left, right, tolerance, f"{where}[{index}] ")
 
 
-def _array_difference(expected: Any, got: Any, where: str) -> str | None:
+def _in_sets(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:
+    left, right = ({*map(set_order, items)} for items in (expected, got))
+    if left != right:
+        yield _named(where, f"{sorted(left - right)!r:.60} in the set", f"{sorted(right - left)!r:.60}")
+
+
+def _in_records(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:
+    names = FIELDS[record_type(expected)]
+    for name, left, right in zip(names, record_fields(expected), record_fields(got), strict=True):
+        yield from differences(left, right, tolerance, f"{where}.{name} ")
+
+
+def _in_tables(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:
+    left, right = table_parts(expected), table_parts(got)
+    ours_at, theirs_at = ([place for place, _ in parts] for parts in (left, right))
+    if ours_at != theirs_at:
+        yield _named(where, f"the parts {ours_at!r:.80}", f"{theirs_at!r:.80}")
+        return
+    for (place, ours), (_, theirs) in zip(left, right, strict=True):
+        yield from differences(ours, theirs, tolerance, f"{where}{place} ")
+
+
+def _in_numbers(expected: complex, got: complex, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:
+    # repr tells -0.0 from 0.0 and makes NaN agree with itself.
+    if repr(expected) == repr(got):
+        return
+    largest, scale = abs(got - expected), abs(expected)
+    is_finite = math.isfinite(largest)
+    if is_finite and tolerance and largest <= min(tolerance.absolute, tolerance.relative * scale):
+        return
+    named = _named(where, repr(expected), repr(got))
+    epsilon = 2.0**-52 if is_finite else 0.0
+    yield Unlike(named.where, named.text, named.expected, named.got, 1, 1, _finite(largest), scale, epsilon)
+
+
+def _in_others(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:
+    left, right = (_ADDRESS.sub("0x", repr(value)) for value in (expected, got))
+    if left != right:
+        named = _named(where, f"{left:.60}", f"{right:.60}")
+        is_integer = type(expected) is int and abs(expected) < 2**1000 > abs(got)
+        largest = float(abs(got - expected)) if is_integer else None
+        yield Unlike(named.where, named.text, named.expected, named.got, largest=largest)
+
+
+_Inside = Callable[[Any, Any, Tolerance | None, str], Iterator[Unlike]]
+_INSIDE: Final[tuple[tuple[Callable[[Any], object], _Inside], ...]] = (
+    (lambda value: isinstance(value, Mapping), _in_mappings),
+    (lambda value: isinstance(value, list | tuple), _in_sequences),
+    (lambda value: isinstance(value, set | frozenset), _in_sets),
+    (lambda value: type(value) in (float, complex), _in_numbers),
+    (record_type, _in_records),
+    (is_table, _in_tables),
+)
+
+
+def _in_arrays(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:
     import numpy as np
 
     if expected.dtype != got.dtype or expected.shape != got.shape:
-        kinds = f"{expected.dtype} {expected.shape}, got {got.dtype} {got.shape}"
-        return f"{where}expected {kinds}"
+        yield _named(where, f"{expected.dtype} {expected.shape}", f"{got.dtype} {got.shape}")
+        return
+    if expected.dtype.hasobject:
+        yield from _in_sequences(np.asarray(expected).reshape(-1).tolist(), got.reshape(-1).tolist(), tolerance, where)
+        return
     left, right = np.ascontiguousarray(expected).reshape(-1), np.ascontiguousarray(got).reshape(-1)
     if left.tobytes() == right.tobytes():
-        return None
+        return
     size = left.dtype.itemsize
     unlike = (left.view(np.uint8).reshape(-1, size) != right.view(np.uint8).reshape(-1, size)).any(axis=1)
-    first = int(unlike.argmax())
-    index = tuple(map(int, np.unravel_index(first, expected.shape))) if expected.shape else ()
-    count = f"{int(unlike.sum())} of {left.size} values differ"
-    return f"{where}{count}, first at {list(index)}: expected {left[first]}, got {right[first]}"
+    distance, scale, epsilon = _distances(left, right)
+    if tolerance and epsilon:
+        unlike &= ~(distance <= min(tolerance.absolute, tolerance.relative * scale))
+    if unlike.any():
+        yield _told(left, right, unlike, expected.shape, where, (distance, scale, epsilon))
+
+
+def _told(left: Any, right: Any, unlike: Any, shape: tuple[int, ...], where: str, measured: Any) -> Unlike:
+    import numpy as np
+
+    distance, scale, epsilon = measured
+    first, count = int(unlike.argmax()), int(unlike.sum())
+    index = list(map(int, np.unravel_index(first, shape))) if shape else []
+    text = f"{where}{count} of {left.size} values differ, first at {index}: expected {left[first]}, got {right[first]}"
+    largest = None if distance is None else _finite(float(distance[unlike].max()))
+    if largest is not None and count > 1:
+        text += f"; the largest difference is {largest:.6g}"
+    place = where.replace(" ", "") + str(index)
+    return Unlike(place, text, str(left[first]), str(right[first]), count, left.size, largest, scale, epsilon)
+
+
+def _distances(left: Any, right: Any) -> tuple[Any, float, float]:
+    """Return how far numbers are apart, the largest magnitude of the left ones, and their epsilon; see Unlike."""
+    import numpy as np
+
+    kind = left.dtype.kind
+    if kind not in "iufc":
+        return None, 0.0, 0.0
+    with np.errstate(all="ignore"):
+        wide = np.complex128 if kind == "c" else np.float64
+        distance = np.abs(right.astype(wide) - left.astype(wide))
+        if kind in "iu":
+            return distance, 0.0, 0.0
+        # What is NaN on both sides, or the same infinity, agrees.
+        distance[(left == right) | ((left != left) & (right != right))] = 0.0
+        magnitude = np.abs(left[np.isfinite(left)])
+        scale = float(magnitude.max()) if magnitude.size else 0.0
+    return distance, scale, float(np.finfo(left.dtype).eps) if np.isfinite(distance).all() else 0.0
+
+
+def _finite(number: float) -> float | None:
+    return number if math.isfinite(number) else None

@@ -9,7 +9,7 @@ from typing import Final
 
 from epypes.bundle.definitions import definitions, early_constants
 from epypes.bundle.graphs import GraphText, grouped
-from epypes.bundle.imports import ordered_imports
+from epypes.bundle.importorder import ordered_imports
 from epypes.bundle.lines import LINE, laid_out
 from epypes.bundle.settings import Settings
 from epypes.bundle.slicer import Slice

@@ -1,4 +1,4 @@
-"""How do graphs stand in a module, with what is a function of them: switches, nodes, pipelines with graphs of their own?"""
+"""How do graphs stand in a module, with the switches, nodes and pipelines that are functions of them?"""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from epypes.bundle.instances import arguments_of, is_by_position
+from epypes.bundle.instances import arguments_of, by_position
 from epypes.bundle.lines import Group, Piece, assignment, call, laid_out, piece_of, prefixed, quoted
 from epypes.bundle.slicer import Slice, slice_functions
 from epypes.bundle.source import Refused
@@ -180,7 +180,7 @@ class Graphs:
         pairs = [prefixed(f"{key}: ", quoted(token)) for key, token in zip(keys, tokens, strict=True)]
         variable = self._variable(name)
         branches = Group("{", tuple(pairs), "}", is_display=True)
-        arguments = [quoted(name), branches, f"by={quoted(by)}", f"output={quoted(output)}"]
+        arguments: list[Piece] = [quoted(name), branches, f"by={quoted(by)}", f"output={quoted(output)}"]
         made = call(f"{self._epypes(what)}.switch", arguments)
         self.blocks.append(
             [f"# Only the branch that {_shown(by)} chooses is computed.", *assignment([variable], True, made, 0)]
@@ -196,15 +196,14 @@ class Graphs:
             self.gathered.refusals.append(str(refusal))
             return "None"
         variable = self._variable(name)
-        arguments, lines = [], list[str]()
-        is_positional = True
+        arguments, lines, names = list[Piece](), list[str](), by_position(kind)
         for parameter, value in given.items():
             if isinstance(value, CompGraph):
                 piece, lines = self._inner_graph(value, what, variable)
             else:
                 piece = piece_of(self._value(bare(value), what, f"{name}_{parameter}"))
-            is_positional = is_positional and is_by_position(kind, parameter) and _is_next(kind, parameter, arguments)
-            arguments.append(piece if is_positional else prefixed(f"{parameter}=", piece))
+            is_next = names[: len(arguments) + 1] == [*given][: len(arguments) + 1]
+            arguments.append(piece if is_next else prefixed(f"{parameter}=", piece))
         self.blocks.append([*lines, *assignment([variable], True, call(known, arguments), 0)])
         return variable
 
@@ -239,14 +238,6 @@ def bare(function: Any) -> Any:
     while type(function) is Node:
         function = function.func
     return function
-
-
-def _is_next(kind: type, name: str, before: list[Piece]) -> bool:
-    """Whether an argument is the next one by position."""
-    import inspect
-
-    _, *names = inspect.signature(kind.__init__).parameters
-    return names[len(before) : len(before) + 1] == [name]
 
 
 def _shown(text: str) -> str:

@@ -40,10 +40,11 @@ def arguments_of(made: Node, what: str) -> dict[str, Any]:
     return found
 
 
-def is_by_position(kind: type, name: str) -> bool:
-    """Whether an argument may be given by position."""
-    parameter = inspect.signature(kind.__init__).parameters.get(name)
-    return parameter is not None and parameter.kind is parameter.POSITIONAL_OR_KEYWORD
+def by_position(kind: type) -> list[str]:
+    """Return the arguments that may be given by position, in order."""
+    first = next(above for above in kind.__mro__ if "__init__" in vars(above))
+    _, *parameters = inspect.signature(vars(first)["__init__"]).parameters.values()
+    return [parameter.name for parameter in parameters if parameter.kind is parameter.POSITIONAL_OR_KEYWORD]
 
 
 class _Missing:
@@ -59,7 +60,7 @@ def parameters_of(kind: type) -> Iterator[inspect.Parameter]:
     for above in kind.__mro__:
         if "__init__" not in vars(above):
             continue
-        _, *parameters = inspect.signature(above.__init__).parameters.values()
+        _, *parameters = inspect.signature(vars(above)["__init__"]).parameters.values()
         named = [parameter for parameter in parameters if parameter.kind not in _GIVEN]
         yield from (parameter for parameter in named if parameter.name not in seen)
         seen.update(parameter.name for parameter in named)
@@ -112,8 +113,8 @@ def _check_made_again(made: Node, given: Mapping[str, Any], what: str) -> None:
 
 # What the pipelines of EPypes keep of a run, or hand to each other.
 _PIPELINES: Final = frozenset({
-    "network", "runner", "source_cg", "attributes", "q_in", "q_out", "f_in", "f_out", "on_error", "failed", "working_on",
-    "_attempts", "_failed_last", "_own", "loop",
+    "network", "runner", "source_cg", "attributes", "q_in", "q_out", "f_in", "f_out", "on_error", "failed",
+    "working_on", "_attempts", "_failed_last", "_own", "loop",
 })  # fmt: skip
 
 

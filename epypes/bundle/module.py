@@ -19,7 +19,8 @@ def write_module(subject: Subject, settings: Settings) -> tuple[str, Settings, l
     """Return the text of ``pipeline.py``, the settings with what it has of its own, and the reasons against it."""
     gathered = Slice()
     graphs = Graphs(gathered)
-    text = graphs.write(subject.cg, {**subject.ports, **subject.classes})
+    ports = {f"Function {name!r}": function for name, function in subject.ports.items()}
+    text = graphs.write(subject.cg, {**ports, **subject.classes})
     own = dict(own_lines(gathered, graphs, subject))
     if settings.has_groups:
         _keep(gathered, "func_groups")

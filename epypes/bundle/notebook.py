@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +18,7 @@ from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner
 
 Progress = Callable[[int, int], None]
+Told = Callable[[str], None]
 
 
 def promote_notebook(
@@ -23,6 +27,7 @@ def promote_notebook(
     to: str | Path,
     outputs: Sequence[str] | None = None,
     on_cell: Progress = lambda done, total: None,
+    told: Told = lambda text: None,
 ) -> None:
     """Execute every cell of a notebook in a new kernel of this Python, then promote one of its objects there.
 
@@ -36,6 +41,8 @@ def promote_notebook(
         As for ``promote``.
     on_cell
         Called with the number of code cells done and their total.
+    told
+        Called on a thread of its own with what the promotion in the kernel is doing.
 
     Raises
     ------
@@ -50,12 +57,35 @@ def promote_notebook(
         code = (
             "from epypes.bundle.notebook import promote_here as _promote_here\n"
             f"_promote_here({name!r}, {str(Path(to).resolve())!r}, "
-            f"{None if outputs is None else list(outputs)!r}, {str(outcome)!r})"
+            f"{None if outputs is None else list(outputs)!r}, {str(outcome)!r}, {str(Path(scratch) / 'told')!r})"
         )
-        _execute(path, code, on_cell, Path(scratch))
-        told = json.loads(outcome.read_text(encoding="utf-8"))
-    if told["reasons"]:
-        raise PromotionRefused(to, told["reasons"])
+        with _lines_of(Path(scratch) / "told", told):
+            _execute(path, code, on_cell, Path(scratch))
+        ended = json.loads(outcome.read_text(encoding="utf-8"))
+    if ended["reasons"]:
+        raise PromotionRefused(to, ended["reasons"])
+
+
+@contextmanager
+def _lines_of(pipe: Path, told: Told) -> Iterator[None]:
+    """While the block runs, tell every line that is written into a named pipe."""
+    os.mkfifo(pipe)
+    # Opened for both, it opens at once, and does not end when the kernel closes its side.
+    descriptor = os.open(pipe, os.O_RDWR)
+
+    def read() -> None:
+        with os.fdopen(descriptor, encoding="utf-8", closefd=False) as lines:
+            for line in iter(lines.readline, "\n"):
+                told(line.rstrip("\n"))
+
+    reader = threading.Thread(target=read, name="epypes-promotion-told", daemon=True)
+    reader.start()
+    try:
+        yield
+    finally:
+        os.write(descriptor, b"\n")
+        reader.join()
+        os.close(descriptor)
 
 
 def _execute(path: Path, last_cell: str, on_cell: Progress, scratch: Path) -> None:
@@ -107,14 +137,19 @@ def _execute(path: Path, last_cell: str, on_cell: Progress, scratch: Path) -> No
         raise BundleError(path, f"{path}: the kernel died in code cell {done + 1} of {total}.") from error
 
 
-def promote_here(name: str, to: str, outputs: Sequence[str] | None, outcome: str) -> None:
+def promote_here(name: str, to: str, outputs: Sequence[str] | None, outcome: str, pipe: str) -> None:
     """Promote a variable of the notebook that this kernel runs; write the reasons against it, if any, as JSON."""
+
+    def told(text: str) -> None:
+        with open(pipe, "w", encoding="utf-8") as file:
+            file.write(" ".join(text.split()) + "\n")
+
     names = vars(sys.modules["__main__"])
     try:
         if name not in names:
             known = [key for key, value in names.items() if isinstance(value, CompGraphRunner | Pipeline)]
             raise UnknownName("variable", name, known, "that holds a runner or pipeline in the notebook")
-        promote(names[name], to, outputs)
+        promote(names[name], to, outputs, told=told)
     except PromotionRefused as refused:
         reasons = list(refused.reasons)
     except EpypesError as error:

@@ -55,19 +55,20 @@ def answer_with(
     """Return an f_out: an Envelope with the output tokens and the times, which answers the event by its id.
 
     The arrays are copies, since a function may use the memory of its result again for the next event before this one
-    is sent; ``detach=False`` is for who encodes an answer before the next event. Images of the tokens named in ``rgb`` are sent as RGB. What can't be sent raises MessageError here, where
-    it becomes the event's failure.
+    is sent; ``detach=False`` is for who encodes an answer before the next event. Images of the tokens named in ``rgb``
+    are sent as RGB. What can't be sent raises MessageError here, where it becomes the event's failure.
     """
 
     def f_out(view: EventView) -> Envelope:
         from epypes.wire import Envelope, encode
 
+        event = view.event if isinstance(view.event, Envelope) else None
         answer = Envelope(
             type=RESULT,
             parts={token: detached(view[token]) if detach else view[token] for token in outputs},
             source=view.name,
-            correlation_id=view.event.id,
-            acquired_ns=view.event.acquired_ns,
+            correlation_id=event.id if event else "",
+            acquired_ns=event.acquired_ns if event else 0,
             revision=view.run.revision,
             bundle_digest=bundle_digest,
             attributes={**view.attributes, "total_ns": view.report.total_ns, "overhead_ns": view.report.overhead_ns},

@@ -7,30 +7,26 @@ bundle that passed them all takes the place of an older one.
 
 from __future__ import annotations
 
-import ctypes
-import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 from epypes.bundle.answers import ANSWERS, record_answer
+from epypes.bundle.exchange import exchange as _exchange
 from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
 from epypes.bundle.module import write_module
-from epypes.bundle.replay import replay_isolated
-from epypes.bundle.seal import MANIFEST, seal
+from epypes.bundle.proof import prove
+from epypes.bundle.seal import MANIFEST
 from epypes.bundle.settings import Settings, unwritable, writable_defaults, write_settings
 from epypes.bundle.source import Refused
 from epypes.bundle.subject import Subject, subject_of
+from epypes.bundle.tolerance import Learnt, learn
 from epypes.errors import BundleError, EpypesError, MessageError, PromotionRefused, run_call
 from epypes.graph import colour_order
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner, Run
-
-REQUIREMENTS: Final = "requirements.txt"
-# From Linux's fcntl.h and fs.h.
-_AT_FDCWD: Final = -100
-_RENAME_EXCHANGE: Final = 2
 
 
 def promote(
@@ -39,7 +35,9 @@ def promote(
     outputs: Sequence[str] | None = None,
     f_in: Callable[[Any], Mapping[str, Any]] | None = None,
     f_out: Callable[[Any], Any] | None = None,
+    *,
     samples: Iterable[Any] = (),
+    told: Callable[[str], None] = lambda text: None,
 ) -> Bundle:
     """Write a bundle: a folder of text that computes what the runner's last run computed, and proves it.
 
@@ -57,6 +55,9 @@ def promote(
     samples
         Further payloads that are run and recorded, besides that of the last run: values of the one free source token,
         or mappings by token.
+    told
+        Is told what is being done: the functions are run three times more, to learn which tokens they repeat to the
+        last bit and how far noise puts the others apart.
 
     Raises
     ------
@@ -78,8 +79,9 @@ def promote(
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{target.name[:40]}-", dir=target.parent) as scratch:
             draft = Path(scratch) / target.name
-            _write(draft, target, subject, outputs, samples)
-            _prove(draft, target)
+            _write(draft, target, subject, outputs, samples, told)
+            told("replaying in a fresh process")
+            prove(draft, target)
             _replace(draft, target)
     except (OSError, UnicodeError) as error:
         if isinstance(error, EpypesError):
@@ -99,7 +101,14 @@ def _check_place(target: Path) -> None:
         )
 
 
-def _write(draft: Path, target: Path, subject: Subject, outputs: Sequence[str] | None, samples: Iterable[Any]) -> None:
+def _write(
+    draft: Path,
+    target: Path,
+    subject: Subject,
+    outputs: Sequence[str] | None,
+    samples: Iterable[Any],
+    told: Callable[[str], None],
+) -> None:
     """Write all that can be written without running anything new; raise every reason against it at once."""
     runner, cg = subject.runner, subject.cg
     wanted = cg.sink_tokens if outputs is None else tuple(outputs)
@@ -116,13 +125,30 @@ def _write(draft: Path, target: Path, subject: Subject, outputs: Sequence[str] |
     module, settings, refusals = write_module(subject, settings)
     if reasons or refusals:
         raise PromotionRefused(target, [*reasons, *refusals])
+    runs = [*_runs(target, subject, samples)]
+    learnt = _learnt(target, subject, runs, wanted, told)
+    settings = replace(settings, tolerances=learnt.tolerances)
     (draft / SAMPLES).mkdir(parents=True)
     (draft / MODULE).write_text(module, encoding="utf-8")
     write_settings(draft / SETTINGS, settings, cg)
-    for number, run in enumerate(_runs(target, subject, samples)):
+    for number, run in enumerate(runs):
         _record(draft / SAMPLES / f"{number:03}.npz", target, run, settings)
-        if "f_out" in subject.ports:
+        # An answer is compared to the last bit, which noise would change.
+        if "f_out" in subject.ports and not learnt.tolerances:
             _record_answer(draft / ANSWERS / f"{number:03}.npz", subject, run, settings)
+
+
+def _learnt(
+    target: Path, subject: Subject, runs: Sequence[Run], outputs: Sequence[str], told: Callable[[str], None]
+) -> Learnt:
+    """Return the tolerances of the outputs; refuse outputs that are something else at every run."""
+    try:
+        learnt = learn(subject.cg, subject.runner.hyperparameters, runs, outputs, told)
+    except BundleError as error:
+        raise PromotionRefused(target, [str(error)]) from error
+    if learnt.reasons:
+        raise PromotionRefused(target, learnt.reasons)
+    return learnt
 
 
 def _runs(target: Path, subject: Subject, samples: Iterable[Any]) -> Iterator[Run]:
@@ -133,7 +159,7 @@ def _runs(target: Path, subject: Subject, samples: Iterable[Any]) -> Iterator[Ru
     for number, sample in enumerate(samples, 1):
         payload = sample if isinstance(sample, Mapping) else dict(zip(free[:1], [sample], strict=False))
         try:
-            run = CompGraphRunner(subject.cg, subject.runner.hyperparameters).run_on(payload)
+            run = subject.fresh_runner().run_on(payload)
         except Exception as error:  # whatever a function raises on it
             text = f"Sample {number} can't be run: {type(error).__name__}: {error}"
             raise PromotionRefused(target, [text]) from error
@@ -143,7 +169,7 @@ def _runs(target: Path, subject: Subject, samples: Iterable[Any]) -> Iterator[Ru
 def _record_answer(path: Path, subject: Subject, run: Run, settings: Settings) -> None:
     """Record what f_out makes of a run where that is no accident: another run of the same payload tells."""
     payload = {token: run[token] for token in settings.inputs}
-    again = CompGraphRunner(subject.cg, settings.hyperparameters).run_on(payload)
+    again = subject.fresh_runner().run_on(payload)
     record_answer(path, subject.ports["f_out"], settings.name, (run, again), settings.attributes)
 
 
@@ -171,21 +197,6 @@ def _record(path: Path, target: Path, run: Run, settings: Settings) -> None:
         raise PromotionRefused(target, [str(error)]) from error
 
 
-def _prove(draft: Path, target: Path) -> None:
-    try:
-        report = replay_isolated(draft, sealed=False)
-    except BundleError as error:
-        raise PromotionRefused(target, [str(error).replace(str(draft.resolve()), str(target))]) from error
-    if not report.identical:
-        why = (
-            "A function may depend on something that is not a token, such as a file, the current folder, a counter, "
-            "the time or random numbers. Pass it in as a token."
-        )
-        raise PromotionRefused(target, [*map(str, report.differences), why])
-    (draft / REQUIREMENTS).write_text("".join(f"{line}\n" for line in report.requirements), encoding="utf-8")
-    seal(draft)
-
-
 def _replace(draft: Path, target: Path) -> None:
     """Put the new bundle in the place of the old one; at every moment one of the two is there."""
     if target.exists():
@@ -193,15 +204,3 @@ def _replace(draft: Path, target: Path) -> None:
         _exchange(draft, target)
     else:
         draft.rename(target)
-
-
-def _exchange(left: Path, right: Path) -> None:
-    """Exchange two folders in one step, which Python has no call for; rename by rename where the system has none."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    exchange = getattr(libc, "renameat2", None)
-    if exchange and exchange(_AT_FDCWD, os.fsencode(left), _AT_FDCWD, os.fsencode(right), _RENAME_EXCHANGE) == 0:
-        return
-    aside = left.with_name("old")
-    right.rename(aside)
-    left.rename(right)
-    aside.rename(left)

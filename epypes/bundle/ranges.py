@@ -1,7 +1,7 @@
 """Which values may a hyperparameter of a service take?
 
-What an annotation says, the branches of a switch, or what is usual for the functions that take it: so that whoever tunes
-the service has a range. What is usual is a ``soft`` range and forbids nothing.
+What an annotation says, the branches of a switch, or what is usual for the functions that take it: so that whoever
+tunes the service has a range. What is usual is a ``soft`` range and forbids nothing.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def _by_function(cg: CompGraph, token: str, value: Any) -> Iterator[Param]:
 
 
 def _by_name(cg: CompGraph, token: str, value: Any) -> Iterator[Param]:
-    if isinstance(value, numbers.Real | str):
+    if isinstance(value, int | float | str):
         names = dict.fromkeys([*(parameter for _, parameter in _takers(cg, token)), token])
         yield from filter(None, (usual(name, value) for name in names if name))
 

@@ -10,49 +10,66 @@ import subprocess
 import sys
 import tempfile
 import traceback
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from epypes.bundle.answers import bundle_answer_difference
-from epypes.bundle.compare import Difference, ReplayReport, first_difference
-from epypes.bundle.load import Bundle, read_bundle
-from epypes.bundle.requirements import imported_requirements
-from epypes.errors import BundleError, EpypesError, ReplayDiffers
+from epypes.bundle.compare import differences
+from epypes.bundle.environment import environment
+from epypes.bundle.importwatch import ImportWatch
+from epypes.bundle.load import SAMPLES, Bundle, pipeline_of, read_bundle
+from epypes.bundle.report import Difference, ReplayReport, difference, report_from
+from epypes.bundle.requirements import owner, requirement_lines
+from epypes.errors import BundleError, EpypesError
 from epypes.run import CompGraphRunner
 
 REPLAY_TIMEOUT_S = 600.0
 
 
-def verify(path: str | Path, *, timeout_s: float = REPLAY_TIMEOUT_S) -> ReplayReport:
-    """Replay a bundle's samples in a fresh isolated process.
-
-    Raises
-    ------
-    ReplayDiffers
-        A token is not what was recorded; token, first differing index and both values are named.
-    BundleError
-        The folder is not the bundle that was promoted, or its code fails.
-    """
-    report = replay_isolated(Path(path), sealed=True, timeout_s=timeout_s)
-    if not report.identical:
-        raise ReplayDiffers(path, report)
-    return report
-
-
-def replay_isolated(folder: Path, *, sealed: bool, timeout_s: float = REPLAY_TIMEOUT_S) -> ReplayReport:
+def replay_isolated(
+    folder: Path, *, sealed: bool, timeout_s: float = REPLAY_TIMEOUT_S, python: str = sys.executable
+) -> ReplayReport:
     """Replay in a new interpreter that sees neither the environment nor the current folder.
+
+    Parameters
+    ----------
+    folder
+        The bundle.
+    sealed
+        Whether it must be what was promoted.
+    timeout_s
+        When the process is ended.
+    python
+        The interpreter, this one without.
 
     Raises
     ------
     BundleError
         The process failed or took longer than ``timeout_s``.
     """
+    outcome = run_isolated(
+        "epypes.bundle.replay", folder, [] if sealed else ["--unsealed"], timeout_s=timeout_s, python=python
+    )
+    return report_from(outcome)
+
+
+def run_isolated(
+    module: str, folder: Path, arguments: Sequence[str], *, timeout_s: float, python: str = sys.executable
+) -> Any:
+    """Run a module of EPypes as a program on a bundle, in a new interpreter; return what it has written as JSON.
+
+    Raises
+    ------
+    BundleError
+        The process failed, took longer than ``timeout_s``, or has written an error.
+    """
     with tempfile.TemporaryDirectory(prefix="epypes-replay-") as scratch:
         out = Path(scratch) / "report.json"
-        command = [sys.executable, "-I", "-m", "epypes.bundle.replay", str(folder.resolve()), str(out)]
         try:
-            done = subprocess.run(  # noqa: S603 - this interpreter, this module
-                [*command, *([] if sealed else ["--unsealed"])],
+            done = subprocess.run(  # noqa: S603 - an interpreter, a module of ours
+                [python, "-I", "-m", module, str(folder.resolve()), str(out), *arguments],
                 cwd=scratch,
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
@@ -68,51 +85,89 @@ def replay_isolated(folder: Path, *, sealed: bool, timeout_s: float = REPLAY_TIM
         outcome = json.loads(out.read_text(encoding="utf-8"))
     if "error" in outcome:
         raise BundleError(folder, outcome["error"])
-    return ReplayReport(
-        outcome["samples"],
-        outcome["tokens"],
-        tuple(Difference(**difference) for difference in outcome["differences"]),
-        tuple(outcome["requirements"]),
-    )
+    return outcome
 
 
 def replay(bundle: Bundle) -> ReplayReport:
     """Replay a bundle's samples in this process."""
     from epypes.wire.samples import load_sample
 
-    differences: list[Difference] = []
+    found: list[Difference] = []
+    unsteady: list[str] = []
     tokens = 0
+    pipeline_of(bundle, None, None)  # what serves it can be made
     for path in bundle.samples:
         inputs, outputs = load_sample(path)
         if (set(inputs), set(outputs)) != (set(bundle.settings.inputs), set(bundle.settings.outputs)):
             ports = f"{', '.join(inputs) or 'nothing'} -> {', '.join(outputs)}"
             why = f"its ports are {ports}, those of pipeline.toml are not"
-            differences.append(Difference(path.stem, ", ".join(bundle.settings.outputs), why))
-        run = CompGraphRunner(bundle.cg, bundle.settings.hyperparameters).run(**inputs)
-        for token, expected in outputs.items():
-            tokens += 1
-            text = first_difference(expected, run[token])
-            if text:
-                differences.append(Difference(path.stem, token, text))
-        text = bundle_answer_difference(bundle, path.stem, run)
-        if text:
-            differences.append(
-                Difference(path.stem, ", ".join(bundle.settings.outputs), f"the answer of f_out: {text}")
-            )
-    return ReplayReport(len(bundle.samples), tokens, tuple(differences), imported_requirements())
+            found.append(Difference(path.stem, ", ".join(bundle.settings.outputs), why))
+        run = _run(bundle, inputs)
+        differing = [*_differing(bundle, path.stem, outputs, run)]
+        if differing:
+            again = _run(bundle, inputs)
+            differs = (entry.token for entry in differing)
+            unsteady += [token for token in differs if next(differences(run[token], again[token]), None)]
+        found += [*differing, *_differing_answer(bundle, path.stem, run)]
+        tokens += len(outputs)
+    return ReplayReport(
+        len(bundle.samples), tokens, tuple(found), environment=environment(), unsteady=tuple(dict.fromkeys(unsteady))
+    )
+
+
+def _run(bundle: Bundle, inputs: dict[str, Any]) -> Any:
+    return CompGraphRunner(bundle.cg, bundle.settings.hyperparameters).run(**inputs)
+
+
+def _differing(bundle: Bundle, sample: str, outputs: dict[str, Any], run: Any) -> list[Difference]:
+    tolerances = bundle.settings.tolerances
+    found = (
+        difference(sample, token, differences(expected, run[token], tolerances.get(token)))
+        for token, expected in outputs.items()
+    )
+    return [entry for entry in found if entry is not None]
+
+
+def _differing_answer(bundle: Bundle, sample: str, run: Any) -> list[Difference]:
+    text = bundle_answer_difference(bundle, sample, run)
+    return [Difference(sample, ", ".join(bundle.settings.outputs), f"the answer of f_out: {text}")] if text else []
 
 
 def main(arguments: list[str]) -> int:
     """Replay the bundle in the folder that is named first; write the outcome as JSON to the file named second."""
     folder, out = Path(arguments[0]), Path(arguments[1])
-    try:
-        outcome = asdict(replay(read_bundle(folder, sealed="--unsealed" not in arguments)))
-    except EpypesError as error:
-        outcome = {"error": str(error)}
-    except BaseException as error:
-        outcome = {"error": _told(error, folder)}
-    out.write_text(json.dumps(outcome), encoding="utf-8")
+    out.write_text(json.dumps(outcome_of(folder, lambda: _watched(folder, arguments))), encoding="utf-8")
     return 0
+
+
+def _watched(folder: Path, arguments: list[str]) -> dict[str, Any]:
+    """Replay, and say what that has imported."""
+    from epypes.wire.samples import load_sample
+
+    with ImportWatch() as watch:
+        for path in sorted((folder / SAMPLES).glob("*.npz")):
+            # What reading a sample needs is loaded now, so that it is not taken for what the bundle needs.
+            try:
+                sample = load_sample(path)
+                list(differences(sample, sample))
+            except EpypesError:
+                break
+        watch.mark()
+        bundle = read_bundle(folder, sealed="--unsealed" not in arguments)
+        report = replay(bundle)
+    modules = watch.imported_by(f"epypes_bundle_{folder.name}", owner)
+    return replace(report, requirements=requirement_lines(modules)).to_dict()
+
+
+def outcome_of(folder: Path, work: Any) -> dict[str, Any]:
+    """Return what some work with a bundle returns, or as an error what stopped it."""
+    try:
+        outcome: dict[str, Any] = work()
+    except EpypesError as error:
+        return {"error": str(error)}
+    except BaseException as error:
+        return {"error": _told(error, folder)}
+    return outcome
 
 
 def _told(error: BaseException, folder: Path) -> str:
@@ -120,7 +175,7 @@ def _told(error: BaseException, folder: Path) -> str:
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.startswith(str(folder))]
     where = f" at {Path(frames[-1].filename).name}, line {frames[-1].lineno}: {frames[-1].line}" if frames else ""
     notes = "; ".join(getattr(error, "__notes__", ()))
-    text = f"The replay of {folder} failed{where}: {type(error).__name__}: {error}"
+    text = f"The replay of {folder} failed{where}: {type(error).__name__}: {' '.join(str(error).split())}"
     if isinstance(error, ModuleNotFoundError):
         text += ". Only installed packages can be imported in a bundle: install it, or move the code into the notebook"
     return f"{text} ({notes})" if notes else text

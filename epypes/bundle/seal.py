@@ -1,19 +1,42 @@
-"""Is every byte of a bundle the one that was promoted?"""
+"""Is every byte of a bundle the one that was promoted, and if not, which line was changed?
+
+The manifest can be checked by ``sha256sum --check MANIFEST.sha256``, which passes over its comments. They say what the
+samples were recorded with, so that a replay that differs can be explained.
+"""
 
 from __future__ import annotations
 
+import difflib
 import hashlib
+import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
 from epypes.errors import BundleError
 
 MANIFEST: Final = "MANIFEST.sha256"
+_TEXTS: Final = ("pipeline.py", "pipeline.toml", "requirements.txt")
+# What a comment of the manifest begins with.
+_FACT: Final = "# "
+_LINES: Final = "lines of "
+_WHOLE: Final = "recorded "
 
 
-def seal(folder: Path) -> str:
-    """Write the manifest, in the format of ``sha256sum``; return the bundle's digest."""
-    lines = [f"{_hash(folder / name)}  {name}\n" for name in _files(folder)]
+def seal(folder: Path, environment: Mapping[str, str] | None = None) -> str:
+    """Write the manifest, in the format of ``sha256sum``; return the bundle's digest.
+
+    Parameters
+    ----------
+    folder
+        The bundle.
+    environment
+        What its samples have been recorded on; without, what the manifest said before is kept.
+    """
+    names = _files(folder)
+    facts = _facts(folder) if environment is None else {**environment, **_recorded(folder, names)}
+    lines = [f"{_FACT}{name}: {value}\n" for name, value in facts.items()]
+    lines += [f"{_hash(folder / name)}  {name}\n" for name in names]
     (folder / MANIFEST).write_text("".join(lines), encoding="utf-8")
     return digest(folder)
 
@@ -37,13 +60,64 @@ def check_seal(folder: Path) -> str:
     present = set(_files(folder))
     findings = [f"{name} is missing" for name in recorded if name not in present]
     findings += [f"{name} was added" for name in sorted(present - recorded.keys())]
+    facts = _facts(folder)
     findings += [
-        f"{name} was changed" for name, value in recorded.items() if name in present and _hash(folder / name) != value
+        f"{name} was changed{_changed_line(folder, name, facts)}"
+        for name, value in recorded.items()
+        if name in present and _hash(folder / name) != value
     ]
     if findings:
         text = f"{folder} is not what was promoted: {'; '.join(findings)}. Restore it, or promote again."
         raise BundleError(folder, text)
     return digest(folder)
+
+
+def recorded_environment(folder: Path) -> dict[str, str]:
+    """Return what the samples of a bundle were recorded on."""
+    return {name: value for name, value in _facts(folder).items() if not name.startswith((_LINES, _WHOLE))}
+
+
+def changed_since_recorded(folder: Path) -> list[str]:
+    """Return as sentences which files, at which line, are not those that the samples were recorded with."""
+    facts = _facts(folder)
+    found = [
+        f"Since the samples were recorded, {name} was changed{_changed_line(folder, name, facts)}."
+        for name in _TEXTS
+        if f"{_LINES}{name}" in facts and (folder / name).is_file() and _sums(folder / name) != facts[_LINES + name]
+    ]
+    samples = {name.removeprefix(_WHOLE): value for name, value in facts.items() if name.startswith(_WHOLE)}
+    found += [
+        f"{name} is not the file that was recorded."
+        for name, value in samples.items()
+        if not (folder / name).is_file() or _hash(folder / name)[:16] != value
+    ]
+    return found
+
+
+def _recorded(folder: Path, names: list[str]) -> dict[str, str]:
+    """Return what stands for each text's lines and for each sample."""
+    lines = {f"{_LINES}{name}": _sums(folder / name) for name in names if name in _TEXTS}
+    whole = {f"{_WHOLE}{name}": _hash(folder / name)[:16] for name in names if name not in _TEXTS}
+    return {**lines, **whole}
+
+
+def _sums(path: Path) -> str:
+    """Return four hexadecimal digits for each line: enough to find the one that was changed."""
+    return " ".join(f"{zlib.crc32(line) & 0xFFFF:04x}" for line in path.read_bytes().splitlines())
+
+
+def _changed_line(folder: Path, name: str, facts: Mapping[str, str]) -> str:
+    """Return where a text was changed first, as ``" at line 3: ..."``; "" if that can't be told."""
+    if f"{_LINES}{name}" not in facts:
+        return ""
+    path = folder / name
+    before, now = facts[_LINES + name].split(), _sums(path).split()
+    changes = difflib.SequenceMatcher(None, before, now, autojunk=False).get_opcodes()
+    what, first, _, at, _ = next((change for change in changes if change[0] != "equal"), ("", 0, 0, 0, 0))
+    if what == "delete":
+        return f", where line {first + 1} is missing"
+    text = [*path.read_text(encoding="utf-8", errors="replace").splitlines(), ""][at].strip()
+    return f" at line {at + 1}: {text:.80}" if what else ""
 
 
 def _no_bundle(folder: Path) -> str:
@@ -54,14 +128,30 @@ def _no_bundle(folder: Path) -> str:
     return f"{folder} does not exist. Make a bundle with: epypes promote NOTEBOOK --to {folder}"
 
 
+def _manifest_lines(folder: Path) -> list[str]:
+    try:
+        return (folder / MANIFEST).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise BundleError(folder, f"{folder / MANIFEST} can't be read: {error}. Promote again.") from error
+
+
+def _facts(folder: Path) -> dict[str, str]:
+    lines = _manifest_lines(folder) if (folder / MANIFEST).is_file() else []
+    facts = (line.removeprefix(_FACT).partition(": ") for line in lines if line.startswith(_FACT))
+    return {name: value for name, _, value in facts}
+
+
 def _read_manifest(folder: Path) -> dict[str, str]:
     recorded: dict[str, str] = {}
-    try:
-        for line in (folder / MANIFEST).read_text(encoding="utf-8").splitlines():
-            value, name = line.split("  ", 1)
-            recorded[name] = value
-    except (ValueError, UnicodeDecodeError) as error:
-        raise BundleError(folder, f"{folder / MANIFEST} can't be read: {error}. Promote again.") from error
+    for line in _manifest_lines(folder):
+        value, spaces, name = line.partition("  ")
+        if line.startswith(_FACT):
+            continue
+        if not spaces:
+            raise BundleError(
+                folder, f"{folder / MANIFEST} can't be read: {line!r:.60} is no line of it. Promote again."
+            )
+        recorded[name] = value
     return recorded
 
 

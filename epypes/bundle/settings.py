@@ -9,15 +9,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
+from epypes.bundle.compare import Tolerance
 from epypes.bundle.entries import Unwritable, fits, members_in, plain, read, written
 from epypes.bundle.ranges import range_of
+from epypes.bundle.tolerance import add_tolerances, read_tolerances
 from epypes.errors import BundleError
 from epypes.graph import CompGraph
 from epypes.hints import Param
 from epypes.images import Order
 
 FORMAT: Final = 1
-# Of a bundle that has what the first format did not: its own ports or pipeline, groups, attributes, values of new kinds.
+# Of a bundle with what the first one has not: ports or a pipeline of its own, groups, attributes, values of new kinds.
 _FORMAT_WITH_MORE: Final = 2
 _FIRST_KINDS: Final = (None, "none", "tuple")
 _LINE: Final = 100
@@ -50,7 +52,9 @@ class Settings:
     has_groups
         Whether the module says which functions are drawn as one box.
     entries
-        The hyperparameters as they stand in the file: value and kind, range, unit; ready for JSON. Empty until it was read.
+        The hyperparameters as they stand in the file: value and kind, range, unit; ready for JSON. Empty before that.
+    tolerances
+        How far outputs may be from what was recorded, by token; those of all others not at all.
     """
 
     name: str
@@ -64,6 +68,7 @@ class Settings:
     attributes: Mapping[str, Any] = field(default_factory=dict)
     has_groups: bool = False
     entries: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    tolerances: Mapping[str, Tolerance] = field(default_factory=dict)
 
     @property
     def has_members(self) -> bool:
@@ -98,7 +103,8 @@ def unwritable(values: Mapping[str, Any], what: str = "Hyperparameter") -> list[
             way_out = "or unfreeze it and pass it to run()" if what == "Hyperparameter" else "or leave it out"
             reasons.append(
                 f"{what} {token!r} is {found}, which pipeline.toml can't hold. "
-                f"Use numbers, strings, a small array or tuples, lists and dicts of them; make it in a function; {way_out}."
+                "Use numbers, strings, a small array or tuples, lists and dicts of them; make it in a function; "
+                f"{way_out}."
             )
     return reasons
 
@@ -141,6 +147,7 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
             for name, value in values.items():
                 table.add(name, _table(written(value)))
             document.add(section, table)
+    add_tolerances(document, settings.tolerances)
     path.write_text(tomlkit.dumps(document), encoding="utf-8")
 
 
@@ -274,6 +281,7 @@ def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Setting
             _values(document.get("attributes", {}), enums),
             bundle.get("groups", False) is True,
             entries,
+            read_tolerances(document),
         )
     except KeyError as error:
         raise BundleError(path, f"{path} lacks {error.args[0]!r}. Promote the graph again.") from error

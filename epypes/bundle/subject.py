@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -15,7 +14,7 @@ from epypes.bundle.ports import is_usual
 from epypes.bundle.slicer import Slice
 from epypes.bundle.source import Refused
 from epypes.bundle.values import expression
-from epypes.graph import CompGraph
+from epypes.graph import CompGraph, with_defaults
 from epypes.pipeline import FullPipeline, Pipeline, SinkPipeline, SourcePipeline
 from epypes.run import CompGraphRunner
 
@@ -57,6 +56,10 @@ class Subject:
         if self.pipeline is None or kind in _OURS:
             return {}
         return {f"Class {kind.__name__!r} of pipeline {self.pipeline.name!r}": kind}
+
+    def fresh_runner(self) -> CompGraphRunner:
+        """Return a runner with the same hyperparameters; what was unfrozen has no default there."""
+        return CompGraphRunner(with_defaults(self.cg, {}), self.runner.hyperparameters)
 
 
 def subject_of(given: object, f_in: Any, f_out: Any) -> Subject:
@@ -150,10 +153,10 @@ def _answering(gathered: Slice, kind: type[Pipeline], known: str, what: str) -> 
     way_out = "Make it a subclass of ep.FullPipeline."
     if issubclass(kind, SourcePipeline):
         raise Refused(f"{what} is of class {kind.__name__!r}, a SourcePipeline, which takes no events. {way_out}")
-    if kind.emit is not SinkPipeline.emit if issubclass(kind, SinkPipeline) else False:
+    usual = SinkPipeline if issubclass(kind, SinkPipeline) else Pipeline
+    if getattr(kind, "emit", None) is not getattr(usual, "emit", None):
         raise Refused(f"{what} is of class {kind.__name__!r}, whose emit() a service would not call. {way_out}")
-    usual = [*inspect.signature(Pipeline.__init__).parameters]
-    if [*inspect.signature(kind.__init__).parameters] != usual and not issubclass(kind, SinkPipeline):
+    if [parameter.name for parameter in parameters_of(kind)] != [parameter.name for parameter in parameters_of(usual)]:
         text = f"{what} is of class {kind.__name__!r}, whose __init__ takes what a service can't give."
         raise Refused(f"{text} {way_out}")
     name = f"Answering{kind.__name__}"

@@ -9,7 +9,7 @@ from typing import Any
 
 from epypes.bundle.branches import Placement, place
 from epypes.bundle.definitions import definitions, early_constants
-from epypes.bundle.imports import ordered_imports
+from epypes.bundle.importorder import ordered_imports
 from epypes.bundle.literal import literal_source
 from epypes.bundle.nodes import called_by, is_plain_pipeline
 from epypes.bundle.slicer import Slice, slice_functions

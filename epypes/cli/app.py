@@ -6,6 +6,7 @@ import typer
 
 from epypes.cli.call import call
 from epypes.cli.demo import demo
+from epypes.cli.deploy import deploy, rollback
 from epypes.cli.experiment import experiment
 from epypes.cli.failures import failures
 from epypes.cli.keys import keys
@@ -25,5 +26,8 @@ app = typer.Typer(
     # A traceback's locals would print whole images.
     pretty_exceptions_enable=False,
 )
-for command in (promote, verify, serve, call, failures, replay, record, play, keys, experiment, demo, lab):
+_COMMANDS = (
+    promote, verify, serve, call, deploy, rollback, failures, replay, record, play, keys, experiment, demo, lab,
+)  # fmt: skip
+for command in _COMMANDS:
     app.command()(command)

@@ -31,9 +31,10 @@ def run_promotion(notebook: Path, to: Path, name: str, outputs: list[str] | None
         task = shown.add_task("executing the notebook", total=None)
 
         def on_cell(done: int, total: int) -> None:
-            last = done == total
-            description = "slicing, replaying, sealing" if last else "executing the notebook"
-            shown.update(task, completed=done, total=total, description=description)
+            shown.update(task, completed=done, total=total, description="executing the notebook")
 
-        promote_notebook(notebook, name, to, outputs, on_cell)
+        def told(text: str) -> None:
+            shown.update(task, description=text)
+
+        promote_notebook(notebook, name, to, outputs, on_cell, told)
         shown.update(task, description="promoted")

@@ -2,17 +2,52 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from epypes.cli.terminal import out
+from epypes.cli.terminal import err, out
+from epypes.errors import BundleError, ReplayDiffers
+from epypes.wording import counted
+
+if TYPE_CHECKING:
+    from epypes.bundle.report import ReplayReport
 
 
-def verify(bundle: Annotated[Path, typer.Argument(help="The folder of the bundle.")]) -> None:
-    """Replay a bundle's samples in a fresh isolated process; exit 0 only if every token is identical."""
+def verify(
+    bundle: Annotated[Path, typer.Argument(help="The folder of the bundle.")],
+    fresh_env: Annotated[
+        bool, typer.Option("--fresh-env", help="Replay in a new environment, made from requirements.txt alone.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the whole report as JSON.")] = False,
+) -> None:
+    """Replay a bundle's samples in a fresh isolated process; exit 0 only if every token is as it was recorded."""
     from epypes.bundle import verify as verify_bundle
 
-    report = verify_bundle(bundle)
-    out.print(f"{bundle}: {report}.")
+    try:
+        report = verify_bundle(bundle, fresh_env=fresh_env)
+    except BundleError as error:
+        found = error.report if isinstance(error, ReplayDiffers) else None
+        if as_json:
+            fields = found.to_dict() if found else {"identical": False}
+            out.print(json.dumps({**fields, "bundle": str(bundle), "error": str(error)}, indent=1), markup=False)
+        elif found:
+            out.print(str(found), markup=False)
+        raise BundleError(bundle, _in_one_line(bundle, found) if found else str(error)) from error
+    if as_json:
+        out.print(json.dumps({**report.to_dict(), "bundle": str(bundle)}, indent=1), markup=False)
+        return
+    where = " in a new environment" if fresh_env else ""
+    out.print(f"{bundle}: {report}{where}.", markup=False)
+    for note in report.notes:
+        err.print(f"Note: {note}", markup=False)
+
+
+def _in_one_line(bundle: Path, report: ReplayReport) -> str:
+    """Return what differs, and what to look at first."""
+    tokens = ", ".join(dict.fromkeys(repr(difference.token) for difference in report.differences))
+    found = f"in {counted(len(report.differences), 'place')}, token {tokens}" if tokens else "it has no samples"
+    cause = f" Likely: {report.causes[0]}" if report.causes else ""
+    return f"{bundle} does not compute what was recorded: {found}.{cause}"

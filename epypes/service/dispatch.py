@@ -289,4 +289,4 @@ def _result(entry: Entry, header: Mapping[str, Any], frames: Sequence[memoryview
         answers.append(bytes(own[0]) if answer["raw"] else decode(own))
     failure = header.get("failure")
     record = reported(entry, failure, setting, "raised") if failure else None
-    return Result(answers, record, header.get("revision", 0), header.get("total_ns", 0))
+    return Result(answers, record, header.get("revision", 0), header.get("total_ns", 0), header.get("durations_ns", {}))

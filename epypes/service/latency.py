@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -24,6 +25,8 @@ class Latency:
         How many there are, and their sum in seconds.
     computing_s
         How much of it the graph took.
+    functions_s
+        How much of that each function took.
     """
 
     bounds_s: tuple[float, ...]
@@ -31,6 +34,7 @@ class Latency:
     count: int
     total_s: float
     computing_s: float
+    functions_s: Mapping[str, float]
 
 
 @dataclass(slots=True)
@@ -40,14 +44,19 @@ class Stopwatch:
     _counts: list[int] = field(default_factory=lambda: [0] * (len(BOUNDS_S) + 1))
     _total_ns: int = 0
     _computing_ns: int = 0
+    _functions_ns: dict[str, int] = field(default_factory=dict)
 
-    def observe(self, duration_ns: int, computing_ns: int) -> None:
-        """Count a duration, and how much of it the graph took, in nanoseconds."""
+    def observe(self, duration_ns: int, computing_ns: int, functions_ns: Mapping[str, int]) -> None:
+        """Count a duration, and how much of it the graph and each function took, in nanoseconds."""
         self._counts[bisect_left(BOUNDS_S, duration_ns / 1e9)] += 1
         self._total_ns += duration_ns
         self._computing_ns += computing_ns
+        for function, spent_ns in functions_ns.items():
+            self._functions_ns[function] = self._functions_ns.get(function, 0) + spent_ns
 
     def read(self) -> Latency:
         """Return what was observed."""
         counts = tuple(self._counts)
-        return Latency(BOUNDS_S, counts, sum(counts), self._total_ns / 1e9, self._computing_ns / 1e9)
+        # Another thread may add a function meanwhile; a copy is made in one step.
+        functions_s = {function: spent_ns / 1e9 for function, spent_ns in self._functions_ns.copy().items()}
+        return Latency(BOUNDS_S, counts, sum(counts), self._total_ns / 1e9, self._computing_ns / 1e9, functions_s)

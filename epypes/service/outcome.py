@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from time import perf_counter_ns, time_ns
 from typing import Any, Final, Literal
 
@@ -49,12 +49,15 @@ class Result:
         None, or what is known of its failure.
     revision, total_ns
         Of the run; 0 where there was none.
+    durations_ns
+        By function.
     """
 
     answers: Sequence[Envelope | bytes]
     failure: FailureRecord | None = None
     revision: int = 0
     total_ns: int = 0
+    durations_ns: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def outcome(self) -> Outcome:
@@ -170,7 +173,7 @@ class Desk:
         if result.failure is not None:
             self._settle_failure(entry, result, result.failure)
             return
-        self.latency.observe(perf_counter_ns() - entry.accepted_ns, result.total_ns)
+        self.latency.observe(perf_counter_ns() - entry.accepted_ns, result.total_ns, result.durations_ns)
         if self._listeners:
             told = {"seq": entry.seq, "event_id": event_id(entry.event), "revision": result.revision}
             self.tell("run", {**told, "total_ns": result.total_ns})

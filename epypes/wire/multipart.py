@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 
 from epypes.errors import MessageError
 from epypes.wire.arrays import flat_bytes
-from epypes.wire.codecs import Payload, Reader, Writer
+from epypes.wire.codecs import Payload, Writer
 from epypes.wire.envelope import Envelope, FailureRecord
 from epypes.wire.limits import DEFAULT_LIMITS, Limits
+from epypes.wire.reading import Reader
 from epypes.wire.schema import message_class
 
 # Fields of the same name and meaning in the dataclass and in the message.

@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Any
 
 from epypes.errors import MessageError
 from epypes.wire.arrays import flat_bytes
-from epypes.wire.codecs import Payload, Reader, to_value
+from epypes.wire.codecs import Payload, to_value
 from epypes.wire.limits import Limits
+from epypes.wire.reading import Reader
 from epypes.wire.schema import message_class
 
 if TYPE_CHECKING:

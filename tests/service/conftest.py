@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import cv2
-import httpx
 import pytest
 
 import epypes as ep
-from epypes.service.http import HttpServer
 from tests.service.served import acting_bundle
 
 
@@ -28,39 +26,6 @@ def edge_bundle(tmp_path_factory, photograph):
     runner = ep.CompGraphRunner(cg, {"side": 5, "lo": 70, "hi": 200})
     runner.run(image=photograph)
     return ep.promote(runner, tmp_path_factory.mktemp("bundles") / "edges")
-
-
-@pytest.fixture(scope="module")
-def service(tmp_path_factory, photograph):
-    from tests.conftest import EDGE_FUNCTIONS, EDGE_HPARAMS, EDGE_IO
-    from tests.service.stand_in import StandIn
-
-    runner = ep.CompGraphRunner(ep.CompGraph(EDGE_FUNCTIONS, EDGE_IO), EDGE_HPARAMS)
-    runner.run(image=photograph)
-    return StandIn(runner, tmp_path_factory.mktemp("served"))
-
-
-@pytest.fixture(scope="module")
-def http(service, tmp_path_factory):
-    """The control of a service, with its token as ``token``."""
-    with HttpServer(service, "127.0.0.1:*", token_file=tmp_path_factory.mktemp("token") / "token") as server:
-        server.token = server.token_file.read_text().strip()
-        yield server
-
-
-@pytest.fixture
-def client(http):
-    """Who may look."""
-    with httpx.Client(base_url=http.url, trust_env=False, timeout=20) as client:
-        yield client
-
-
-@pytest.fixture
-def changing(http):
-    """Who may change."""
-    headers = {"Authorization": f"Bearer {http.token}"}
-    with httpx.Client(base_url=http.url, trust_env=False, timeout=60, headers=headers) as client:
-        yield client
 
 
 @pytest.fixture(scope="session")

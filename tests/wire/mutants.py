@@ -51,6 +51,25 @@ def mutate_description(frames: list[bytes], rng: random.Random) -> list[bytes]:
         value.tensor.dtype = rng.choice(["<f4", "|O8", "O", "<U3", "|S0", "|V8", ">c32", "<U999999999", "b1", "f"])
         value.tensor.shape.append(rng.choice([-1, 0, 2**62, -(2**63), 2**63 - 1, *numbers]))
         value.tensor.scalar = rng.random() < 0.5
+    elif value.HasField("records"):
+        records = value.records
+        records.type = rng.choice(["KeyPoint", "DMatch", "KeyPoint", "UMat", "imread", ""])
+        records.outer, records.inner = rng.randrange(4), rng.randrange(4)
+        records.counts.extend(rng.choices(numbers, k=rng.randrange(3)))
+        records.rows.dtype = rng.choice(["<f8", "<f8", "<i8", "|u1"])
+        if rng.random() < 0.5:
+            records.rows.shape[:] = rng.choice([(30, 7), (0, 7), (7, 30), (2**61, 7), (), (210,)])
+    elif value.HasField("table"):
+        table = value.table
+        column = rng.choice([table.index, table.columns, *table.data])
+        column.dtype = rng.choice(
+            ["range", "object", "str", "float64", "datetime64[ns]", "datetime64[Y]", "O", "Int64"]
+        )
+        table.series = rng.random() < 0.3
+        if rng.random() < 0.5:
+            column.values.Clear()
+            for number in rng.choices([*numbers, -1, 2**62, -(2**63)], k=rng.randrange(5)):
+                column.values.list.items.add().integer = number
     else:
         value.tensor.frame = rng.choice(numbers)
     return [frames[0], message.SerializeToString(), *frames[2:]]

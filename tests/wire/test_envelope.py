@@ -5,13 +5,23 @@ from __future__ import annotations
 import dataclasses
 import random
 
+import cv2
 import numpy as np
+import pandas as pd
 import pytest
 
 from epypes.errors import MessageError
 from epypes.wire import Envelope, FailureRecord, Limits, decode, encode
 from epypes.wire.schema import message_class
 from tests.wire.mutants import mutate_description, mutate_frames
+
+
+def opencv_and_pandas():
+    points = [cv2.KeyPoint(x, 2.5, 31, -1, 0.25, 1, -1) for x in range(30)]
+    pairs = tuple((cv2.DMatch(n, 1, 0, 0.5), cv2.DMatch(n, 2, 0, 1.5)) for n in range(3))
+    columns = {"row": [1, 2], "word": ["a", None], "score": [0.5, float("nan")], "more": [(1,), None]}
+    table = pd.DataFrame(columns, index=pd.to_datetime(["2019-01-01", "2019-01-02"]))
+    return {"keypoints": points, "pairs": pairs, "keypoint": points[0], "table": table, "column": table["score"]}
 
 
 def full_envelope() -> Envelope:
@@ -25,6 +35,9 @@ def full_envelope() -> Envelope:
             "points": [(1.5, 2), {"size": np.float32(3)}, None],
             "jpeg": b"\xff\xd8" + bytes(500),
             "huge": 1 << 80,
+            "phase": 1 - 2j,
+            "labels": {"left", 3, frozenset({None})},
+            **opencv_and_pandas(),
         },
         source="cam1",
         epoch=1,

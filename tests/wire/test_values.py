@@ -29,6 +29,8 @@ def same(a, b) -> bool:
         return struct.pack("d", a) == struct.pack("d", b) or (math.isnan(a) and math.isnan(b))
     if isinstance(a, list | tuple):
         return len(a) == len(b) and all(map(same, a, b))
+    if isinstance(a, complex):
+        return same((a.real, a.imag), (b.real, b.imag))
     if isinstance(a, dict):
         return same(list(a.items()), list(b.items()))
     return a == b
@@ -51,9 +53,10 @@ ARRAYS = hnp.arrays(DTYPES, hnp.array_shapes(min_dims=0, max_dims=4, min_side=0,
 SCALARS = DTYPES.flatmap(lambda dtype: hnp.arrays(dtype, ())).map(lambda array: array[()])
 TEXT = st.text(st.characters(exclude_categories=["Cs"]))
 KEYS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | TEXT | st.binary()
-PLAIN = st.none() | st.booleans() | st.integers() | st.floats() | TEXT | st.binary()
+PLAIN = st.none() | st.booleans() | st.integers() | st.floats() | st.complex_numbers() | TEXT | st.binary()
+SETS = st.frozensets(KEYS | st.frozensets(KEYS, max_size=3), max_size=4)
 VALUES = st.recursive(
-    PLAIN | ARRAYS | SCALARS,
+    PLAIN | ARRAYS | SCALARS | SETS | SETS.map(set),
     lambda inner: (
         st.lists(inner, max_size=4)
         | st.lists(inner, max_size=4).map(tuple)
@@ -150,7 +153,6 @@ class Point(NamedTuple):
     "value",
     [
         object(),
-        {1, 2},
         Point(1, 2),
         datetime.date(2019, 1, 1),
         np.array([object()], dtype=object),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
@@ -16,6 +16,7 @@ from epypes.errors import (
     DeployRefused,
     EpypesError,
     FailureNotKept,
+    HyperparameterError,
     MessageError,
     NotComputed,
     ParametersRefused,
@@ -23,6 +24,9 @@ from epypes.errors import (
     ServiceError,
     UnknownName,
 )
+
+if TYPE_CHECKING:
+    from epypes.service.parameters import Parameters
 
 _MOST_CHARACTERS: Final = 4_000
 RETRY_AFTER_S: Final = 1
@@ -54,7 +58,7 @@ def unavailable(detail: str) -> Response:
     return refusal(503, detail, {"Retry-After": str(RETRY_AFTER_S)})
 
 
-def written(parameters: Any) -> dict[str, Any]:
+def written(parameters: Parameters) -> dict[str, Any]:
     """Return the service's Parameters as they are answered."""
     return {"revision": parameters.revision, "parameters": parameters.entries}
 
@@ -68,6 +72,7 @@ _STATUS: Final[Mapping[type[EpypesError], int]] = {
     RevisionConflict: 409,
     ParametersRefused: 422,
     BundleError: 422,
+    HyperparameterError: 422,
     MessageError: 422,
     ServiceError: 503,
 }

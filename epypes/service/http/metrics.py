@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry
     from prometheus_client.core import Metric
+
+    from epypes.service.latency import Latency
+    from epypes.service.server import Service
 
 _STATES: Final = ("LOADING", "READY", "PAUSED", "DEGRADED", "DRAINING", "FAULTED", "STOPPED")
 _NS_PER_S: Final = 1e9
@@ -29,7 +33,7 @@ _HELD: Final = {
 class Collector:
     """Reads a service whenever it is asked; nothing is kept here."""
 
-    service: Any
+    service: Service
 
     def collect(self) -> Iterator[Metric]:
         """Give all metrics."""
@@ -40,7 +44,7 @@ class Collector:
         yield from _times(self.service.latency())
 
 
-def registry_of(service: Any) -> CollectorRegistry:
+def registry_of(service: Service) -> CollectorRegistry:
     """Return a registry with this service's metrics alone."""
     from prometheus_client import CollectorRegistry
 
@@ -90,27 +94,15 @@ def _state(state: str) -> Metric:
     return metric
 
 
-def _times(latency: Any) -> Iterator[Metric]:
+def _times(latency: Latency) -> Iterator[Metric]:
     from prometheus_client.core import CounterMetricFamily, HistogramMetricFamily
 
-    total_s = latency.total_ns / _NS_PER_S
     histogram = HistogramMetricFamily("epypes_event_latency_seconds", "From the acceptance of an event to its answer.")
-    histogram.add_metric([], _cumulative(latency.buckets), total_s)
+    ends = [*map(str, latency.bounds_s), "+Inf"]
+    histogram.add_metric([], list(zip(ends, accumulate(latency.counts), strict=True)), latency.total_s)
     yield histogram
+    yield CounterMetricFamily("epypes_computing_seconds", "Time that the graph took.", latency.computing_s)
     spent = CounterMetricFamily("epypes_function_seconds", "Time that a function took.", labels=["function"])
-    for function, total_ns in latency.functions.items():
-        spent.add_metric([function], total_ns / _NS_PER_S)
+    for function, spent_s in latency.functions_s.items():
+        spent.add_metric([function], spent_s)
     yield spent
-
-
-def _cumulative(buckets: Mapping[int, int]) -> list[tuple[str, float]]:
-    """Return counts of events that took at most so long; the keys are nanoseconds, the last one stands for more."""
-    from prometheus_client.utils import floatToGoString
-
-    found, total = [], 0
-    *_, longest = buckets
-    for upper_ns, count in buckets.items():
-        total += count
-        upper = "+Inf" if upper_ns == longest else floatToGoString(upper_ns / _NS_PER_S)
-        found.append((upper, float(total)))
-    return found

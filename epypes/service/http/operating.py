@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Body, Response
 
+from epypes.bundle.seal import check_seal
 from epypes.errors import BundleError
 from epypes.service.http.answers import answer
 from epypes.service.http.exchanging import exchanging
@@ -16,11 +17,13 @@ from epypes.service.http.served import CHANGE_REFUSALS, NEEDS_TOKEN, OfRequest, 
 
 router = APIRouter(prefix="/v1", tags=["operation"], dependencies=[NEEDS_TOKEN])
 
-_EXCHANGE = CHANGE_REFUSALS | {
+_EXCHANGE: Final = CHANGE_REFUSALS | {
     409: {"model": DeployRefusal, "description": "It is not served, for these reasons; the one before goes on."},
     422: {"model": Refusal, "description": "There is no bundle at this path."},
 }
-_INVALID = {422: {"model": Refusal, "description": "The request is not as described here."}}
+_INVALID: Final[dict[int | str, dict[str, Any]]] = {
+    422: {"model": Refusal, "description": "The request is not as described here."}
+}
 
 
 @router.post("/deploy", response_model=Info, responses=_EXCHANGE)
@@ -57,7 +60,9 @@ async def drain(served: OfRequest, wanted: Annotated[Drain | None, Body()] = Non
 
 
 def _deploy(served: Served, path: str) -> Any:
+    # Unlike Path's own, these take any text.
     if not os.path.isabs(path) or not os.path.isdir(path):
         text = f"{path!r:.300} is no folder on the service's machine. Name a bundle's folder, from the root on."
         raise BundleError(path, text)
-    return served.service.deploy(Path(path))
+    check_seal(Path(path))
+    return served.service.deploy(path)

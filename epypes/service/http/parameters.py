@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Final
 
 from fastapi import APIRouter, Response
@@ -64,6 +65,6 @@ def _write_back(served: Served, dry_run: bool) -> dict[str, str]:
     return {"diff": done.diff, "digest": done.digest}
 
 
-def _number(value: Any, entry: dict[str, Any]) -> Any:
+def _number(value: Any, entry: Mapping[str, Any]) -> Any:
     """Return a number that JSON has no sign for, if the parameter is a number and the text means one."""
     return _NUMBERS.get(value, value) if isinstance(value, str) and isinstance(entry.get("value"), float) else value

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Path, Query, Response
 
+from epypes.errors import NotComputed
 from epypes.service.http.models import Refusal
 from epypes.service.http.served import BINARY, REFUSALS, OfRequest
 
@@ -80,4 +81,7 @@ async def run(
     ] = None,
 ) -> Response:
     """Give the values that tokens had in the latest run."""
+    now = (await served.asks(served.service.parameters)).revision
+    if revision is not None and revision > now:
+        raise NotComputed("", f"There is no revision {revision} yet: the parameters have revision {now}.")
     return Response(await served.asks(served.service.run, tokens, revision=revision), media_type=FRAMES)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from fastapi import Depends, Request, Security
 from fastapi.security import HTTPBearer
@@ -11,6 +11,9 @@ from fastapi.security import HTTPBearer
 from epypes.service.http.calls import Calls
 from epypes.service.http.models import Refusal
 from epypes.service.http.told import Told
+
+if TYPE_CHECKING:
+    from epypes.service.server import Service
 
 _MOST_CALLS: Final = 8
 _PATIENCE_S: Final = 2.0
@@ -27,7 +30,7 @@ class Served:
     Attributes
     ----------
     service
-        What is served: a ``Service``.
+        What is served.
     told
         What its listeners are told.
     asks
@@ -38,7 +41,7 @@ class Served:
         The one call that loads another bundle, or writes the parameters into this one.
     """
 
-    service: Any
+    service: Service
     told: Told
     asks: Calls = field(default_factory=_calls)
     changes: Calls = field(default_factory=_calls)

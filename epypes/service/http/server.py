@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
     import uvicorn
 
+    from epypes.service.http.served import Served
+    from epypes.service.server import Service
+
 STOP_TIMEOUT_S: Final = 3.0
 _START_TIMEOUT_S: Final = 30.0
 # How long answers may take to get out when the server stops; uvicorn counts in whole seconds what comes after.
@@ -48,7 +51,7 @@ class HttpServer:
     """
 
     def __init__(
-        self, service: Any, address: str, *, token_file: str | Path | None = None, insecure: bool = False
+        self, service: Service, address: str, *, token_file: str | Path | None = None, insecure: bool = False
     ) -> None:
         self.address, self.insecure = address, insecure
         self.url = ""
@@ -59,9 +62,14 @@ class HttpServer:
         self._thread: threading.Thread | None = None
         self._started = threading.Event()
         self.connections = Connections()
-        self._served: Any = None
+        self._served: Served | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._error: BaseException | None = None
+
+    @property
+    def listeners(self) -> int:
+        """How many are told of events."""
+        return 0 if self._served is None else len(self._served.told)
 
     def start(self) -> str:
         """Listen; return the URL.
@@ -155,7 +163,8 @@ class HttpServer:
 
     def _end(self) -> None:
         """Let all who wait have an answer; those who don't take it lose their connection."""
-        self._served.stop()
+        if self._served is not None:
+            self._served.stop()
         self.connections.abort_idle()
         asyncio.get_running_loop().call_later(_TAKING_S, self.connections.abort)
 

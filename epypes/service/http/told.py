@@ -12,14 +12,16 @@ import math
 from collections import deque
 from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
-from dataclasses import asdict, is_dataclass
 from time import monotonic
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from fastapi.sse import ServerSentEvent
 
 from epypes.errors import EpypesError, ServiceError
 from epypes.service.http.answers import json_ready, written
+
+if TYPE_CHECKING:
+    from epypes.service.server import Service
 
 MOST_LISTENERS: Final = 64
 _MOST_WAITING: Final = 100
@@ -67,7 +69,7 @@ class Listener:
 class Told:
     """What a service tells, and those who listen to it; used on the server's thread but for what the service calls."""
 
-    def __init__(self, service: Any) -> None:
+    def __init__(self, service: Service) -> None:
         self._service = service
         self._listeners: set[Listener] = set()
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -170,7 +172,5 @@ class Told:
 
 
 def _message(kind: str, data: Any) -> ServerSentEvent:
-    if is_dataclass(data) and not isinstance(data, type):
-        data = written(data) if kind == "parameters" else asdict(data)
     text = json.dumps(json_ready(data), allow_nan=False, separators=(",", ":"))
     return ServerSentEvent(raw_data=text, event=kind)

@@ -41,9 +41,8 @@ async function loadInfo() {
 }
 
 function showOperations() {
-  const isPaused = state === "PAUSED";
-  part("pause").disabled = !hasToken() || state !== "READY";
-  part("resume").disabled = !hasToken() || !isPaused;
+  part("pause").disabled = !hasToken() || !["READY", "DEGRADED"].includes(state);
+  part("resume").disabled = !hasToken() || !["PAUSED", "DRAINING"].includes(state);
   part("drain").disabled = !hasToken() || !["READY", "PAUSED", "DEGRADED"].includes(state);
 }
 
@@ -59,7 +58,7 @@ async function operate(path, body = undefined) {
 }
 
 async function drain() {
-  const text = make("p", {}, "The service takes no more events, and works off those that wait. Its clients get no answers after that.");
+  const text = make("p", {}, "The service takes no more events until it is resumed, and works off those that wait.");
   if (await confirmed("Drain the service?", text, "Drain")) await operate("v1/drain", {});
 }
 

@@ -26,7 +26,7 @@ export function watchParameters() {
  */
 export function sawParameters(now) {
   const wanted = changes();
-  const before = new Map([...fields].map(([token, field]) => [token, valueOf(field.entry)]));
+  const before = values();
   revision = now.revision;
   part("revision").textContent = `revision ${revision}`;
   if ([...fields.keys()].join("\n") !== Object.keys(now.parameters).join("\n")) {
@@ -65,6 +65,7 @@ function changes() {
 async function apply() {
   const wanted = changes();
   if (!wanted.size) return;
+  const before = values();
   const invalid = [...wanted].filter(([, value]) => value === undefined).map(([token]) => token);
   if (invalid.length) return say("parameters-note", `This can't be read: ${invalid.join(", ")}.`);
   try {
@@ -73,18 +74,24 @@ async function apply() {
     say("parameters-note", "");
     sawParameters(now);
   } catch (error) {
-    refuse(/** @type {Refused} */ (error), wanted);
+    refuse(/** @type {Refused} */ (error), wanted, before);
   }
 }
 
-/** @param {Refused} error @param {Map<string, any>} wanted */
-function refuse(error, wanted) {
+/** @returns {Map<string, any>} what is in the service, as far as it is known here, by token */
+function values() {
+  return new Map([...fields].map(([token, field]) => [token, valueOf(field.entry)]));
+}
+
+/** @param {Refused} error @param {Map<string, any>} wanted @param {Map<string, any>} before */
+function refuse(error, wanted, before) {
   if (error.status === 409 && error.data.parameters) {
-    const theirs = [...fields].filter(([token, field]) => !same(valueOf(field.entry), valueOf(error.data.parameters[token]))).map(
-      ([token, field]) => `${token}: ${text(valueOf(field.entry))} → ${text(valueOf(error.data.parameters[token]))}`,
-    );
     sawParameters(error.data);
-    say("parameters-note", `Somebody else changed the parameters meanwhile, so nothing was applied. They are loaded anew: ${theirs.join("; ")}. Yours are marked; apply again to use them.`, false);
+    // They may have been told of before the refusal came.
+    const theirs = [...values()]
+      .filter(([token, value]) => !same(before.get(token), value))
+      .map(([token, value]) => `${token}: ${text(before.get(token))} → ${text(value)}`);
+    say("parameters-note", `Somebody else changed the parameters meanwhile, so nothing was applied. They are loaded anew (${theirs.join("; ")}). Yours are marked; apply again to use them.`, false);
     return;
   }
   say("parameters-note", error.message);

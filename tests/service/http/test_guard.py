@@ -8,7 +8,7 @@ import httpx
 import pytest
 
 from epypes.service.http import HttpServer
-from tests.service.raw import connection, exchange, received, request, until
+from tests.service.http.raw import connection, exchange, received, request, until
 
 CHANGES = [
     ("PATCH", "/v1/parameters"),
@@ -159,10 +159,10 @@ def test_a_body_that_is_not_said_to_be_json_is_refused(changing):
 def test_huge_headers_and_addresses_are_refused(http):
     for start, header in [("GET / HTTP/1.1", "X: " + "a" * 100_000), ("GET /" + "a" * 100_000 + " HTTP/1.1", "X: 1")]:
         answer = exchange(http.url, f"{start}\r\nHost: localhost\r\n{header}\r\n\r\n".encode())
-        assert answer == b"" or b" 400 " in answer.splitlines()[0]
+        assert answer == b"" or int(answer.split()[1]) in (400, 414, 431)
     many = "".join(f"X-{number}: 1\r\n" for number in range(20_000))
     answer = exchange(http.url, f"GET / HTTP/1.1\r\nHost: localhost\r\n{many}\r\n".encode())
-    assert answer == b"" or b" 400 " in answer.splitlines()[0]
+    assert answer == b"" or int(answer.split()[1]) in (400, 414, 431)
     assert is_well(http)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import schemathesis
 from hypothesis import HealthCheck, settings
 from schemathesis.config import SchemathesisConfig
@@ -9,6 +10,8 @@ from schemathesis.config import SchemathesisConfig
 from epypes.service.http.app import app_of
 from epypes.service.http.served import Served
 from epypes.service.http.told import Told
+
+pytestmark = pytest.mark.slow
 
 # What is as described may still be refused for what the service knows: no such token, a value beyond its range.
 CONFIG = {

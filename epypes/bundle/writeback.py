@@ -1,0 +1,174 @@
+"""How do values that were tuned on a running service get into its bundle, so that it still proves what it computes?
+
+Run as a program (``python -I -m epypes.bundle.writeback FOLDER REPORT``) it records a draft's samples again.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import shutil
+import sys
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from epypes.bundle.answers import ANSWERS, record_answer
+from epypes.bundle.entries import fits, plain, read, written
+from epypes.bundle.exchange import exchange
+from epypes.bundle.load import SETTINGS, read_bundle
+from epypes.bundle.proof import prove
+from epypes.bundle.replay import REPLAY_TIMEOUT_S, outcome_of, run_isolated
+from epypes.bundle.seal import check_seal, digest
+from epypes.errors import BundleError, HyperparameterError, PromotionRefused, UnknownName
+from epypes.run import CompGraphRunner
+
+
+@dataclass(frozen=True, slots=True)
+class WriteBack:
+    """What was written back, or would be.
+
+    Attributes
+    ----------
+    diff
+        The lines of pipeline.toml that are others now, as ``diff -u`` writes them; "" if there are none.
+    digest
+        That of the bundle with these values.
+    """
+
+    diff: str
+    digest: str
+
+
+def write_back(
+    path: str | Path, values: Mapping[str, Any], *, dry_run: bool = False, timeout_s: float = REPLAY_TIMEOUT_S
+) -> WriteBack:
+    """Write values of hyperparameters into a bundle's pipeline.toml, and record what its samples give with them.
+
+    The samples are run in an isolated process, replayed in another, and sealed; then the new bundle takes the place of
+    the old one in one step.
+
+    Parameters
+    ----------
+    path
+        The bundle.
+    values
+        By hyperparameter; all others stay as they are.
+    dry_run
+        Do all of it, but leave the bundle alone.
+    timeout_s
+        When a process is ended.
+
+    Raises
+    ------
+    UnknownName
+        There is no such hyperparameter.
+    HyperparameterError
+        TOML can't hold a value.
+    BundleError
+        The folder is not the bundle that was promoted, or a function fails with these values; then the bundle stays as
+        it is.
+    """
+    folder = Path(path).resolve()
+    before = check_seal(folder)
+    text = (folder / SETTINGS).read_text(encoding="utf-8")
+    changed = changed_settings(text, values)
+    if changed == text:
+        return WriteBack("", before)
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name[:40]}-", dir=folder.parent) as scratch:
+            draft = Path(scratch) / folder.name
+            shutil.copytree(folder, draft, ignore=shutil.ignore_patterns("__pycache__"))
+            (draft / SETTINGS).write_text(changed, encoding="utf-8")
+            _record(draft, folder, timeout_s)
+            found = WriteBack(_diff(text, changed), digest(draft))
+            if check_seal(folder) != before:
+                raise BundleError(folder, f"{folder} was replaced meanwhile. Write the values back again.")
+            if not dry_run:
+                exchange(draft, folder)
+    except OSError as error:
+        raise BundleError(folder, f"{folder} can't be written: {error}. The bundle stays as it is.") from error
+    return found
+
+
+def changed_settings(text: str, values: Mapping[str, Any]) -> str:
+    """Return the text of pipeline.toml with other values of hyperparameters; all other lines stay as they are.
+
+    Raises
+    ------
+    UnknownName
+        There is no such hyperparameter.
+    HyperparameterError
+        TOML can't hold a value.
+    """
+    import tomlkit
+
+    document = tomlkit.parse(text)
+    entries: Any = document.get("hyperparameters", {})
+    for token, value in values.items():
+        if token not in entries:
+            raise UnknownName("hyperparameter", token, entries, "in this bundle")
+        if not fits(plain(value)):
+            kind = type(value).__name__
+            raise HyperparameterError(token, f"Hyperparameter {token!r} can't be a {kind}: {SETTINGS} can't hold one.")
+        _change(entries[token], written(plain(value)))
+    return tomlkit.dumps(document)
+
+
+def _change(entry: Any, new: Mapping[str, Any]) -> None:
+    """Change what an entry says of its value, and leave its range alone."""
+    old = written(read(entry.unwrap()))
+    for key in old.keys() - new.keys():
+        del entry[key]
+    for key, part in new.items():
+        # 1, 1.0 and true are equal, but not the same.
+        if key not in old or repr(old[key]) != repr(part):
+            entry[key] = part
+
+
+def _diff(before: str, after: str) -> str:
+    left, right = (text.splitlines(keepends=True) for text in (before, after))
+    return "".join(difflib.unified_diff(left, right, f"a/{SETTINGS}", f"b/{SETTINGS}"))
+
+
+def _record(draft: Path, target: Path, timeout_s: float) -> None:
+    """Record the outputs of a draft's samples again, replay and seal it."""
+    try:
+        run_isolated("epypes.bundle.writeback", draft, [], timeout_s=timeout_s)
+        prove(draft, target)
+    except BundleError as error:
+        reasons = error.reasons if isinstance(error, PromotionRefused) else (str(error),)
+        why = " ".join(reasons).replace(str(draft.resolve()), str(target)).rstrip(".")
+        text = f"The values were not written back: {why}. The bundle stays as it is: try other values."
+        raise BundleError(target, text) from error
+
+
+def record_again(folder: Path) -> dict[str, Any]:
+    """Run the samples of an unsealed bundle in this process, and write down what comes out."""
+    from epypes.wire.samples import load_sample, save_sample
+
+    bundle = read_bundle(folder, sealed=False)
+    settings = bundle.settings
+    for path in bundle.samples:
+        inputs, outputs = load_sample(path)
+        run = CompGraphRunner(bundle.cg, settings.hyperparameters).run(**inputs)
+        save_sample(path, inputs, {token: run[token] for token in outputs}, rgb=settings.rgb)
+        answer = folder / ANSWERS / path.name
+        if answer.is_file():
+            answer.unlink()
+            again = CompGraphRunner(bundle.cg, settings.hyperparameters).run(**inputs)
+            record_answer(answer, bundle.own["f_out"], settings.name, (run, again), settings.attributes)
+    return {"samples": len(bundle.samples)}
+
+
+def main(arguments: list[str]) -> int:
+    """Record the samples of the draft that is named first; write how many, or an error, to the file named second."""
+    folder, out = Path(arguments[0]), Path(arguments[1])
+    out.write_text(json.dumps(outcome_of(folder, lambda: record_again(folder))), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,316 @@
+"""Does the live page of a service show what happens, and do what it is asked?"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import threading
+from contextlib import contextmanager
+
+import httpx
+import pytest
+
+from epypes.bundle.ports import REQUEST
+from epypes.bundle.seal import seal
+from epypes.service import Service
+from epypes.service.http import HttpServer
+from epypes.wire import Envelope
+from tests.browser.conftest import SCREENSHOTS
+from tests.browser.contrast import unreadable
+from tests.conftest import EDGE_HPARAMS
+from tests.service.bundles import written_bundle
+from tests.service.served import peer_of
+
+pytestmark = pytest.mark.browser
+
+RANGES = {
+    "blur_kernel": "low = 1\nhigh = 31\nodd = true",
+    "canny_lo": "low = 0\nhigh = 255",
+    "canny_hi": 'low = 0\nhigh = 400\nunit = "grey levels"',
+}
+
+
+SOURCE = '''
+    """The edges of a photograph."""
+
+    import cv2
+
+
+    def grayscale(im):
+        return cv2.cvtColor(im, cv2.COLOR_BGR2GRAY)
+
+
+    def blur(img, k):
+        return cv2.GaussianBlur(img, (k, k), 0)
+
+
+    func_dict = {"grayscale": grayscale, "blur": blur, "canny": cv2.Canny}
+    func_io = {
+        "grayscale": ("image", "image_gray"),
+        "blur": (("image_gray", "blur_kernel"), "image_blurred"),
+        "canny": (("image_blurred", "canny_lo", "canny_hi"), "edges"),
+    }
+'''
+
+
+class Line:
+    """A publisher that sends frames to a service until it is left."""
+
+    def __init__(self, peer, photograph):
+        self._peer, self._photograph = peer, photograph
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._send, daemon=True)
+
+    def _send(self):
+        while not self._end.wait(0.04):
+            self._peer.requests.put(Envelope(type=REQUEST, parts={"image": self._photograph}))
+
+    def fail(self):
+        self._peer.requests.put(Envelope(type=REQUEST, parts={"image": "no image"}))
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exception):
+        self._end.set()
+        self._thread.join()
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory, photograph, straight_edges):
+    """The edge graph, whose parameters have ranges."""
+    sample = {"image": photograph}, {"edges": straight_edges}
+    folder = tmp_path_factory.mktemp("bundles") / "edges"
+    written_bundle(folder, SOURCE, ["image"], ["edges"], hyperparameters=EDGE_HPARAMS, sample=sample)
+    text = (folder / "pipeline.toml").read_text()
+    for token, lines in RANGES.items():
+        text = re.sub(rf"(\[hyperparameters\.{token}\]\nvalue = .*)", rf"\1\n{lines}", text)
+    (folder / "pipeline.toml").write_text(text)
+    seal(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as own:
+        for name in ("XDG_STATE_HOME", "XDG_RUNTIME_DIR"):
+            own.setenv(name, str(tmp_path_factory.mktemp("home")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def served(bundle, photograph, home):
+    with Service(bundle) as service, HttpServer(service, "127.0.0.1:*") as http, peer_of(service) as peer:
+        http.token = http.token_file.read_text().strip()
+        with Line(peer, photograph) as line:
+            yield service, http, line
+
+
+@contextmanager
+def page_of(browser, http, theme="light", width=1400, token=True):
+    """Open the page; whatever it complains of is a failure of the test."""
+    context = browser.new_context(viewport={"width": width, "height": 1000}, color_scheme=theme)
+    page = context.new_page()
+    said = []
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
+    page.goto(f"{http.url}/#token={http.token}" if token else http.url)
+    page.wait_for_selector("#graph svg")
+    page.complaints = said
+    yield page
+    context.close()
+
+
+def change(http, **values):
+    """Change parameters as somebody else."""
+    headers = {"Authorization": f"Bearer {http.token}"}
+    answer = httpx.patch(f"{http.url}/v1/parameters", json={"values": values}, headers=headers, trust_env=False)
+    assert answer.status_code == 200, answer.text
+
+
+def state_is(page, state):
+    page.wait_for_function("state => document.getElementById('state').textContent === state", arg=state)
+
+
+def test_the_page_shows_the_running_service(browser, served, theme):
+    _, http, _ = served
+    with page_of(browser, http, theme) as page:
+        state_is(page, "READY")
+        page.wait_for_function("() => parseFloat(document.getElementById('rate').textContent) > 1", timeout=20_000)
+        page.wait_for_function("() => /ms|µs/.test(document.getElementById('p95').textContent)")
+        assert page.locator("#name").text_content() == "edges"
+        assert page.locator("#graph [id^=token-]").count() == 7
+        assert page.locator("#graph image").count() >= 4
+        assert page.locator("#counts dd").first.text_content() != "0"
+        assert "token=" not in page.url
+        page.screenshot(path=SCREENSHOTS / f"service-{theme}.png", full_page=True)
+        assert not unreadable(page, "body")
+        assert not page.complaints
+
+
+def test_a_narrow_page_needs_no_scrolling_sideways(browser, served):
+    _, http, line = served
+    line.fail()
+    with page_of(browser, http, width=400) as page:
+        page.wait_for_selector("#failures tbody tr")
+        assert page.evaluate("() => document.documentElement.scrollWidth") <= 400
+        page.screenshot(path=SCREENSHOTS / "service-narrow.png", full_page=True)
+
+
+def test_the_picture_follows_the_runs_without_flicker(browser, served):
+    _, http, _ = served
+    with page_of(browser, http) as page:
+        first = page.locator("#graph svg").get_attribute("aria-label")
+        page.wait_for_function(
+            "first => document.querySelector('#graph svg').getAttribute('aria-label') !== first", arg=first
+        )
+        heights = page.evaluate(
+            """async () => {
+                const found = new Set();
+                for (let i = 0; i < 60; i++) {
+                    found.add(document.getElementById('graph').getBoundingClientRect().height);
+                    await new Promise(requestAnimationFrame);
+                }
+                return [...found];
+            }"""
+        )
+        assert len(heights) == 1
+
+
+def test_a_token_is_seen_larger_by_mouse_and_by_keyboard(browser, served):
+    _, http, _ = served
+    with page_of(browser, http) as page:
+        page.locator("#token-edges").click()
+        page.wait_for_selector("#look[open] img")
+        assert page.locator("#look-title").text_content() == "edges"
+        assert page.locator("#look img").evaluate("image => image.naturalWidth") > 500
+        page.keyboard.press("Escape")
+        page.wait_for_selector("#look", state="hidden")
+        page.locator("#token-canny_lo").focus()
+        page.keyboard.press("Enter")
+        page.wait_for_selector("#look[open] pre")
+        assert not page.complaints
+
+
+def test_parameters_are_applied_all_at_once(browser, served):
+    service, http, _ = served
+    change(http, canny_lo=70, blur_kernel=11)
+    with page_of(browser, http) as page:
+        page.wait_for_selector("#parameter-canny_lo")
+        page.locator("#parameter-canny_lo").fill("90")
+        page.locator("#parameter-blur_kernel").fill("5")
+        assert page.locator(".field.changed").count() == 2
+        assert "70 in the service" in page.locator("#parameter-canny_lo-note").text_content()
+        assert page.locator("#apply").text_content() == "Apply 2"
+        before = service.parameters().revision
+        page.locator("#apply").click()
+        page.wait_for_function("() => document.querySelectorAll('.field.changed').length === 0")
+        now = service.parameters()
+        assert now.revision == before + 1
+        assert (now.entries["canny_lo"]["value"], now.entries["blur_kernel"]["value"]) == (90, 5)
+        page.locator("#parameter-blur_kernel").evaluate(
+            "box => { box.value = '4'; box.dispatchEvent(new Event('input', { bubbles: true })) }"
+        )
+        page.locator("#parameters").evaluate("form => { form.noValidate = true; form.requestSubmit() }")
+        page.wait_for_selector(".field.refused")
+        assert "odd" in page.locator("#parameter-blur_kernel-note").text_content()
+        assert service.parameters() == now
+        page.locator("#undo").click()
+        assert page.locator("#parameter-blur_kernel").input_value() == "5"
+
+
+def test_what_somebody_else_changed_is_shown_and_not_overwritten(browser, served, theme):
+    service, http, _ = served
+    change(http, canny_lo=70, canny_hi=200)
+    with page_of(browser, http, theme) as page:
+        page.wait_for_selector("#parameter-canny_lo")
+        # What is told of a change arrives after this one was asked for.
+        page.route("**/v1/parameters", lambda route: (change(http, canny_lo=33, canny_hi=150), route.continue_()))
+        page.locator("#parameter-canny_lo").fill("90")
+        page.locator("#apply").click()
+        page.wait_for_selector("#parameters-note:not([hidden])")
+        page.unroute("**/v1/parameters")
+        said = page.locator("#parameters-note").text_content()
+        assert "Somebody else" in said
+        assert "canny_lo: 70 → 33; canny_hi: 200 → 150" in said
+        assert service.parameters().entries["canny_lo"]["value"] == 33
+        assert page.locator("#parameter-canny_lo").input_value() == "90"
+        assert page.locator("#parameter-canny_hi").input_value() == "150"
+        assert "33 in the service" in page.locator("#parameter-canny_lo-note").text_content()
+        page.screenshot(path=SCREENSHOTS / f"service-conflict-{theme}.png", full_page=True)
+        page.locator("#apply").click()
+        page.wait_for_function("() => document.querySelectorAll('.field.changed').length === 0")
+        assert service.parameters().entries["canny_lo"]["value"] == 90
+
+
+def test_a_failure_is_listed_with_what_opens_it_again(browser, served, theme):
+    _, http, line = served
+    with page_of(browser, http, theme) as page:
+        rows = page.locator("#failures tbody tr").count()
+        line.fail()
+        page.wait_for_function("rows => document.querySelectorAll('#failures tbody tr').length > rows", arg=rows)
+        row = page.locator("#failures tbody tr").first
+        name = row.get_attribute("data-id")
+        assert f"epypes replay {name} {http.url}" in row.text_content()
+        assert f'ep.load_failure("{name}", "{http.url}")' in row.text_content()
+        assert "grayscale" in row.text_content()
+        page.screenshot(path=SCREENSHOTS / f"service-failing-{theme}.png", full_page=True)
+        page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+        row.locator("button").first.click()
+        assert page.evaluate("() => navigator.clipboard.readText()") == f"epypes replay {name} {http.url}"
+
+
+def test_without_the_token_nothing_can_be_changed_and_with_it_the_service_is_paused(browser, served):
+    service, http, _ = served
+    with page_of(browser, http, token=False) as page:
+        state_is(page, "READY")
+        assert page.locator("#pause").is_disabled()
+        page.locator("#token").fill("x" * 43)
+        page.locator("#token-form button").click()
+        page.locator("#pause").click()
+        page.wait_for_selector("#notice:not([hidden])")
+        assert "not the service's token" in page.locator("#notice").text_content()
+        page.locator("#token").fill(http.token)
+        page.locator("#token-form button").click()
+        page.locator("#pause").click()
+        state_is(page, "PAUSED")
+        assert service.state == "PAUSED"
+        page.locator("#resume").click()
+        state_is(page, "READY")
+
+
+def test_values_are_written_back_after_their_difference_was_seen(browser, bundle, photograph, home, tmp_path):
+    folder = shutil.copytree(bundle, tmp_path / "edges")
+    with Service(folder) as service, HttpServer(service, "127.0.0.1:*") as http:
+        http.token = http.token_file.read_text().strip()
+        change(http, canny_lo=64)
+        with page_of(browser, http) as page:
+            page.locator("#write-back:enabled").click()
+            page.wait_for_selector("#ask[open]", timeout=60_000)
+            assert "+value = 64" in page.locator("#ask pre").text_content()
+            page.screenshot(path=SCREENSHOTS / "service-write-back.png")
+            page.locator("#ask-yes").click()
+            page.wait_for_selector("#parameters-note:not([hidden])", timeout=60_000)
+            assert "Written" in page.locator("#parameters-note").text_content()
+    assert "value = 64" in (folder / "pipeline.toml").read_text()
+
+
+def test_a_service_that_is_faulted_says_why_and_one_that_is_gone_is_asked_again(browser, bundle, home, tmp_path, theme):
+    folder = shutil.copytree(bundle, tmp_path / "wrong")
+    text = (folder / "pipeline.toml").read_text()
+    (folder / "pipeline.toml").write_text(text.replace("value = 200", "value = 20"))
+    seal(folder)
+    context = browser.new_context(viewport={"width": 1400, "height": 700}, color_scheme=theme)
+    page = context.new_page()
+    with Service(folder) as service, HttpServer(service, "127.0.0.1:*") as http:
+        page.goto(http.url)
+        state_is(page, "FAULTED")
+        assert "edges" in page.locator("#reason").text_content()
+        page.screenshot(path=SCREENSHOTS / f"service-faulted-{theme}.png", full_page=True)
+    page.wait_for_selector("#notice:not([hidden])")
+    assert "can't be reached" in page.locator("#notice").text_content()
+    with Service(bundle) as service, HttpServer(service, http.url):
+        state_is(page, "READY")
+        page.wait_for_selector("#notice", state="hidden")
+    context.close()

@@ -1,0 +1,167 @@
+"""Does every command that fails exit non-zero with one actionable line?
+
+Each command has a row here: a new one without a row fails the first test.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import typer.main
+
+import epypes as ep
+from epypes.bundle.seal import seal
+from epypes.cli import main
+from epypes.cli.app import app
+from epypes.wire import load_sample, save_sample
+
+# By command: what it is given, and what its line says. {bundle} is a good bundle, {broken} one whose pipeline.toml is no
+# TOML, {other} one that computes something else, {folder} an empty folder, {text} a file of text.
+ROWS = {
+    "promote": [
+        (["{folder}/none.ipynb", "--to", "{folder}/b"], "Notebook {folder}/none.ipynb can't be read: No such file"),
+        (["{text}", "--to", "{folder}/b"], "{text} is not a notebook"),
+    ],
+    "verify": [
+        (["{folder}/none"], "{folder}/none does not exist. Make a bundle with: epypes promote"),
+        (["{folder}"], "{folder} is not a bundle"),
+        (["{text}"], "{text} is a file. Name the folder of a bundle"),
+        (["{broken}"], "pipeline.toml can't be read: "),
+        (["{other}"], "{other} does not compute what was recorded: in 1 place, token 'edges'. Likely: "),
+        (["{other}", "--json"], "does not compute what was recorded"),
+    ],
+    "serve": [
+        (["{folder}/none"], "{folder}/none does not exist"),
+        (["{broken}"], "pipeline.toml can't be read: "),
+        (["{bundle}", "--sub", "nonsense"], "nonsense"),
+    ],
+    "call": [
+        (["{folder}/none", "image.png"], "{folder}/none does not exist"),
+        (["{bundle}", "{folder}/none.png"], "Image '{folder}/none.png' can't be read"),
+        (["{broken}", "image.png"], "pipeline.toml can't be read: "),
+    ],
+    "record": [(["nonsense", "{folder}/a.mcap"], "nonsense can't be connected: Invalid argument")],
+    "play": [
+        (["{folder}/none.mcap"], "can't be read"),
+        (["{text}"], "is no MCAP file"),
+    ],
+    "experiment": [(["--camera", "left.png"], "cameras must be two")],
+    "demo": [(["{folder}/none.ipynb", "--to", "{folder}/demo"], "Notebook {folder}/none.ipynb can't be read")],
+    "lab": [(["{folder}/none"], "There is no folder '{folder}/none' to show in JupyterLab")],
+}
+
+
+# By command: what does not fail before it is looked for what an extra brings.
+FIRST = {
+    "promote": ["{text}", "--to", "{folder}/b"],
+    "demo": ["{text}", "--to", "{folder}/demo"],
+    "lab": ["{folder}"],
+    "serve": ["{bundle}"],
+}
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory):
+    """Folders and files by the names that the rows have for them."""
+    base = tmp_path_factory.mktemp("failing")
+    runner = ep.CompGraphRunner(
+        ep.CompGraph({"canny": cv2.Canny}, {"canny": (("image", "lo", "hi"), "edges")}), {"lo": 70, "hi": 200}
+    )
+    runner.run(image=np.random.default_rng(3).integers(0, 255, (60, 80), np.uint8))
+    found = {name: base / name for name in ("bundle", "broken", "other", "folder", "text")}
+    ep.promote(runner, found["bundle"])
+    for name in ("broken", "other"):
+        shutil.copytree(found["bundle"], found[name])
+    (found["broken"] / "pipeline.toml").write_text("[ports\n")
+    seal(found["broken"])
+    sample = found["other"] / "samples" / "000.npz"
+    inputs, outputs = load_sample(sample)
+    save_sample(sample, inputs, {"edges": outputs["edges"] ^ 255})
+    seal(found["other"])
+    found["folder"].mkdir()
+    found["text"].write_text("some text")
+    return {name: str(path) for name, path in found.items()}
+
+
+@pytest.fixture(autouse=True)
+def own_folders(tmp_path, monkeypatch):
+    for name in ("XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
+        monkeypatch.setenv(name, str(tmp_path))
+
+
+def run(capsys, *arguments):
+    """Run a command in this process, as far as its exit."""
+    with pytest.raises(SystemExit) as stop:
+        main([*arguments])
+    said = capsys.readouterr()
+    code = stop.value.code
+    # A text is printed by the interpreter at its end.
+    is_text = isinstance(code, str)
+    return subprocess.CompletedProcess(
+        arguments, 1 if is_text else code, said.out, said.err + (code if is_text else "")
+    )
+
+
+def one_line(done):
+    """Return the line that says why; what a progress display has left may stand above it."""
+    lines = done.stderr.strip().splitlines()
+    said = [line for line in lines if "\u2501" not in line and line.strip()]
+    assert done.returncode == 1, done
+    assert len(said) == 1, lines
+    assert said[0].startswith("epypes: "), lines
+    return said[0]
+
+
+def test_every_command_has_a_row():
+    commands = set(typer.main.get_command(app).commands)
+    assert commands - ROWS.keys() == set(), "give each new command a row of what makes it fail, and what it says then"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("command", "row"), [(command, row) for command, rows in ROWS.items() for row in rows])
+def test_a_command_that_fails_says_so_in_one_line(command, row, places, capsys):
+    arguments, says = row
+    done = run(capsys, command, *(argument.format(**places) for argument in arguments))
+    assert says.format(**places) in one_line(done)
+
+
+@pytest.mark.parametrize("command", sorted(typer.main.get_command(app).commands))
+def test_an_option_that_there_is_not_exits_with_2(command, capsys):
+    done = run(capsys, command, "--no-such-option")
+    assert done.returncode == 2
+    assert "No such option" in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("command", "module"),
+    [("promote", "nbclient"), ("promote", "nbformat"), ("demo", "nbclient"), ("lab", "jupyterlab"), ("serve", "zmq")],
+)
+def test_without_an_extra_a_command_says_what_to_install(command, module, places):
+    arguments = [argument.format(**places) for argument in FIRST[command]]
+    code = f"import sys; sys.modules[{module!r}] = None; from epypes.cli import main; main({[command, *arguments]!r})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
+    assert f"module '{module}' is missing. Run: pip install 'epypes[all]'" in one_line(done)
+
+
+@pytest.mark.slow
+def test_verify_prints_the_report_and_as_json_every_field(places, capsys):
+    done = run(capsys, "verify", places["other"])
+    assert "sample 000, token 'edges': 4800 of 4800 values differ, first at [0, 0]: expected " in done.stdout
+    assert "Likely: samples/000.npz is not the file that was recorded." in done.stdout
+    done = run(capsys, "verify", places["other"], "--json")
+    found = json.loads(done.stdout)
+    assert (found["identical"], found["bundle"]) == (False, places["other"])
+    (difference,) = found["differences"]
+    assert (difference["token"], difference["index"], difference["count"]) == ("edges", "[0, 0]", 4800)
+    assert found["environment"]["opencv"]
+    done = run(capsys, "verify", places["bundle"], "--json")
+    assert (done.returncode, json.loads(done.stdout)["identical"]) == (0, True)
+    done = run(capsys, "verify", places["broken"], "--json")
+    assert json.loads(done.stdout)["identical"] is False

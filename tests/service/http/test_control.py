@@ -1,0 +1,281 @@
+"""Does the control over HTTP do with a service what it says, and say what it does?"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+
+from epypes.bundle.load import read_bundle
+from epypes.bundle.ports import REQUEST
+from epypes.bundle.seal import seal
+from epypes.cli import main
+from epypes.service import Service
+from epypes.service.http import HttpServer
+from epypes.service.packing import unpack, unpack_event
+from epypes.wire import Envelope, decode
+from tests.service.http.raw import until
+from tests.service.served import acting_bundle, peer_of
+
+
+def test_info_says_what_is_served(client, service, edge_bundle):
+    info = client.get("/v1/info").json()
+    assert info == service.info()
+    assert info["digest"] == edge_bundle.digest
+    assert info["func_io"].keys() == {"smooth", "canny"}
+
+
+def test_it_is_alive_and_ready(client):
+    assert client.get("/livez").json() == {"alive": True, "reason": ""}
+    assert client.get("/readyz").json() == {"ready": True, "state": "READY", "reason": ""}
+
+
+def test_the_graph_is_drawn_with_the_latest_run(client):
+    answer = client.get("/v1/graph.svg")
+    assert answer.headers["content-type"] == "image/svg+xml"
+    assert 'id="token-edges"' in answer.text
+    assert "data:image/" in answer.text
+    assert {token["name"] for token in client.get("/v1/view").json()["tokens"]} >= {"image", "edges", "lo"}
+
+
+def test_a_token_is_previewed_in_the_size_that_is_asked_for(client):
+    answer = client.get("/v1/tokens/edges/preview", params={"max_side_px": 64})
+    assert answer.headers["content-type"].startswith("image/")
+    picture = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert max(picture.shape[:2]) == 64
+    assert client.get("/v1/tokens/lo/preview").headers["content-type"].startswith("text/plain")
+    assert "Did you mean 'edges'?" in client.get("/v1/tokens/edge/preview").json()["detail"]
+
+
+def test_values_of_the_latest_run_come_as_an_envelope(changing, photograph, service):
+    lo = service.parameters().entries["lo"]["value"]
+    answer = changing.get("/v1/run", params={"tokens": ["edges", "lo"]})
+    assert answer.headers["content-type"] == "application/vnd.epypes.v1+frames"
+    envelope = decode(unpack(answer.content))
+    assert np.array_equal(envelope.parts["edges"], cv2.Canny(cv2.medianBlur(photograph, 5), lo, 200))
+    revision = changing.patch("/v1/parameters", json={"values": {"lo": lo - 1}}).json()["revision"]
+    answer = changing.get("/v1/run", params={"tokens": ["edges"], "revision": revision})
+    envelope = decode(unpack(answer.content))
+    assert envelope.revision == revision
+    assert np.array_equal(envelope.parts["edges"], cv2.Canny(cv2.medianBlur(photograph, 5), lo - 1, 200))
+    answer = changing.get("/v1/run", params={"tokens": ["edges"], "revision": revision + 1})
+    assert answer.status_code == 409
+
+
+def test_a_change_that_does_not_know_the_latest_revision_changes_nothing(changing):
+    now = changing.get("/v1/parameters").json()
+    first = changing.patch("/v1/parameters", json={"revision": now["revision"], "values": {"lo": 33}})
+    assert first.status_code == 200
+    assert first.json()["parameters"]["lo"]["value"] == 33
+    second = changing.patch("/v1/parameters", json={"revision": now["revision"], "values": {"lo": 44, "hi": 180}})
+    assert second.status_code == 409
+    assert second.json()["revision"] == first.json()["revision"]
+    assert (
+        second.json()["parameters"] == first.json()["parameters"] == changing.get("/v1/parameters").json()["parameters"]
+    )
+
+
+def test_of_a_change_with_one_bad_value_none_is_taken(changing):
+    before = changing.get("/v1/parameters").json()
+    answer = changing.patch("/v1/parameters", json={"values": {"lo": 20, "low": 1, "hi": "much"}})
+    assert answer.status_code == 422
+    assert answer.json()["problems"].keys() == {"low", "hi"}
+    assert changing.get("/v1/parameters").json() == before
+
+
+def test_a_failure_can_be_had_with_its_event(client, service):
+    with peer_of(service) as peer:
+        event = Envelope(type=REQUEST, parts={"image": "no image"})
+        peer.requests.put(event)
+        peer.take()
+    assert service.failure_store.flush()
+    failure = client.get("/v1/failures", params={"limit": 1}).json()["failures"][0]
+    assert failure["event_id"] == event.id
+    assert client.get(f"/v1/failures/{failure['id']}").json() == failure
+    kept = unpack_event(client.get(f"/v1/failures/{failure['id']}/event").content)
+    assert kept.parts == event.parts
+
+
+def test_pause_and_resume_say_what_they_did(changing):
+    assert changing.post("/v1/pause").json()["state"] == "PAUSED"
+    ready = changing.get("/readyz")
+    assert (ready.status_code, ready.json()["state"]) == (503, "PAUSED")
+    assert changing.get("/livez").status_code == 200
+    assert changing.post("/v1/resume").json()["state"] == "READY"
+
+
+@pytest.mark.slow
+def test_parameters_are_written_back_after_a_look_at_what_would_change(edge_bundle, tmp_path):
+    folder = shutil.copytree(edge_bundle.path, tmp_path / "edges")
+    with Service(folder) as service, HttpServer(service, "127.0.0.1:*") as http:
+        headers = {"Authorization": f"Bearer {http.token_file.read_text().strip()}"}
+        with httpx.Client(base_url=http.url, trust_env=False, timeout=60, headers=headers) as client:
+            client.patch("/v1/parameters", json={"values": {"lo": 64}})
+            would = client.post("/v1/parameters/write-back", json={"dry_run": True}).json()
+            assert "+value = 64" in would["diff"]
+            assert read_bundle(folder).digest == edge_bundle.digest
+            written = client.post("/v1/parameters/write-back", json={"dry_run": False}).json()
+            assert written == would
+            assert read_bundle(folder).digest == written["digest"]
+            assert client.post("/v1/parameters/write-back", json={"dry_run": True}).json()["diff"] == ""
+
+
+# -- another bundle -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def changed(edge_bundle, tmp_path):
+    """Make another state of the edge bundle, sealed anew."""
+
+    def change(name, before, after, file="pipeline.toml"):
+        folder = shutil.copytree(edge_bundle.path, tmp_path / name)
+        text = (folder / file).read_text()
+        assert before in text
+        (folder / file).write_text(text.replace(before, after))
+        seal(folder)
+        return folder
+
+    return change
+
+
+@pytest.fixture
+def epypes(capsys, monkeypatch, http):
+    """Run a command in this process, as far as its exit; return its status and what it said."""
+    monkeypatch.setenv("EPYPES_TOKEN", http.token)
+
+    def run(*arguments):
+        with pytest.raises(SystemExit) as stop:
+            main(list(map(str, arguments)))
+        said = capsys.readouterr()
+        if isinstance(stop.value.code, str):
+            return 1, said.out + stop.value.code
+        return stop.value.code or 0, said.out
+
+    return run
+
+
+def test_a_bundle_that_computes_something_else_does_not_take_over(changing, changed, epypes, http, edge_bundle):
+    bad = changed("bad", "value = 200", "value = 20")
+    answer = changing.post("/v1/deploy", json={"bundle": str(bad)})
+    assert answer.status_code == 409
+    assert "edges" in " ".join(answer.json()["reasons"])
+    status, said = epypes("deploy", bad, "--http", http.url)
+    assert status == 1
+    assert len(said.strip().splitlines()) == 1
+    assert "edges" in said
+    info = changing.get("/v1/info").json()
+    assert (info["digest"], info["state"]) == (edge_bundle.digest, "READY")
+
+
+def test_a_bundle_that_was_changed_since_its_promotion_is_none(changing, edge_bundle, tmp_path, epypes, http):
+    folder = shutil.copytree(edge_bundle.path, tmp_path / "broken")
+    (folder / "pipeline.py").write_text("import os\n")
+    answer = changing.post("/v1/deploy", json={"bundle": str(folder)})
+    assert answer.status_code == 422
+    assert "pipeline.py was changed" in answer.json()["detail"]
+    status, said = epypes("deploy", tmp_path / "nothing", "--http", http.url)
+    assert status == 1
+    assert "no folder" in said
+
+
+def test_a_good_bundle_takes_over_and_a_rollback_brings_the_one_before(changing, changed, epypes, http, edge_bundle):
+    good = changed("good", 'name = "edges"', 'name = "edges-2"')
+    assert epypes("deploy", good, "--http", http.url) == (
+        0,
+        f"DEPLOYED {good} ({read_bundle(good).digest[:12]}) in place of {edge_bundle.path} ({edge_bundle.digest[:12]}): READY.\n",
+    )
+    assert changing.get("/v1/info").json()["name"] == "edges-2"
+    status, said = epypes("rollback", "--http", http.url)
+    assert status == 0
+    assert said.startswith(f"ROLLED BACK {edge_bundle.path}")
+    assert changing.get("/v1/info").json()["digest"] == edge_bundle.digest
+
+
+def test_without_a_service_or_its_token_nothing_is_deployed(epypes, http, edge_bundle, tmp_path, monkeypatch):
+    status, said = epypes("deploy", edge_bundle.path, "--http", "http://127.0.0.1:1")
+    assert (status, len(said.strip().splitlines())) == (1, 1)
+    (tmp_path / "token").write_text("x" * 43)
+    status, said = epypes("deploy", edge_bundle.path, "--http", http.url, "--token-file", tmp_path / "token")
+    assert status == 1
+    assert "token" in said
+
+
+@pytest.mark.slow
+def test_while_a_bundle_is_deployed_another_one_is_refused_and_all_else_is_answered(tmp_path):
+    slow = acting_bundle(tmp_path / "slow")
+    waiting = acting_bundle(tmp_path / "waiting")
+    (waiting / "pipeline.py").write_text(
+        f"import os, time\nwhile not os.path.exists({str(tmp_path / 'go')!r}): time.sleep(0.01)\n"
+        + (waiting / "pipeline.py").read_text()
+    )
+    seal(waiting)
+    with Service(slow) as service, HttpServer(service, "127.0.0.1:*") as http:
+        headers = {"Authorization": f"Bearer {http.token_file.read_text().strip()}"}
+        with httpx.Client(base_url=http.url, trust_env=False, timeout=60, headers=headers) as client:
+            answers = []
+            first = threading.Thread(
+                target=lambda: answers.append(client.post("/v1/deploy", json={"bundle": str(waiting)}))
+            )
+            first.start()
+            until(lambda: client.post("/v1/deploy", json={"bundle": str(slow)}).status_code == 409)
+            refused = client.post("/v1/rollback")
+            assert refused.status_code == 409
+            assert "exchanged already" in refused.json()["detail"]
+            assert client.get("/readyz").status_code == 200
+            assert client.post("/v1/pause").status_code == 200
+            assert client.post("/v1/resume").status_code == 200
+            (tmp_path / "go").touch()
+            first.join(30)
+            assert answers[0].json()["bundle"] == str(waiting)
+
+
+# -- FAILURES 46 to 48 ----------------------------------------------------------------------------------------------
+
+
+def test_a_bundle_that_does_not_compute_what_was_recorded_is_never_ready(tmp_path):
+    bundle = acting_bundle(tmp_path / "wrong", expected=7)
+    with Service(bundle) as service, HttpServer(service, "127.0.0.1:*") as http:
+        answer = httpx.get(f"{http.url}/readyz", trust_env=False)
+        assert answer.status_code == 503
+        assert answer.json()["state"] == "FAULTED"
+        assert "out" in answer.json()["reason"]
+
+
+def test_health_names_a_function_that_does_not_return_and_is_well_again(tmp_path, acting):
+    with (
+        Service(acting, job_timeout_s=0.5) as service,
+        HttpServer(service, "127.0.0.1:*") as http,
+        peer_of(service) as peer,
+    ):
+        reasons = []
+
+        def is_unwell():
+            answer = httpx.get(f"{http.url}/livez", trust_env=False)
+            reasons.append(answer.json()["reason"])
+            return answer.status_code == 503 and "act" in answer.json()["reason"]
+
+        peer.send("sleep:1000")
+        until(is_unwell)
+        until(lambda: httpx.get(f"{http.url}/readyz", trust_env=False).status_code == 200)
+        assert peer.ask(number=4).parts["out"] == 8
+        until(lambda: httpx.get(f"{http.url}/livez", trust_env=False).status_code == 200)
+        failures = httpx.get(f"{http.url}/v1/failures", trust_env=False).json()["failures"]
+        assert failures[0]["kind"] == "stuck"
+
+
+def test_health_is_answered_while_a_function_holds_the_interpreter(acting):
+    with (
+        Service(acting, drain_timeout_s=0.3) as service,
+        HttpServer(service, "127.0.0.1:*") as http,
+        peer_of(service) as peer,
+    ):
+        peer.send("regex")
+        until(lambda: service.counts()["in_flight"] == 1)
+        with httpx.Client(base_url=http.url, trust_env=False, timeout=1.0) as client:
+            answers = [client.get("/livez").status_code for _ in range(20)]
+        assert answers == [200] * 20
+        assert service.counts()["in_flight"] == 1

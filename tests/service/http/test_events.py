@@ -1,0 +1,131 @@
+"""What are listeners told, and what do those cost who do not listen?"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections import Counter
+from contextlib import ExitStack, contextmanager
+from time import monotonic
+
+import httpx
+import pytest
+from httpx_sse import EventSource
+
+from epypes.bundle.ports import REQUEST
+from epypes.service.http import HttpServer
+from epypes.wire import Envelope
+from tests.service.http.raw import connection, until
+from tests.service.served import peer_of
+
+
+@contextmanager
+def listening(url, **query):
+    """Give what a listener is told, as pairs of kind and data."""
+    with httpx.stream("GET", f"{url}/v1/events", params=query, timeout=20, trust_env=False) as answer:
+        assert answer.status_code == 200
+        yield ((event.event, json.loads(event.data)) for event in EventSource(answer).iter_sse())
+
+
+@pytest.fixture(scope="module")
+def peer(service):
+    with peer_of(service) as peer:
+        yield peer
+
+
+def work(peer, photograph, count):
+    for _ in range(count):
+        peer.requests.put(Envelope(type=REQUEST, parts={"image": photograph[:40, :40]}))
+        peer.take()
+
+
+def test_a_listener_is_told_first_how_things_are(http, service):
+    with listening(http.url) as told:
+        first = [next(told) for _ in range(3)]
+    assert [kind for kind, _ in first] == ["state", "parameters", "counts"]
+    assert first[0][1] == {"state": "READY", "reason": ""}
+    assert first[1][1]["parameters"].keys() == {"side", "lo", "hi"}
+    assert first[2][1] == service.counts()
+
+
+def test_counts_are_told_each_second(http):
+    with listening(http.url, for_s=2.5) as told:
+        kinds = Counter(kind for kind, _ in told)
+    assert kinds["counts"] >= 3
+
+
+def test_runs_are_told_ten_times_a_second_at_most_and_the_last_one_always(http, service, peer, photograph):
+    with listening(http.url) as told:
+        before = service.counts()["answered"]
+        start = monotonic()
+        work(peer, photograph, 60)
+        took_s = monotonic() - start
+        runs = []
+        while sum(1 + run["skipped"] for run in runs) < 60:
+            kind, data = next(told)
+            if kind == "run":
+                runs.append(data)
+    assert service.counts()["answered"] == before + 60
+    assert len(runs) <= took_s * 10 + 3
+    assert [run["seq"] for run in runs] == sorted(run["seq"] for run in runs)
+    assert all(run["total_ns"] > 0 and run["event_id"] for run in runs)
+
+
+def test_a_failure_is_told_with_its_record(http, peer):
+    with listening(http.url) as told:
+        peer.requests.put(Envelope(type=REQUEST, parts={"image": "no image"}))
+        record = next(data for kind, data in told if kind == "failure")
+    assert record["function"] == "smooth"
+    assert record["id"]
+
+
+def test_a_change_of_parameters_is_told_to_all(http, changing):
+    with listening(http.url) as one, listening(http.url) as other:
+        revision = changing.patch("/v1/parameters", json={"values": {"lo": 61}}).json()["revision"]
+        for told in (one, other):
+            assert (
+                next(d for k, d in told if k == "parameters" and d["revision"] == revision)["parameters"]["lo"]["value"]
+                == 61
+            )
+
+
+def test_fifty_listen_at_once_and_the_last_of_too_many_is_told_so(http, service, peer, photograph):
+    with ExitStack() as all_of_them:
+        told = [all_of_them.enter_context(listening(http.url)) for _ in range(50)]
+        work(peer, photograph, 1)
+        for each in told:
+            assert next(data for kind, data in each if kind == "run")["total_ns"] > 0
+        for _ in range(14):
+            all_of_them.enter_context(listening(http.url))
+        refused = httpx.get(f"{http.url}/v1/events", trust_env=False)
+        assert refused.status_code == 503
+        assert "64 listeners" in refused.json()["detail"]
+        assert httpx.get(f"{http.url}/livez", trust_env=False).status_code == 200
+    until(lambda: http.listeners == 0)
+
+
+def test_one_who_goes_away_is_forgotten(http):
+    with connection(http.url) as gone:
+        gone.sendall(b"GET /v1/events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        until(lambda: http.listeners == 1)
+    until(lambda: http.listeners == 0)
+
+
+def test_listeners_are_let_go_when_the_server_stops(service):
+    server, before = HttpServer(service, "127.0.0.1:*"), set(threading.enumerate())
+    with ExitStack() as all_of_them:
+        url = server.start()
+        told = [all_of_them.enter_context(listening(url)) for _ in range(5)]
+        deaf = all_of_them.enter_context(connection(url))
+        deaf.sendall(b"GET /v1/events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        start = monotonic()
+        server.stop()
+        assert monotonic() - start < 3
+        for each in told:
+            list(each)
+    assert not [thread for thread in set(threading.enumerate()) - before if thread.name.startswith("epypes-http")]
+
+
+def test_for_s_of_zero_tells_how_things_are_and_ends(http):
+    with listening(http.url, for_s=0) as told:
+        assert [kind for kind, _ in told] == ["state", "parameters", "counts"]
