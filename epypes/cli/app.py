@@ -29,9 +29,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 _COMMANDS = (
-    (promote, verify, serve, call)
-    + (deploy, rollback, failures, replay)
-    + (record, play, keys, experiment, demo, lab, doctor)
+    *(promote, verify, serve, call, deploy, rollback, failures, replay),
+    *(record, play, keys, experiment, demo, lab, doctor),
 )
 for command in _COMMANDS:
     app.command()(command)

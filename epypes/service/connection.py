@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 from urllib.parse import quote
 
-from epypes.bundle.entries import plain, read, written
+from epypes.bundle.entries import plain, written
 from epypes.bundle.ports import in_order
-from epypes.errors import EpypesError, NotComputed, ServiceError
+from epypes.errors import EpypesError, ServiceError
 from epypes.service.control import Control, address_of, parameters_of
 from epypes.service.failurerecord import FailureRecord
 from epypes.service.parameters import Parameters
@@ -316,14 +316,6 @@ def _token_on_this_machine(address: str) -> str:
 def _sent(value: Any) -> Any:
     """Return a value of a hyperparameter as JSON has it."""
     return written(plain(value)).get("value")
-
-
-def value_of(entry: Mapping[str, Any]) -> Any:
-    """Return the value in an entry; NotComputed if there is none."""
-    try:
-        return read(entry)
-    except KeyError as error:
-        raise NotComputed("", "A hyperparameter of the service has no value.") from error
 
 
 def _record(said: Mapping[str, Any]) -> FailureRecord:
