@@ -75,7 +75,7 @@ class Slice:
         self._positions: dict[str, Position] = {}
         self._reads: dict[str, frozenset[str]] = {}
         self._files: dict[str, int] = {}
-        self._notebook: Mapping[str, Any] = {}
+        self._first: Definition | None = None
 
     def add_graph_function(self, what: str, function: Callable[..., Any], wanted: str = "") -> str:
         """Add a function of the graph; return the expression by which the module refers to it.
@@ -122,7 +122,7 @@ class Slice:
         aliases = [name for name, imported in self.imports if imported == module]
         if aliases:
             return min(aliases)
-        name = self.names.alias_for(sys.modules.get(module), self._notebook, module)
+        name = self.names.alias_for(sys.modules.get(module), self._first.names if self._first else {}, module)
         if not name:
             self._import_module(module, what)
             return module
@@ -160,7 +160,7 @@ class Slice:
             return source
         self.names.claim(name, of_object(function), what)
         self._known[id(function)] = name
-        self._write(name, f"{name} = {source}\n", self._binding(name, None))
+        self._write(name, f"{name} = {source}\n", self._binding(name))
         return name
 
     def _argument(self, value: Any, what: str) -> str:
@@ -175,7 +175,7 @@ class Slice:
     def _add_definition(self, function: Any, what: str, wanted: str = "") -> Written:
         """Add a function of the notebook."""
         found = found_definition(function, what)
-        self._notebook = self._notebook or found.function.__globals__
+        self._first = self._first or found
         name = self.names.name_for(function, found, wanted)
         self.names.claim(name, of_object(function), what)
         self._known[id(function)] = name
@@ -202,7 +202,7 @@ class Slice:
         arguments += [f"{word}={self._argument(value, what)}" for word, value in made.named.items()]
         inner = f"Function {made.factory.__name__!r}, which makes {what[0].lower()}{what[1:]},"
         factory = self._callable(made.factory, inner, "")
-        position = self._binding(name, found) or self._position(found)
+        position = self._binding(name) or self._position(found)
         self._write(name, f"{name} = {factory}({', '.join(arguments)})\n", position)
 
     def _write(self, name: str, text: str, position: Position) -> None:
@@ -216,10 +216,11 @@ class Slice:
         cell = cell_of(code.co_filename, found.names)
         return (cell, 0 if cell else self._files.setdefault(code.co_filename, len(self._files)), code.co_firstlineno)
 
-    def _binding(self, name: str, found: Definition | None) -> Position:
-        """Return where a notebook gave a name its value, () if it does not say."""
-        code = found.function.__code__ if found else None
-        given = next(statements_of(name, self._notebook, code), None)
+    def _binding(self, name: str) -> Position:
+        """Return where the notebook gave a name its value, () if it does not say."""
+        if self._first is None:
+            return ()
+        given = next(statements_of(name, self._first.names, self._first.function.__code__), None)
         return (given.cell, 0, given.node.lineno) if given else ()
 
     def _add_name(self, name: str, found: Definition, what: str) -> None:
@@ -250,7 +251,7 @@ class Slice:
         source = self._callable(helper, f"Function {name!r}, which {what[0].lower()}{what[1:]} calls,", name)
         if source != name and name not in self.definitions:
             self.names.claim(name, of_object(helper), what)
-            self._write(name, f"{name} = {source}\n", self._binding(name, found))
+            self._write(name, f"{name} = {source}\n", self._binding(name))
 
     def _add_constant(self, name: str, value: Any, found: Definition, what: str) -> None:
         code = found.function.__code__
@@ -264,7 +265,12 @@ class Slice:
         source = self._constant_source(name, value, found, what)
         if self.constants.get(name, source) != source:
             text = f"{what} uses {name!r} ({found.place_of(name)}), which has another value elsewhere"
-            raise Refused(f"{text}. Rename one of the two.")
+            way_out = (
+                f"Make {name} a parameter of the function around it"
+                if name in found.captured
+                else "Rename one of the two"
+            )
+            raise Refused(f"{text}. {way_out}.")
         if name in self.constants or name in self.definitions:
             return
         self.names.claim(name, ("constant", name), what)
@@ -283,7 +289,7 @@ class Slice:
         if name not in self.definitions:
             source = self._argument(value, f"{name!r}, which {what[0].lower()}{what[1:]} uses,")
             text = "\n".join(assignment([name], True, piece_of(source), 0))
-            self._write(name, f"{text}\n", self._binding(name, found))
+            self._write(name, f"{text}\n", self._binding(name))
         return True
 
     def _constant_source(self, name: str, value: Any, found: Definition, what: str) -> str:
