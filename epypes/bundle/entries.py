@@ -1,36 +1,268 @@
-"""How does the value of a hyperparameter stand in TOML, and how is it read back?"""
+"""How does the value of a hyperparameter stand in TOML, and how is it read back?
+
+What TOML has stands there as it is. Anything else is a table with its ``kind``: beside the value where the whole value
+is meant, as an inline table where it is inside a list or a table. Every entry is ready for JSON too.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+import enum
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from epypes.run.guard import is_plain_array
+
+# What a person still reads, and a line of a diff still shows.
+MOST_NUMBERS: Final = 400
+_KIND: Final = "kind"
+_SMALL: Final = range(-(2**63), 2**63)
+_DEEPEST: Final = 20
+
+
+class Unwritable(ValueError):
+    """A value that no entry holds to the last bit; its text says of which kind it is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """A member of an enumeration that is known by its names alone, where the bundle's module is not executed."""
+
+    enum: str
+    name: str
 
 
 def plain(value: Any) -> Any:
-    """Return a number of NumPy's as Python's own; whether that computes the same, the replay shows."""
-    is_number = type(value).__module__ == "numpy" and getattr(value, "shape", None) == ()
-    return value.item() if is_number else value
+    """Return a number of NumPy's as Python's own, for what compares it."""
+    return value.item() if _is_numpy_number(value) else value
 
 
 def fits(value: Any) -> bool:
-    """Whether TOML, with a word on its kind where need be, holds a plain value to the last bit."""
-    if type(value) in (tuple, list):
-        # One kind per table entry: what is inside a sequence keeps its type only if TOML has it.
-        return all(type(item) in (bool, int, float, str) and fits(item) for item in value)
-    if type(value) is int:
-        return -(2**63) <= value < 2**63
-    return value is None or type(value) in (bool, float, str)
+    """Whether an entry holds a value to the last bit."""
+    try:
+        written(value)
+    except Unwritable:
+        return False
+    return True
 
 
 def written(value: Any) -> dict[str, Any]:
-    """Return the entry of a value that fits: ``value``, and its ``kind`` where TOML has none like it."""
-    if value is None:
-        return {"kind": "none"}
-    return {"value": list(value), "kind": "tuple"} if isinstance(value, tuple) else {"value": value}
+    """Return the entry of a value: ``value``, with its ``kind`` and what else that needs where TOML has none like it.
+
+    Raises
+    ------
+    Unwritable
+        There is no entry for a value of this kind, or of this size.
+    """
+    return _written(value, _DEEPEST)
 
 
-def read(entry: Mapping[str, Any]) -> Any:
-    """Return the value of an entry; KeyError if it has none."""
-    if entry.get("kind") == "none":
-        return None
-    return tuple(entry["value"]) if entry.get("kind") == "tuple" else entry["value"]
+def _written(value: Any, depth: int) -> dict[str, Any]:
+    if depth < 0:
+        raise Unwritable("nested too deep")
+    write = _WRITERS.get(type(value))
+    if write is not None:
+        return write(value, depth - 1)
+    if is_plain_array(value):
+        return _array(value)
+    if _is_numpy_number(value):
+        return {"value": _of_number(value), _KIND: "numpy", "dtype": value.dtype.name}
+    if isinstance(value, enum.Enum) and value.name in type(value).__members__:
+        return {"value": value.name, _KIND: "enum", "enum": type(value).__qualname__}
+    if isinstance(value, Member):
+        return {"value": value.name, _KIND: "enum", "enum": value.enum}
+    raise Unwritable(f"a {type(value).__name__}")
+
+
+def _part(value: Any, depth: int) -> Any:
+    """Return a value as it stands inside a list or table."""
+    entry = _written(value, depth)
+    return entry if _KIND in entry else entry["value"]
+
+
+def _whole(part: Any, enums: Mapping[str, Any]) -> Any:
+    if isinstance(part, dict):
+        if _KIND in part:
+            return read(part, enums)
+        return {key: _whole(item, enums) for key, item in part.items()}
+    return [_whole(item, enums) for item in part] if isinstance(part, list) else part
+
+
+def read(entry: Mapping[str, Any], enums: Mapping[str, Any] | None = None) -> Any:
+    """Return the value of an entry.
+
+    Parameters
+    ----------
+    entry
+        What :func:`written` returned; other keys are passed over.
+    enums
+        The enumerations by name. Members of others are read as :class:`Member`.
+
+    Raises
+    ------
+    KeyError
+        The entry lacks something.
+    TypeError
+        It makes no sense.
+    """
+    known = {} if enums is None else enums
+    kind = entry.get(_KIND)
+    if kind is None:
+        return _whole(entry["value"], known)
+    if not isinstance(kind, str) or kind not in _READERS:
+        raise TypeError(f"no value has the kind {kind!r}")
+    return _READERS[kind](entry, known)
+
+
+def members_in(value: Any) -> Iterator[enum.Enum | Member]:
+    """Give the members of enumerations that are in a value."""
+    if isinstance(value, enum.Enum | Member):
+        yield value
+    elif isinstance(value, dict):
+        for pair in value.items():
+            yield from members_in(pair)
+    elif type(value) in (tuple, list, set, frozenset):
+        for item in value:
+            yield from members_in(item)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+def _is_numpy_number(value: Any) -> bool:
+    """Whether this is a scalar of NumPy's that Python's own numbers hold to the last bit."""
+    numpy = sys.modules.get("numpy")
+    if numpy is None or not isinstance(value, numpy.number | numpy.bool_):
+        return False
+    return value.dtype.kind in "biuf" and value.dtype.itemsize <= 8
+
+
+def _of_number(number: Any) -> Any:
+    """Return a number of NumPy's as the shortest one of Python's that makes it again."""
+    whole = number.item()
+    if number.dtype.kind != "f":
+        return _part(whole, 0)
+    short = float(str(number))
+    return _part(short if number.dtype.type(short).tobytes() == number.tobytes() else whole, 0)
+
+
+def _as_it_is(value: Any, depth: int) -> dict[str, Any]:
+    return {"value": value}
+
+
+def _text(value: str, depth: int) -> dict[str, Any]:
+    if any("\ud800" <= character <= "\udfff" for character in value):
+        raise Unwritable("a text with half a character in it")
+    return {"value": value}
+
+
+def _integer(value: int, depth: int) -> dict[str, Any]:
+    return {"value": value} if value in _SMALL else {"value": hex(value), _KIND: "int"}
+
+
+def _float(value: float, depth: int) -> dict[str, Any]:
+    import struct
+
+    if value == value or struct.pack("d", value) == struct.pack("d", float("nan")):
+        return {"value": value}
+    return {"value": struct.pack(">d", value).hex(), _KIND: "nan"}
+
+
+def _read_nan(entry: Mapping[str, Any], enums: Mapping[str, Any]) -> float:
+    import struct
+
+    (value,) = struct.unpack(">d", bytes.fromhex(entry["value"]))
+    return float(value)
+
+
+def _sequence(value: Any, depth: int) -> dict[str, Any]:
+    items = [_part(item, depth) for item in value]
+    return {"value": items} if type(value) is list else {"value": items, _KIND: type(value).__name__}
+
+
+def _set(value: Any, depth: int) -> dict[str, Any]:
+    items = sorted((_part(item, depth) for item in value), key=repr)
+    return {"value": items, _KIND: type(value).__name__}
+
+
+def _mapping(value: dict[Any, Any], depth: int) -> dict[str, Any]:
+    if _KIND not in value and all(type(key) is str and fits(key) for key in value):
+        return {"value": {key: _part(item, depth) for key, item in value.items()}}
+    return {"value": [[_part(key, depth), _part(item, depth)] for key, item in value.items()], _KIND: "dict"}
+
+
+def _array(array: Any) -> dict[str, Any]:
+    import numpy as np
+
+    if array.dtype.kind not in "biuf" or array.dtype.itemsize > 8:
+        raise Unwritable(f"an array of {array.dtype}")
+    if array.size > MOST_NUMBERS:
+        raise Unwritable(f"an array of {array.size} numbers, and {MOST_NUMBERS} are the most that people read")
+    dtype = array.dtype.name if array.dtype.isnative else array.dtype.str
+    numbers = [_of_number(number) for number in array.astype(array.dtype.newbyteorder("=")).reshape(-1)]
+    value = numbers[0] if array.shape == () else _nested(numbers, array.shape)
+    entry = {"value": value, _KIND: "array", "dtype": dtype}
+    if array.size == 0:
+        entry["shape"] = list(array.shape)
+    if np.asarray(read(entry)).tobytes() != array.tobytes():
+        raise Unwritable(f"an array of {array.dtype} with numbers that TOML has not")
+    return entry
+
+
+def _nested(numbers: list[Any], shape: tuple[int, ...]) -> list[Any]:
+    if len(shape) <= 1:
+        return numbers
+    stride = len(numbers) // shape[0] if shape[0] else 0
+    return [_nested(numbers[row * stride : (row + 1) * stride], shape[1:]) for row in range(shape[0])]
+
+
+def _read_array(entry: Mapping[str, Any], enums: Mapping[str, Any]) -> Any:
+    import numpy as np
+
+    dtype = np.dtype(entry["dtype"])
+    if "shape" in entry:
+        return np.zeros(entry["shape"], dtype)
+    return np.array(_whole(entry["value"], enums), dtype)
+
+
+def _read_number(entry: Mapping[str, Any], enums: Mapping[str, Any]) -> Any:
+    import numpy as np
+
+    return np.dtype(entry["dtype"]).type(_whole(entry["value"], enums))
+
+
+def _read_member(entry: Mapping[str, Any], enums: Mapping[str, Any]) -> Any:
+    name, member = entry["enum"], entry["value"]
+    return enums[name][member] if name in enums else Member(name, member)
+
+
+_WRITERS: Final[Mapping[type, Callable[[Any, int], dict[str, Any]]]] = {
+    type(None): lambda value, depth: {_KIND: "none"},
+    bool: _as_it_is,
+    int: _integer,
+    float: _float,
+    str: _text,
+    complex: lambda value, depth: {"value": [_part(value.real, 0), _part(value.imag, 0)], _KIND: "complex"},
+    bytes: lambda value, depth: {"value": value.hex(), _KIND: "bytes"},
+    tuple: _sequence,
+    list: _sequence,
+    set: _set,
+    frozenset: _set,
+    dict: _mapping,
+}
+
+_READERS: Final[Mapping[str, Callable[[Mapping[str, Any], Mapping[str, Any]], Any]]] = {
+    "none": lambda entry, enums: None,
+    "int": lambda entry, enums: int(entry["value"], 16),
+    "nan": _read_nan,
+    "complex": lambda entry, enums: complex(*_whole(entry["value"], enums)),
+    "bytes": lambda entry, enums: bytes.fromhex(entry["value"]),
+    "tuple": lambda entry, enums: tuple(_whole(entry["value"], enums)),
+    "set": lambda entry, enums: set(_whole(entry["value"], enums)),
+    "frozenset": lambda entry, enums: frozenset(_whole(entry["value"], enums)),
+    "dict": lambda entry, enums: {_whole(key, enums): _whole(item, enums) for key, item in entry["value"]},
+    "array": _read_array,
+    "numpy": _read_number,
+    "enum": _read_member,
+}

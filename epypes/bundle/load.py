@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 import types
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,23 +13,42 @@ from epypes.bundle.ports import answer_with, payload_of
 from epypes.bundle.seal import check_seal
 from epypes.bundle.settings import Settings, read_settings
 from epypes.errors import BundleError
-from epypes.graph import CompGraph, with_defaults
+from epypes.graph import CompGraph, group, with_defaults
 from epypes.pipeline import FullPipeline
 from epypes.run import CompGraphRunner
 
 MODULE: Final = "pipeline.py"
 SETTINGS: Final = "pipeline.toml"
 SAMPLES: Final = "samples"
+MAKER: Final = "make_pipeline"
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Bundle:
-    """A bundle that was read: its graph, its settings and its digest (empty while it is not sealed)."""
+    """A bundle that was read.
+
+    Attributes
+    ----------
+    path
+        Its folder.
+    cg
+        Its graph.
+    settings
+        What stands in pipeline.toml.
+    digest
+        Its digest; empty while it is not sealed.
+    own
+        What its module has of its own in place of the usual ports and pipeline, by the names in ``settings.own``.
+    enums
+        The enumerations whose members are values of hyperparameters, by name; ``entries.read`` takes them.
+    """
 
     path: Path
     cg: CompGraph
     settings: Settings
     digest: str
+    own: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
+    enums: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def samples(self) -> tuple[Path, ...]:
@@ -64,11 +85,25 @@ def read_bundle(path: str | Path, *, sealed: bool = True) -> Bundle:
             break
     module = _execute(folder / MODULE, source)
     try:
-        cg = CompGraph(module.func_dict, module.func_io, types=settings.types)
+        enums = getattr(module, "enums", {}) if settings.has_members else {}
+        settings = settings.with_enums(enums)
+        cg = _graph(module, settings)
+        own = {name: getattr(module, name) for name in settings.own}
     except AttributeError as error:
         text = f"{folder / MODULE} defines no {error.name!r}. Promote the graph again."
         raise BundleError(folder, text) from error
-    return Bundle(folder, with_defaults(cg, settings.defaults), settings, digest)
+    except (KeyError, TypeError) as error:
+        text = f"{folder / MODULE} has no {error} that {SETTINGS} names. Promote the graph again."
+        raise BundleError(folder, text) from error
+    return Bundle(folder, cg, settings, digest, own, enums)
+
+
+def _graph(module: Any, settings: Settings) -> CompGraph:
+    cg = CompGraph(module.func_dict, module.func_io, types=settings.types)
+    if settings.has_groups:
+        for name, functions in module.func_groups.items():
+            cg = group(cg, name, functions)
+    return with_defaults(cg, settings.defaults)
 
 
 def _identity(folder: Path) -> tuple[int, int] | None:
@@ -84,7 +119,16 @@ def _execute(path: Path, source: bytes) -> Any:
     """Execute the module's source as it was checked; a cached .pyc, which the seal does not cover, is not looked at."""
     module = types.ModuleType(f"epypes_bundle_{path.parent.name}")
     module.__file__ = str(path)
-    exec(compile(source, str(path), "exec"), module.__dict__)  # noqa: S102 - loading code is its purpose
+    # While their module runs, dataclasses look for it there.
+    before = sys.modules.get(module.__name__)
+    sys.modules[module.__name__] = module
+    try:
+        exec(compile(source, str(path), "exec", dont_inherit=True), module.__dict__)  # noqa: S102 - its purpose
+    finally:
+        if before is None:
+            del sys.modules[module.__name__]
+        else:
+            sys.modules[module.__name__] = before
     return module
 
 
@@ -108,9 +152,9 @@ def load_pipeline(path: str | Path, q_in: Any, q_out: Any) -> FullPipeline:
     path
         The bundle's folder.
     q_in
-        Gives Envelopes whose parts are the bundle's input tokens.
+        Gives Envelopes whose parts are the bundle's input tokens; or what the bundle's own f_in takes.
     q_out
-        Gets Envelopes whose parts are its output tokens.
+        Gets Envelopes whose parts are its output tokens; or what its own f_out makes.
 
     Raises
     ------
@@ -120,15 +164,25 @@ def load_pipeline(path: str | Path, q_in: Any, q_out: Any) -> FullPipeline:
     return pipeline_of(read_bundle(path), q_in, q_out)
 
 
-def pipeline_of(bundle: Bundle, q_in: Any, q_out: Any) -> FullPipeline:
-    """Return the FullPipeline of a bundle that was read."""
-    settings = bundle.settings
-    return FullPipeline(
-        settings.name,
-        bundle.cg,
-        q_in,
-        q_out,
-        payload_of(settings.inputs, settings.rgb),
-        answer_with(settings.outputs, bundle.digest, settings.rgb),
-        settings.hyperparameters,
-    )
+def pipeline_of(bundle: Bundle, q_in: Any, q_out: Any, *, detach: bool = True) -> FullPipeline:
+    """Return the FullPipeline of a bundle that was read.
+
+    Parameters
+    ----------
+    bundle
+        The bundle.
+    q_in, q_out
+        As for :func:`load_pipeline`.
+    detach
+        Whether answers are copies, for a ``q_out`` that keeps them while the next event is worked on.
+    """
+    settings, own = bundle.settings, bundle.own
+    f_in = own.get("f_in") or payload_of(settings.inputs, settings.rgb)
+    f_out = own.get("f_out") or answer_with(settings.outputs, bundle.digest, settings.rgb, detach=detach)
+    make = own.get(MAKER)
+    if make is None:
+        pipeline = FullPipeline(settings.name, bundle.cg, q_in, q_out, f_in, f_out, settings.hyperparameters)
+    else:
+        pipeline = make(bundle.cg, q_in, q_out, f_in, f_out, settings.hyperparameters)
+    pipeline.attributes.update(settings.attributes)
+    return pipeline

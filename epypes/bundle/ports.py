@@ -50,24 +50,25 @@ def in_order(envelope: Envelope, rgb: Collection[str]) -> dict[str, Any]:
 
 
 def answer_with(
-    outputs: Sequence[str], bundle_digest: str, rgb: Collection[str] = ()
+    outputs: Sequence[str], bundle_digest: str, rgb: Collection[str] = (), *, detach: bool = True
 ) -> Callable[[EventView], Envelope]:
     """Return an f_out: an Envelope with the output tokens and the times, which answers the event by its id.
 
     The arrays are copies, since a function may use the memory of its result again for the next event before this one
-    is sent. Images of the tokens named in ``rgb`` are sent as RGB. What can't be sent raises MessageError here, where
-    it becomes the event's failure.
+    is sent; ``detach=False`` is for who encodes an answer before the next event. Images of the tokens named in ``rgb``
+    are sent as RGB. What can't be sent raises MessageError here, where it becomes the event's failure.
     """
 
     def f_out(view: EventView) -> Envelope:
         from epypes.wire import Envelope, encode
 
+        event = view.event if isinstance(view.event, Envelope) else None
         answer = Envelope(
             type=RESULT,
-            parts={token: detached(view[token]) for token in outputs},
+            parts={token: detached(view[token]) if detach else view[token] for token in outputs},
             source=view.name,
-            correlation_id=view.event.id,
-            acquired_ns=view.event.acquired_ns,
+            correlation_id=event.id if event else "",
+            acquired_ns=event.acquired_ns if event else 0,
             revision=view.run.revision,
             bundle_digest=bundle_digest,
             attributes={**view.attributes, "total_ns": view.report.total_ns, "overhead_ns": view.report.overhead_ns},
@@ -78,6 +79,11 @@ def answer_with(
         return answer
 
     return f_out
+
+
+def is_usual(port: Callable[..., Any]) -> bool:
+    """Whether this is an f_in or f_out that a bundle has without being told."""
+    return getattr(port, "__module__", None) == __name__
 
 
 def detached(value: Any) -> Any:

@@ -10,34 +10,27 @@ from __future__ import annotations
 import ctypes
 import os
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from epypes.bundle.emit import emit_module
+from epypes.bundle.answers import ANSWERS, record_answer
 from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
-from epypes.bundle.nodes import called_by, is_plain_pipeline
+from epypes.bundle.module import write_module
 from epypes.bundle.replay import replay_isolated
 from epypes.bundle.seal import MANIFEST, seal
 from epypes.bundle.settings import Settings, unwritable, writable_defaults, write_settings
-from epypes.bundle.slicer import slice_graph
+from epypes.bundle.source import Refused
+from epypes.bundle.subject import Subject, subject_of
 from epypes.errors import BundleError, EpypesError, MessageError, PromotionRefused, run_call
-from epypes.graph import CompGraph, as_switch, colour_order, is_placeholder
-from epypes.pipeline import Node, Pipeline
+from epypes.graph import colour_order
+from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner, Run
 
 REQUIREMENTS: Final = "requirements.txt"
 # From Linux's fcntl.h and fs.h.
 _AT_FDCWD: Final = -100
 _RENAME_EXCHANGE: Final = 2
-_NO_RUNNER: Final = (
-    "An object of class {} can't be promoted. Make a runner and run it: "
-    "runner = CompGraphRunner(cg, hparams); runner.run(...)."
-)
-_AS_ONE: Final = (
-    "ep.to_source(cg) writes the graph as one plain function: put its text into a cell, make a graph of that "
-    "function, run it and promote that."
-)
 
 
 def promote(
@@ -46,6 +39,8 @@ def promote(
     outputs: Sequence[str] | None = None,
     f_in: Callable[[Any], Mapping[str, Any]] | None = None,
     f_out: Callable[[Any], Any] | None = None,
+    *,
+    samples: Iterable[Any] = (),
 ) -> Bundle:
     """Write a bundle: a folder of text that computes what the runner's last run computed, and proves it.
 
@@ -58,7 +53,11 @@ def promote(
     outputs
         The tokens that the service answers with; the sink tokens without.
     f_in, f_out
-        Refused so far: a bundle takes and gives Envelopes with one part per token.
+        How the service makes a payload of an event, and an answer of an event's view; those of a reactive pipeline
+        without. Otherwise it takes and gives Envelopes with one part per token. Events may be Envelopes or bytes.
+    samples
+        Further payloads that are run and recorded, besides that of the last run: values of the one free source token,
+        or mappings by token.
 
     Raises
     ------
@@ -71,15 +70,16 @@ def promote(
         target = Path(to).resolve()
     except (OSError, RuntimeError) as error:
         raise PromotionRefused(to, [f"{to} is no place to write to: {error}. Name another folder."]) from error
-    runner, cg = _subject(runner_or_pipeline, target)
-    if f_in is not None or f_out is not None:
-        raise PromotionRefused(target, ["f_in and f_out can't be promoted yet. Leave them out."])
+    try:
+        subject = subject_of(runner_or_pipeline, f_in, f_out)
+    except Refused as refusal:
+        raise PromotionRefused(target, [str(refusal)]) from refusal
     try:
         _check_place(target)
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{target.name[:40]}-", dir=target.parent) as scratch:
             draft = Path(scratch) / target.name
-            _write(draft, target, runner, cg, outputs)
+            _write(draft, target, subject, outputs, samples)
             _prove(draft, target)
             _replace(draft, target)
     except (OSError, UnicodeError) as error:
@@ -100,61 +100,52 @@ def _check_place(target: Path) -> None:
         )
 
 
-def _subject(given: object, target: Path) -> tuple[CompGraphRunner, CompGraph]:
-    if isinstance(given, CompGraphRunner):
-        return given, given.cg
-    if type(given) is Pipeline:
-        return given.runner, given.source_cg
-    if isinstance(given, Pipeline):
-        kind = type(given).__name__
-        text = f"A {kind} can't be promoted yet. Promote its runner: promote(CompGraphRunner(pipe.cg, hparams), ...)."
-        raise PromotionRefused(target, [text])
-    raise PromotionRefused(target, [_NO_RUNNER.format(type(given).__name__)])
-
-
-def _write(draft: Path, target: Path, runner: CompGraphRunner, cg: CompGraph, outputs: Sequence[str] | None) -> None:
-    """Write all that can be written without running anything; raise every reason against it at once."""
+def _write(draft: Path, target: Path, subject: Subject, outputs: Sequence[str] | None, samples: Iterable[Any]) -> None:
+    """Write all that can be written without running anything new; raise every reason against it at once."""
+    runner, cg = subject.runner, subject.cg
     wanted = cg.sink_tokens if outputs is None else tuple(outputs)
     for token in wanted:
         cg.require_token(token)
     reasons = [*_unready(runner, wanted), *unwritable(runner.hyperparameters)]
-    functions = {name: function.func if type(function) is Node else function for name, function in cg.functions.items()}
-    reasons += _unheld(functions)
-    needed, references = slice_graph({name: function for name, function in functions.items() if not _kind(function)})
-    reasons += needed.refusals
-    if reasons:
-        raise PromotionRefused(target, reasons)
-    (draft / SAMPLES).mkdir(parents=True)
-    free = runner.free_source_tokens
+    reasons += unwritable(subject.attributes, "Attribute")
+    hyperparameters, free = runner.hyperparameters, runner.free_source_tokens
     rgb = tuple(token for token in dict.fromkeys((*free, *wanted)) if colour_order(cg, token) == "rgb")
-    hyperparameters = runner.hyperparameters
-    defaults = writable_defaults(cg, hyperparameters)
-    settings = Settings(target.name, free, wanted, hyperparameters, rgb, defaults, cg.types)
-    (draft / MODULE).write_text(emit_module(settings, cg, needed, references), encoding="utf-8")
+    settings = Settings(
+        target.name, free, wanted, hyperparameters, rgb, writable_defaults(cg, hyperparameters), cg.types,
+        attributes=subject.attributes, has_groups=bool(cg.groups),
+    )  # fmt: skip
+    module, settings, refusals = write_module(subject, settings)
+    if reasons or refusals:
+        raise PromotionRefused(target, [*reasons, *refusals])
+    (draft / SAMPLES).mkdir(parents=True)
+    (draft / MODULE).write_text(module, encoding="utf-8")
     write_settings(draft / SETTINGS, settings, cg)
-    if runner.last is not None:  # as _unready has made sure
-        _record(draft / SAMPLES / "000.npz", target, runner.last, settings)
+    for number, run in enumerate(_runs(target, subject, samples)):
+        _record(draft / SAMPLES / f"{number:03}.npz", target, run, settings)
+        if "f_out" in subject.ports:
+            _record_answer(draft / ANSWERS / f"{number:03}.npz", subject, run, settings)
 
 
-def _kind(function: object) -> str:
-    """Return what a function is that a bundle can't hold yet, though it has no text to be refused for; "" if none."""
-    if is_placeholder(function):
-        return "a placeholder"
-    if as_switch(function) is not None:
-        return "a switch"
-    return "a pipeline" if is_plain_pipeline(called_by(function)) else ""
+def _runs(target: Path, subject: Subject, samples: Iterable[Any]) -> Iterator[Run]:
+    """Give the last run, then runs of further payloads."""
+    if subject.runner.last is not None:  # as _unready has made sure
+        yield subject.runner.last
+    free = subject.runner.free_source_tokens
+    for number, sample in enumerate(samples, 1):
+        payload = sample if isinstance(sample, Mapping) else dict(zip(free[:1], [sample], strict=False))
+        try:
+            run = subject.fresh_runner().run_on(payload)
+        except Exception as error:  # whatever a function raises on it
+            text = f"Sample {number} can't be run: {type(error).__name__}: {error}"
+            raise PromotionRefused(target, [text]) from error
+        yield run
 
 
-def _unheld(functions: Mapping[str, Callable[..., Any]]) -> list[str]:
-    """Return a reason, with the way out, for each function that a bundle can't hold yet."""
-    kinds = {name: _kind(function) for name, function in functions.items()}
-    return [
-        f"Function {name!r} is a placeholder. Give it: ep.extend(cg, {{{name!r}: ...}}), and run that graph."
-        if kind == "a placeholder"
-        else f"Function {name!r} is {kind}, which a bundle can't hold yet. {_AS_ONE}"
-        for name, kind in kinds.items()
-        if kind
-    ]
+def _record_answer(path: Path, subject: Subject, run: Run, settings: Settings) -> None:
+    """Record what f_out makes of a run where that is no accident: another run of the same payload tells."""
+    payload = {token: run[token] for token in settings.inputs}
+    again = subject.fresh_runner().run_on(payload)
+    record_answer(path, subject.ports["f_out"], settings.name, (run, again), settings.attributes)
 
 
 def _unready(runner: CompGraphRunner, outputs: Sequence[str]) -> list[str]:

@@ -13,8 +13,9 @@ import traceback
 from dataclasses import asdict
 from pathlib import Path
 
+from epypes.bundle.answers import bundle_answer_difference
 from epypes.bundle.compare import Difference, ReplayReport, first_difference
-from epypes.bundle.load import Bundle, read_bundle
+from epypes.bundle.load import Bundle, pipeline_of, read_bundle
 from epypes.bundle.requirements import imported_requirements
 from epypes.errors import BundleError, EpypesError, ReplayDiffers
 from epypes.run import CompGraphRunner
@@ -81,6 +82,7 @@ def replay(bundle: Bundle) -> ReplayReport:
 
     differences: list[Difference] = []
     tokens = 0
+    pipeline_of(bundle, None, None)  # what serves it can be made
     for path in bundle.samples:
         inputs, outputs = load_sample(path)
         if (set(inputs), set(outputs)) != (set(bundle.settings.inputs), set(bundle.settings.outputs)):
@@ -93,6 +95,11 @@ def replay(bundle: Bundle) -> ReplayReport:
             text = first_difference(expected, run[token])
             if text:
                 differences.append(Difference(path.stem, token, text))
+        text = bundle_answer_difference(bundle, path.stem, run)
+        if text:
+            differences.append(
+                Difference(path.stem, ", ".join(bundle.settings.outputs), f"the answer of f_out: {text}")
+            )
     return ReplayReport(len(bundle.samples), tokens, tuple(differences), imported_requirements())
 
 

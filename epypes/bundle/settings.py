@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from epypes.bundle.entries import fits, plain, read, written
+from epypes.bundle.entries import Unwritable, fits, members_in, plain, read, written
+from epypes.bundle.ranges import range_of
 from epypes.errors import BundleError
-from epypes.graph import CompGraph, annotated_params
-from epypes.hints import Param, Roi
+from epypes.graph import CompGraph
+from epypes.hints import Param
 from epypes.images import Order
 
 FORMAT: Final = 1
+# Of a bundle with what the first one has not: ports or a pipeline of its own, groups, attributes, values of new kinds.
+_FORMAT_WITH_MORE: Final = 2
+_FIRST_KINDS: Final = (None, "none", "tuple")
+_LINE: Final = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +43,14 @@ class Settings:
         The graph's defaults of hyperparameters by token: what they are where the graph is used without these settings.
     types
         Whether the graph compares annotations, as CompGraph does unless told otherwise.
+    own
+        What of the pipeline the module defines itself: ``"f_in"``, ``"f_out"``, ``"make_pipeline"``.
+    attributes
+        The pipeline's attributes.
+    has_groups
+        Whether the module says which functions are drawn as one box.
+    entries
+        The hyperparameters as they stand in the file: value and kind, range, unit; ready for JSON. Empty before that.
     """
 
     name: str
@@ -46,20 +60,48 @@ class Settings:
     rgb: tuple[str, ...] = ()
     defaults: Mapping[str, Any] = field(default_factory=dict)
     types: bool = True
+    own: tuple[str, ...] = ()
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+    has_groups: bool = False
+    entries: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    @property
+    def has_members(self) -> bool:
+        """Whether a value is a member of an enumeration, which the bundle's module has."""
+        return any(_has_member(value) for values in self._values for value in values.values())
+
+    @property
+    def _values(self) -> tuple[Mapping[str, Any], ...]:
+        return self.hyperparameters, self.defaults, self.attributes
+
+    def with_enums(self, enums: Mapping[str, Any]) -> Settings:
+        """Return the settings with members of enumerations in place of their names."""
+        if not self.has_members:
+            return self
+        hyperparameters, defaults, attributes = (
+            {name: read(written(value), enums) for name, value in values.items()} for values in self._values
+        )
+        return replace(self, hyperparameters=hyperparameters, defaults=defaults, attributes=attributes)
 
     def order(self, token: str) -> Order:
         """Return the order of a token's colours."""
         return "rgb" if token in self.rgb else "bgr"
 
 
-def unwritable(hyperparameters: Mapping[str, Any]) -> list[str]:
-    """Return a reason for each hyperparameter whose value TOML can't hold."""
-    return [
-        f"Hyperparameter {token!r} is a {type(value).__name__}, which pipeline.toml can't hold. "
-        "Use a number, string, bool, None, or a tuple or list of them; or unfreeze it and pass it to run()."
-        for token, value in hyperparameters.items()
-        if not fits(plain(value))
-    ]
+def unwritable(values: Mapping[str, Any], what: str = "Hyperparameter") -> list[str]:
+    """Return a reason for each value that pipeline.toml can't hold."""
+    reasons = []
+    for token, value in values.items():
+        try:
+            written(value)
+        except Unwritable as found:
+            way_out = "or unfreeze it and pass it to run()" if what == "Hyperparameter" else "or leave it out"
+            reasons.append(
+                f"{what} {token!r} is {found}, which pipeline.toml can't hold. "
+                "Use numbers, strings, a small array or tuples, lists and dicts of them; make it in a function; "
+                f"{way_out}."
+            )
+    return reasons
 
 
 def writable_defaults(cg: CompGraph, hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
@@ -67,11 +109,11 @@ def writable_defaults(cg: CompGraph, hyperparameters: Mapping[str, Any]) -> dict
 
     They may be missing: in the bundle every hyperparameter has a value. What an event brings has no default there.
     """
-    return {token: value for token, value in cg.defaults.items() if token in hyperparameters and fits(plain(value))}
+    return {token: value for token, value in cg.defaults.items() if token in hyperparameters and fits(value)}
 
 
 def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
-    """Write pipeline.toml, with a comment per section and the ranges that annotations give."""
+    """Write pipeline.toml, with a comment per section and the ranges that annotations and usual names give."""
     import tomlkit
 
     document = tomlkit.document()
@@ -81,12 +123,48 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
         )
     )
     bundle = tomlkit.table()
-    bundle.add("format", FORMAT)
+    bundle.add("format", _format_of(settings))
     bundle.add("name", settings.name)
     if not settings.types:
         bundle.add(tomlkit.comment("The annotations of the functions are not compared."))
         bundle.add("types", False)
+    if settings.has_groups:
+        bundle.add("groups", True)
     document.add("bundle", bundle)
+    document.add("ports", _ports(settings))
+    hyperparameters = tomlkit.table(is_super_table=True)
+    for token, value in settings.hyperparameters.items():
+        hyperparameters.add(token, _table(entry_of(cg, token, value), _takers(cg, token)))
+    document.add("hyperparameters", hyperparameters)
+    for section, values in (("defaults", settings.defaults), ("attributes", settings.attributes)):
+        if values:
+            table = tomlkit.table(is_super_table=True)
+            for name, value in values.items():
+                table.add(name, _table(written(value)))
+            document.add(section, table)
+    path.write_text(tomlkit.dumps(document), encoding="utf-8")
+
+
+def _has_member(value: Any) -> bool:
+    return any(True for _ in members_in(value))
+
+
+def _format_of(settings: Settings) -> int:
+    values = (*settings.hyperparameters.values(), *settings.defaults.values())
+    is_first = all(map(_is_of_first_kind, values)) and not (settings.own or settings.has_groups or settings.attributes)
+    return FORMAT if is_first else _FORMAT_WITH_MORE
+
+
+def _is_of_first_kind(value: Any) -> bool:
+    entry = written(value)
+    items = entry.get("value")
+    nested = isinstance(items, dict) or (isinstance(items, list) and any(isinstance(x, list | dict) for x in items))
+    return entry.get("kind") in _FIRST_KINDS and not nested
+
+
+def _ports(settings: Settings) -> Any:
+    import tomlkit
+
     ports = tomlkit.table()
     ports.add(tomlkit.comment("The tokens that an event brings, and those that its answer carries."))
     ports.add("inputs", list(settings.inputs))
@@ -94,37 +172,84 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
     if settings.rgb:
         ports.add(tomlkit.comment("Their three or four channels are RGB; those of all others are BGR."))
         ports.add("rgb", list(settings.rgb))
-    document.add("ports", ports)
-    hyperparameters = tomlkit.table(is_super_table=True)
-    for token, value in settings.hyperparameters.items():
-        hyperparameters.add(token, _entry(plain(value), next(annotated_params(cg, token), None)))
-    document.add("hyperparameters", hyperparameters)
-    if settings.defaults:
-        defaults = tomlkit.table(is_super_table=True)
-        for token, value in settings.defaults.items():
-            defaults.add(token, _entry(plain(value), None))
-        document.add("defaults", defaults)
-    path.write_text(tomlkit.dumps(document), encoding="utf-8")
+    if settings.own:
+        ports.add(tomlkit.comment("What pipeline.py has of its own, in place of what a bundle usually does."))
+        ports.add("own", list(settings.own))
+    return ports
 
 
-def _entry(value: Any, hint: Param | Roi | None) -> Any:
+def entry_of(cg: CompGraph, token: str, value: Any) -> dict[str, Any]:
+    """Return what stands in pipeline.toml of a hyperparameter: its value, and the range that it may take."""
+    entry = written(value)
+    hint = range_of(cg, token, value)
+    if not isinstance(hint, Param):
+        return entry
+    limits = {key: getattr(hint, key) for key in ("low", "high", "step")}
+    entry.update({key: plain(limit) for key, limit in limits.items() if limit is not None and _is_finite(limit)})
+    entry.update({key: True for key in ("odd", "log") if getattr(hint, key)})
+    if hint.soft is not None and all(map(_is_finite, hint.soft)):
+        entry["soft"] = [plain(end) for end in hint.soft]
+    if hint.choices and all(map(fits, hint.choices)):
+        entry["choices"] = [_choice(choice, value) for choice in hint.choices]
+        entry.update({"labels": list(hint.labels)} if hint.labels else {})
+    entry.update({key: getattr(hint, key) for key in ("unit", "about") if getattr(hint, key)})
+    return entry
+
+
+def _is_finite(limit: Any) -> bool:
+    return math.isfinite(limit) and fits(plain(limit)) and "kind" not in written(plain(limit))
+
+
+def _choice(choice: Any, value: Any) -> Any:
+    """Return a choice as the value would be written in its place."""
+    entry = written(choice)
+    same = "kind" not in entry or ("value" in entry and {**entry, "value": 0} == {**written(value), "value": 0})
+    return entry["value"] if same else entry
+
+
+def _takers(cg: CompGraph, token: str) -> str:
+    takers = cg.digraph.consumers.get(token, ())
+    return f"Taken by {', '.join(takers)}."
+
+
+def _table(entry: Mapping[str, Any], comment: str = "") -> Any:
     import tomlkit
 
     table = tomlkit.table()
-    for key, part in written(value).items():
-        table.add(key, part)
-    for key in ("low", "high", "step", "odd", "log", "unit"):
-        setting = getattr(hint, key, None)
-        if setting:
-            table.add(key, setting)
-    choices = getattr(hint, "choices", None)
-    if choices and all(fits(choice) and choice is not None for choice in choices):
-        table.add("choices", list(choices))
+    if comment and comment.isprintable():
+        table.add(tomlkit.comment(comment))
+    for key, part in entry.items():
+        table.add(key, _item(part))
     return table
 
 
-def read_settings(path: Path) -> Settings:
+def _item(part: Any) -> Any:
+    """Return a value for TOML: rows of a matrix, and what is long, on lines of their own."""
+    import tomlkit
+
+    if isinstance(part, dict):
+        table = tomlkit.inline_table()
+        for key, item in part.items():
+            table.append(key, _item(item))
+        return table
+    if not isinstance(part, list):
+        return part
+    array = tomlkit.array()
+    for item in part:
+        array.append(_item(item))
+    has_rows = any(isinstance(item, list) for item in part) and len(part) > 1
+    return array.multiline(True) if has_rows or len(array.as_string()) > _LINE else array
+
+
+def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Settings:
     """Read pipeline.toml.
+
+    Parameters
+    ----------
+    path
+        The file.
+    enums
+        The enumerations of the bundle's module by name. Without, members of them are read as :class:`Member`.
 
     Raises
     ------
@@ -134,20 +259,26 @@ def read_settings(path: Path) -> Settings:
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
         bundle, ports = document["bundle"], document["ports"]
-        if bundle["format"] != FORMAT:
-            raise BundleError(path, f"{path} has format {bundle['format']}; this EPypes reads format {FORMAT}.")
+        if bundle["format"] not in (FORMAT, _FORMAT_WITH_MORE):
+            known = f"{FORMAT} and {_FORMAT_WITH_MORE}"
+            raise BundleError(path, f"{path} has format {bundle['format']}; this EPypes reads the formats {known}.")
+        entries = document.get("hyperparameters", {})
         return Settings(
             str(bundle["name"]),
             _strings(ports["inputs"]),
             _strings(ports["outputs"]),
-            _values(document.get("hyperparameters", {})),
+            _values(entries, enums),
             _strings(ports.get("rgb", [])),
-            _values(document.get("defaults", {})),
+            _values(document.get("defaults", {}), enums),
             bundle.get("types", True) is not False,
+            _strings(ports.get("own", [])),
+            _values(document.get("attributes", {}), enums),
+            bundle.get("groups", False) is True,
+            entries,
         )
     except KeyError as error:
         raise BundleError(path, f"{path} lacks {error.args[0]!r}. Promote the graph again.") from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, TypeError, AttributeError) as error:
         raise BundleError(path, f"{path} can't be read: {error}.") from error
 
 
@@ -159,5 +290,5 @@ def _strings(values: Sequence[Any]) -> tuple[str, ...]:
     return tuple(values)
 
 
-def _values(entries: Mapping[str, Any]) -> dict[str, Any]:
-    return {token: read(entry) for token, entry in entries.items()}
+def _values(entries: Mapping[str, Any], enums: Mapping[str, Any] | None) -> dict[str, Any]:
+    return {token: read(entry, enums) for token, entry in entries.items()}

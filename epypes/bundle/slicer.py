@@ -13,8 +13,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
 
-from epypes.bundle.callables import found_definition, is_function, method_of
-from epypes.bundle.cells import cell_of, statements_of
+from epypes.bundle.callables import found_definition, holds_functions, is_function, method_of
+from epypes.bundle.classes import class_definition, class_names
 from epypes.bundle.closures import FactoryCall, factory_call
 from epypes.bundle.constants import Remark, imported_as, remark_on
 from epypes.bundle.defaults import check_defaults
@@ -22,6 +22,7 @@ from epypes.bundle.lines import assignment, flat, piece_of
 from epypes.bundle.literal import is_data
 from epypes.bundle.names import Names, of_object
 from epypes.bundle.order import Position, arranged
+from epypes.bundle.positions import AnyDefinition, Positions
 from epypes.bundle.source import Definition, Importable, Refused, importable
 from epypes.bundle.state import check_asked, check_state
 from epypes.bundle.text import renamed
@@ -74,8 +75,7 @@ class Slice:
         self._known: dict[int, str] = {}
         self._positions: dict[str, Position] = {}
         self._reads: dict[str, frozenset[str]] = {}
-        self._files: dict[str, int] = {}
-        self._first: Definition | None = None
+        self._places = Positions()
 
     def add_graph_function(self, what: str, function: Callable[..., Any], wanted: str = "") -> str:
         """Add a function of the graph; return the expression by which the module refers to it.
@@ -122,7 +122,7 @@ class Slice:
         aliases = [name for name, imported in self.imports if imported == module]
         if aliases:
             return min(aliases)
-        name = self.names.alias_for(sys.modules.get(module), self._first.names if self._first else {}, module)
+        name = self.names.alias_for(sys.modules.get(module), self._places.notebook, module)
         if not name:
             self._import_module(module, what)
             return module
@@ -136,6 +136,8 @@ class Slice:
             return self.reference(home, what)
         if id(function) in self._known:
             return self._known[id(function)]
+        if isinstance(function, type):
+            return self.add_class(function, None, what)
         owner = method_of(function)
         if owner is not None:
             of, method = owner
@@ -160,7 +162,7 @@ class Slice:
             return source
         self.names.claim(name, of_object(function), what)
         self._known[id(function)] = name
-        self._write(name, f"{name} = {source}\n", self._binding(name))
+        self._write(name, f"{name} = {source}\n", self._places.of_name(name))
         return name
 
     def _argument(self, value: Any, what: str) -> str:
@@ -175,7 +177,7 @@ class Slice:
     def _add_definition(self, function: Any, what: str, wanted: str = "") -> Written:
         """Add a function of the notebook."""
         found = found_definition(function, what)
-        self._first = self._first or found
+        self._places.learn(found)
         name = self.names.name_for(function, found, wanted)
         self.names.claim(name, of_object(function), what)
         self._known[id(function)] = name
@@ -185,15 +187,33 @@ class Slice:
             return self.definitions[name]
         check_defaults(found, what)
         names = list(global_names(found))
-        self._reads[name] = frozenset(names)
         check_state(found, names, what)
+        self._add_names(name, names, found, what)
+        self._write(name, renamed(found.text, found.name, name), self._places.of_definition(found))
+        return self.definitions[name]
+
+    def _add_names(self, name: str, names: Sequence[str], found: AnyDefinition, what: str) -> None:
+        """Add what a definition has from outside."""
+        self._reads[name] = frozenset(names)
         for needed in names:
             try:
                 self._add_name(needed, found, what)
             except Refused as refusal:
                 self.refusals.append(str(refusal))
-        self._write(name, renamed(found.text, found.name, name), self._position(found))
-        return self.definitions[name]
+
+    def add_class(self, kind: type, around: Mapping[str, Any] | None, what: str) -> str:
+        """Add a class, which reads the names ``around`` it if it is the notebook's; return its expression."""
+        home = importable(kind)
+        if home is not None:
+            return self.reference(home, what)
+        found = class_definition(kind, self._places.names_with(kind) if around is None else around, what)
+        self.names.claim(found.name, of_object(kind), what)
+        if id(kind) not in self._known:
+            self._known[id(kind)] = found.name
+            self._places.learn(found)
+            self._add_names(found.name, list(class_names(found)), found, what)
+            self._write(found.name, found.text, self._places.of_definition(found))
+        return found.name
 
     def _add_made(self, name: str, made: FactoryCall, found: Definition, what: str) -> None:
         """Add a closure as a call of the function that made it."""
@@ -202,7 +222,7 @@ class Slice:
         arguments += [f"{word}={self._argument(value, what)}" for word, value in made.named.items()]
         inner = f"Function {made.factory.__name__!r}, which makes {what[0].lower()}{what[1:]},"
         factory = self._callable(made.factory, inner, "")
-        position = self._binding(name) or self._position(found)
+        position = self._places.of_name(name) or self._places.of_definition(found)
         self._write(name, f"{name} = {factory}({', '.join(arguments)})\n", position)
 
     def _write(self, name: str, text: str, position: Position) -> None:
@@ -210,20 +230,7 @@ class Slice:
         if position:
             self._positions[name] = position
 
-    def _position(self, found: Definition) -> Position:
-        """Return where a function stands in the notebook: cell, or file, and line."""
-        code = found.function.__code__
-        cell = cell_of(code.co_filename, found.names)
-        return (cell, 0 if cell else self._files.setdefault(code.co_filename, len(self._files)), code.co_firstlineno)
-
-    def _binding(self, name: str) -> Position:
-        """Return where the notebook gave a name its value, () if it does not say."""
-        if self._first is None:
-            return ()
-        given = next(statements_of(name, self._first.names, self._first.function.__code__), None)
-        return (given.cell, 0, given.node.lineno) if given else ()
-
-    def _add_name(self, name: str, found: Definition, what: str) -> None:
+    def _add_name(self, name: str, found: AnyDefinition, what: str) -> None:
         """Add what one global name of a function means at the time of promotion."""
         names = found.names
         value = names.get(name)
@@ -243,19 +250,26 @@ class Slice:
             self._import_from(home, name)
         elif is_function(value):
             self._add_helper(name, value, found, what)
+        elif isinstance(value, type):
+            self._add_notebook_class(name, value, found, what)
         else:
             self._add_constant(name, value, found, what)
 
-    def _add_helper(self, name: str, helper: Any, found: Definition, what: str) -> None:
+    def _add_helper(self, name: str, helper: Any, found: AnyDefinition, what: str) -> None:
         """Add something that a function calls, under the name by which it calls it."""
         source = self._callable(helper, f"Function {name!r}, which {what[0].lower()}{what[1:]} calls,", name)
         if source != name and name not in self.definitions:
             self.names.claim(name, of_object(helper), what)
-            self._write(name, f"{name} = {source}\n", self._binding(name))
+            self._write(name, f"{name} = {source}\n", self._places.of_name(name))
 
-    def _add_constant(self, name: str, value: Any, found: Definition, what: str) -> None:
-        code = found.function.__code__
-        module, own = imported_as(name, value, found.names, code) if name not in found.captured else ("", "")
+    def _add_notebook_class(self, name: str, kind: type, found: AnyDefinition, what: str) -> None:
+        own = self.add_class(kind, found.names, f"Class {kind.__name__!r}, which {what[0].lower()}{what[1:]} uses,")
+        if own != name and name not in self.definitions:
+            self.names.claim(name, of_object(kind), what)
+            self._write(name, f"{name} = {own}\n", self._places.of_name(name))
+
+    def _add_constant(self, name: str, value: Any, found: AnyDefinition, what: str) -> None:
+        module, own = imported_as(name, value, found.names, found.file) if name not in found.captured else ("", "")
         if module:
             self.names.claim(name, ("constant", name), what)
             self._import_from(Importable(module, own), name)
@@ -274,26 +288,30 @@ class Slice:
         if name in self.constants or name in self.definitions:
             return
         self.names.claim(name, ("constant", name), what)
-        factory = code.co_qualname.partition(".")[0]
-        captured = Remark(self._position(found), beside=f"# as {factory}() had it in the notebook")
-        remark = captured if name in found.captured else remark_on(name, value, source, found.names, code)
-        if remark:
+        if name in found.captured and isinstance(found, Definition):
+            factory = found.function.__code__.co_qualname.partition(".")[0]
+            remark: Remark | None = Remark(
+                self._places.of_definition(found), beside=f"# as {factory}() had it in the notebook"
+            )
+        else:
+            remark = remark_on(name, value, source, found.names, found.file)
+        if remark is not None:
             self.remarks[name] = remark
         self.constants[name] = source
 
-    def _add_table(self, name: str, value: Any, found: Definition, what: str) -> bool:
+    def _add_table(self, name: str, value: Any, found: AnyDefinition, what: str) -> bool:
         """Add a dict or sequence with functions of the notebook in it; return whether it is one."""
-        if not isinstance(value, dict | list | tuple) or not any(map(_is_own, _leaves(value))):
+        if not isinstance(value, dict | list | tuple) or not holds_functions(value):
             return False
         self.names.claim(name, of_object(value), what)
         if name not in self.definitions:
             source = self._argument(value, f"{name!r}, which {what[0].lower()}{what[1:]} uses,")
             text = "\n".join(assignment([name], True, piece_of(source), 0))
-            self._write(name, f"{text}\n", self._binding(name))
+            self._write(name, f"{text}\n", self._places.of_name(name))
         return True
 
-    def _constant_source(self, name: str, value: Any, found: Definition, what: str) -> str:
-        source = "" if isinstance(value, type) else expression(self, value, what)
+    def _constant_source(self, name: str, value: Any, found: AnyDefinition, what: str) -> str:
+        source = expression(self, value, what)
         if not source or len(source) > _CONSTANT_CHARACTERS:
             kind = f"the class {name!r}" if isinstance(value, type) else f"of type {type(value).__name__}"
             raise Refused(
@@ -302,7 +320,7 @@ class Slice:
             )
         return source
 
-    def _add_module(self, name: str, module: types.ModuleType, found: Definition, what: str) -> None:
+    def _add_module(self, name: str, module: types.ModuleType, found: AnyDefinition, what: str) -> None:
         if module.__name__ == "__main__":
             raise Refused(f"{what} uses the notebook itself as module {name!r} ({found.place_of(name)}).")
         other = replaced(found.node, name, module)
@@ -333,18 +351,6 @@ class Slice:
                 f"{name!r} is {home.module}.{home.qualname}, a name inside a class. Use it through the class."
             )
         self.imports[name, f"{home.module}.{top}"] = f"from {home.module} import {top}{alias}"
-
-
-def _leaves(value: Any, depth: int = 5) -> list[Any]:
-    """Return what is in tuples, lists and dicts."""
-    if depth and type(value) in (tuple, list, dict):
-        parts = value.values() if isinstance(value, dict) else value
-        return [leaf for part in parts for leaf in _leaves(part, depth - 1)]
-    return [value]
-
-
-def _is_own(value: Any) -> bool:
-    return is_function(value) and importable(value) is None
 
 
 def slice_functions(gathered: Slice, functions: Sequence[tuple[str, Callable[..., Any]]]) -> list[str]:

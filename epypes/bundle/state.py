@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Collection, Iterator
 from typing import Any, Final
 
+from epypes.bundle.classes import ClassDefinition
 from epypes.bundle.source import Definition, Refused
 from epypes.bundle.text import nested_codes
 from epypes.run.guard import is_plain_array
@@ -63,7 +64,7 @@ def _is_container(value: Any) -> bool:
     return isinstance(value, list | dict | set | bytearray | deque) or is_plain_array(value)
 
 
-def check_asked(name: str, value: Any, found: Definition, what: str) -> None:
+def check_asked(name: str, value: Any, found: Definition | ClassDefinition, what: str) -> None:
     """Refuse a name that means something in a notebook alone."""
     if name in _ASKED and not (isinstance(value, types.FunctionType) and value.__module__ == "__main__"):
         raise Refused(f"{what} uses {name!r} ({found.place_of(name)}), {_ASKED[name]}.")

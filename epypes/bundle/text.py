@@ -15,7 +15,7 @@ import re
 import tokenize
 import types
 import warnings
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from itertools import takewhile
@@ -123,12 +123,33 @@ def _bare(code: types.CodeType) -> types.CodeType:
     return code.replace(co_consts=constants, co_filename="", co_firstlineno=1, co_linetable=b"")
 
 
-def first_line(node: ast.FunctionDef) -> int:
+def same_methods(text: str, node: ast.ClassDef, written: Mapping[str, Sequence[types.FunctionType]]) -> str:
+    """Return the name of a method in the text of a class that is not what the class has; "" if there is none."""
+    for method in node.body:
+        if not isinstance(method, ast.FunctionDef):
+            continue
+        codes = [function.__code__ for function in written[method.name]]
+        late = LATE_ANNOTATIONS if any(code.co_flags & LATE_ANNOTATIONS for code in codes) else 0
+        known = [_definitions(text, late, apart).get((method.name, first_line(method))) for apart in (False, True)]
+        if not any(found and any(computes_the_same(found[1], code) for code in codes) for found in known):
+            return method.name
+    return ""
+
+
+def class_code(text: str, node: ast.ClassDef) -> types.CodeType | None:
+    """Compile a class that was taken out, as a module; None if it means something else there."""
+    tree = parsed(text)
+    if tree is None or len(tree.body) != 1 or spelled_tree(tree.body[0]) != spelled_tree(node):
+        return None
+    return compiled(tree, 0)
+
+
+def first_line(node: ast.FunctionDef | ast.ClassDef) -> int:
     """Return the line where a definition begins, decorators included."""
     return min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
 
 
-def own_text(lines: list[str], node: ast.FunctionDef, dropped: Collection[ast.expr]) -> str:
+def own_text(lines: list[str], node: ast.FunctionDef | ast.ClassDef, dropped: Collection[ast.expr]) -> str:
     """Return a definition with the comment above it, not indented, without the decorators that are dropped."""
     first = first_line(node) - 1
     margin = lines[first][: len(lines[first]) - len(lines[first].lstrip())]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import enum
 import pathlib
 import re
 import sys
@@ -14,6 +13,7 @@ from fractions import Fraction
 from operator import attrgetter, itemgetter, methodcaller
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin
 
+from epypes.bundle.classes import made_again
 from epypes.bundle.literal import literal_source
 from epypes.bundle.source import Importable, importable
 from epypes.hints import Param
@@ -113,15 +113,20 @@ def _object(gathered: Slice, value: Any, what: str, function: FunctionWriter | N
     if _is_numpy_number(value):
         number = expression(gathered, value.item(), what)
         return f"{gathered.reference(Importable('numpy', type(value).__name__), what)}({number})"
-    if isinstance(value, enum.Enum):
-        home = importable(type(value))
-        return (
-            f"{gathered.reference(home, what)}.{value.name}" if home and value.name in type(value).__members__ else ""
-        )
+    mark = _mark(gathered, value, what)
+    if mark:
+        return mark
+    made = made_again(
+        value,
+        lambda part: expression(gathered, part, what),
+        lambda kind: gathered.add_class(kind, None, f"Class {kind.__name__!r} of {what[0].lower()}{what[1:]}"),
+    )
+    if made:
+        return made
     home = importable(value)
     if home is None and function is not None and callable(value) and not isinstance(value, type):
         return function(value)
-    return gathered.reference(home, what) if home else _mark(gathered, value, what)
+    return gathered.reference(home, what) if home else ""
 
 
 def _is_numpy_number(value: Any) -> bool:
@@ -158,4 +163,4 @@ def _mark(gathered: Slice, value: Any, what: str) -> str:
     if home is None or not all(parts):
         return ""
     plain = home.qualname if home.module == "builtins" else f"{gathered.module_name(home.module, what)}.{home.qualname}"
-    return f"{gathered.module_name('typing', what)}.Annotated[{plain}, {', '.join(parts)}]"
+    return f"{gathered.reference(Importable('typing', 'Annotated'), what)}[{plain}, {', '.join(parts)}]"

@@ -19,14 +19,16 @@ def cut(
     return image
 
 
-def test_a_rectangle_is_kept_and_what_only_a_panel_needs_is_left_out(tmp_path: Path) -> None:
+def test_ranges_and_their_words_are_kept_and_what_only_a_picture_needs_is_left_out(tmp_path: Path) -> None:
     cg = ep.CompGraph.from_functions(cut)
     values = {"part": (1, 2, 30, 40), "level": 100, "how": 1}
     write_settings(tmp_path / "pipeline.toml", Settings("cut", ("image",), ("cut",), values), cg)
     written = tomllib.loads((tmp_path / "pipeline.toml").read_text())["hyperparameters"]
     assert written == {
         "part": {"value": [1, 2, 30, 40], "kind": "tuple"},
-        "level": {"value": 100, "high": 255, "unit": "DN"},
-        "how": {"value": 1, "choices": [0, 1]},
-    }
+        "level": {
+            "value": 100, "low": 0, "high": 255, "soft": [0, 100], "unit": "DN", "about": "What counts as bright.",
+        },
+        "how": {"value": 1, "choices": [0, 1], "labels": ["FAST", "EXACT"]},
+    }  # fmt: skip
     assert read_settings(tmp_path / "pipeline.toml").hyperparameters == values

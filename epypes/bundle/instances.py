@@ -1,0 +1,128 @@
+"""With which arguments was a node or pipeline made?
+
+They are read back from its attributes. An object made again with them must be like it, or it is refused: what was set
+on it later would be lost in the bundle.
+"""
+
+from __future__ import annotations
+
+import dis
+import inspect
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+from epypes.bundle.classes import functions_of
+from epypes.bundle.literal import is_data, is_same_data
+from epypes.bundle.source import Refused
+from epypes.pipeline import Node, Pipeline
+from epypes.run.guard import is_plain_array
+
+_GIVEN: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+
+
+def arguments_of(made: Node, what: str) -> dict[str, Any]:
+    """Return the arguments that make an object again, by parameter; those that are as by default are left out.
+
+    Raises
+    ------
+    Refused
+        An argument is not kept by the object, or the object is another by now than a new one would be.
+    """
+    found: dict[str, Any] = {}
+    for parameter in parameters_of(type(made)):
+        value = _kept(made, parameter.name)
+        if value is _MISSING and parameter.default is parameter.empty:
+            way_out = f"Keep it in __init__: self.{parameter.name} = {parameter.name}."
+            raise Refused(f"{what} is made with {parameter.name!r}, which it does not keep. {way_out}")
+        if value is not _MISSING and not _is_same(value, parameter.default):
+            found[parameter.name] = value
+    _check_made_again(made, found, what)
+    return found
+
+
+def by_position(kind: type) -> list[str]:
+    """Return the arguments that may be given by position, in order."""
+    first = next(above for above in kind.__mro__ if "__init__" in vars(above))
+    _, *parameters = inspect.signature(vars(first)["__init__"]).parameters.values()
+    return [parameter.name for parameter in parameters if parameter.kind is parameter.POSITIONAL_OR_KEYWORD]
+
+
+class _Missing:
+    pass
+
+
+_MISSING: Final = _Missing()
+
+
+def parameters_of(kind: type) -> Iterator[inspect.Parameter]:
+    """Give the parameters of a class's __init__; of those that take any others, also those of the class above."""
+    seen: set[str] = set()
+    for above in kind.__mro__:
+        if "__init__" not in vars(above):
+            continue
+        _, *parameters = inspect.signature(vars(above)["__init__"]).parameters.values()
+        named = [parameter for parameter in parameters if parameter.kind not in _GIVEN]
+        yield from (parameter for parameter in named if parameter.name not in seen)
+        seen.update(parameter.name for parameter in named)
+        if len(named) == len(parameters):
+            return
+
+
+def _kept(made: Node, name: str) -> Any:
+    """Return the value of an argument that an object keeps."""
+    if isinstance(made, Pipeline) and name in ("cg", "hparams", "workers"):
+        return {
+            "cg": made.source_cg,
+            "hparams": dict(made.runner.hyperparameters) or None,
+            "workers": made.runner.workers,
+        }[name]
+    for attribute in (name, f"_{name}"):
+        if attribute in vars(made):
+            return vars(made)[attribute]
+    return _MISSING
+
+
+def _is_same(left: Any, right: Any) -> bool:
+    """Whether two attributes are the same; of what is no data, whether they are of one class."""
+    if left is right:
+        return True
+    if type(left) is not type(right):
+        return False
+    if is_plain_array(left):
+        return bool(left.dtype == right.dtype and left.shape == right.shape and left.tobytes() == right.tobytes())
+    return is_same_data(left, right) if is_data(left) else False
+
+
+def _check_made_again(made: Node, given: Mapping[str, Any], what: str) -> None:
+    kind = type(made)
+    try:
+        again = kind(**given)
+    except Exception as error:  # whatever a user's constructor raises
+        told = f"{type(error).__name__}: {error}"
+        text = f"{what} can't be made again with {', '.join(given) or 'no argument'}: {told}."
+        raise Refused(f"{text} Keep every argument of __init__ as an attribute of its name.") from error
+    ours = vars(again).keys() & {*vars(Node("node", len)), *_PIPELINES, "__wrapped__"}
+    by_runs = {name for above in kind.__mro__[: kind.__mro__.index(Node)] for name in _set_by_runs(above)}
+    for name in sorted((vars(made).keys() | vars(again).keys()) - ours - by_runs):
+        one, other = vars(made).get(name, _MISSING), vars(again).get(name, _MISSING)
+        is_other_object = type(one) is type(other) and not is_data(one) and not is_plain_array(one)
+        if not is_other_object and not _is_same(one, other):
+            text = f"{what} has another {name!r} by now than one that is made anew."
+            raise Refused(f"{text} Make it an argument of __init__, and give it there.")
+
+
+# What the pipelines of EPypes keep of a run, or hand to each other.
+_PIPELINES: Final = frozenset({
+    "network", "runner", "source_cg", "attributes", "q_in", "q_out", "f_in", "f_out", "on_error", "failed",
+    "working_on", "_attempts", "_failed_last", "_own", "loop",
+})  # fmt: skip
+
+
+def _set_by_runs(kind: type) -> Iterator[str]:
+    """Give the attributes that the methods of a class set, but for its __init__: what it counts or remembers."""
+    if kind.__module__.startswith("epypes."):
+        return
+    for name, function in functions_of(kind).items():
+        if name != "__init__":
+            found = dis.get_instructions(function.__code__)
+            yield from (instruction.argval for instruction in found if instruction.opname == "STORE_ATTR")

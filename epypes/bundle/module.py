@@ -1,0 +1,68 @@
+"""Which module is written of a graph, and what does that make of the settings?"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Iterable
+from dataclasses import replace
+
+from epypes.bundle.emit import emit_module
+from epypes.bundle.entries import members_in
+from epypes.bundle.graphs import Graphs
+from epypes.bundle.settings import Settings
+from epypes.bundle.slicer import Slice
+from epypes.bundle.source import Refused
+from epypes.bundle.subject import Subject, own_lines
+
+
+def write_module(subject: Subject, settings: Settings) -> tuple[str, Settings, list[str]]:
+    """Return the text of ``pipeline.py``, the settings with what it has of its own, and the reasons against it."""
+    gathered = Slice()
+    graphs = Graphs(gathered)
+    ports = {f"Function {name!r}": function for name, function in subject.ports.items()}
+    text = graphs.write(subject.cg, {**ports, **subject.classes})
+    own = dict(own_lines(gathered, graphs, subject))
+    if settings.has_groups:
+        _keep(gathered, "func_groups")
+    blocks = [lines for lines in own.values() if lines]
+    enums = _enums(gathered, settings)
+    if enums:
+        blocks.append(enums)
+    settings = replace(settings, own=tuple(own))
+    if gathered.refusals:
+        return "", settings, list(dict.fromkeys(gathered.refusals))
+    return emit_module(settings, subject.cg, gathered, text, graphs.blocks, blocks), settings, []
+
+
+def _enums(gathered: Slice, settings: Settings) -> list[str]:
+    """Return the lines that name the enumerations whose members stand in pipeline.toml."""
+    values = [settings.hyperparameters, settings.defaults, settings.attributes]
+    members = [member for part in values for value in part.values() for member in members_in(value)]
+    kinds = dict.fromkeys(type(member) for member in members if isinstance(member, enum.Enum))
+    return _listed(gathered, kinds) if kinds else []
+
+
+def _listed(gathered: Slice, kinds: Iterable[type[enum.Enum]]) -> list[str]:
+    found: dict[str, str] = {}
+    for kind in kinds:
+        try:
+            reference = gathered.add_class(kind, None, f"Class {kind.__name__!r} of a hyperparameter")
+        except Refused as refusal:
+            gathered.refusals.append(str(refusal))
+            continue
+        if found.setdefault(kind.__qualname__, reference) != reference:
+            gathered.refusals.append(f"Two hyperparameters are of two classes called {kind.__name__!r}. Rename one.")
+    _keep(gathered, "enums")
+    return [
+        "# Whose members stand in pipeline.toml.",
+        "enums = {",
+        *(f'    "{n}": {r},' for n, r in found.items()),
+        "}",
+    ]
+
+
+def _keep(gathered: Slice, name: str) -> None:
+    try:
+        gathered.keep_name(name)
+    except Refused as refusal:
+        gathered.refusals.append(str(refusal))

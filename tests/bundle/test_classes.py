@@ -1,0 +1,122 @@
+"""Classes of the notebook: their text goes into the bundle if it says what they are."""
+
+from __future__ import annotations
+
+import re
+import types
+
+import pytest
+
+import epypes as ep
+from epypes.bundle.emit import emit_module
+from epypes.bundle.settings import Settings
+from epypes.bundle.slicer import slice_graph
+from tests.bundle.cells import cell
+
+
+def promoted(source: str) -> tuple[str, list[str], dict]:
+    names = cell(source)
+    cg = ep.CompGraph({"f": names["f"]}, {"f": ("x", "y")})
+    needed, references = slice_graph(cg.functions)
+    return emit_module(Settings("case", ("x",), ("y",), {}), cg, needed, references), needed.refusals, names
+
+
+def executed(text: str) -> types.SimpleNamespace:
+    names: dict = {"__name__": "bundle"}
+    exec(compile(text, "bundle", "exec", dont_inherit=True), names)
+    return types.SimpleNamespace(**names)
+
+
+PROMOTED = {
+    "plain": (
+        "class P:\n    K = 3\n    def __init__(self, a):\n        self.a = a\n    def get(self):\n"
+        "        return self.a * self.K * G\nG = 2\ndef f(x):\n    return P(x).get()\n"
+    ),
+    "dataclass": (
+        "import dataclasses\n@dataclasses.dataclass(frozen=True, slots=True)\nclass P:\n    a: int\n    b: float = 2.0\n"
+        "    c: list = dataclasses.field(default_factory=list)\n    @property\n    def s(self):\n"
+        "        return self.a + self.b\ndef f(x):\n    return P(x).s\n"
+    ),
+    "enumeration": (
+        "import enum\n# Two.\nclass M(enum.Enum):\n    A = 1\n    B = enum.auto()\n    @classmethod\n    def one(cls):\n"
+        "        return cls.A\ndef f(x):\n    return x + M.one().value + M.B.value\n"
+    ),
+    "member": "import enum\nclass M(enum.IntEnum):\n    A = 1\n    B = 2\nBEST = M.B\ndef f(x):\n    return x + BEST\n",
+    "named tuple": (
+        "from typing import NamedTuple\nclass Pt(NamedTuple):\n    x: int\n    y: int = 4\nZERO = Pt(0)\n"
+        "def f(x):\n    return ZERO.y + Pt(x).x\n"
+    ),
+    "base": (
+        "class A:\n    def g(self):\n        return 1\nclass B(A):\n    def g(self):\n        return super().g() + 1\n"
+        "def f(x):\n    return B().g() + x\n"
+    ),
+    "record": (
+        "from dataclasses import dataclass\n@dataclass\nclass Cfg:\n    k: int = 3\n    t: tuple = (1, 2)\n"
+        "CFG = Cfg(k=5)\ndef f(x):\n    return CFG.k + x\n"
+    ),
+    "abstract": (
+        "import abc\nimport functools\nclass A(abc.ABC):\n    @abc.abstractmethod\n    def g(self): ...\nclass B(A):\n"
+        "    def g(self):\n        return 5\n    @staticmethod\n    def s(x):\n        return x\n"
+        "    @functools.cached_property\n    def c(self):\n        return 8\ndef f(x):\n    return B().g() + B.s(x) + B().c\n"
+    ),
+    "made by itself": (
+        "class A:\n    def twice(self):\n        return type(A()).__name__ * 2\ndef f(x):\n    return A().twice() * x\n"
+    ),
+    "annotations read late": (
+        "from __future__ import annotations\nfrom dataclasses import dataclass\n@dataclass\nclass P:\n    a: int = 4\n"
+        "    def of(self, other: int) -> float:\n        return self.a + other\ndef f(x):\n    return P().of(x)\n"
+    ),
+    "in an if": "if True:\n    class A:\n        K = 4\ndef f(x):\n    return A.K + x\n",
+}
+
+
+@pytest.mark.parametrize("source", PROMOTED.values(), ids=PROMOTED)
+def test_a_class_is_sliced_with_what_it_needs(source):
+    text, refusals, names = promoted(source)
+    assert refusals == []
+    assert executed(text).func_dict["f"](3) == names["f"](3)
+
+
+def test_a_class_stands_before_what_is_made_of_it():
+    text, _, _ = promoted(PROMOTED["record"])
+    assert text.split('"""\n', 2)[1].startswith("\nfrom dataclasses import dataclass\n\n\n@dataclass\nclass Cfg:\n")
+    assert "\n    t: tuple = (1, 2)\n\n\nCFG = Cfg(k=5, t=(1, 2))\n\n\ndef f(x):\n" in text
+
+
+USED = "def f(x):\n    return A().g() + x\n"
+REFUSED = {
+    "another method": (f"class A:\n    def g(self):\n        return 1\nA.g = lambda self: 2\n{USED}", "'g' is not what"),
+    "a method more": (f"class A:\n    def g(self):\n        return self.h()\nA.h = lambda self: 2\n{USED}", "it has 'h'"),
+    "a value changed": (f"class A:\n    K = 1\n    def g(self):\n        return self.K\nA.K = 2\n{USED}", "'K' has another"),
+    "a value more": (f"class A:\n    def g(self):\n        return self.K\nA.K = 2\n{USED}", "it has 'K', which its text"),
+    "an attribute gone": (f"class A:\n    K = 1\n    def g(self):\n        return 1\ndel A.K\n{USED}", "has no 'K'"),
+    "another base": (
+        f"class B:\n    def g(self):\n        return 1\nclass A(B):\n    pass\nclass B:\n    pass\n{USED}",
+        r"line 4\) is made from 'B', which was defined again",
+    ),
+    "made in a function": (
+        f"def make():\n    class A:\n        def g(self):\n            return 1\n    return A\nA = make()\n{USED}",
+        r"defined inside 'make\.<locals>'\. Define it at the margin",
+    ),
+    "made by a call": (f"A = type('A', (), {{'g': lambda self: 1}})\n{USED}", "is not to be had as text"),
+    "writes a global": (
+        f"N = 0\nclass A:\n    def g(self):\n        global N\n        N += 1\n        return N\n{USED}", "changes the global 'N'",
+    ),
+    "object of the notebook": ("class A:\n    pass\nONE = A()\ndef f(x):\n    return ONE\n", "uses 'ONE' .* of type A"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("source", "words"), REFUSED.values(), ids=REFUSED)
+def test_a_class_that_is_not_what_its_text_says_is_refused(source, words):
+    _, refusals, _ = promoted(source)
+    assert len(refusals) == 1
+    assert re.search(words, refusals[0])
+
+
+def test_a_class_that_was_defined_again_is_taken_as_it_is_now():
+    names = cell("class A:\n    K = 1\ndef f(x):\n    return A.K + x\n")
+    cell("class A:\n    K = 7\n", names)
+    needed, references = slice_graph({"f": names["f"]})
+    cg = ep.CompGraph({"f": names["f"]}, {"f": ("x", "y")})
+    text = emit_module(Settings("case", ("x",), ("y",), {}), cg, needed, references)
+    assert executed(text).func_dict["f"](1) == names["f"](1) == 8
