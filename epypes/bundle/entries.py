@@ -38,6 +38,16 @@ def plain(value: Any) -> Any:
     return value.item() if _is_numpy_number(value) else value
 
 
+def alike(entry: Mapping[str, Any], value: Any) -> Any:
+    """Return a number as one of the kind that an entry has: NumPy's of its dtype, else Python's own."""
+    number = plain(value)
+    if entry.get(_KIND) != "numpy" or not isinstance(number, bool | int | float):
+        return number
+    import numpy as np
+
+    return np.dtype(entry["dtype"]).type(number)
+
+
 def fits(value: Any) -> bool:
     """Whether an entry holds a value to the last bit."""
     try:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 import epypes as ep
-from epypes.bundle.entries import MOST_NUMBERS, Member, Unwritable, fits, read, written
+from epypes.bundle.entries import MOST_NUMBERS, Member, Unwritable, alike, fits, read, written
 from epypes.bundle.settings import Settings, read_settings, unwritable, write_settings
 
 
@@ -110,6 +110,11 @@ def test_what_no_entry_holds_is_refused_with_the_way_out(value, words):
     (reason,) = unwritable({"k": value})
     assert reason.startswith("Hyperparameter 'k' is ")
     assert reason.endswith("or unfreeze it and pass it to run().")
+
+
+def test_a_number_in_the_place_of_another_is_of_its_kind():
+    assert bits(alike(written(np.float32(0.5)), 0.1)) == bits(np.float32(0.1))
+    assert bits(alike(written(3), np.int64(4))) == bits(4)
 
 
 def test_a_value_that_holds_itself_is_refused():
