@@ -37,6 +37,18 @@ def is_function(value: Any) -> bool:
     return isinstance(value, kinds) or len(layers(value)) > 1
 
 
+def holds_functions(value: Any) -> bool:
+    """Whether there are functions of the notebook in tuples, lists and dicts."""
+    return any(is_function(leaf) and importable(leaf) is None for leaf in _leaves(value, 5))
+
+
+def _leaves(value: Any, depth: int) -> list[Any]:
+    if depth and type(value) in (tuple, list, dict):
+        parts = value.values() if isinstance(value, dict) else value
+        return [leaf for part in parts for leaf in _leaves(part, depth - 1)]
+    return [value]
+
+
 def method_of(function: Any) -> tuple[str | Importable, str] | None:
     """Return what a method is of, an expression or what can be imported, and the method's name; None for any other."""
     name, owner = getattr(function, "__name__", ""), getattr(function, "__self__", None)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final
 
-from epypes.bundle.text import lines_of, parsed
+from epypes.bundle.text import parsed
 
 _CELL_MAGIC: Final = "get_ipython().run_cell_magic("
 _EXECUTING: Final = ("capture", "time", "prun")
@@ -79,7 +79,7 @@ def place_in(file: str, number: int) -> str:
     return f"cell [{cell}], line {number + below}" if cell else f"{file}, line {number}"
 
 
-def statements_of(name: str, names: Mapping[str, Any], code: types.CodeType | None = None) -> Iterator[Statement]:
+def statements_of(name: str, names: Mapping[str, Any], file: str = "") -> Iterator[Statement]:
     """Return the statements that have given a name its value, the last one first.
 
     Parameters
@@ -88,12 +88,12 @@ def statements_of(name: str, names: Mapping[str, Any], code: types.CodeType | No
         A global name.
     names
         The notebook's names.
-    code
-        A function's code: without a notebook, the text is that of its file.
+    file
+        Without a notebook, the text is that of this file.
     """
     texts = executed_cells(names)
-    if not texts and code is not None:
-        texts = [(0, "".join(lines_of(code)))]
+    if not texts and file:
+        texts = [(0, "".join(linecache.getlines(file)))]
     for cell, text in reversed(texts):
         for node in reversed(_givers(text).get(name, ())):
             yield Statement(node, tuple(text.split("\n")), cell)

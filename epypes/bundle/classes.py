@@ -14,7 +14,7 @@ import linecache
 import sys
 import types
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import cached_property
 from typing import Any, Final
 
@@ -38,39 +38,36 @@ class ClassDefinition:
         Its source with the comment above it and its decorators, not indented.
     node
         Its syntax tree.
-    file
-        The file, or cell as Python knows it, that it is from.
+    place
+        Cell and line, for people.
     code
         What that text compiles to, as a module.
     names
         The names of the notebook.
+    file
+        The file or cell that it is from, as Python knows it.
+    captured
+        Nothing: a class inside of a function is not taken.
     """
 
     name: str
     text: str
     node: ast.ClassDef
-    file: str
+    place: str
     code: types.CodeType
     names: Mapping[str, Any]
+    file: str
+    captured: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def captured(self) -> Mapping[str, Any]:
-        """Nothing: a class in a function is refused."""
-        return {}
-
-    @property
-    def origin(self) -> types.CodeType:
-        """Its code where it was defined."""
-        return self.code.replace(co_filename=self.file, co_firstlineno=self.node.lineno)
-
-    def place_in(self, node: ast.AST) -> str:
-        """Return where a part of it stands, for people."""
-        return place_in(self.file, getattr(node, "lineno", self.node.lineno))
+    def line(self) -> int:
+        """Where it begins."""
+        return self.node.lineno
 
     def place_of(self, name: str) -> str:
         """Return where it uses a name, for people."""
-        uses = (node for node in ast.walk(self.node) if isinstance(node, ast.Name) and node.id == name)
-        return self.place_in(next(uses, self.node))
+        uses = (node.lineno for node in ast.walk(self.node) if isinstance(node, ast.Name) and node.id == name)
+        return place_in(self.file, next(uses, self.line))
 
 
 def class_definition(kind: type, around: Mapping[str, Any], what: str) -> ClassDefinition:
@@ -121,7 +118,7 @@ def _definition(
             if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
                 text = f"{what} changes the global {instruction.argval!r} ({place})."
                 raise Refused(f"{text} Keep it in the object.")
-    return ClassDefinition(kind.__name__, text, node, file, code, names)
+    return ClassDefinition(kind.__name__, text, node, place, code, names, file)
 
 
 def class_names(found: ClassDefinition) -> Iterator[str]:

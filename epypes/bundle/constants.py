@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ast
 import sys
-import types
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -41,16 +40,16 @@ class Remark:
     source: str = ""
 
 
-def imported_as(name: str, value: Any, names: Mapping[str, Any], code: types.CodeType) -> tuple[str, str]:
+def imported_as(name: str, value: Any, names: Mapping[str, Any], file: str) -> tuple[str, str]:
     """Return the module from which a notebook imported a value, and what it is called there; else empty strings."""
-    for statement in statements_of(name, names, code):
+    for statement in statements_of(name, names, file):
         node = statement.node
         if not isinstance(node, ast.ImportFrom) or node.level or not node.module:
             return "", ""
         own = next((alias.name for alias in node.names if (alias.asname or alias.name) == name), name)
         there = getattr(sys.modules.get(node.module), own, UNKNOWN)
         return (node.module, own) if _is_same(there, value) else ("", "")
-    stars = (statement.node for statement in statements_of("*", names, code))
+    stars = (statement.node for statement in statements_of("*", names, file))
     modules = (node.module for node in stars if isinstance(node, ast.ImportFrom) and not node.level)
     found = (module for module in modules if _is_same(getattr(sys.modules.get(module or ""), name, UNKNOWN), value))
     return next(((module, name) for module in found if module), ("", ""))
@@ -60,7 +59,7 @@ def _is_same(one: Any, other: Any) -> bool:
     return one is other or is_same_data(one, other)
 
 
-def remark_on(name: str, value: Any, source: str, names: Mapping[str, Any], code: types.CodeType) -> Remark | None:
+def remark_on(name: str, value: Any, source: str, names: Mapping[str, Any], file: str) -> Remark | None:
     """Return what a notebook says where it last gave a name this value; None if it does not say it.
 
     Parameters
@@ -69,10 +68,10 @@ def remark_on(name: str, value: Any, source: str, names: Mapping[str, Any], code
         The constant, and the expression that makes it again.
     names
         The notebook's names.
-    code
-        The code of a function that reads it.
+    file
+        The file of a function that reads it.
     """
-    for statement in statements_of(name, names, code):
+    for statement in statements_of(name, names, file):
         given = getattr(statement.node, "value", None)
         if not isinstance(given, ast.expr):
             continue
@@ -130,7 +129,7 @@ def constant_lines(name: str, source: str, remark: Remark | None) -> list[str]:
 
 
 def constants_text(constants: Mapping[str, str], remarks: Mapping[str, Remark]) -> list[str]:
-    """Return the lines of all constants in the order of the notebook, each that has a comment above it set off."""
+    """Return the lines of constants in the order of the notebook, each that has a comment above it set off."""
     return list(_lines(constants, remarks))
 
 

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from epypes.bundle.constants import constants_text
+from epypes.bundle.definitions import definitions, early_constants
 from epypes.bundle.graphs import GraphText, grouped
 from epypes.bundle.importorder import ordered_imports
 from epypes.bundle.lines import LINE, laid_out
@@ -58,9 +58,10 @@ def emit_module(
     head = [_docstring(settings)]
     if needed.imports:
         head.append("\n".join(ordered_imports(list(needed.imports.values()))))
-    if needed.constants:
-        head.append("\n".join(constants_text(needed.constants, needed.remarks)))
-    sections = ["\n\n".join(head), *(found.text.rstrip() for found in needed.definitions.values())]
+    constants = early_constants(needed)
+    if constants:
+        head.append(constants)
+    sections = ["\n\n".join(head), *definitions(needed)]
     tail = ["\n".join(block) for block in blocks]
     tail += ["\n".join(text.functions("func_dict")), "\n".join(text.io("func_io", cg))]
     if cg.groups:

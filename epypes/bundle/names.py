@@ -80,4 +80,5 @@ class Names:
 
     def alias_for(self, value: object, notebook: Mapping[str, object], own: str) -> str:
         """Return the name that a notebook has for an object besides its own; "" if it has none that is free."""
-        return next((name for name in names_of(value, notebook) if name != own and self.is_free(name, value)), "")
+        known = names_of(value, notebook)
+        return "" if own in known else next((name for name in known if self.is_free(name, value)), "")

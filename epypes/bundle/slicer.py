@@ -5,7 +5,6 @@ Imports, constants and other functions of the notebook are followed; everything 
 
 from __future__ import annotations
 
-import ast
 import builtins
 import dataclasses
 import sys
@@ -14,9 +13,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
 
-from epypes.bundle.callables import found_definition, is_function, method_of
-from epypes.bundle.cells import cell_of, statements_of
-from epypes.bundle.classes import ClassDefinition, class_definition, class_names
+from epypes.bundle.callables import found_definition, holds_functions, is_function, method_of
+from epypes.bundle.classes import class_definition, class_names
 from epypes.bundle.closures import FactoryCall, factory_call
 from epypes.bundle.constants import Remark, imported_as, remark_on
 from epypes.bundle.defaults import check_defaults
@@ -24,13 +22,12 @@ from epypes.bundle.lines import assignment, flat, piece_of
 from epypes.bundle.literal import is_data
 from epypes.bundle.names import Names, of_object
 from epypes.bundle.order import Position, arranged
+from epypes.bundle.positions import AnyDefinition, Positions
 from epypes.bundle.source import Definition, Importable, Refused, importable
-from epypes.bundle.state import check_asked, check_state, check_written
+from epypes.bundle.state import check_asked, check_state
 from epypes.bundle.text import renamed
 from epypes.bundle.uses import global_names, replaced, submodules
 from epypes.bundle.values import expression
-
-AnyDefinition = Definition | ClassDefinition
 
 _CONSTANT_CHARACTERS: Final = 400
 RESERVED: Final = frozenset({"func_dict", "func_io"})
@@ -78,8 +75,7 @@ class Slice:
         self._known: dict[int, str] = {}
         self._positions: dict[str, Position] = {}
         self._reads: dict[str, frozenset[str]] = {}
-        self._files: dict[str, int] = {}
-        self._notebook: Mapping[str, Any] = {}
+        self._places = Positions()
 
     def add_graph_function(self, what: str, function: Callable[..., Any], wanted: str = "") -> str:
         """Add a function of the graph; return the expression by which the module refers to it.
@@ -126,7 +122,7 @@ class Slice:
         aliases = [name for name, imported in self.imports if imported == module]
         if aliases:
             return min(aliases)
-        name = self.names.alias_for(sys.modules.get(module), self._notebook, module)
+        name = self.names.alias_for(sys.modules.get(module), self._places.notebook, module)
         if not name:
             self._import_module(module, what)
             return module
@@ -140,50 +136,16 @@ class Slice:
             return self.reference(home, what)
         if id(function) in self._known:
             return self._known[id(function)]
+        if isinstance(function, type):
+            return self.add_class(function, None, what)
         owner = method_of(function)
         if owner is not None:
             of, method = owner
             return f"{of if isinstance(of, str) else self.reference(of, what)}.{method}"
         if type(function) is partial and not function.__dict__:
             return self._add_partial(function, what, wanted)
-        if isinstance(function, type):
-            return self.add_class(function, None, what)
         source = "" if isinstance(function, types.FunctionType) else expression(self, function, what)
         return source or self._add_definition(function, what, wanted).name
-
-    def add_class(self, kind: type, around: Mapping[str, Any] | None, what: str) -> str:
-        """Add a class; return its expression.
-
-        Parameters
-        ----------
-        kind
-            The class.
-        around
-            The names of the notebook, as far as the class does not know them; None for those of the functions.
-        what
-            How to call it in a reason.
-        """
-        home = importable(kind)
-        if home is not None:
-            return self.reference(home, what)
-        if id(kind) in self._known:
-            return self._known[id(kind)]
-        found = class_definition(kind, around or self._notebook or vars(sys.modules["__main__"]), what)
-        self.names.claim(found.name, of_object(kind), what)
-        self._known[id(kind)] = found.name
-        names = list(class_names(found))
-        self._reads[found.name] = frozenset(names)
-        check_written(found, names, what)
-        self._add_names(names, found, what)
-        self._write(found.name, found.text, self._position(found))
-        return found.name
-
-    def _add_names(self, names: Sequence[str], found: AnyDefinition, what: str) -> None:
-        for needed in names:
-            try:
-                self._add_name(needed, found, what)
-            except Refused as refusal:
-                self.refusals.append(str(refusal))
 
     def _add_partial(self, function: partial[Any], what: str, wanted: str) -> str:
         """Return the expression of a partial, or the name that functions call it by."""
@@ -200,7 +162,7 @@ class Slice:
             return source
         self.names.claim(name, of_object(function), what)
         self._known[id(function)] = name
-        self._write(name, f"{name} = {source}\n", self._binding(name, None))
+        self._write(name, f"{name} = {source}\n", self._places.of_name(name))
         return name
 
     def _argument(self, value: Any, what: str) -> str:
@@ -215,7 +177,7 @@ class Slice:
     def _add_definition(self, function: Any, what: str, wanted: str = "") -> Written:
         """Add a function of the notebook."""
         found = found_definition(function, what)
-        self._notebook = self._notebook or found.function.__globals__
+        self._places.learn(found)
         name = self.names.name_for(function, found, wanted)
         self.names.claim(name, of_object(function), what)
         self._known[id(function)] = name
@@ -225,11 +187,33 @@ class Slice:
             return self.definitions[name]
         check_defaults(found, what)
         names = list(global_names(found))
-        self._reads[name] = frozenset(names)
         check_state(found, names, what)
-        self._add_names(names, found, what)
-        self._write(name, renamed(found.text, found.name, name), self._position(found))
+        self._add_names(name, names, found, what)
+        self._write(name, renamed(found.text, found.name, name), self._places.of_definition(found))
         return self.definitions[name]
+
+    def _add_names(self, name: str, names: Sequence[str], found: AnyDefinition, what: str) -> None:
+        """Add what a definition has from outside."""
+        self._reads[name] = frozenset(names)
+        for needed in names:
+            try:
+                self._add_name(needed, found, what)
+            except Refused as refusal:
+                self.refusals.append(str(refusal))
+
+    def add_class(self, kind: type, around: Mapping[str, Any] | None, what: str) -> str:
+        """Add a class, which reads the names ``around`` it if it is the notebook's; return its expression."""
+        home = importable(kind)
+        if home is not None:
+            return self.reference(home, what)
+        found = class_definition(kind, self._places.names_with(kind) if around is None else around, what)
+        self.names.claim(found.name, of_object(kind), what)
+        if id(kind) not in self._known:
+            self._known[id(kind)] = found.name
+            self._places.learn(found)
+            self._add_names(found.name, list(class_names(found)), found, what)
+            self._write(found.name, found.text, self._places.of_definition(found))
+        return found.name
 
     def _add_made(self, name: str, made: FactoryCall, found: Definition, what: str) -> None:
         """Add a closure as a call of the function that made it."""
@@ -238,25 +222,13 @@ class Slice:
         arguments += [f"{word}={self._argument(value, what)}" for word, value in made.named.items()]
         inner = f"Function {made.factory.__name__!r}, which makes {what[0].lower()}{what[1:]},"
         factory = self._callable(made.factory, inner, "")
-        position = self._binding(name, found) or self._position(found)
+        position = self._places.of_name(name) or self._places.of_definition(found)
         self._write(name, f"{name} = {factory}({', '.join(arguments)})\n", position)
 
     def _write(self, name: str, text: str, position: Position) -> None:
         self.definitions[name] = Written(name, text)
         if position:
             self._positions[name] = position
-
-    def _position(self, found: AnyDefinition) -> Position:
-        """Return where a function stands in the notebook: cell, or file, and line."""
-        code = found.origin
-        cell = cell_of(code.co_filename, found.names)
-        return (cell, 0 if cell else self._files.setdefault(code.co_filename, len(self._files)), code.co_firstlineno)
-
-    def _binding(self, name: str, found: AnyDefinition | None) -> Position:
-        """Return where a notebook gave a name its value, () if it does not say."""
-        code = found.origin if found else None
-        given = next(statements_of(name, self._notebook, code), None)
-        return (given.cell, 0, given.node.lineno) if given else ()
 
     def _add_name(self, name: str, found: AnyDefinition, what: str) -> None:
         """Add what one global name of a function means at the time of promotion."""
@@ -276,22 +248,28 @@ class Slice:
         if home is not None:
             self.names.claim(name, of_object(value), what)
             self._import_from(home, name)
-        elif is_function(value) or isinstance(value, type):
+        elif is_function(value):
             self._add_helper(name, value, found, what)
+        elif isinstance(value, type):
+            self._add_notebook_class(name, value, found, what)
         else:
             self._add_constant(name, value, found, what)
 
     def _add_helper(self, name: str, helper: Any, found: AnyDefinition, what: str) -> None:
         """Add something that a function calls, under the name by which it calls it."""
-        kind, uses = ("Class", "uses") if isinstance(helper, type) else ("Function", "calls")
-        source = self._callable(helper, f"{kind} {name!r}, which {what[0].lower()}{what[1:]} {uses},", name)
+        source = self._callable(helper, f"Function {name!r}, which {what[0].lower()}{what[1:]} calls,", name)
         if source != name and name not in self.definitions:
             self.names.claim(name, of_object(helper), what)
-            self._write(name, f"{name} = {source}\n", self._binding(name, found))
+            self._write(name, f"{name} = {source}\n", self._places.of_name(name))
+
+    def _add_notebook_class(self, name: str, kind: type, found: AnyDefinition, what: str) -> None:
+        own = self.add_class(kind, found.names, f"Class {kind.__name__!r}, which {what[0].lower()}{what[1:]} uses,")
+        if own != name and name not in self.definitions:
+            self.names.claim(name, of_object(kind), what)
+            self._write(name, f"{name} = {own}\n", self._places.of_name(name))
 
     def _add_constant(self, name: str, value: Any, found: AnyDefinition, what: str) -> None:
-        code = found.origin
-        module, own = imported_as(name, value, found.names, code) if name not in found.captured else ("", "")
+        module, own = imported_as(name, value, found.names, found.file) if name not in found.captured else ("", "")
         if module:
             self.names.claim(name, ("constant", name), what)
             self._import_from(Importable(module, own), name)
@@ -301,41 +279,41 @@ class Slice:
         source = self._constant_source(name, value, found, what)
         if self.constants.get(name, source) != source:
             text = f"{what} uses {name!r} ({found.place_of(name)}), which has another value elsewhere"
-            raise Refused(f"{text}. Rename one of the two.")
+            way_out = (
+                f"Make {name} a parameter of the function around it"
+                if name in found.captured
+                else "Rename one of the two"
+            )
+            raise Refused(f"{text}. {way_out}.")
         if name in self.constants or name in self.definitions:
             return
         self.names.claim(name, ("constant", name), what)
-        factory = code.co_qualname.partition(".")[0]
-        captured = Remark(self._position(found), beside=f"# as {factory}() had it in the notebook")
-        remark = captured if name in found.captured else remark_on(name, value, source, found.names, code)
-        if self._is_made_here(source):
-            lines = [*(remark.above if remark else ()), *assignment([name], True, piece_of(source), 0)]
-            self._write(name, "".join(f"{line}\n" for line in lines), self._binding(name, found))
-            return
-        if remark:
+        if name in found.captured and isinstance(found, Definition):
+            factory = found.function.__code__.co_qualname.partition(".")[0]
+            remark: Remark | None = Remark(
+                self._places.of_definition(found), beside=f"# as {factory}() had it in the notebook"
+            )
+        else:
+            remark = remark_on(name, value, source, found.names, found.file)
+        if remark is not None:
             self.remarks[name] = remark
         self.constants[name] = source
 
-    def _is_made_here(self, source: str) -> bool:
-        """Whether an expression needs something that the module defines."""
-        names = (node.id for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Name))
-        return any(name in self.definitions for name in names)
-
     def _add_table(self, name: str, value: Any, found: AnyDefinition, what: str) -> bool:
         """Add a dict or sequence with functions of the notebook in it; return whether it is one."""
-        if not isinstance(value, dict | list | tuple) or not any(map(_is_own, _leaves(value))):
+        if not isinstance(value, dict | list | tuple) or not holds_functions(value):
             return False
         self.names.claim(name, of_object(value), what)
         if name not in self.definitions:
             source = self._argument(value, f"{name!r}, which {what[0].lower()}{what[1:]} uses,")
             text = "\n".join(assignment([name], True, piece_of(source), 0))
-            self._write(name, f"{text}\n", self._binding(name, found))
+            self._write(name, f"{text}\n", self._places.of_name(name))
         return True
 
     def _constant_source(self, name: str, value: Any, found: AnyDefinition, what: str) -> str:
         source = expression(self, value, what)
         if not source or len(source) > _CONSTANT_CHARACTERS:
-            kind = f"of type {type(value).__name__}"
+            kind = f"the class {name!r}" if isinstance(value, type) else f"of type {type(value).__name__}"
             raise Refused(
                 f"{what} is defined in the notebook ({found.place_of(name)}) and uses {name!r} from it, {kind}. "
                 f"Make {name} a token, make it inside the function, or move both into a module that is installed."
@@ -373,18 +351,6 @@ class Slice:
                 f"{name!r} is {home.module}.{home.qualname}, a name inside a class. Use it through the class."
             )
         self.imports[name, f"{home.module}.{top}"] = f"from {home.module} import {top}{alias}"
-
-
-def _leaves(value: Any, depth: int = 5) -> list[Any]:
-    """Return what is in tuples, lists and dicts."""
-    if depth and type(value) in (tuple, list, dict):
-        parts = value.values() if isinstance(value, dict) else value
-        return [leaf for part in parts for leaf in _leaves(part, depth - 1)]
-    return [value]
-
-
-def _is_own(value: Any) -> bool:
-    return is_function(value) and importable(value) is None
 
 
 def slice_functions(gathered: Slice, functions: Sequence[tuple[str, Callable[..., Any]]]) -> list[str]:

@@ -74,14 +74,18 @@ class Definition:
         return {**self.function.__globals__, **self.captured} if self.captured else self.function.__globals__
 
     @property
-    def origin(self) -> types.CodeType:
-        """Its code where it was defined."""
-        return self.function.__code__
+    def file(self) -> str:
+        """The file or cell that it is from, as Python knows it."""
+        return self.function.__code__.co_filename
+
+    @property
+    def line(self) -> int:
+        """Where it begins."""
+        return self.function.__code__.co_firstlineno
 
     def place_in(self, node: ast.AST) -> str:
         """Return where a part of it stands, for people."""
-        code = self.function.__code__
-        return place_in(code.co_filename, getattr(node, "lineno", code.co_firstlineno))
+        return place_in(self.file, getattr(node, "lineno", self.line))
 
     def place_of(self, name: str) -> str:
         """Return where it uses a name, for people."""

@@ -54,11 +54,6 @@ def check_state(found: Definition, names: Collection[str], what: str) -> None:
             name = instruction.argval
             if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
                 raise Refused(f"{what} changes the global {name!r} ({found.place_of(name)}). Return the value.")
-    check_written(found, names, what)
-
-
-def check_written(found: Definition | ClassDefinition, names: Collection[str], what: str) -> None:
-    """Refuse a function, or a class with methods, that writes into what outlives a call."""
     for node, name in _changes(found.node):
         if name in names and (not isinstance(node, ast.Call) or _is_container(found.names.get(name))):
             text = f"{what} writes into {name!r}, which outlives the call ({found.place_in(node)})"

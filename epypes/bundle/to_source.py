@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from epypes.bundle.branches import Placement, place
-from epypes.bundle.constants import constants_text
+from epypes.bundle.definitions import definitions, early_constants
 from epypes.bundle.importorder import ordered_imports
 from epypes.bundle.literal import literal_source
 from epypes.bundle.nodes import called_by, is_plain_pipeline
@@ -271,8 +271,8 @@ def _module(gathered: Slice, straights: Sequence[Straight]) -> str:
     blocks = []
     if gathered.imports:
         blocks.append("\n".join(ordered_imports(list(gathered.imports.values()))))
-    if gathered.constants:
-        blocks.append("\n".join(constants_text(gathered.constants, gathered.remarks)))
+    constants = early_constants(gathered)
+    if constants:
+        blocks.append(constants)
     head = ["\n\n".join(blocks)] if blocks else []
-    own = [found.text.rstrip() for found in gathered.definitions.values()]
-    return "\n\n\n".join([*head, *own, *map(emit_function, straights)]) + "\n"
+    return "\n\n\n".join([*head, *definitions(gathered), *map(emit_function, straights)]) + "\n"

@@ -113,9 +113,12 @@ def _object(gathered: Slice, value: Any, what: str, function: FunctionWriter | N
     if _is_numpy_number(value):
         number = expression(gathered, value.item(), what)
         return f"{gathered.reference(Importable('numpy', type(value).__name__), what)}({number})"
-    made = _mark(gathered, value, what) or made_again(
+    mark = _mark(gathered, value, what)
+    if mark:
+        return mark
+    made = made_again(
         value,
-        lambda part: expression(gathered, part, what, function),
+        lambda part: expression(gathered, part, what),
         lambda kind: gathered.add_class(kind, None, f"Class {kind.__name__!r} of {what[0].lower()}{what[1:]}"),
     )
     if made:
@@ -160,4 +163,4 @@ def _mark(gathered: Slice, value: Any, what: str) -> str:
     if home is None or not all(parts):
         return ""
     plain = home.qualname if home.module == "builtins" else f"{gathered.module_name(home.module, what)}.{home.qualname}"
-    return f"{gathered.module_name('typing', what)}.Annotated[{plain}, {', '.join(parts)}]"
+    return f"{gathered.reference(Importable('typing', 'Annotated'), what)}[{plain}, {', '.join(parts)}]"

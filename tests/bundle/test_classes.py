@@ -66,7 +66,6 @@ PROMOTED = {
         "from __future__ import annotations\nfrom dataclasses import dataclass\n@dataclass\nclass P:\n    a: int = 4\n"
         "    def of(self, other: int) -> float:\n        return self.a + other\ndef f(x):\n    return P().of(x)\n"
     ),
-    "under another name": "class B:\n    K = 2\nA = B\ndef f(x):\n    return A.K + x\n",
     "in an if": "if True:\n    class A:\n        K = 4\ndef f(x):\n    return A.K + x\n",
 }
 

@@ -94,3 +94,14 @@ def test_magics_inside_of_functions_are_refused_by_line(tmp_path):
     assert len(error.value.reasons) == len(words)
     for reason, expected in zip(error.value.reasons, words, strict=True):
         assert re.search(expected, reason)
+
+
+@pytest.mark.slow
+def test_to_source_writes_all_of_it_too(promoted):
+    text = ep.to_source(promoted.runner)
+    names: dict = {}
+    exec(compile(text, "straight", "exec", dont_inherit=True), names)
+    made = dict(zip(promoted.runner.cg.sink_tokens, names["run_graph"](promoted.runner.last["a"]), strict=True))
+    assert {token: first_difference(promoted.runner[token], value) for token, value in made.items()} == dict.fromkeys(
+        made
+    )

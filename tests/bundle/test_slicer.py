@@ -222,3 +222,103 @@ def test_the_module_reads_like_one_that_a_colleague_wrote():
         "def weigh(im):\n    return im * GAIN\n\n\ndef f(im):\n    return weigh(im)\n\n\n"
         'func_dict = {\n    "f": f,\n}\n\nfunc_io = {\n    "f": (("x0",), "y"),\n}\n'
     )
+
+
+def test_constants_and_functions_stand_as_in_the_notebook_with_their_comments():
+    cell = """\
+# Thresholds, found by hand.
+LOW, HIGH = 0.5, 2
+SIZE = 0x10  # of the window
+LIMIT = sum([1, 2])
+STEP = 7
+STEP = 3  # the second
+
+def blurred(im):
+    return smooth(im) + offset(im)
+
+WEIGHTS = (1, 2,
+           3)
+
+# Makes filters.
+def make_smooth(k, sigma=0):
+    def smooth(im):
+        return im * k + sigma
+    return smooth
+
+smooth = make_smooth(5)
+offset = functools.partial(max, LIMIT, key=abs)
+by_name = {"smooth": smooth}
+
+def f(im):
+    return by_name["smooth"](im) + blurred(im) + LOW + SIZE + LIMIT + STEP + WEIGHTS[2]
+"""
+    text, refusals = promoted(cell)
+    assert refusals == []
+    body = text.split('"""')[2].partition("func_dict")[0]
+    assert body.split("\n\n\n") == [
+        "\n\nimport functools\n\nLOW = 0.5\nSIZE = 0x10  # of the window\nLIMIT = 3  # sum([1, 2]) in the notebook\n"
+        "STEP = 3  # the second\nWEIGHTS = (1, 2, 3)",
+        "def blurred(im):\n    return smooth(im) + offset(im)",
+        "# Makes filters.\ndef make_smooth(k, sigma=0):\n    def smooth(im):\n        return im * k + sigma\n    return smooth",
+        "smooth = make_smooth(5)",
+        "offset = functools.partial(max, 3, key=abs)",
+        'by_name = {"smooth": smooth}',
+        'def f(im):\n    return by_name["smooth"](im) + blurred(im) + LOW + SIZE + LIMIT + STEP + WEIGHTS[2]',
+        "",
+    ]
+    assert executed(text).func_dict["f"](3) == notebook(cell)["f"](3)
+
+
+def test_a_decorator_stands_before_what_it_decorates_wherever_the_notebook_has_it():
+    cell = (
+        "def plain(x):\n    return scaled(x)\n"
+        "def scaled(x):\n    return x * 2\n"
+        "def shifted(g):\n    by = base()\n    @functools.wraps(g)\n    def w(x):\n        return g(x) + by\n    return w\n"
+        "def base():\n    return 40\n"
+        "@shifted\ndef f(x):\n    return plain(x)\n"
+        "def base():\n    return 39 + 1\n"
+    )
+    text, refusals = promoted(cell)
+    assert refusals == []
+    places = [text.index(f"def {name}(") for name in ("plain", "scaled", "shifted", "base", "f")]
+    assert places == sorted(places), "base, which shifted calls when f is defined, stands before f"
+    assert executed(text).func_dict["f"](1) == 42
+
+
+def test_what_is_named_freely_gives_way_to_what_functions_read_by_name():
+    names = notebook("blur = 3\nedges = 4\ndef g(x):\n    return x + blur\n")
+    functions = {"blur": eval_in_cell("lambda x: x * 10"), "edges": eval_in_cell("lambda x: x * 100"), "g": names["g"]}
+    cg = ep.CompGraph(functions, {name: ("x", f"{name}_made") for name in functions})
+    needed, references = slice_graph(cg.functions)
+    assert references == {"blur": "blur_", "edges": "edges", "g": "g"}, "nobody reads edges"
+    module = executed(emit_module(SETTINGS, cg, needed, references))
+    assert [function(1) for function in module.func_dict.values()] == [10, 100, 4]
+
+
+def eval_in_cell(source: str):
+    return notebook(f"made = [{source}]\n")["made"][0]
+
+
+def test_closures_over_different_values_of_one_name_are_refused_with_the_way_out():
+    cell = "def make(k):\n    k = 2 * k\n    def f(x):\n        return x + k\n    return f\na, b = make(3), make(5)\n"
+    names = notebook(cell)
+    needed, _ = slice_graph({"a": names["a"], "b": names["b"]})
+    assert len(needed.refusals) == 1
+    assert re.search(
+        r"uses 'k' \(.*line 4\), which has another value elsewhere\. Make k a parameter", needed.refusals[0]
+    )
+
+
+def test_lambdas_on_a_line_that_python_can_not_tell_apart_are_refused():
+    function = notebook("f, g = lambda x: x, lambda x: -x\n")["g"]
+    bare = function.__code__.replace(co_linetable=b"")
+    function.__code__ = bare
+    needed, _ = slice_graph({"g": function})
+    assert re.search("is not what its source says|nothing tells apart", needed.refusals[0])
+
+
+def test_what_the_notebook_put_into_a_dict_of_functions_that_reads_it_comes_back():
+    cell = "def down(x):\n    return x if x < 1 else STEPS['down'](x - 1)\nSTEPS = {'down': down}\ndef f(x):\n    return STEPS['down'](x)\n"
+    text, refusals = promoted(cell)
+    assert refusals == []
+    assert executed(text).func_dict["f"](3) == 0
