@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from epypes.bundle.answers import ANSWERS, record_answer
 from epypes.bundle.exchange import exchange as _exchange
