@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import threading
 from collections import deque
 from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
@@ -76,8 +77,9 @@ class Told:
         self._forget: Callable[[], object] = lambda: None
         self._counting: asyncio.Task[None] | None = None
         self._stopped = False
-        # The service's threads write these, one event at a time.
         self._next_run = 0.0
+        # The service's threads write these two.
+        self._turn = threading.Lock()
         self._skipped = 0
         self._held: dict[str, Any] | None = None
 
@@ -131,11 +133,13 @@ class Told:
 
     async def _count(self) -> None:
         """Tell the counts each second, as long as anybody listens."""
-        while self._listeners:
-            await asyncio.sleep(_COUNTS_EVERY_S)
-            with suppress(EpypesError):
-                self._spread("counts", self._service.counts())
-        self._counting = None
+        try:
+            while self._listeners:
+                await asyncio.sleep(_COUNTS_EVERY_S)
+                with suppress(EpypesError):
+                    self._spread("counts", self._service.counts())
+        finally:
+            self._counting = None
 
     def _hear(self, kind: str, data: Any) -> None:
         """Take what the service tells, on its thread, and return at once."""
@@ -143,11 +147,16 @@ class Told:
             return
         if kind != "run":
             self._soon(self._spread, kind, data)
-        elif self._held is not None:
-            self._held, self._skipped = data, self._skipped + 1
-        else:
-            self._held = data
+        elif self._hold(data):
             self._soon(self._run_soon)
+
+    def _hold(self, run: dict[str, Any]) -> bool:
+        """Keep a run until it is told; return whether that has to be asked for."""
+        with self._turn:
+            is_first = self._held is None
+            self._skipped += not is_first
+            self._held = run
+            return is_first
 
     def _soon(self, function: Callable[..., None], *arguments: Any) -> None:
         if self._loop is not None:
@@ -161,8 +170,9 @@ class Told:
             self._loop.call_later(wait_s, self._run_soon)
             return
         self._next_run = monotonic() + RUN_EVERY_S
-        skipped, self._skipped = self._skipped, 0
-        held, self._held = self._held, None
+        with self._turn:
+            skipped, self._skipped = self._skipped, 0
+            held, self._held = self._held, None
         self._spread("run", {**(held or {}), "skipped": skipped})
 
     def _spread(self, kind: str, data: Any) -> None:
