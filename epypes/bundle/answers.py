@@ -5,17 +5,18 @@ Recorded beside a sample, where two runs made the same answer: an Envelope with 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from epypes.bundle.compare import first_difference
-from epypes.bundle.load import Bundle
+from epypes.bundle.compare import differences, first_difference
+from epypes.bundle.load import SAMPLES, Bundle
+from epypes.bundle.report import Difference, difference
 from epypes.errors import MessageError
 from epypes.pipeline import EventView
 from epypes.pipeline.answering import FOut
 from epypes.pipeline.stamps import Stamps
-from epypes.run import Run
+from epypes.run import CompGraphRunner, Run
 
 ANSWERS: Final = "answers"
 _BYTES: Final = "bytes"
@@ -52,16 +53,30 @@ def record_answer(path: Path, f_out: FOut, name: str, runs: tuple[Run, Run], att
     return True
 
 
-def bundle_answer_difference(bundle: Bundle, sample: str, run: Run) -> str | None:
-    """Return how the answer of a bundle's f_out is another one than was recorded; None if it is not, or none was."""
+def answer_differences(bundle: Bundle, sample: str, run: Run) -> Iterator[Difference]:
+    """Give what the answer of a bundle's f_out is otherwise than was recorded; nothing if none was."""
     from epypes.wire.samples import load_sample
 
     path = bundle.path / ANSWERS / f"{sample}.npz"
     if "f_out" not in bundle.own or not path.is_file():
-        return None
+        return
     _, expected = load_sample(path)
     got = _parts(_answer(bundle.own["f_out"], bundle.settings.name, run, bundle.settings.attributes))
-    return "f_out makes no answer" if got is None else first_difference(expected, dict(got))
+    found = difference(sample, "the answer of f_out", differences(expected, None if got is None else dict(got)))
+    if found is not None:
+        yield found
+
+
+def record_answers_again(bundle: Bundle) -> None:
+    """Record anew what the f_out of an unsealed bundle makes of its samples, for those whose answer was recorded."""
+    from epypes.wire.samples import load_sample
+
+    for path in (bundle.path / ANSWERS).glob("*.npz"):
+        inputs, _ = load_sample(bundle.path / SAMPLES / path.name)
+        one, other = (CompGraphRunner(bundle.cg, bundle.settings.hyperparameters).run(**inputs) for _ in range(2))
+        path.unlink()
+        settings = bundle.settings
+        record_answer(path, bundle.own["f_out"], settings.name, (one, other), settings.attributes)
 
 
 def _answer(f_out: FOut, name: str, run: Run, attributes: _Parts) -> Any:

@@ -60,11 +60,11 @@ def _wanted(folder: Path) -> list[str]:
     pinned = pins(lines)
     named = [_source(name, version) for name, version in pinned.items() if name != _OURS]
     needed = [requirement for name, requirement in _own_needs().items() if name not in pinned]
-    return [*named, *needed, _ours(pinned)]
+    return [*named, *needed, epypes_source(pinned)]
 
 
-def _ours(pinned: Mapping[str, str]) -> str:
-    """Return where to install EPypes from: the checkout that runs now, if it is one."""
+def epypes_source(pinned: Mapping[str, str]) -> str:
+    """Return where to install EPypes from: the checkout that runs now, if it is one, else a requirement."""
     checkout = Path(__file__).resolve().parents[2]
     if (checkout / "pyproject.toml").is_file():
         return str(checkout)
@@ -103,14 +103,22 @@ def _steps(home: Path, wanted: Sequence[str]) -> list[tuple[str, list[str]]]:
     """Return the commands that make the environment, each with what it does: uv where it is, else venv and pip."""
     python = str(home / "bin" / "python")
     made, installed = "A new environment can't be made", "What requirements.txt names can't be installed"
-    uv = [sys.executable, "-m", "uv"] if importlib.util.find_spec("uv") else [shutil.which("uv") or ""]
-    if uv != [""]:
+    uv = uv_command()
+    if uv:
         return [
             (made, [*uv, "venv", "--quiet", "--no-project", "--python", sys.executable, str(home)]),
             (installed, [*uv, "pip", "install", "--quiet", *_REFRESHED, "--python", python, *wanted]),
         ]
     pip = [python, "-I", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-input"]
     return [(made, [sys.executable, "-I", "-m", "venv", str(home)]), (installed, [*pip, *wanted])]
+
+
+def uv_command() -> list[str]:
+    """Return how uv is called on this machine; empty if it is not there."""
+    if importlib.util.find_spec("uv"):
+        return [sys.executable, "-m", "uv"]
+    path = shutil.which("uv")
+    return [path] if path else []
 
 
 def _step(folder: Path, what: str, command: Sequence[str], timeout_s: float) -> None:

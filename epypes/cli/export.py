@@ -51,12 +51,10 @@ def docker(
     options: _Options = None,
 ) -> None:
     """Write a folder from which docker or podman builds the service: container file, requirements, bundle."""
-    from epypes.bundle.requirements import installable_epypes
     from epypes.service.export import write_container
 
     _check_serve_options(bundle, options or ())
-    with installable_epypes() as (requirement, wheel):
-        path = write_container(bundle, to, options or (), requirements=[requirement], wheel=wheel)
+    path = write_container(bundle, to, options or ())
     out.print(f"Wrote {path}. What to do with it stands at its top.", markup=False)
 
 

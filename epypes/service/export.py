@@ -9,12 +9,16 @@ import json
 import re
 import shlex
 import shutil
+import subprocess
 import sys
 from collections.abc import Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import Final
 
+from epypes.bundle.freshenv import epypes_source, uv_command
 from epypes.bundle.load import SETTINGS
+from epypes.bundle.requirements import pins
 from epypes.bundle.seal import check_seal
 from epypes.bundle.settings import read_settings
 from epypes.errors import ServiceError
@@ -144,9 +148,7 @@ def unit_name(bundle: str | Path) -> str:
     return f"epypes-{_checked(bundle)[1]}.service"
 
 
-def write_container(
-    bundle: str | Path, to: str | Path, options: Sequence[str] = (), *, requirements: Sequence[str], wheel: Path | None
-) -> Path:
+def write_container(bundle: str | Path, to: str | Path, options: Sequence[str] = ()) -> Path:
     """Write a folder from which a container is built: Containerfile, requirements and a copy of the bundle.
 
     Parameters
@@ -157,22 +159,18 @@ def write_container(
         The folder to write; it must not exist, or be empty.
     options
         Further arguments of ``epypes serve``.
-    requirements
-        What is installed besides the bundle's own requirements: EPypes with what serving stands on.
-    wheel
-        A wheel of EPypes to install from, where no index has this version; copied into the folder.
 
     Returns
     -------
     Path
-        The Containerfile.
+        The Containerfile. Where EPypes runs from a checkout, which no index has, a wheel of it lies beside.
 
     Raises
     ------
     BundleError
         The folder is not the bundle that was promoted.
     ServiceError
-        The folder can't be written.
+        The folder can't be written, or no wheel can be built.
     """
     folder, name = _checked(bundle)
     target = Path(to)
@@ -181,19 +179,18 @@ def write_container(
             raise ServiceError(to, f"{to} is there already and not empty. Name another folder.")
         target.mkdir(parents=True, exist_ok=True)
         shutil.copytree(folder, target / "bundle")
-        if wheel is not None:
-            (target / "wheels").mkdir()
-            shutil.copy(wheel, target / "wheels")
-        own = (folder / "requirements.txt").read_text(encoding="utf-8").splitlines()
-        kept = [line for line in own if re.split(r"[^\w-]", line, maxsplit=1)[0].lower() != "epypes"]
-        (target / "requirements.txt").write_text("\n".join([*kept, *requirements]) + "\n", encoding="utf-8")
+        pinned = (folder / "requirements.txt").read_text(encoding="utf-8")
+        kept = [line for line in pinned.splitlines() if not _is_epypes(line)]
+        has_wheel = _add_wheel(target, epypes_source(pins(pinned.splitlines())))
+        own = f"epypes[service]=={metadata.version('epypes')}"
+        (target / "requirements.txt").write_text("\n".join([*kept, own]) + "\n", encoding="utf-8")
         entrypoint = ["epypes", "serve", "/service/bundle", *options]
         text = _CONTAINERFILE.format(
             name=name,
             tag=f"epypes-{name}",
             python=_PYTHON,
-            wheels="COPY wheels ./wheels\n" if wheel is not None else "",
-            find="--find-links wheels " if wheel is not None else "",
+            wheels="COPY wheels ./wheels\n" if has_wheel else "",
+            find="--find-links wheels " if has_wheel else "",
             entrypoint=_json_list(entrypoint),
         )
         path = target / "Containerfile"
@@ -203,6 +200,29 @@ def write_container(
             raise
         raise ServiceError(to, f"{to} can't be written: {error}. Name another folder.") from error
     return path
+
+
+def _is_epypes(line: str) -> bool:
+    return re.split(r"[^\w-]", line, maxsplit=1)[0].lower() == "epypes"
+
+
+def _add_wheel(target: Path, source: str) -> bool:
+    """Build a wheel of a checkout into the folder ``wheels``; return False where an index has what is wanted."""
+    if not Path(source).is_dir():
+        return False
+    wheels = str(target / "wheels")
+    uv = uv_command()
+    pip = [sys.executable, "-I", "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", wheels, source]
+    command = [*uv, "build", "--quiet", "--wheel", "--out-dir", wheels, source] if uv else pip
+    done = subprocess.run(  # noqa: S603 - uv or pip of this interpreter
+        command, stdin=subprocess.DEVNULL, capture_output=True, check=False
+    )
+    if done.returncode != 0:
+        said = " ".join(done.stderr.decode(errors="replace").split())[-300:]
+        raise ServiceError(target, f"No wheel can be built of {source}: {said}. Connect to the network, or install uv.")
+    # uv leaves one for version control.
+    (target / "wheels" / ".gitignore").unlink(missing_ok=True)
+    return True
 
 
 def _checked(bundle: str | Path) -> tuple[Path, str]:

@@ -11,8 +11,6 @@ import signal
 import sys
 import threading
 
-import numpy as np
-
 import epypes as ep
 from epypes.wire import Envelope
 
@@ -28,13 +26,13 @@ def main(address: str, poison: int, count: int, pace_ms: int) -> None:
     items: queue.SimpleQueue = queue.SimpleQueue()
     with ep.ZMQPublisher(address, items, bind=False) as publisher:
         publisher.wait_for_subscriber(30)
-        print("JOINED", flush=True)
+        print("JOINED", flush=True)  # noqa: T201
         sent = 0
         while sent < count and not ended.wait(pace_ms / 1000):
             kind = kind_of(sent, poison)
-            items.put(Envelope("frame", {"number": np.int64(sent), "kind": kind}, id=f"event-{sent}"))
+            items.put(Envelope("frame", {"number": sent, "kind": kind}, id=f"event-{sent}"))
             sent += 1
-    print(f"SENT {sent}", flush=True)
+    print(f"SENT {sent}", flush=True)  # noqa: T201
 
 
 if __name__ == "__main__":

@@ -16,12 +16,13 @@ import time
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.bundle.seal import seal
 from epypes.errors import EpypesError
 from epypes.service.state import read_state
+from tests.service.bundles import written_bundle
 from tests.service.chaos_publisher import kind_of
 from tests.service.processes import running
 
@@ -31,7 +32,7 @@ ROOT = Path(__file__).parents[2]
 POISON = 250
 ENOUGH = 100_000
 WAIT_S = 60.0
-CELL = '''
+CELL = """
 import os
 import time
 
@@ -47,7 +48,7 @@ def work(number, kind, gain):
         raise ValueError(f"event {number} is spoilt")
     time.sleep(0.001)
     return np.array([number, gain, number * gain + OFFSET])
-'''
+"""
 
 
 def until(condition, what):
@@ -59,21 +60,21 @@ def until(condition, what):
 
 
 @pytest.fixture
-def bundles(run_cell, tmp_path):
+def bundles(tmp_path):
     """Three versions: the first, one that does not compute what it recorded, and a good one."""
 
-    def promoted(name, offset):
-        names = run_cell(CELL.replace("OFFSET = 0", f"OFFSET = {offset}"))
-        cg = ep.CompGraph({"work": names["work"]}, {"work": (("number", "kind", "gain"), "result")})
-        runner = ep.CompGraphRunner(cg, {"gain": 1})
-        runner.run(number=names["np"].int64(3), kind=0)
-        return ep.promote(runner, tmp_path / name).path
+    def version(name, offset, recorded):
+        sample = {"number": 3, "kind": 0}, {"result": np.array([3, 1, 3 + recorded])}
+        return written_bundle(
+            tmp_path / name,
+            SOURCE.replace("OFFSET = 0", f"OFFSET = {offset}"),
+            ("number", "kind"),
+            ("result",),
+            hyperparameters={"gain": 1},
+            sample=sample,
+        )
 
-    first, bad, good = (promoted(name, offset) for name, offset in (("first", 0), ("bad", 0), ("good", 7)))
-    module = bad / "pipeline.py"
-    module.write_text(module.read_text().replace("OFFSET = 0", "OFFSET = 1"))
-    seal(bad)
-    return first, bad, good
+    return version("first", 0, 0), version("bad", 1, 0), version("good", 7, 7)
 
 
 class Received:
@@ -93,10 +94,10 @@ class Received:
         return sum(answer.failure is None for answer in self.answers)
 
 
-def test_nothing_is_lost_uncounted_and_order_is_kept(bundles, threads=2):
+def test_nothing_is_lost_uncounted_and_order_is_kept(bundles):
     first, bad, good = bundles
     answers, failures = queue.SimpleQueue(), queue.SimpleQueue()
-    options = ["--http", "http://127.0.0.1:0", "--threads", str(threads), "--mailbox-size", "64"]
+    options = ["--http", "http://127.0.0.1:0", "--threads", "2", "--mailbox-size", "64"]
     with running(first, *options) as service:
         assert service.ready.startswith("READY"), service.stderr.read()
         state = read_state(first)
