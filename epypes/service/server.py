@@ -264,6 +264,7 @@ class Service:
             "addresses": {**self._sockets.addresses, "http": self.http},
             "started_ns": self._started_ns,
             "restarts": self._supervisor.health.restarts,
+            "counts": self.counts(),
         }
 
     def listen(self, callback: Listener) -> Callable[[], None]:

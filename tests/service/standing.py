@@ -83,7 +83,7 @@ class Standing:
             "inputs": list(self.runner.free_source_tokens), "outputs": list(self.outputs),
             "func_io": json.loads(json.dumps(dict(self.runner.cg.func_io))),
             "rgb": [], "threads": 1, "revision": self.revision, "addresses": {"sub": "tcp://127.0.0.1:1", "pub": "tcp://127.0.0.1:2"},
-            "pid": os.getpid(), "worker_pid": None, "started_ns": 1, "restarts": 0, "versions": {"epypes": "1.0.0.dev0"},
+            "pid": os.getpid(), "worker_pid": None, "started_ns": 1, "restarts": 0, "counts": {}, "versions": {"epypes": "1.0.0.dev0"},
         }  # fmt: skip
 
     def counts(self):

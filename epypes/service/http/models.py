@@ -83,6 +83,7 @@ class Info(BaseModel):
     worker_pid: int | None
     started_ns: int
     restarts: int
+    counts: dict[str, int]
     versions: dict[str, str]
 
 
