@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-import queue
 import signal
+import socket
 import threading
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Any, Final
+from typing import Any, Final, Self
 
 from epypes.errors import ServiceError
 from epypes.service.server import Service
 from epypes.service.state import ServiceState, StateLock
 
 _SIGNALS: Final = (signal.SIGTERM, signal.SIGINT)
+# No signal has this number.
+_DONE: Final = 0
 
 
 def serve(
@@ -52,52 +54,69 @@ def serve(
     BundleError, AddressError
         As for Service.
     """
-    signals: queue.SimpleQueue[str] = queue.SimpleQueue()
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        # No Event, whose lock the main thread may hold when a signal arrives in it.
-        signals.put("signal")
-
-    before = {number: signal.signal(number, on_signal) for number in _SIGNALS}
-    try:
-        with StateLock(path) as lock, ExitStack() as control:
-            service = Service(path, sub, pub, insecure=insecure, **options)
-            if http:
-                _serve_http(service, http, token_file, insecure, control)
-            begin = _Aside(service.start, signals)
-            if not begin.wait():
-                _stop(service, signals)
-                return service.counts()
+    with _Signals() as signals, StateLock(path) as lock, ExitStack() as control:
+        service = Service(path, sub, pub, insecure=insecure, **options)
+        if http:
+            _serve_http(service, http, token_file, insecure, control)
+        if signals.wait_during(service.start):
             _announce(service, lock, bool(http), on_ready, on_fault)
-            signals.get()
-            _stop(service, signals)
-            return service.counts()
-    finally:
-        for number, handler in before.items():
+            signals.wait()
+        _stop(service, signals)
+        return service.counts()
+
+
+class _Signals:
+    """While its block runs, SIGTERM and SIGINT end `wait` instead of the process.
+
+    A signal may be given to any thread, and then the main thread, which waits, would not hear of it. So each writes its
+    number into a socket, which the main thread reads from.
+    """
+
+    def __enter__(self) -> Self:
+        self._reader, self._writer = socket.socketpair()
+        self._writer.setblocking(False)
+        self._woken_before = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
+        self._before = {number: signal.signal(number, _hear) for number in _SIGNALS}
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        for number, handler in self._before.items():
             signal.signal(number, handler)
-
-
-class _Aside:
-    """Something that takes its time, on a thread of its own, so that the main thread hears of signals."""
-
-    def __init__(self, work: Callable[[], Any], signals: queue.SimpleQueue[str]) -> None:
-        self._work, self._signals = work, signals
-        self._error: BaseException | None = None
+        signal.set_wakeup_fd(self._woken_before)
+        self._reader.close()
+        self._writer.close()
 
     def wait(self) -> bool:
-        """Do it; return whether it was done before a signal came. What it raises is raised."""
-        threading.Thread(target=self._run, name="epypes serve", daemon=True).start()
-        is_done = self._signals.get() == "done"
-        if self._error is not None:
-            raise self._error
-        return is_done
+        """Wait for a signal, or for `wait_during`'s work to be done; return whether it was a signal."""
+        while (number := self._reader.recv(1)[0]) not in (*_SIGNALS, _DONE):
+            continue
+        return number != _DONE
 
-    def _run(self) -> None:
-        try:
-            self._work()
-        except BaseException as error:
-            self._error = error
-        self._signals.put("done")
+    def wait_during(self, work: Callable[[], Any]) -> bool:
+        """Do something on a thread of its own; return whether it was done before a signal came.
+
+        What it raises is raised.
+        """
+        errors: list[BaseException] = []
+
+        def run() -> None:
+            try:
+                work()
+            except BaseException as error:
+                errors.append(error)
+            # Closed, if nobody waits any more.
+            with suppress(OSError):
+                self._writer.send(bytes([_DONE]))
+
+        threading.Thread(target=run, name="epypes serve", daemon=True).start()
+        is_signal = self.wait()
+        if errors:
+            raise errors[0]
+        return not is_signal
+
+
+def _hear(number: int, frame: FrameType | None) -> None:
+    """Do nothing: the signal's number has been written."""
 
 
 def _serve_http(
@@ -135,7 +154,7 @@ def _announce(
         on_ready(service.service_state)
 
 
-def _stop(service: Service, signals: queue.SimpleQueue[str]) -> None:
+def _stop(service: Service, signals: _Signals) -> None:
     """Stop a service; at once, if another signal comes.
 
     Raises
@@ -143,6 +162,6 @@ def _stop(service: Service, signals: queue.SimpleQueue[str]) -> None:
     ServiceError
         One came.
     """
-    if not _Aside(service.stop, signals).wait():
+    if not signals.wait_during(service.stop):
         count = service.abandon()
         raise ServiceError(service.path, f"Stopped at once by a second signal; {count} events were not finished.")
