@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from epypes.cli.ending import Ending
 from epypes.cli.options import Allow, Keys
 from epypes.cli.terminal import out
 from epypes.errors import RecordingError
@@ -35,6 +34,7 @@ def play(
     only_info: Annotated[bool, typer.Option("--info", help="Send nothing; print what is in the file.")] = False,
 ) -> None:
     """Publish the messages of a file as they came, at the same distances in time."""
+    from epypes.service.signals import Signals
     from epypes.transport import Player, recording_info
 
     if only_info:
@@ -44,7 +44,7 @@ def play(
         raise RecordingError(file, "--speed inf is no speed. 0 is as fast as possible.")
     place = address.removeprefix(_CONNECT)
     bind = not address.startswith(_CONNECT)
-    with Ending() as ending:
+    with Signals() as signals:
         player = Player(
             file,
             place,
@@ -55,11 +55,11 @@ def play(
             insecure=insecure,
             keys=keys,
             allow=allow,
-            on_end=ending.now,
+            on_end=signals.now,
         ).start()
         try:
             out.print(f"PLAYING {file} at {player.address}. Ctrl+C ends it.", markup=False)
-            ending.wait()
+            signals.wait()
         finally:
             try:
                 player.stop()

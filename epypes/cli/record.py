@@ -8,7 +8,6 @@ from typing import Annotated
 
 import typer
 
-from epypes.cli.ending import Ending
 from epypes.cli.options import Allow, Keys
 from epypes.cli.terminal import out
 from epypes.errors import RecordingError
@@ -32,6 +31,7 @@ def record(
     allow: Allow = None,
 ) -> None:
     """Write every message that is published into a file, until SIGTERM or Ctrl+C."""
+    from epypes.service.signals import Signals
     from epypes.transport import Recorder
 
     if seconds is not None and seconds > threading.TIMEOUT_MAX:
@@ -39,7 +39,7 @@ def record(
         raise RecordingError(file, text)
     bind = address.startswith(_BIND)
     place = address.removeprefix(_BIND)
-    with Ending() as ending:
+    with Signals() as signals:
         recorder = Recorder(
             place,
             file,
@@ -50,13 +50,13 @@ def record(
             insecure=insecure,
             keys=keys,
             allow=allow,
-            on_end=ending.now,
+            on_end=signals.now,
         )
         recorder.start()
         try:
             joined = "" if recorder.wait_joined(_JOIN_S) else " (nobody has confirmed yet)"
             out.print(f"RECORDING {recorder.address}{joined} to {file}. Ctrl+C ends it.", markup=False)
-            ending.wait(seconds)
+            signals.wait(seconds)
         finally:
             try:
                 recorder.stop(_STOP_S)

@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import signal
-import socket
-import threading
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
-from types import FrameType
-from typing import Any, Final, Self
+from typing import Any
 
 from epypes.errors import ServiceError
 from epypes.service.server import Service
+from epypes.service.signals import Signals
 from epypes.service.state import ServiceState, StateLock
-
-_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT)
-# No signal has this number.
-_DONE: Final = 0
 
 
 def serve(
@@ -54,7 +47,7 @@ def serve(
     BundleError, AddressError
         As for Service.
     """
-    with _Signals() as signals, StateLock(path) as lock, ExitStack() as control:
+    with Signals() as signals, StateLock(path) as lock, ExitStack() as control:
         service = Service(path, sub, pub, insecure=insecure, **options)
         if http:
             _serve_http(service, http, token_file, insecure, control)
@@ -63,60 +56,6 @@ def serve(
             signals.wait()
         _stop(service, signals)
         return service.counts()
-
-
-class _Signals:
-    """While its block runs, SIGTERM and SIGINT end `wait` instead of the process.
-
-    A signal may be given to any thread, and then the main thread, which waits, would not hear of it. So each writes its
-    number into a socket, which the main thread reads from.
-    """
-
-    def __enter__(self) -> Self:
-        self._reader, self._writer = socket.socketpair()
-        self._writer.setblocking(False)
-        self._woken_before = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
-        self._before = {number: signal.signal(number, _hear) for number in _SIGNALS}
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-        signal.set_wakeup_fd(self._woken_before)
-        self._reader.close()
-        self._writer.close()
-
-    def wait(self) -> bool:
-        """Wait for a signal, or for `wait_during`'s work to be done; return whether it was a signal."""
-        while (number := self._reader.recv(1)[0]) not in (*_SIGNALS, _DONE):
-            continue
-        return number != _DONE
-
-    def wait_during(self, work: Callable[[], Any]) -> bool:
-        """Do something on a thread of its own; return whether it was done before a signal came.
-
-        What it raises is raised.
-        """
-        errors: list[BaseException] = []
-
-        def run() -> None:
-            try:
-                work()
-            except BaseException as error:
-                errors.append(error)
-            # Closed, if nobody waits any more.
-            with suppress(OSError):
-                self._writer.send(bytes([_DONE]))
-
-        threading.Thread(target=run, name="epypes serve", daemon=True).start()
-        is_signal = self.wait()
-        if errors:
-            raise errors[0]
-        return not is_signal
-
-
-def _hear(number: int, frame: FrameType | None) -> None:
-    """Do nothing: the signal's number has been written."""
 
 
 def _serve_http(
@@ -154,7 +93,7 @@ def _announce(
         on_ready(service.service_state)
 
 
-def _stop(service: Service, signals: _Signals) -> None:
+def _stop(service: Service, signals: Signals) -> None:
     """Stop a service; at once, if another signal comes.
 
     Raises
