@@ -55,8 +55,8 @@ if TYPE_CHECKING:
         summarize,
     )
     from epypes.run.guard import unguarded
-    from epypes.service.connection import connect
-    from epypes.service.reopen import load_failure
+    from epypes.service.failures.reopen import load_failure
+    from epypes.service.remote.connection import connect
     from epypes.transport import ZMQPublisher, ZMQSubscriber
 
 _HOMES = {
@@ -103,9 +103,9 @@ _HOMES = {
     "Stages": "epypes.pipeline",
     "ZMQPublisher": "epypes.transport",
     "ZMQSubscriber": "epypes.transport",
-    "connect": "epypes.service.connection",
+    "connect": "epypes.service.remote.connection",
     "load": "epypes.bundle",
-    "load_failure": "epypes.service.reopen",
+    "load_failure": "epypes.service.failures.reopen",
     "load_pipeline": "epypes.bundle",
     "promote": "epypes.bundle",
     "to_source": "epypes.bundle",

@@ -11,7 +11,7 @@ from epypes.cli.terminal import err, out
 from epypes.errors import KeysError
 
 if TYPE_CHECKING:
-    from epypes.service.connection import Connection
+    from epypes.service.remote.connection import Connection
 
 _Http = Annotated[str, typer.Option(help="Where the service is controlled, as http://127.0.0.1:8642.")]
 _TokenFile = Annotated[
@@ -45,7 +45,7 @@ def _told(what: str, before: dict[str, Any], now: dict[str, Any]) -> str:
 
 
 def _connected(http: str, token_file: Path | None) -> Connection:
-    from epypes.service.connection import connect
+    from epypes.service.remote.connection import connect
 
     return connect(http, token=None if token_file is None else _token(token_file))
 

@@ -16,7 +16,7 @@ from epypes.cli.terminal import err, out
 from epypes.errors import ServiceError
 
 if TYPE_CHECKING:
-    from epypes.service.failurerecord import FailureRecord
+    from epypes.service.failures.record import FailureRecord
 
 _MOST_CHARACTERS: Final = 200
 
@@ -35,7 +35,7 @@ def failures(
     allow: Allow = None,
 ) -> None:
     """List the failures that were kept; epypes replay ID runs one again."""
-    from epypes.service.failuresource import failures_of
+    from epypes.service.failures.source import failures_of
 
     if follow:
         _follow(source, as_json, keys, allow)
@@ -54,7 +54,7 @@ def failures(
 
 def _follow(source: str | None, as_json: bool, keys: Path | None, allow: list[Path] | None) -> None:
     """Print a line for each failure as it happens."""
-    from epypes.service.failurenews import failures_from_now_on
+    from epypes.service.failures.news import failures_from_now_on
 
     if source is None:
         raise ServiceError("", "Whose failures? Say: epypes failures --follow BUNDLE, or the http URL of its service.")

@@ -10,8 +10,8 @@ import typer
 from epypes.cli.terminal import out
 
 if TYPE_CHECKING:
-    from epypes.service.failurerecord import FailureRecord
-    from epypes.service.reproduce import Reproduction
+    from epypes.service.failures.record import FailureRecord
+    from epypes.service.failures.reproduce import Reproduction
 
 
 def replay(
@@ -29,8 +29,8 @@ def replay(
     trace: Annotated[bool, typer.Option("--trace", help="Print the whole traceback.")] = False,
 ) -> None:
     """Run an event that failed again, in a process of its own; exit 0 only if it is fine now."""
-    from epypes.service.failuresource import bundle_of, failures_of, found_by, path_of
-    from epypes.service.reproduce import reproduce
+    from epypes.service.failures.reproduce import reproduce
+    from epypes.service.failures.source import bundle_of, failures_of, found_by, path_of
 
     failures = failures_of(source)
     record = found_by(failures, failure)

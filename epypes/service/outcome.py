@@ -10,8 +10,8 @@ from typing import Any, Final, Literal
 
 from epypes.errors import MailboxOverflow, MessageError, ServiceError
 from epypes.run import Failure
-from epypes.service.failurerecord import FailureRecord
-from epypes.service.failurestore import FailureStore
+from epypes.service.failures.record import FailureRecord
+from epypes.service.failures.store import FailureStore
 from epypes.service.latency import Stopwatch
 from epypes.service.ledger import Entry, Outcome
 from epypes.wire import Envelope

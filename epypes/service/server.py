@@ -13,8 +13,8 @@ from epypes.service.about import about
 from epypes.service.asks import Asks
 from epypes.service.deploying import Deployer
 from epypes.service.dispatch import Dispatcher
-from epypes.service.failurerecord import FailureRecord
-from epypes.service.failurestore import FailureStore, failures_folder
+from epypes.service.failures.record import FailureRecord
+from epypes.service.failures.store import FailureStore, failures_folder
 from epypes.service.latency import Latency
 from epypes.service.ledger import Ledger, Policy
 from epypes.service.notify import notify

@@ -8,8 +8,8 @@ import numpy as np
 
 import epypes as ep
 from epypes.bundle.seal import check_seal
-from epypes.service.failurerecord import FailureRecord
-from epypes.service.failurestore import FailureStore, failures_folder
+from epypes.service.failures.record import FailureRecord
+from epypes.service.failures.store import FailureStore, failures_folder
 from epypes.wire import Envelope
 
 FINE, KILLS, HANGS, EXITS, CRASHES, RAISES = 20, 6, 8, 9, 7, 94

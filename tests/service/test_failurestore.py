@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from epypes.errors import FailureNotKept, UnknownName
-from epypes.service.failurefiles import Entry, to_remove
-from epypes.service.failurepace import Waiting
-from epypes.service.failurerecord import ID, FailureRecord, record_of, with_id
-from epypes.service.failurestore import FailureStore, failures_folder
+from epypes.service.failures.files import Entry, to_remove
+from epypes.service.failures.pace import Waiting
+from epypes.service.failures.record import ID, FailureRecord, record_of, with_id
+from epypes.service.failures.store import FailureStore, failures_folder
 from epypes.wire import Envelope
 
 FAILED = FailureRecord(

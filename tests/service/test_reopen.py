@@ -15,11 +15,11 @@ from epypes.bundle.seal import seal
 from epypes.display.views.view import view
 from epypes.errors import BundleError, FailureNotKept, NotComputed, RemoteFailure, UnknownName
 from epypes.service import Service
-from epypes.service.failurerecord import FailureRecord
-from epypes.service.failuresource import failures_of, found_by
-from epypes.service.failurestore import FailureStore, failures_folder
+from epypes.service.failures.record import FailureRecord
+from epypes.service.failures.reproduce import reproduce
+from epypes.service.failures.source import failures_of, found_by
+from epypes.service.failures.store import FailureStore, failures_folder
 from epypes.service.http import HttpServer
-from epypes.service.reproduce import reproduce
 from epypes.wire import Envelope
 from tests.service.failing import CRASHES, EXITS, FINE, HANGS, KILLS, RAISES, keep, picture, promoted, request
 from tests.transport.peers import wait_until

@@ -12,7 +12,7 @@ import pytest
 
 import epypes as ep
 from epypes.errors import PayloadError, ServiceError
-from epypes.service.connection import Connection
+from epypes.service.remote.connection import Connection
 from epypes_widgets import Panel, tune
 from tests.service.standing import Standing, standing
 from tests.widgets.frontend import FrontEnd

@@ -31,7 +31,7 @@ from epypes_widgets.still import Still
 from epypes_widgets.tuning import Tuning
 
 if TYPE_CHECKING:
-    from epypes.service.connection import Connection
+    from epypes.service.remote.connection import Connection
     from epypes_widgets.historyframe import HistoryFrame
 
 

@@ -25,12 +25,12 @@ from typing import Any, Final, NoReturn
 from epypes.bundle.load import Bundle, read_bundle
 from epypes.bundle.replay import replay
 from epypes.pipeline import Pipeline
-from epypes.service.asked import Asked, Latest
-from epypes.service.changes import Changes
 from epypes.service.channel import Channel
-from epypes.service.inbox import Change, Event, Inbox
-from epypes.service.slots import Slot
-from epypes.service.traces import reason_of
+from epypes.service.worker.asked import Asked, Latest
+from epypes.service.worker.changes import Changes
+from epypes.service.worker.inbox import Change, Event, Inbox
+from epypes.service.worker.slots import Slot
+from epypes.service.worker.traces import reason_of
 
 ENDED: Final = 0
 REFUSED: Final = 1

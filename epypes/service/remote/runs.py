@@ -17,7 +17,7 @@ from epypes.run.tokens import NOT_COMPUTED, Freshness
 from epypes.service.parameters import Parameters
 
 if TYPE_CHECKING:
-    from epypes.service.connection import Connection
+    from epypes.service.remote.connection import Connection
     from epypes.wire import Envelope
 
 _MOST_VALUES: Final = 1_000

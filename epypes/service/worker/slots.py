@@ -20,9 +20,9 @@ from epypes.pipeline.answering import Answering
 from epypes.pipeline.reactive import SinkPipeline
 from epypes.run import Failure, Run
 from epypes.service.channel import Channel
-from epypes.service.inbox import Event, Inbox
 from epypes.service.packing import BytesLike
-from epypes.service.traces import failure_told
+from epypes.service.worker.inbox import Event, Inbox
+from epypes.service.worker.traces import failure_told
 from epypes.wire import Envelope, decode, encode, serialized
 from epypes.wire.failures import failure_event
 

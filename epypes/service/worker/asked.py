@@ -19,9 +19,9 @@ from epypes.graph import colour_order
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner, Run
 from epypes.service.channel import Channel
-from epypes.service.inbox import Inbox, Job
 from epypes.service.packing import BytesLike, pack
-from epypes.service.slots import Completed
+from epypes.service.worker.inbox import Inbox, Job
+from epypes.service.worker.slots import Completed
 from epypes.wire import Envelope, encode
 
 if TYPE_CHECKING:

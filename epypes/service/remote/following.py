@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, suppress
 from typing import Any, Final
 
 from epypes.errors import EpypesError
-from epypes.service.control import Stream
+from epypes.service.remote.control import Stream
 
 _LOG: Final = logging.getLogger(__name__)
 _FIRST_WAIT_S: Final = 0.25

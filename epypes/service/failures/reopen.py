@@ -13,9 +13,9 @@ from epypes.bundle.load import Bundle, pipeline_of, read_bundle
 from epypes.errors import RemoteFailure
 from epypes.run import CompGraphRunner
 from epypes.run.stopped import stop_at
-from epypes.service.failurerecord import FailureRecord, values_of
-from epypes.service.failuresource import bundle_of, failures_of, found_by, path_of
-from epypes.service.reproduce import reproduce
+from epypes.service.failures.record import FailureRecord, values_of
+from epypes.service.failures.reproduce import reproduce
+from epypes.service.failures.source import bundle_of, failures_of, found_by, path_of
 
 _NOT_AGAIN = ("killed", "stuck")
 

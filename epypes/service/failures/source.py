@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from epypes.bundle.seal import check_seal
 from epypes.errors import BundleError, FailureNotKept, UnknownName
-from epypes.service.failurerecord import ID, FailureRecord, record_of
-from epypes.service.failurestore import FailureStore, failures_folder
+from epypes.service.failures.record import ID, FailureRecord, record_of
+from epypes.service.failures.store import FailureStore, failures_folder
 
 if TYPE_CHECKING:
-    from epypes.service.connection import Connection
+    from epypes.service.remote.connection import Connection
     from epypes.wire import Envelope
 
 LATEST: Final = "latest"
@@ -113,7 +113,7 @@ def connected(source: Any) -> Connection:
     TypeError
         It is neither.
     """
-    from epypes.service.connection import Connection, connect
+    from epypes.service.remote.connection import Connection, connect
 
     if isinstance(source, str):
         return connect(source)

@@ -1,6 +1,6 @@
 """Does an event that failed in a service fail again, in a fresh process that may be killed or stuck?
 
-Run as a program (``python -I -m epypes.service.reproduce BUNDLE FOLDER SECONDS``) it is that process.
+Run as a program (``python -I -m epypes.service.failures.reproduce BUNDLE FOLDER SECONDS``) it is that process.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.errors import BundleError, EpypesError
-from epypes.service.failurerecord import FailureRecord, record_of, values_of, with_id
+from epypes.service.failures.record import FailureRecord, record_of, values_of, with_id
 
 if TYPE_CHECKING:
     from epypes.pipeline import FullPipeline
@@ -103,7 +103,15 @@ def reproduce(
 
 def _run_apart(folder: Path, scratch: Path, timeout_s: float) -> int | None:
     """Return the exit status of the process; None if it had to be killed."""
-    command = [sys.executable, "-I", "-m", "epypes.service.reproduce", str(folder), str(scratch), f"{timeout_s:g}"]
+    command = [
+        sys.executable,
+        "-I",
+        "-m",
+        "epypes.service.failures.reproduce",
+        str(folder),
+        str(scratch),
+        f"{timeout_s:g}",
+    ]
     with (scratch / _DUMP).open("wb") as dump:
         process = subprocess.Popen(  # noqa: S603 - this interpreter, this module
             command,

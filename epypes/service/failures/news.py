@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import ServiceError
 from epypes.service.client import why_unreachable
-from epypes.service.failurerecord import FailureRecord, record_of
-from epypes.service.failuresource import connected, path_of
+from epypes.service.failures.record import FailureRecord, record_of
+from epypes.service.failures.source import connected, path_of
 from epypes.service.outcome import FAILURE_TOPIC
 from epypes.service.state import read_state
 from epypes.transport import ZMQSubscriber

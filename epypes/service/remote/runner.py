@@ -25,16 +25,16 @@ from epypes.errors import (
 from epypes.run import Run
 from epypes.run.program import Program
 from epypes.run.watchers import Watchers
-from epypes.service.control import parameters_of
-from epypes.service.following import Follower
 from epypes.service.parameters import Parameters
-from epypes.service.remoteruns import RemoteRuns
-from epypes.service.seenruns import SeenRuns
-from epypes.service.standins import graph_of
+from epypes.service.remote.control import parameters_of
+from epypes.service.remote.following import Follower
+from epypes.service.remote.runs import RemoteRuns
+from epypes.service.remote.seenruns import SeenRuns
+from epypes.service.remote.standins import graph_of
 
 if TYPE_CHECKING:
-    from epypes.service.connection import Connection
-    from epypes.service.control import Stream
+    from epypes.service.remote.connection import Connection
+    from epypes.service.remote.control import Stream
 
 # Somebody else who changes the parameters all the time must not keep the panel from coming to an end.
 _MOST_TRIES: Final = 5

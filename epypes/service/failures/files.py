@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from epypes.errors import FailureNotKept, UnknownName
-from epypes.service.failurerecord import ID, FailureRecord, record_of
+from epypes.service.failures.record import ID, FailureRecord, record_of
 
 _RECORD, _EVENT, _PART = ".json", ".event", ".part"
 # Larger ones were not written here.

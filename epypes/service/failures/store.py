@@ -17,9 +17,9 @@ from time import monotonic
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import EpypesError, FailureNotKept, UnknownName
-from epypes.service.failurefiles import Entry, entries, read_event, read_record, remove, sweep, to_remove, write
-from epypes.service.failurepace import BURST, Waiting
-from epypes.service.failurerecord import FailureRecord, record_of, with_id
+from epypes.service.failures.files import Entry, entries, read_event, read_record, remove, sweep, to_remove, write
+from epypes.service.failures.pace import BURST, Waiting
+from epypes.service.failures.record import FailureRecord, record_of, with_id
 
 if TYPE_CHECKING:
     from epypes.wire import Envelope

@@ -13,13 +13,13 @@ from urllib.parse import quote
 from epypes.bundle.entries import plain, written
 from epypes.bundle.ports import in_order
 from epypes.errors import EpypesError, ServiceError
-from epypes.service.control import Control, address_of, parameters_of
-from epypes.service.failurerecord import FailureRecord
+from epypes.service.failures.record import FailureRecord
 from epypes.service.parameters import Parameters
+from epypes.service.remote.control import Control, address_of, parameters_of
 
 if TYPE_CHECKING:
     from epypes.display.views.graphview import GraphView
-    from epypes.service.remote import RemoteRunner
+    from epypes.service.remote.runner import RemoteRunner
     from epypes.wire import Envelope
 
 _TOKEN: Final = "EPYPES_TOKEN"  # noqa: S105 - the name of a variable, not a secret
@@ -240,7 +240,7 @@ class Connection:
 
     def to_tune(self) -> RemoteRunner:
         """Return what ``tune`` moves: the same for all panels of this connection, so that they share a history."""
-        from epypes.service.remote import RemoteRunner
+        from epypes.service.remote.runner import RemoteRunner
 
         if self._runner is None:
             self._runner = RemoteRunner(self, self._control.events)
@@ -264,7 +264,7 @@ class Connection:
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         from epypes.display.mime import bundle_of
-        from epypes.service.shown import painted
+        from epypes.service.remote.shown import painted
 
         return bundle_of(self, lambda: painted(self.url, self._info, self._view), lambda: self._seen_or_nothing())
 

@@ -1,0 +1,1 @@
+"""A running service as a notebook sees it, over HTTP: looked at, changed, tuned."""
