@@ -34,8 +34,9 @@ class Member:
 
 
 def plain(value: Any) -> Any:
-    """Return a number of NumPy's as Python's own, for what compares it."""
-    return value.item() if _is_numpy_number(value) else value
+    """Return a scalar of NumPy's as Python's own, for what compares it."""
+    is_scalar = type(value).__module__ == "numpy" and getattr(value, "shape", None) == ()
+    return value.item() if is_scalar else value
 
 
 def alike(entry: Mapping[str, Any], value: Any) -> Any:

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from epypes.cli.terminal import out
+from epypes.errors import ServiceError
 
 _STYLES = {"ok": "green", "warning": "yellow", "failed": "red"}
 
@@ -36,5 +37,7 @@ def doctor(
                 out.print(f"{'':9}{check.way_out}", markup=False, style=style)
     if as_json:
         out.print(json.dumps([asdict(check) for check in checks], indent=1), markup=False)
-    if any(check.outcome == "failed" for check in checks):
-        raise typer.Exit(1)
+    failed = [check.name for check in checks if check.outcome == "failed"]
+    if failed:
+        text = f"Not ready: {', '.join(failed)}. What helps stands above, beside each."
+        raise ServiceError(bundle or "this machine", text)

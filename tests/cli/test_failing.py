@@ -46,6 +46,16 @@ ROWS = {
         (["{bundle}", "{folder}/none.png"], "Image '{folder}/none.png' can't be read"),
         (["{broken}", "image.png"], "pipeline.toml can't be read: "),
     ],
+    "deploy": [(["{bundle}", "--http", "http://127.0.0.1:9"], "No service answers at http://127.0.0.1:9. Start one: ")],
+    "rollback": [(["--http", "nonsense"], "'nonsense' is no address of a service. Write it as http://127.0.0.1:8642")],
+    "failures": [(["{folder}/none"], "{folder}/none does not exist")],
+    "replay": [(["latest", "{folder}/none"], "{folder}/none does not exist"), (["abc"], "No failure 'abc' here")],
+    "keys": [(["a/b"], "is no name for keys")],
+    "doctor": [(["{folder}"], "Not ready: bundle")],
+    "export": [
+        (["systemd", "{folder}/none"], "{folder}/none does not exist"),
+        (["docker", "{broken}", "--to", "{folder}/image"], "pipeline.toml can't be read: "),
+    ],
     "record": [(["nonsense", "{folder}/a.mcap"], "nonsense can't be connected: Invalid argument")],
     "play": [
         (["{folder}/none.mcap"], "can't be read"),

@@ -110,11 +110,11 @@ def test_a_runner_that_has_not_been_run_is_refused(told: Told, tmp_path: Path) -
 
 
 def test_every_reason_is_said(told: Told, tmp_path: Path) -> None:
-    runner = runner_of(lambda x, k, m: x, "x", "k", "m", k=np.ones(3), m=len)
+    runner = runner_of(lambda x, k, m: x, "x", "k", "m", k=np.ones(1_000), m=len)
     runner.run(x=1)
     outcome = told.promoted(runner, tmp_path / "b")
     assert outcome.state == "refused"
-    assert "Hyperparameter 'k' is a ndarray" in outcome.text
+    assert "Hyperparameter 'k' is an array of 1000 numbers" in outcome.text
     assert "Hyperparameter 'm'" in outcome.text
 
 

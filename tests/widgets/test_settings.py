@@ -134,10 +134,10 @@ def test_all_that_is_wrong_is_said_at_once_with_the_nearest_names(tmp_path: Path
 
 
 def test_values_that_can_not_be_written_are_all_named_and_nothing_is_written(tmp_path: Path) -> None:
-    values = {"kernel": np.ones(3), "f": len, "flags": Flags.A | Flags.B, "big": 2**63, "half": "\ud800", "fine": 1}
+    values = {"kernel": np.ones(1_000), "f": len, "flags": Flags.A | Flags.B, "half": "\ud800", "fine": 1}
     with pytest.raises(SettingsError) as caught:
         save(tmp_path / "x", values, graph(*values))
-    assert [reason.split("'")[1] for reason in caught.value.reasons] == ["kernel", "f", "flags", "big", "half"]
+    assert [reason.split("'")[1] for reason in caught.value.reasons] == ["kernel", "f", "flags", "half"]
     assert "which TOML can't hold" in caught.value.reasons[0]
     assert list(tmp_path.iterdir()) == []
 

@@ -127,16 +127,16 @@ def _with_suffix(path: str | Path) -> Path:
 
 
 def _unwritable(token: str, value: Any) -> Iterator[str]:
-    if isinstance(value, enum.Enum):
+    if not _is_text(token) or (isinstance(value, str) and not _is_text(value)):
+        yield f"Hyperparameter {token!r} has characters that no file can hold: half of a surrogate pair."
+    elif isinstance(value, enum.Enum):
         if value.name not in type(value).__members__:
             yield f"Hyperparameter {token!r} is {value!r:.60}, which has no name of its own. Set one that has."
     elif not fits(plain(value)):
         yield (
             f"Hyperparameter {token!r} is a {type(value).__name__}, which TOML can't hold. Leave it out, or make it a "
-            "number, string, bool, None, a member of an enumeration, or a tuple or list of numbers and strings."
+            "number, string, bool, None, a member of an enumeration, a small array, or a tuple, list or dict of these."
         )
-    if not _is_text(token) or (isinstance(value, str) and not _is_text(value)):
-        yield f"Hyperparameter {token!r} has characters that no file can hold: half of a surrogate pair."
 
 
 def _is_text(text: str) -> bool:
@@ -254,6 +254,8 @@ def _is_foreign(file: Path) -> bool:
 
 def _value(token: str, entry: Any) -> Any:
     try:
+        if _is_member(entry):
+            return entry["value"]
         value = read(entry) if isinstance(entry, dict) else entry
     except (KeyError, TypeError) as error:
         raise ValueError(f"Hyperparameter {token!r} is a table without a value.") from error
@@ -262,9 +264,14 @@ def _value(token: str, entry: Any) -> Any:
     return value
 
 
+def _is_member(entry: Any) -> bool:
+    """Whether an entry names a member of an enumeration; of which, the present value says."""
+    return isinstance(entry, dict) and entry.get("kind") == _MEMBER
+
+
 def _restored(value: Any, entry: Any, token: str, present: Any) -> Any:
     """Return a value as the kind that the present one is of, where the file can't say it."""
-    if isinstance(entry, dict) and entry.get("kind") == _MEMBER:
+    if _is_member(entry):
         return _member(value, token, present)
     if type(present).__module__ == "numpy" and getattr(present, "shape", None) == ():
         return _scalar(value, token, present)
