@@ -209,7 +209,7 @@ def test_while_a_bundle_is_deployed_another_one_is_refused_and_all_else_is_answe
     slow = acting_bundle(tmp_path / "slow")
     waiting = acting_bundle(tmp_path / "waiting")
     (waiting / "pipeline.py").write_text(
-        f"import os, time\nwhile not os.path.exists({str(tmp_path / 'go')!r}): time.sleep(0.01)\n"
+        f"import os, time\nopen({str(tmp_path / 'begun')!r}, 'w').close()\nwhile not os.path.exists({str(tmp_path / 'go')!r}): time.sleep(0.01)\n"
         + (waiting / "pipeline.py").read_text()
     )
     seal(waiting)
@@ -221,7 +221,8 @@ def test_while_a_bundle_is_deployed_another_one_is_refused_and_all_else_is_answe
                 target=lambda: answers.append(client.post("/v1/deploy", json={"bundle": str(waiting)}))
             )
             first.start()
-            until(lambda: client.post("/v1/deploy", json={"bundle": str(slow)}).status_code == 409)
+            until((tmp_path / "begun").exists)
+            assert client.post("/v1/deploy", json={"bundle": str(slow)}).status_code == 409
             refused = client.post("/v1/rollback")
             assert refused.status_code == 409
             assert "exchanged already" in refused.json()["detail"]

@@ -18,7 +18,7 @@ CONFIG = {
     "checks": {
         "positive_data_acceptance": {"expected-statuses": ["2xx", "401", "403", "404", "409", "422"]},
         "negative_data_rejection": {
-            "expected-statuses": ["400", "401", "403", "404", "405", "413", "415", "421", "422"]
+            "expected-statuses": ["400", "401", "403", "404", "405", "413", "414", "415", "421", "422"]
         },
     },
 }
