@@ -15,7 +15,7 @@ test: $(VENV)/.test chromium
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/pytest -m "" -n 0 -p nbval.plugin --nbval --nbval-sanitize-with tests/notebooks/sanitize.cfg \
+	$(BIN)/pytest -m "" -n 2 -p nbval.plugin --nbval --nbval-sanitize-with tests/notebooks/sanitize.cfg \
 		tests epypes widgets/epypes_widgets notebooks
 
 lab: $(VENV)/.all

@@ -8,11 +8,24 @@ import cv2
 import numpy as np
 import pytest
 from skimage import data
+from xdist.scheduler import LoadFileScheduling
 
 import epypes as ep
 
 # They inherit it: the tutorial on the experiment asks so often where a reader asks 500 times.
 os.environ.setdefault("EPYPES_REQUESTS", "20")
+
+
+class _Scheduling(LoadFileScheduling):
+    """Tests of one file share what they begin with; those of the browser share JupyterLab, and never run side by side."""
+
+    def _split_scope(self, nodeid):
+        file = super()._split_scope(nodeid)
+        return "tests/browser" if file.startswith("tests/browser/") else file
+
+
+def pytest_xdist_make_scheduler(config, log):
+    return _Scheduling(config, log)
 
 
 def grayscale(im):

@@ -93,12 +93,15 @@ class WorkerProcess:
         if not self.wait(_ENDING_S):
             self.kill()
         self.process.wait()
+        if self._traces == -1:
+            return
         self._last_traces = self._traces_from(0)
         self.channel.close()
         # Its last words are on their way; a process that it has started may hold the pipe open for longer.
         self._listener.join(0.2)
-        with contextlib.suppress(OSError):
-            os.close(self._traces)
+        # Once: later the number may be that of another file.
+        traces, self._traces = self._traces, -1
+        os.close(traces)
 
     @property
     def ending(self) -> str:

@@ -84,8 +84,8 @@ class FailureRecord:
 
     @property
     def summary(self) -> str:
-        """What failed, in one line."""
-        text = " ".join(self.message.split())
+        """What failed, in one line that every log and terminal can write."""
+        text = " ".join(self.message.split()).encode(errors="backslashreplace").decode()
         return f"{self.exception}: {text}" if text else self.exception
 
 
