@@ -16,6 +16,7 @@ from typing import Any, Final
 from epypes.bundle.evaluate import UNKNOWN, value_of
 from epypes.bundle.literal import is_same_data
 from epypes.bundle.source import evaluated, importable
+from epypes.bundle.text import nested_codes
 from epypes.run.guard import is_plain_array
 
 # fmt: off
@@ -72,11 +73,11 @@ def unlike(
 
 def with_inner(captured: Mapping[str, Any], code: types.CodeType) -> dict[str, Any]:
     """Return what is captured, and what functions in it that are defined in some code have captured themselves."""
-    every = dict(captured)
+    every, inside = dict(captured), set(nested_codes(code))
     waiting = list(captured.values())
     while waiting:
         function = waiting.pop()
-        if not isinstance(function, types.FunctionType) or function.__code__ not in code.co_consts:
+        if not isinstance(function, types.FunctionType) or function.__code__ not in inside:
             continue
         for name, value in _cells(function):
             if name not in every:

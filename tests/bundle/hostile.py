@@ -91,6 +91,17 @@ PROMOTED: dict[str, tuple[str, dict[str, str]]] = {
         "    return decorate\n\n# Twice.\n@repeated(2)\n@ep.unguarded\ndef twice(a):\n    return a + SHIFT\nSHIFT = 1.5",
         {"twice": "twice"},
     ),
+    "decorator that derives": (
+        "def limited(low, high=5):\n    width = high - low\n    def decorate(f):\n        name = 3\n        @functools.wraps(f)\n"
+        "        def limit(a, k=low):\n            return np.clip(f(a), low, low + width) + k + name\n        return limit\n    return decorate\n"
+        "@limited(2)\ndef within(a):\n    return a * 2",
+        {"within": "within"},
+    ),
+    "decorators of libraries": (
+        "import contextlib\n@contextlib.contextmanager\ndef opened(a):\n    yield a + 1\n@functools.cache\ndef cached(n):\n    return n + 1\n"
+        "def with_opened(a):\n    with opened(a) as b:\n        return b + cached(2)",
+        {"with_opened": "with_opened"},
+    ),
     "lazy import": ("def lazy(a):\n    import math\n    from fractions import Fraction as F\n    return math.floor(F(7, 2))", {"lazy": "lazy"}),
     "imports": (
         "def imported(a):\n    return down(sqrt(16)) + NORM_L1 + len(take(0)(a)) + pi", {"imported": "imported"},
@@ -162,6 +173,33 @@ REFUSED: dict[str, tuple[str, str, str]] = {
     "decorator that counts": (
         "def d(g):\n    n = 0\n    @functools.wraps(g)\n    def w(a):\n        nonlocal n\n        n += 1\n        return g(a) + n\n    return w\n"
         "@d\ndef f(a):\n    return a", "f", r"@d \(cell \[1\], line 9\), which counts or keeps something in 'n'",
+    ),
+    "decorator that derives from what has changed": (
+        "LIM = 2\ndef d(g):\n    lim = LIM * 2\n    @functools.wraps(g)\n    def w(a):\n        return g(a) * lim\n    return w\n"
+        "@d\ndef f(a):\n    return a\nLIM = 3", "f", r"@d \(cell \[1\], line 8\), which keeps 'lim', of which the text",
+    ),
+    "decorator that derives from a changed argument": (
+        "N = 2\ndef d(n):\n    lim = n * 2\n    def deco(g):\n        @functools.wraps(g)\n        def w(a):\n            return g(a) * lim\n"
+        "        return w\n    return deco\n@d(N)\ndef f(a):\n    return a\nN = 3", "f", r"@d\(N\) \(cell \[1\], line 10\), which keeps 'lim'",
+    ),
+    "decorator that remembers": (
+        "def d(g):\n    seen = {}\n    @functools.wraps(g)\n    def w(a):\n        seen.setdefault('first', g(a))\n        return a - seen['first']\n"
+        "    return w\n@d\ndef f(a):\n    return a", "f", r"@d \(cell \[1\], line 8\), which keeps something in 'seen' from call to call",
+    ),
+    "decorator that hangs a count on it": (
+        "def d(g):\n    @functools.wraps(g)\n    def w(a):\n        return g(a)\n    w.calls = 0\n    return w\n@d\ndef f(a):\n    return a", "f",
+        r"@d \(cell \[1\], line 7\), which hangs 'calls' on it",
+    ),
+    "decorator with a default that was changed": (
+        "N = 2\ndef d(g):\n    @functools.wraps(g)\n    def w(a, n=N):\n        return g(a) * n\n    return w\n@d\ndef f(a):\n    return a\nN = 3", "f",
+        r"@d \(cell \[1\], line 7\), which keeps 'N'",
+    ),
+    "function with others for other types": (
+        "@functools.singledispatch\ndef f(a):\n    return a\n@f.register(float)\ndef _(a):\n    return 1", "f",
+        r"@functools\.singledispatch \(cell \[1\], line 1\), which knows other functions besides it",
+    ),
+    "library's decorator with a changed argument": (
+        "N = 2\n@functools.lru_cache(N)\ndef f(a):\n    return a\nN = 3", "f", r"\(cell \[1\], line 2\), whose argument 'N' may have had another value: write",
     ),
     "default that has changed": ("K = 1\ndef f(a, k=K):\n    return a + k\nK = 2", "f", r"default 'K' \(cell \[1\], line 2\), which has another value by now\. Define the function again"),
     "partial of an object": ("f = functools.partial(np.add, object())", "f", r"has a value of type object inside.* Make it a token"),
