@@ -20,6 +20,9 @@ _ASKED: Final = {
     "breakpoint": "which waits for a person. Leave it out",
     "exit": "which ends the notebook. Raise an exception",
     "quit": "which ends the notebook. Raise an exception",
+    "globals": "all names of the notebook. Use those that you need by name",
+    "eval": "which may use any name. Write what it evaluates",
+    "exec": "which may use any name. Write what it runs",
     "In": "the notebook's cells. Make the text a token",
     "Out": "what the notebook's cells have shown. Make the value a token",
 }
@@ -60,6 +63,14 @@ def check_asked(name: str, value: Any, found: Definition | ClassDefinition, what
     """Refuse a name that means something in a notebook alone."""
     if name in _ASKED and not (isinstance(value, types.FunctionType) and value.__module__ == "__main__"):
         raise Refused(f"{what} uses {name!r} ({found.place_of(name)}), {_ASKED[name]}.")
+    if name == "vars" and any(map(_asks_for_names, ast.walk(found.node))):
+        raise Refused(f"{what} uses 'vars()' ({found.place_of(name)}), all names there are. Use those that you need.")
     if name in _OF_A_MODULE:
         text = f"{what} uses {name!r} ({found.place_of(name)}), which is another one in a bundle"
         raise Refused(f"{text}. Write the value itself, or make it a token.")
+
+
+def _asks_for_names(node: ast.AST) -> bool:
+    """Whether this is ``vars()``, or a module's."""
+    is_call = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "vars"
+    return isinstance(node, ast.Call) and is_call and not any(isinstance(part, ast.Name) for part in node.args)
