@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import functools
+import operator
 
 import cv2
 import numpy as np
 import pytest
 
+import epypes as ep
 from epypes.bundle.slicer import slice_graph
+from epypes.errors import PromotionRefused
 from tests.bundle.hostile import in_notebook
 
 
@@ -96,3 +99,22 @@ def test_helpers_inside_of_a_factory_are_made_by_it(monkeypatch):
     found = sliced(monkeypatch, cell, f="f")
     assert found.refusals == []
     assert found.definitions["f"].text == "f = make(3)\n"
+
+
+@pytest.mark.parametrize(
+    ("cell", "known"),
+    [
+        ("K = [0]\ndef g(k):\n    operator.iadd(k, [1])\ndef f(a):\n    g(K)\n    return a", "K"),
+        ("K = np.zeros(3)\ndef f(a):\n    np.ndarray.__iadd__(K, 1)\n    return a", "K"),
+        (
+            "def make(k):\n    def f(a):\n        operator.iadd(k, [1])\n        return a\n    return f\nf = make([1])",
+            "k",
+        ),
+    ],
+)
+def test_what_a_function_changes_out_of_sight_is_seen_when_it_is_run_again(monkeypatch, tmp_path, cell, known):
+    names = in_notebook(monkeypatch, cell, operator=operator, np=np)
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": names["f"]}, {"f": ("a", "b")}))
+    runner.run(a=3)
+    with pytest.raises(PromotionRefused, match=f"'f' changes '{known}' from run to run.* make it a token"):
+        ep.promote(runner, tmp_path / "b")
