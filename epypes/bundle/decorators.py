@@ -14,9 +14,10 @@ from typing import Any, Final
 
 from epypes.bundle.cells import place_in, place_of
 from epypes.bundle.closures import rebound
-from epypes.bundle.evaluate import is_same
+from epypes.bundle.evaluate import UNKNOWN, is_same, value_of
 from epypes.bundle.source import Definition, Refused, definition, evaluated, importable, other_decorators
 from epypes.bundle.text import definition_of, nested_codes
+from epypes.bundle.wrappers import captured_by, library_state, own_state
 
 # A wrapper may be made to wrap itself; nobody wraps this deep on purpose.
 _DEEPEST: Final = 100
@@ -77,7 +78,7 @@ def _contradiction(decorator: ast.expr, wrapper: Any, wrapped: Any, names: Mappi
         return f"an object of class {type(made_by).__name__!r}"
     if isinstance(wrapper, types.FunctionType) and wrapper.__globals__ is names:
         return "which did not make it"
-    return ""
+    return library_state(decorator, wrapper, wrapped, names)
 
 
 def _own_contradiction(
@@ -86,17 +87,18 @@ def _own_contradiction(
     """Return why a wrapper is not what a decorator of the notebook makes."""
     if not isinstance(wrapper, types.FunctionType) or wrapper.__code__ not in set(nested_codes(made_by.__code__)):
         return "which makes something else by now"
-    free = wrapper.__code__.co_freevars
-    captured = {name: cell.cell_contents for name, cell in zip(free, wrapper.__closure__ or (), strict=True)}
+    captured = captured_by(wrapper)
     if not any(value is wrapped for value in captured.values()):
         return "which wraps something else"
-    changed = [name for name in free if name in rebound(wrapper.__code__)]
+    changed = [name for name in captured if name in rebound(wrapper.__code__)]
     if changed:
         return f"which counts or keeps something in {changed[0]!r} from call to call"
-    for name, given in _arguments(decorator, made_by):
-        if name in captured and (given is None or not is_same(given, captured[name], names)):
+    given: dict[str, Any] = {}
+    for name, expression in _arguments(decorator, made_by):
+        if name in captured and (expression is None or not is_same(expression, captured[name], names)):
             return f"whose argument {name!r} had another value"
-    return ""
+        given[name] = UNKNOWN if expression is None else value_of(expression, names)
+    return own_state(made_by, wrapper, wrapped, given, names)
 
 
 def _arguments(decorator: ast.expr, made_by: Callable[..., Any]) -> Iterator[tuple[str, ast.expr | None]]:

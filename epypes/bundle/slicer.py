@@ -22,6 +22,7 @@ from epypes.bundle.lines import assignment, flat, piece_of
 from epypes.bundle.literal import is_data
 from epypes.bundle.names import Names, of_object
 from epypes.bundle.order import Position, arranged
+from epypes.bundle.patches import check_home, check_patches
 from epypes.bundle.positions import AnyDefinition, Positions
 from epypes.bundle.source import Definition, Importable, Refused, importable
 from epypes.bundle.state import check_asked, check_state
@@ -90,6 +91,7 @@ class Slice:
 
     def reference(self, home: Importable, what: str) -> str:
         """Return the expression for what can be imported: ``cv2.Canny``, or ``len``, which needs no import."""
+        check_home(home, what)
         top = home.qualname.partition(".")[0]
         known = [name for name, imported in self.imports if imported == f"{home.module}.{top}"]
         if known:
@@ -194,6 +196,7 @@ class Slice:
 
     def _add_names(self, name: str, names: Sequence[str], found: AnyDefinition, what: str) -> None:
         """Add what a definition has from outside."""
+        check_patches(found, what)
         self._reads[name] = frozenset(names)
         for needed in names:
             try:
@@ -239,6 +242,7 @@ class Slice:
             if not hasattr(builtins, name):
                 place = found.place_of(name)
                 raise Refused(f"{what} uses {name!r}, which is not defined ({place}). Define it, or rename.")
+            self.names.claim(name, ("builtin", name), what)
             return
         self.names.read[name] = value
         if isinstance(value, types.ModuleType):
@@ -343,6 +347,7 @@ class Slice:
         self.imports[module, module] = f"import {module}"
 
     def _import_from(self, home: Importable, name: str) -> None:
+        check_home(home, f"A function that uses {name!r}")
         top, _, rest = home.qualname.partition(".")
         alias = "" if name == top else f" as {name}"
         if rest:

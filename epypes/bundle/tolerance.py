@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.bundle.compare import Tolerance, Unlike, differences
+from epypes.bundle.kept import kept_by, what_changed
 from epypes.bundle.nodes import called_by, is_plain_pipeline
 from epypes.bundle.suspects import suspicion, way_out
 from epypes.errors import BundleError
@@ -78,6 +79,7 @@ def learn(
     runner = CompGraphRunner(with_defaults(apart(cg), {}), hyperparameters)
     tolerances: dict[str, Tolerance] = {}
     reasons: list[str] = []
+    before = kept_by(cg.functions)
     for number, sample in enumerate(samples, 1):
         of = f" of sample {number} of {len(samples)}" if len(samples) > 1 else ""
         seen = _Seen(runner, sample, lambda text, of=of: told(text + of))  # type: ignore[misc]
@@ -86,7 +88,7 @@ def learn(
                 tolerances[token] = _widened(tolerances.get(token), found)
         reason = seen.reason(outputs)
         reasons += [reason] if reason and reason not in reasons else []
-    return Learnt(tolerances, tuple(reasons))
+    return Learnt(tolerances, tuple(reasons or what_changed(before, kept_by(cg.functions))))
 
 
 def apart(cg: CompGraph) -> CompGraph:

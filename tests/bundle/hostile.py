@@ -91,6 +91,23 @@ PROMOTED: dict[str, tuple[str, dict[str, str]]] = {
         "    return decorate\n\n# Twice.\n@repeated(2)\n@ep.unguarded\ndef twice(a):\n    return a + SHIFT\nSHIFT = 1.5",
         {"twice": "twice"},
     ),
+    "decorator that derives": (
+        "def limited(low, high=5):\n    width = high - low\n    def decorate(f):\n        name = 3\n        @functools.wraps(f)\n"
+        "        def limit(a, k=low):\n            return np.clip(f(a), low, low + width) + k + name\n        return limit\n    return decorate\n"
+        "@limited(2)\ndef within(a):\n    return a * 2",
+        {"within": "within"},
+    ),
+    "decorators of libraries": (
+        "import contextlib\n@contextlib.contextmanager\ndef opened(a):\n    yield a + 1\n@functools.cache\ndef cached(n):\n    return n + 1\n"
+        "def with_opened(a):\n    with opened(a) as b:\n        return b + cached(2)",
+        {"with_opened": "with_opened"},
+    ),
+    "what only looks like writing into constants": (
+        "KEPT = [3, 1, 2]\nBASE = {'k': 1}\nPLATE = np.zeros((2, 3))\ndef ordered(rows):\n    rows = list(rows)\n    rows.sort()\n    return rows\n"
+        "def harmless(a):\n    some = KEPT[1:]\n    some.append(4)\n    base = BASE\n    base = {**base, 'j': 2}\n    base['i'] = 3\n"
+        "    plate = PLATE.copy()\n    np.add(a, 1, out=plate)\n    return ordered(KEPT) + some, base, plate",
+        {"harmless": "harmless"},
+    ),
     "lazy import": ("def lazy(a):\n    import math\n    from fractions import Fraction as F\n    return math.floor(F(7, 2))", {"lazy": "lazy"}),
     "imports": (
         "def imported(a):\n    return down(sqrt(16)) + NORM_L1 + len(take(0)(a)) + pi", {"imported": "imported"},
@@ -143,7 +160,7 @@ REFUSED: dict[str, tuple[str, str, str]] = {
     "replaced code": ("def g(a):\n    return -a\ndef f(a):\n    return a\nf.__code__ = g.__code__.replace(co_name='f', co_firstlineno=3)", "f", r"not what its source says \(cell \[1\], line 3\).* Run it again"),
     "replaced function of a module": (
         "import types\nlib = types.ModuleType('lib')\nlib.f = lambda a: a\ndef f(a):\n    return lib.f(a)", "f",
-        r"'lib\.f' \(cell \[1\], line 5\), which the notebook has replaced.* Call yours by a name",
+        r"'lib\.f', which the notebook has changed \(cell \[1\], line 3\).* Call yours by a name",
     ),
     "decorator without wraps": (
         "def d(g):\n    def w(a):\n        return g(a)\n    return w\n@d\ndef f(a):\n    return a", "f",
@@ -162,6 +179,66 @@ REFUSED: dict[str, tuple[str, str, str]] = {
     "decorator that counts": (
         "def d(g):\n    n = 0\n    @functools.wraps(g)\n    def w(a):\n        nonlocal n\n        n += 1\n        return g(a) + n\n    return w\n"
         "@d\ndef f(a):\n    return a", "f", r"@d \(cell \[1\], line 9\), which counts or keeps something in 'n'",
+    ),
+    "decorator that derives from what has changed": (
+        "LIM = 2\ndef d(g):\n    lim = LIM * 2\n    @functools.wraps(g)\n    def w(a):\n        return g(a) * lim\n    return w\n"
+        "@d\ndef f(a):\n    return a\nLIM = 3", "f", r"@d \(cell \[1\], line 8\), which keeps 'lim', of which the text",
+    ),
+    "decorator that derives from a changed argument": (
+        "N = 2\ndef d(n):\n    lim = n * 2\n    def deco(g):\n        @functools.wraps(g)\n        def w(a):\n            return g(a) * lim\n"
+        "        return w\n    return deco\n@d(N)\ndef f(a):\n    return a\nN = 3", "f", r"@d\(N\) \(cell \[1\], line 10\), which keeps 'lim'",
+    ),
+    "decorator that remembers": (
+        "def d(g):\n    seen = {}\n    @functools.wraps(g)\n    def w(a):\n        seen.setdefault('first', g(a))\n        return a - seen['first']\n"
+        "    return w\n@d\ndef f(a):\n    return a", "f", r"@d \(cell \[1\], line 8\), which keeps something in 'seen' from call to call",
+    ),
+    "decorator that hangs a count on it": (
+        "def d(g):\n    @functools.wraps(g)\n    def w(a):\n        return g(a)\n    w.calls = 0\n    return w\n@d\ndef f(a):\n    return a", "f",
+        r"@d \(cell \[1\], line 7\), which hangs 'calls' on it",
+    ),
+    "decorator with a default that was changed": (
+        "N = 2\ndef d(g):\n    @functools.wraps(g)\n    def w(a, n=N):\n        return g(a) * n\n    return w\n@d\ndef f(a):\n    return a\nN = 3", "f",
+        r"@d \(cell \[1\], line 7\), which keeps 'N'",
+    ),
+    "function with others for other types": (
+        "@functools.singledispatch\ndef f(a):\n    return a\n@f.register(float)\ndef _(a):\n    return 1", "f",
+        r"@functools\.singledispatch \(cell \[1\], line 1\), which knows other functions besides it",
+    ),
+    "library's decorator with a changed argument": (
+        "N = 2\n@functools.lru_cache(N)\ndef f(a):\n    return a\nN = 3", "f", r"\(cell \[1\], line 2\), whose argument 'N' may have had another value: write",
+    ),
+    "local of a factory that hides a builtin of others": (
+        "def make():\n    max = np.random.rand()\n    def g(a):\n        return a + max\n    return g\ng = make()\ndef f(a):\n    return g(a) + max(1, 2)", "f",
+        r"uses the name 'max', which means something else in another function of the graph\. Rename one",
+    ),
+    "value of a module that was changed": (
+        "import string\nstring.digits = '0123456789'\ndef f(a):\n    return string.digits", "f",
+        r"'string\.digits', which the notebook has changed \(cell \[1\], line 2\).* make the value a token",
+    ),
+    "partial in the place of a module's function": (
+        "import textwrap\nkeep = textwrap.dedent\ntextwrap.dedent = functools.partial(keep)\ndef f(a):\n    return textwrap.dedent('a')\ntextwrap.dedent = keep", "f",
+        r"'textwrap\.dedent', which the notebook has changed \(cell \[1\], line 6\)",
+    ),
+    "changed module that a function imports": (
+        "import string\nsetattr(string, 'digits', '0123456789')\ndef f(a):\n    from string import digits\n    return digits", "f",
+        r"string\.digits', which the notebook has changed \(cell \[1\], line 2\)",
+    ),
+    "all names of the notebook": ("K = 1\ndef f(a):\n    return globals()['K']", "f", r"'globals' \(cell \[1\], line 3\), all names.* by name"),
+    "evaluated text": ("K = 1\ndef f(a):\n    return eval('K')", "f", r"'eval' \(cell \[1\], line 3\), which may use any name\. Write what"),
+    "array that a function writes its result into": (
+        "K = np.zeros((2, 3))\ndef f(a):\n    return np.maximum(K, a, out=K).copy()", "f", r"writes into 'K', .*\(cell \[1\], line 3\)",
+    ),
+    "array that a library accumulates into": (
+        "K = np.zeros((2, 3))\ndef f(a):\n    cv2.accumulateWeighted(a, K, 1.0)\n    return K.copy()", "f", r"writes into 'K', .*\(cell \[1\], line 3\)",
+    ),
+    "dict under another name": (
+        "LOG = {}\ndef f(a):\n    log = LOG\n    log[a.size] = 1\n    return a", "f", r"writes into 'LOG', .*\(cell \[1\], line 4\)",
+    ),
+    "dict that a helper writes into": (
+        "SEEN = {}\ndef keep(d, v):\n    return d.setdefault(1, v)\ndef f(a):\n    return a - keep(SEEN, a)", "f", r"writes into 'SEEN', .*\(cell \[1\], line 5\)",
+    ),
+    "set of a class": (
+        "class M:\n    seen = set()\ndef f(a):\n    M.seen.add(a.size)\n    return a", "f", r"writes into 'M', .*\(cell \[1\], line 4\)",
     ),
     "default that has changed": ("K = 1\ndef f(a, k=K):\n    return a + k\nK = 2", "f", r"default 'K' \(cell \[1\], line 2\), which has another value by now\. Define the function again"),
     "partial of an object": ("f = functools.partial(np.add, object())", "f", r"has a value of type object inside.* Make it a token"),

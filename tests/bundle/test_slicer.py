@@ -273,7 +273,7 @@ def test_a_decorator_stands_before_what_it_decorates_wherever_the_notebook_has_i
     cell = (
         "def plain(x):\n    return scaled(x)\n"
         "def scaled(x):\n    return x * 2\n"
-        "def shifted(g):\n    by = base()\n    @functools.wraps(g)\n    def w(x):\n        return g(x) + by\n    return w\n"
+        "def shifted(g):\n    base()\n    by = 40\n    @functools.wraps(g)\n    def w(x):\n        return g(x) + by\n    return w\n"
         "def base():\n    return 40\n"
         "@shifted\ndef f(x):\n    return plain(x)\n"
         "def base():\n    return 39 + 1\n"
