@@ -285,6 +285,66 @@ def test_a_folder_that_holds_something_else_is_not_touched(runner, tmp_path):
     assert (tmp_path / "thesis.tex").read_text() == "years of work"
 
 
+@pytest.mark.parametrize(
+    ("manifest", "words"),
+    [
+        ("x", "is not a bundle"),
+        ("x  thesis.tex\n", "is not a bundle"),
+        ("", "is not a bundle"),
+        ("x  ../a\n", "is not a"),
+    ],
+)
+def test_a_folder_with_a_manifest_that_is_no_bundles_is_not_touched(manifest, words, runner, tmp_path):
+    (tmp_path / "MANIFEST.sha256").write_text(manifest)
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(PromotionRefused, match=words):
+        ep.promote(runner, tmp_path)
+    assert (tmp_path / "thesis.tex").read_text() == "years of work"
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "samples/mine.npz", "__pycache__/results.csv"])
+def test_a_bundle_with_a_file_that_is_not_its_own_is_not_replaced(name, bundle, runner):
+    (bundle.path / name).parent.mkdir(exist_ok=True)
+    (bundle.path / name).write_text("measured by hand")
+    with pytest.raises(PromotionRefused, match=f"not the bundle's: {name}.*name another folder, or move that away"):
+        ep.promote(runner, bundle.path)
+    assert (bundle.path / name).read_text() == "measured by hand"
+
+
+def test_a_bundle_with_changed_and_missing_files_and_bytecode_is_replaced(bundle, runner):
+    (bundle.path / "requirements.txt").unlink()
+    module = bundle.path / "pipeline.py"
+    module.write_text(module.read_text() + "# by hand\n")
+    py_compile.compile(str(module))
+    assert ep.promote(runner, bundle.path, outputs=["edges"]).digest
+
+
+@pytest.mark.parametrize("when", ["replaying", "exchanging"])
+@pytest.mark.parametrize("was_there", [True, False])
+def test_what_is_put_there_while_the_promotion_runs_is_kept(when, was_there, bundle, runner, monkeypatch):
+    mine = bundle.path / "mine.csv"
+    if not was_there:
+        shutil.rmtree(bundle.path)
+    exchange, told = promote_module._exchange, []
+
+    def put():
+        if not told:
+            told.append(bundle.path.mkdir(exist_ok=True))
+            mine.write_text("important")
+
+    def putting(left, right):
+        put()
+        exchange(left, right)
+
+    monkeypatch.setattr(promote_module, "_exchange", putting)
+    if when == "exchanging" and not was_there:
+        bundle.path.mkdir()
+    with pytest.raises(PromotionRefused, match=re.escape(str(bundle.path))):
+        ep.promote(runner, bundle.path, told=lambda text: put() if when in text else None)
+    assert mine.read_text() == "important"
+    assert [path.name for path in bundle.path.parent.iterdir()] == [bundle.path.name]
+
+
 def test_a_pipeline_is_promoted_too_and_other_things_are_refused_by_name(runner, photograph, tmp_path):
     pipe = ep.Pipeline("edges", runner.cg, runner.hyperparameters)
     pipe.run(image=photograph)
