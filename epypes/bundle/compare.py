@@ -12,7 +12,10 @@ from epypes.wire.codecs import set_order
 from epypes.wire.records import FIELDS, record_fields, record_type
 from epypes.wire.tables import is_table, table_parts
 
-_ADDRESS: Final = re.compile(r"0x[0-9a-fA-F]+")
+# As Python and OpenCV write them; other text may hold numbers that look alike.
+_ADDRESS: Final = re.compile(r"( at |< ?[\w.]+ )0x[0-9a-fA-F]+")
+# Whose repr says all of it.
+_EXACT: Final = (bool, int, float, complex, str, bytes, bytearray, type(None))
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,11 +102,16 @@ def _named(where: str, expected: str, got: str) -> Unlike:
 def _in_mappings(
     expected: Mapping[Any, Any], got: Mapping[Any, Any], tolerance: Tolerance | None, where: str
 ) -> Iterator[Unlike]:
-    if list(expected) != list(got):
+    if _keys(expected) != _keys(got):
         yield _named(where, f"the keys {list(expected)!r:.80}", f"{list(got)!r:.80}")
         return
     for key in expected:
         yield from differences(expected[key], got[key], tolerance, f"{where}[{key!r}] ")
+
+
+def _keys(mapping: Mapping[Any, Any]) -> list[tuple[type, str]]:
+    # 1, 1.0 and True are equal, but not the same.
+    return [(type(key), _described(key)) for key in mapping]
 
 
 def _in_sequences(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:
@@ -150,12 +158,17 @@ def _in_numbers(expected: complex, got: complex, tolerance: Tolerance | None, wh
 
 
 def _in_others(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:
-    left, right = (_ADDRESS.sub("0x", repr(value)) for value in (expected, got))
+    left, right = _described(expected), _described(got)
     if left != right:
         named = _named(where, f"{left:.60}", f"{right:.60}")
         is_integer = type(expected) is int and abs(expected) < 2**1000 > abs(got)
         largest = float(abs(got - expected)) if is_integer else None
         yield Unlike(named.where, named.text, named.expected, named.got, largest=largest)
+
+
+def _described(value: Any) -> str:
+    """Return the repr of a value, of an object without its address."""
+    return repr(value) if type(value) in _EXACT else _ADDRESS.sub(r"\g<1>0x", repr(value))
 
 
 _Inside = Callable[[Any, Any, Tolerance | None, str], Iterator[Unlike]]

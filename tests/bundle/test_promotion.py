@@ -9,6 +9,7 @@ import re
 import shutil
 import threading
 import tomllib
+import types
 from pathlib import Path
 
 import cv2
@@ -367,6 +368,13 @@ def test_a_pipeline_is_promoted_too_and_other_things_are_refused_by_name(runner,
         ({"a": 1}, {"b": 1}, "expected the keys"),
         ([1], [1, 2], "expected 1 items, got 2"),
         (0.0, -0.0, "expected 0.0, got -0.0"),
+        ("0x12", "0x13", "expected '0x12', got '0x13'"),
+        ("<f at 0x12>", "<f at 0x13>", "expected '<f at 0x12>'"),
+        (b"0x12", b"0x13", "expected b'0x12'"),
+        ({"id": "0x1"}, {"id": "0x2"}, "'0x2'"),
+        (types.SimpleNamespace(id="0x1"), types.SimpleNamespace(id="0x2"), "0x2"),
+        ({1: "x"}, {True: "x"}, r"expected the keys \[1\], got \[True\]"),
+        ({"0x1": 1}, {"0x2": 1}, "expected the keys"),
     ],
 )
 def test_a_difference_is_described_by_its_first_place(left, right, words):
@@ -374,10 +382,17 @@ def test_a_difference_is_described_by_its_first_place(left, right, words):
 
 
 @pytest.mark.parametrize(
-    "value", [np.nan, np.array([np.nan, 1]), None, "a", (1, [2.0]), {"k": np.eye(2)}, np.zeros((0, 3))]
+    "value", [np.nan, {np.nan: 1}, np.array([np.nan, 1]), None, "a", (1, [2.0]), {"k": np.eye(2)}, np.zeros((0, 3))]
 )
 def test_a_value_agrees_with_itself(value):
     assert first_difference(value, value) is None
+
+
+@pytest.mark.parametrize(
+    "make", [object, cv2.ORB_create, lambda: {"a": object()}, lambda: lambda: 1, lambda: [].append]
+)
+def test_where_an_object_is_in_memory_is_no_difference(make):
+    assert first_difference(make(), make()) is None
 
 
 def cells(path, *sources):
