@@ -67,7 +67,7 @@ PROMOTED = {
         "    def of(self, other: int) -> float:\n        return self.a + other\ndef f(x):\n    return P().of(x)\n"
     ),
     "values that are computed": (
-        "import dataclasses\nimport enum\nimport numpy as np\nGAIN = 3\nROW = np.arange(9.0)[::2]\n"
+        "import dataclasses\nimport enum\nimport numpy as np\nGAIN = 3\nROW = np.arange(9.0)\n"
         "class A:\n    K = GAIN * 10\n    T = np.array([1, 2], np.float32) / 3\n    U = K + 1\n    R = ROW\n    D = dict(a=1)\n"
         "    S = [i * GAIN for i in range(3)]\n    a, b = 1, GAIN\n    _low: int = -GAIN\n    N = f'{K} of {GAIN}'\n"
         "    Z = np.zeros((2, 3))\n    def g(self, k=GAIN, *, u=U, dtype=np.uint8):\n        return k + u + self._low\n"
