@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import ast
 import dis
-import enum
 import io
 import linecache
 import sys
 import types
-from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final
 
@@ -270,32 +269,3 @@ def _check_bases(kind: type, node: ast.ClassDef, names: Mapping[str, Any], what:
         if isinstance(base, type) and not any(base is one for one in known):
             text = f"{what} is made from {ast.unparse(expression)!r}, which was defined again since."
             raise Refused(f"{text} Define the class again too, and what was made of it.")
-
-
-def made_again(value: Any, expression_of: Callable[[Any], str], class_of: Callable[[type], str]) -> str:
-    """Return the expression of a member of an enumeration, or of a record of values; "" for any other.
-
-    Parameters
-    ----------
-    value
-        Anything.
-    expression_of
-        Returns the expression of a value in it; "" if there is none.
-    class_of
-        Returns the expression of a class, which is added to the module.
-    """
-    kind = type(value)
-    if isinstance(value, enum.Enum):
-        return f"{class_of(kind)}.{value.name}" if value.name in kind.__members__ else ""
-    if not hasattr(kind, "__dataclass_fields__") and not (isinstance(value, tuple) and hasattr(kind, "_fields")):
-        return ""
-    records = [(field.name, field.init) for field in fields(value)] if is_dataclass(value) else _of_tuple(value)
-    parts = [(name, expression_of(getattr(value, name))) for name, _ in records]
-    more = getattr(value, "__dict__", {}).keys() - {name for name, _ in records}
-    if more or not all(source for _, source in parts) or not all(is_given for _, is_given in records):
-        return ""
-    return f"{class_of(kind)}({', '.join(f'{name}={source}' for name, source in parts)})"
-
-
-def _of_tuple(value: Any) -> list[tuple[str, bool]]:
-    return [(name, True) for name in type(value)._fields]

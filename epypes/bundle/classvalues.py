@@ -116,7 +116,7 @@ def names_in(kind: type, bound: Mapping[str, object], names: Mapping[str, Any]) 
 def is_other(kind: type, name: str, expression: ast.expr, names: Mapping[str, Any]) -> bool:
     """Whether an attribute is known to be something else than its text makes by now."""
     return any(
-        written is not UNKNOWN and not _is_same(written, value)
+        written is not UNKNOWN and not is_same_value(written, value)
         for _, written, value in _pairs(kind, name, expression, names)
     )
 
@@ -144,7 +144,7 @@ def defaults_in(
         for function in _functions_of(method, node, written[method.name]):
             for default, value in _defaults(method.args, function):
                 made = evaluated_safely(default, names)
-                if made is UNKNOWN or not _is_same(made, value):
+                if made is UNKNOWN or not is_same_value(made, value):
                     yield method.name, default, made is not UNKNOWN
 
 
@@ -213,7 +213,7 @@ def _pairs(
         yield expression, evaluated_safely(expression, names), value
 
 
-def _is_same(written: Any, value: Any) -> bool:
+def is_same_value(written: Any, value: Any) -> bool:
     """Whether two values are the same to the last bit; objects, whether they are one."""
     if written is value or is_same_data(written, value):
         return True
@@ -222,9 +222,9 @@ def _is_same(written: Any, value: Any) -> bool:
     if is_plain_array(value):
         return _bits(written) == _bits(value)
     if type(value) in (list, tuple):
-        return len(written) == len(value) and all(map(_is_same, written, value))
+        return len(written) == len(value) and all(map(is_same_value, written, value))
     if type(value) in (dict, collections.OrderedDict):
-        return _is_same([*written.items()], [*value.items()])
+        return is_same_value([*written.items()], [*value.items()])
     numpy = sys.modules.get("numpy")
     if numpy is not None and isinstance(value, numpy.generic):
         return bool(written.dtype == value.dtype and written.tobytes() == value.tobytes())

@@ -13,8 +13,8 @@ from fractions import Fraction
 from operator import attrgetter, itemgetter, methodcaller
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin
 
-from epypes.bundle.classes import made_again
 from epypes.bundle.literal import literal_source
+from epypes.bundle.records import made_again
 from epypes.bundle.source import Importable, Refused, importable
 from epypes.hints import Param
 from epypes.images import Image

@@ -54,6 +54,12 @@ PROMOTED = {
         "from dataclasses import dataclass\n@dataclass\nclass Cfg:\n    k: int = 3\n    t: tuple = (1, 2)\n"
         "CFG = Cfg(k=5)\ndef f(x):\n    return CFG.k + x\n"
     ),
+    "record that checks itself": (
+        "from dataclasses import dataclass\nimport numpy as np\n@dataclass(frozen=True, slots=True)\nclass Inner:\n    t: tuple\n"
+        "@dataclass\nclass Cfg:\n    k: float\n    w: np.ndarray\n    i: Inner\n    def __post_init__(self):\n"
+        "        self.k = float(self.k)\n        if self.k < 0:\n            raise ValueError\nCFG = Cfg(5, np.eye(2), Inner((1, float('nan'))))\n"
+        "def f(x):\n    return CFG.k + x + float(CFG.w.sum()) + CFG.i.t[0]\n"
+    ),
     "abstract": (
         "import abc\nimport functools\nclass A(abc.ABC):\n    @abc.abstractmethod\n    def g(self): ...\nclass B(A):\n"
         "    def g(self):\n        return 5\n    @staticmethod\n    def s(x):\n        return x\n"
@@ -139,6 +145,18 @@ REFUSED = {
         f"class A:\n    K = 1\n    for i in range(3):\n        K += i\n    def g(self): return self.K\n{USED}", "has 'K' .*which its text makes in steps",
     ),
     "a default that was read": (f"class A:\n    def g(self, k=id(1)): return k\n{USED}", r"has 'g' .*computes by 'id\(1\)'.*Compute it above"),
+    "a record that changes what it is given": (
+        "import dataclasses\n@dataclasses.dataclass\nclass Twice:\n    k: float\n    def __post_init__(self):\n        self.k *= 2\n"
+        "ONE = Twice(30)\ndef f(x):\n    return ONE.k + x\n", "uses 'ONE' .* of type Twice",
+    ),
+    "a record that changes its list": (
+        "import dataclasses\n@dataclasses.dataclass\nclass Longer:\n    k: list\n    def __post_init__(self):\n        self.k.append(2)\n"
+        "ONE = Longer([1])\ndef f(x):\n    return len(ONE.k) + x\n", "uses 'ONE' .* of type Longer",
+    ),
+    "a record with more": (
+        "import dataclasses\n@dataclasses.dataclass\nclass More:\n    k: int\nONE = More(3)\nONE.m = 5\ndef f(x):\n    return ONE.m + x\n",
+        "uses 'ONE' .* of type More",
+    ),
     "object of the notebook": ("class A:\n    pass\nONE = A()\ndef f(x):\n    return ONE\n", "uses 'ONE' .* of type A"),
 }  # fmt: skip
 
