@@ -134,7 +134,7 @@ REFUSED = {
         "def f(x):\n    return Other().k + x\n", "'k' has another",
     ),
     "a member": ("import enum\nG = 2\nclass Kinds(enum.Enum):\n    K = G\nG = 5\ndef f(x):\n    return Kinds.K.value + x\n", "'K' has another"),
-    "a value of a class above": ("G = 2\nclass B:\n    K = G + 1\nclass A(B):\n    def g(self): return self.K\nG = 5\n" + USED, "'K' has another"),
+    "a value of a class above": ("G = 2\nclass Above:\n    K = G + 1\nclass A(Above):\n    def g(self): return self.K\nG = 5\n" + USED, "'K' has another"),
     "a private value more": (f"class A:\n    def g(self): return getattr(self, '_k', 1)\nA._k = 5\n{USED}", "it has '_k', which its text"),
     "a number of NumPy's more": (f"import numpy as np\nclass A:\n    def g(self): return self.q\nA.q = np.float64(3)\n{USED}", "it has 'q'"),
     "a value that was read": (
