@@ -8,24 +8,34 @@ from __future__ import annotations
 
 import ast
 import dis
-import enum
 import io
 import linecache
 import sys
 import types
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final
 
 from epypes.bundle.cells import place_in
-from epypes.bundle.literal import is_data, is_same_data
+from epypes.bundle.classvalues import (
+    IN_STEPS,
+    bound_names,
+    defaults_in,
+    is_other,
+    is_value,
+    names_in,
+    unknown_in,
+    values_of_fields,
+)  # fmt: skip
 from epypes.bundle.source import Refused, evaluated
 from epypes.bundle.text import class_code, nested_codes, own_text, parsed, same_methods
 from epypes.bundle.uses import names_from_outside
 
 # What Python itself puts into every class.
 _ALWAYS: Final = frozenset({"__module__", "__qualname__", "__annotations__", "__doc__", "__classcell__"})
+# What a NamedTuple has of its own.
+_OF_TUPLES: Final = frozenset({"_fields", "_field_defaults", "_field_types"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +104,7 @@ def class_definition(kind: type, around: Mapping[str, Any], what: str) -> ClassD
     for file in _files(kind):
         lines = io.StringIO("".join(linecache.getlines(file)), newline=None).readlines()
         for node in _classes(lines, kind.__name__):
-            problem = next(_differences(kind, node, "".join(lines)), "")
+            problem = next(_differences(kind, node, "".join(lines), around), "")
             if not problem:
                 return _definition(kind, around, what, file, lines, node)
             why = why or f"{problem} ({place_in(file, node.lineno)})"
@@ -105,10 +115,10 @@ def class_definition(kind: type, around: Mapping[str, Any], what: str) -> ClassD
 def _definition(
     kind: type, around: Mapping[str, Any], what: str, file: str, lines: list[str], node: ast.ClassDef
 ) -> ClassDefinition:
-    own = next((function.__globals__ for function in functions_of(kind).values()), None)
-    names = around if own is None else own
+    names = _names(kind, around)
     place = place_in(file, node.lineno)
     _check_bases(kind, node, names, f"{what} ({place})")
+    _check_known(kind, node, names, what, file)
     text = own_text(lines, node, ())
     code = class_code(text, node)
     if code is None:
@@ -168,70 +178,87 @@ def _classes(lines: list[str], name: str) -> list[ast.ClassDef]:
     return found[::-1]
 
 
-def _differences(kind: type, node: ast.ClassDef, text: str) -> Iterator[str]:
+def _differences(kind: type, node: ast.ClassDef, text: str, around: Mapping[str, Any]) -> Iterator[str]:
     """Give what a class is otherwise than a text says."""
     own, bound = vars(kind), _bound(node)
-    gone = bound.keys() - own.keys() - _fields(kind).keys() - {"_ignore_"}
+    plain = {name for name, expression in bound.items() if expression is not IN_STEPS}
+    gone = plain - own.keys() - values_of_fields(kind).keys() - {"_ignore_"}
     if gone:
         yield f"the class has no {sorted(gone)[0]!r}, which its text gives it"
-    methods = {function.name for function in node.body if isinstance(function, ast.FunctionDef)}
-    written = {name: list(_functions_in(own.get(name))) for name in methods}
-    changed = same_methods(text, node, written)
+    methods = _methods(kind, node)
+    changed = same_methods(text, node, methods)
     if changed:
         yield f"its {changed!r} is not what its text says: one of the two was changed since"
+    names = names_in(kind, bound, _names(kind, around))
     for name, expression in bound.items():
-        if expression is not None and not _is_as_written(kind, name, expression):
+        if expression is not None and is_other(kind, name, expression, names):
             yield f"its {name!r} has another value by now than its text gives it"
-    yield from _added(kind, bound.keys() | methods)
+    for name, default, is_changed in defaults_in(node, methods, names):
+        if is_changed:
+            yield f"its {name!r} has another default by now than {ast.unparse(default)!r}, which its text gives it"
+    yield from _added(kind, bound.keys(), node)
 
 
-def _added(kind: type, said: set[str]) -> Iterator[str]:
+def _methods(kind: type, node: ast.ClassDef) -> dict[str, list[types.FunctionType]]:
+    """Return the functions that a class has by the names of the methods in its text."""
+    names = {function.name for function in node.body if isinstance(function, ast.FunctionDef)}
+    return {name: list(_functions_in(vars(kind).get(name))) for name in names}
+
+
+def _names(kind: type, around: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the names of the notebook that a class was defined in."""
+    return next((function.__globals__ for function in functions_of(kind).values()), around)
+
+
+def _check_known(kind: type, node: ast.ClassDef, names: Mapping[str, Any], what: str, file: str) -> None:
+    """Refuse values of which nobody can tell whether the text still makes them."""
+    bound = _bound(node)
+    names = names_in(kind, bound, names)
+    found = [
+        (name, part)
+        for name, expression in bound.items()
+        for part in (unknown_in(kind, name, expression, names) if expression is not None else ())
+    ]
+    found += [
+        (name, default)
+        for name, default, is_changed in defaults_in(node, _methods(kind, node), names)
+        if not is_changed
+    ]
+    for name, part in found:
+        how = "makes in steps" if part is IN_STEPS else f"computes by {ast.unparse(part)!r}"
+        text = f"{what} has {name!r} ({place_in(file, getattr(part, 'lineno', node.lineno))}), which its text {how}"
+        way_out = (
+            f"Compute it above the class under a name of its own, {name.upper()} = ..., and use that name in the class"
+        )
+        raise Refused(f"{text}: it may be another value by the time it is served. {way_out}.")
+
+
+def _added(kind: type, said: Collection[str], node: ast.ClassDef) -> Iterator[str]:
     """Give what was hung on a class besides its text, but for what Python and its decorators make of it."""
+    fields = values_of_fields(kind)
     for name, value in vars(kind).items():
-        if name in said or name in _ALWAYS or name in _fields(kind):
+        if name in said or name in _ALWAYS or name in fields or _is_of_python(kind, name):
             continue
         is_own = any(True for _ in _functions_in(value))
-        if is_own or (is_data(value) and not name.startswith("_")):
+        if is_own or (is_value(value) and not (name.startswith("_") and node.decorator_list)):
             yield f"it has {name!r}, which its text does not give it"
+
+
+def _is_of_python(kind: type, name: str) -> bool:
+    """Whether a name is one that Python or a library gives to the classes of its kind, as Enum does."""
+    if name.startswith("__") and name.endswith("__"):
+        return name not in _functions_named(kind)
+    bases = (above for above in kind.__mro__[1:] if above.__module__ != kind.__module__)
+    return name in _OF_TUPLES or any(name in vars(above) for above in bases)
+
+
+def _functions_named(kind: type) -> set[str]:
+    return {name for name, value in vars(kind).items() if any(True for _ in _functions_in(value))}
 
 
 def _bound(node: ast.ClassDef) -> dict[str, ast.expr | None]:
     """Return the names that the body of a class binds, each with its expression if it is a plain assignment."""
-    found: dict[str, ast.expr | None] = {}
-    for statement in node.body:
-        if isinstance(statement, ast.Assign):
-            targets = [target for target in statement.targets if isinstance(target, ast.Name)]
-            found.update({target.id: statement.value for target in targets})
-        elif isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name) and statement.value:
-            found[statement.target.id] = statement.value
-        elif isinstance(statement, ast.FunctionDef | ast.ClassDef):
-            found[statement.name] = None
-    return {name: value for name, value in found.items() if name not in _ALWAYS}
-
-
-def _fields(kind: type) -> Mapping[str, Any]:
-    """Return the defaults of a dataclass's or NamedTuple's fields, which may not be attributes of the class."""
-    fields = vars(kind).get("__dataclass_fields__", {})
-    defaults = {name: field.default for name, field in fields.items()}
-    return {
-        **defaults,
-        **dict.fromkeys(vars(kind).get("_fields", ()), MISSING),
-        **vars(kind).get("_field_defaults", {}),
-    }
-
-
-def _is_as_written(kind: type, name: str, expression: ast.expr) -> bool:
-    """Whether an attribute still is what a literal in the text says; other expressions the replay must tell."""
-    try:
-        written = ast.literal_eval(expression)
-    except (ValueError, TypeError, SyntaxError, RecursionError):
-        return True
-    value = _fields(kind).get(name, MISSING)
-    if issubclass(kind, enum.Enum):
-        value = kind.__members__[name].value if name in kind.__members__ else written
-    elif value is MISSING:
-        value = vars(kind).get(name, written)
-    return is_same_data(written, value) or not is_data(value)
+    return {name: value for name, value in bound_names(node.body).items() if name not in _ALWAYS}
 
 
 def _check_bases(kind: type, node: ast.ClassDef, names: Mapping[str, Any], what: str) -> None:
@@ -242,32 +269,3 @@ def _check_bases(kind: type, node: ast.ClassDef, names: Mapping[str, Any], what:
         if isinstance(base, type) and not any(base is one for one in known):
             text = f"{what} is made from {ast.unparse(expression)!r}, which was defined again since."
             raise Refused(f"{text} Define the class again too, and what was made of it.")
-
-
-def made_again(value: Any, expression_of: Callable[[Any], str], class_of: Callable[[type], str]) -> str:
-    """Return the expression of a member of an enumeration, or of a record of values; "" for any other.
-
-    Parameters
-    ----------
-    value
-        Anything.
-    expression_of
-        Returns the expression of a value in it; "" if there is none.
-    class_of
-        Returns the expression of a class, which is added to the module.
-    """
-    kind = type(value)
-    if isinstance(value, enum.Enum):
-        return f"{class_of(kind)}.{value.name}" if value.name in kind.__members__ else ""
-    if not hasattr(kind, "__dataclass_fields__") and not (isinstance(value, tuple) and hasattr(kind, "_fields")):
-        return ""
-    records = [(field.name, field.init) for field in fields(value)] if is_dataclass(value) else _of_tuple(value)
-    parts = [(name, expression_of(getattr(value, name))) for name, _ in records]
-    more = getattr(value, "__dict__", {}).keys() - {name for name, _ in records}
-    if more or not all(source for _, source in parts) or not all(is_given for _, is_given in records):
-        return ""
-    return f"{class_of(kind)}({', '.join(f'{name}={source}' for name, source in parts)})"
-
-
-def _of_tuple(value: Any) -> list[tuple[str, bool]]:
-    return [(name, True) for name in type(value)._fields]

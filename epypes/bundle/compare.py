@@ -12,7 +12,14 @@ from epypes.wire.codecs import set_order
 from epypes.wire.records import FIELDS, record_fields, record_type
 from epypes.wire.tables import is_table, table_parts
 
-_ADDRESS: Final = re.compile(r"0x[0-9a-fA-F]+")
+# As Python and OpenCV write them; other text may hold numbers that look alike.
+_ADDRESS: Final = re.compile(r"( at |< ?[\w.]+ )0x[0-9a-fA-F]+")
+# Whose repr says all of it.
+_EXACT: Final = (bool, int, float, complex, str, bytes, bytearray, type(None))
+
+
+# What is left where large numbers of an array cancel each other is a few of the last digits of those.
+FLOOR: Final = 16.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +31,8 @@ class Tolerance:
     absolute
         The largest difference.
     relative
-        The largest difference, as a part of the largest magnitude in the array (or of the number).
+        The largest difference of each number, as a part of its own magnitude; of one that is almost nothing beside the
+        largest of its array, as a part of FLOOR * sqrt(epsilon) of that.
     """
 
     absolute: float
@@ -47,8 +55,9 @@ class Unlike:
         How many values differ, of how many.
     largest
         The largest difference; None if they are no numbers.
-    scale
-        The largest magnitude of what was expected; 0.0 for what is no floating-point number.
+    relative
+        The largest difference of a number as a part of its magnitude, see Tolerance; 0.0 for what is no floating-point
+        number.
     epsilon
         The distance of neighbouring numbers at 1.0, if these are floating-point numbers that differ as such: no NaN or
         infinity has come or gone. 0.0 for everything else.
@@ -61,7 +70,7 @@ class Unlike:
     count: int = 1
     size: int = 1
     largest: float | None = None
-    scale: float = 0.0
+    relative: float = 0.0
     epsilon: float = 0.0
 
 
@@ -99,11 +108,16 @@ def _named(where: str, expected: str, got: str) -> Unlike:
 def _in_mappings(
     expected: Mapping[Any, Any], got: Mapping[Any, Any], tolerance: Tolerance | None, where: str
 ) -> Iterator[Unlike]:
-    if list(expected) != list(got):
+    if _keys(expected) != _keys(got):
         yield _named(where, f"the keys {list(expected)!r:.80}", f"{list(got)!r:.80}")
         return
     for key in expected:
         yield from differences(expected[key], got[key], tolerance, f"{where}[{key!r}] ")
+
+
+def _keys(mapping: Mapping[Any, Any]) -> list[tuple[type, str]]:
+    # 1, 1.0 and True are equal, but not the same.
+    return [(type(key), _described(key)) for key in mapping]
 
 
 def _in_sequences(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:
@@ -140,22 +154,28 @@ def _in_numbers(expected: complex, got: complex, tolerance: Tolerance | None, wh
     # repr tells -0.0 from 0.0 and makes NaN agree with itself.
     if repr(expected) == repr(got):
         return
-    largest, scale = abs(got - expected), abs(expected)
+    largest, magnitude = abs(got - expected), abs(expected)
     is_finite = math.isfinite(largest)
-    if is_finite and tolerance and largest <= min(tolerance.absolute, tolerance.relative * scale):
+    if is_finite and tolerance and largest <= min(tolerance.absolute, tolerance.relative * magnitude):
         return
     named = _named(where, repr(expected), repr(got))
     epsilon = 2.0**-52 if is_finite else 0.0
-    yield Unlike(named.where, named.text, named.expected, named.got, 1, 1, _finite(largest), scale, epsilon)
+    relative = largest / magnitude if is_finite and magnitude else math.inf
+    yield Unlike(named.where, named.text, named.expected, named.got, 1, 1, _finite(largest), relative, epsilon)
 
 
 def _in_others(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:
-    left, right = (_ADDRESS.sub("0x", repr(value)) for value in (expected, got))
+    left, right = _described(expected), _described(got)
     if left != right:
         named = _named(where, f"{left:.60}", f"{right:.60}")
         is_integer = type(expected) is int and abs(expected) < 2**1000 > abs(got)
         largest = float(abs(got - expected)) if is_integer else None
         yield Unlike(named.where, named.text, named.expected, named.got, largest=largest)
+
+
+def _described(value: Any) -> str:
+    """Return the repr of a value, of an object without its address."""
+    return repr(value) if type(value) in _EXACT else _ADDRESS.sub(r"\g<1>0x", repr(value))
 
 
 _Inside = Callable[[Any, Any, Tolerance | None, str], Iterator[Unlike]]
@@ -183,44 +203,50 @@ def _in_arrays(expected: Any, got: Any, tolerance: Tolerance | None, where: str)
         return
     size = left.dtype.itemsize
     unlike = (left.view(np.uint8).reshape(-1, size) != right.view(np.uint8).reshape(-1, size)).any(axis=1)
-    distance, scale, epsilon = _distances(left, right)
+    distance, magnitude, epsilon = _distances(left, right)
     if tolerance and epsilon:
-        unlike &= ~(distance <= min(tolerance.absolute, tolerance.relative * scale))
+        unlike &= ~(distance <= np.minimum(tolerance.absolute, tolerance.relative * magnitude))
     if unlike.any():
-        yield _told(left, right, unlike, expected.shape, where, (distance, scale, epsilon))
+        yield _told(left, right, unlike, expected.shape, where, (distance, magnitude, epsilon))
 
 
 def _told(left: Any, right: Any, unlike: Any, shape: tuple[int, ...], where: str, measured: Any) -> Unlike:
     import numpy as np
 
-    distance, scale, epsilon = measured
+    distance, magnitude, epsilon = measured
     first, count = int(unlike.argmax()), int(unlike.sum())
     index = list(map(int, np.unravel_index(first, shape))) if shape else []
     text = f"{where}{count} of {left.size} values differ, first at {index}: expected {left[first]}, got {right[first]}"
     largest = None if distance is None else _finite(float(distance[unlike].max()))
     if largest is not None and count > 1:
         text += f"; the largest difference is {largest:.6g}"
+    relative = 0.0
+    if epsilon:
+        with np.errstate(all="ignore"):
+            relative = float((distance[unlike] / magnitude[unlike]).max())
     place = where.replace(" ", "") + str(index)
-    return Unlike(place, text, str(left[first]), str(right[first]), count, left.size, largest, scale, epsilon)
+    return Unlike(place, text, str(left[first]), str(right[first]), count, left.size, largest, relative, epsilon)
 
 
-def _distances(left: Any, right: Any) -> tuple[Any, float, float]:
-    """Return how far numbers are apart, the largest magnitude of the left ones, and their epsilon; see Unlike."""
+def _distances(left: Any, right: Any) -> tuple[Any, Any, float]:
+    """Return how far numbers are apart, the magnitudes of the left ones, and their epsilon; see Tolerance, Unlike."""
     import numpy as np
 
     kind = left.dtype.kind
     if kind not in "iufc":
-        return None, 0.0, 0.0
+        return None, None, 0.0
     with np.errstate(all="ignore"):
         wide = np.complex128 if kind == "c" else np.float64
         distance = np.abs(right.astype(wide) - left.astype(wide))
         if kind in "iu":
-            return distance, 0.0, 0.0
+            return distance, None, 0.0
         # What is NaN on both sides, or the same infinity, agrees.
         distance[(left == right) | ((left != left) & (right != right))] = 0.0
-        magnitude = np.abs(left[np.isfinite(left)])
-        scale = float(magnitude.max()) if magnitude.size else 0.0
-    return distance, scale, float(np.finfo(left.dtype).eps) if np.isfinite(distance).all() else 0.0
+        magnitude = np.abs(left.astype(wide))
+        magnitude[~np.isfinite(magnitude)] = 0.0
+        epsilon = float(np.finfo(left.dtype).eps)
+        magnitude = np.maximum(magnitude, FLOOR * math.sqrt(epsilon) * magnitude.max(initial=0.0))
+    return distance, magnitude, epsilon if np.isfinite(distance).all() else 0.0
 
 
 def _finite(number: float) -> float | None:

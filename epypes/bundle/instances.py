@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import dis
 import inspect
+import types
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from epypes.bundle.classes import functions_of
 from epypes.bundle.literal import is_data, is_same_data
 from epypes.bundle.source import Refused
+from epypes.bundle.text import nested_codes
 from epypes.pipeline import Node, Pipeline
 from epypes.run.guard import is_plain_array
 
@@ -102,15 +104,27 @@ def _check_made_again(made: Node, given: Mapping[str, Any], what: str) -> None:
         text = f"{what} can't be made again with {', '.join(given) or 'no argument'}: {told}."
         raise Refused(f"{text} Keep every argument of __init__ as an attribute of its name.") from error
     ours = vars(again).keys() & {*vars(Node("node", len)), *_PIPELINES, "__wrapped__"}
-    by_runs = {name for above in kind.__mro__[: kind.__mro__.index(Node)] for name in _set_by_runs(above)}
+    by_runs = set(_set_by_runs(kind, _called_by(made)))
     for name in sorted((vars(made).keys() | vars(again).keys()) - ours - by_runs):
         one, other = vars(made).get(name, _MISSING), vars(again).get(name, _MISSING)
-        is_other_object = type(one) is type(other) and not is_data(one) and not is_plain_array(one)
-        if not is_other_object and not _is_same(one, other):
+        if not _is_alike(one, other):
             text = f"{what} has another {name!r} by now than one that is made anew."
             raise Refused(f"{text} Make it an argument of __init__, and give it there.")
 
 
+def _is_alike(one: Any, other: Any, seen: frozenset[int] = frozenset()) -> bool:
+    """Whether two attributes are the same, or objects of one class whose own attributes are."""
+    if id(one) in seen or _is_same(one, other):
+        return True
+    if type(one) is not type(other) or is_data(one) or is_plain_array(one):
+        return False
+    left, right = (dict(getattr(value, "__dict__", {})) for value in (one, other))
+    inside = seen | {id(one)}
+    return left.keys() == right.keys() and all(_is_alike(left[name], right[name], inside) for name in left)
+
+
+# What EPypes calls of an object when it runs.
+_HOOKS: Final = ("__call__", "compute", "run", "handle", "emit", "stages", "f_in", "f_out", "on_error")
 # What the pipelines of EPypes keep of a run, or hand to each other.
 _PIPELINES: Final = frozenset({
     "network", "runner", "source_cg", "attributes", "q_in", "q_out", "f_in", "f_out", "on_error", "failed",
@@ -118,11 +132,23 @@ _PIPELINES: Final = frozenset({
 })  # fmt: skip
 
 
-def _set_by_runs(kind: type) -> Iterator[str]:
-    """Give the attributes that the methods of a class set, but for its __init__: what it counts or remembers."""
-    if kind.__module__.startswith("epypes."):
-        return
-    for name, function in functions_of(kind).items():
-        if name != "__init__":
-            found = dis.get_instructions(function.__code__)
+def _called_by(made: Node) -> list[str]:
+    """Return the names of the methods that a run calls: the hooks, and what the node was made to call."""
+    function = getattr(made, "func", None)
+    own = [function.__name__] if isinstance(function, types.MethodType) and function.__self__ is made else []
+    return [*_HOOKS, *own]
+
+
+def _set_by_runs(kind: type, called: list[str]) -> Iterator[str]:
+    """Give the attributes that a run sets by the methods of a class: what it counts or remembers."""
+    functions = {name: function for above in reversed(kind.__mro__) for name, function in functions_of(above).items()}
+    waiting, reached = [*called], set[str]()
+    while waiting:
+        name = waiting.pop()
+        if name in reached or name not in functions or name == "__init__":
+            continue
+        reached.add(name)
+        for code in nested_codes(functions[name].__code__):
+            waiting += code.co_names
+            found = dis.get_instructions(code)
             yield from (instruction.argval for instruction in found if instruction.opname == "STORE_ATTR")

@@ -19,7 +19,7 @@ from epypes.bundle.exchange import exchange as _exchange
 from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
 from epypes.bundle.module import write_module
 from epypes.bundle.proof import prove
-from epypes.bundle.seal import MANIFEST
+from epypes.bundle.seal import MANIFEST, why_no_bundle
 from epypes.bundle.settings import Settings, unwritable, writable_defaults, write_settings
 from epypes.bundle.source import Refused
 from epypes.bundle.subject import Subject, subject_of
@@ -47,7 +47,7 @@ def promote(
     runner_or_pipeline
         Its last run becomes the recorded sample.
     to
-        The folder; a bundle that is there is replaced, anything else is not.
+        The folder; a bundle that is there is replaced, if all its files are its own; anything else is not.
     outputs
         The tokens that the service answers with; the sink tokens without.
     f_in, f_out
@@ -93,13 +93,24 @@ def promote(
 
 def _check_place(target: Path) -> None:
     """Refuse to write over what is not a bundle, or into one."""
-    if target.exists() and not (target / MANIFEST).is_file() and (not target.is_dir() or any(target.iterdir())):
-        raise PromotionRefused(target, [f"{target} exists and is not a bundle. Name another folder, or remove it."])
+    why = _why_kept(target)
+    if why:
+        raise PromotionRefused(target, [why])
     around = next((parent for parent in target.parents if (parent / MANIFEST).is_file()), None)
     if around is not None:
         raise PromotionRefused(
             target, [f"{target} is inside the bundle {around}, which is sealed. Name another folder."]
         )
+
+
+def _why_kept(target: Path) -> str:
+    """Return why what is at a place may not be replaced; "" if it is a bundle, an empty folder, or nothing."""
+    if not target.exists() or (target.is_dir() and not any(target.iterdir())):
+        return ""
+    if not (target / MANIFEST).is_file():
+        return f"{target} exists and is not a bundle. Name another folder, or remove it."
+    why = why_no_bundle(target)
+    return f"{why} Replacing it would delete what it holds: name another folder, or move that away." if why else ""
 
 
 def _write(
@@ -199,8 +210,13 @@ def _record(path: Path, target: Path, run: Run, settings: Settings) -> None:
 
 def _replace(draft: Path, target: Path) -> None:
     """Put the new bundle in the place of the old one; at every moment one of the two is there."""
-    if target.exists():
-        # The old one is then in the scratch folder, and goes with it.
-        _exchange(draft, target)
-    else:
+    _check_place(target)
+    if not target.exists():
         draft.rename(target)
+        return
+    # The old one is then in the scratch folder, and goes with it; unless it is no bundle any more.
+    _exchange(draft, target)
+    why = _why_kept(draft)
+    if why:
+        _exchange(draft, target)
+        raise PromotionRefused(target, [why.replace(str(draft), str(target))])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -17,6 +17,8 @@ from epypes.errors import BundleError
 
 MANIFEST: Final = "MANIFEST.sha256"
 _TEXTS: Final = ("pipeline.py", "pipeline.toml", "requirements.txt")
+# What every manifest names.
+_NEEDED: Final = frozenset({"pipeline.py", "pipeline.toml"})
 # What a comment of the manifest begins with.
 _FACT: Final = "# "
 _LINES: Final = "lines of "
@@ -70,6 +72,25 @@ def check_seal(folder: Path) -> str:
         text = f"{folder} is not what was promoted: {'; '.join(findings)}. Restore it, or promote again."
         raise BundleError(folder, text)
     return digest(folder)
+
+
+def why_no_bundle(folder: Path) -> str:
+    """Return as a sentence why a folder is not a bundle and nothing else; "" if it is.
+
+    A file that was changed or removed since is no reason; one that the manifest does not name is somebody's own.
+    """
+    no_bundle = f"{folder} exists and is not a bundle."
+    try:
+        named = _read_manifest(folder)
+    except BundleError:
+        return no_bundle
+    if not named.keys() >= _NEEDED:
+        return no_bundle
+    try:
+        foreign = [name for name in _files(folder, _is_bytecode) if name not in named]
+    except BundleError as error:
+        return str(error)
+    return f"{folder} has files that are not the bundle's: {', '.join(foreign):.200}." if foreign else ""
 
 
 def recorded_environment(folder: Path) -> dict[str, str]:
@@ -155,7 +176,15 @@ def _read_manifest(folder: Path) -> dict[str, str]:
     return recorded
 
 
-def _files(folder: Path) -> list[str]:
+def _is_cached(path: Path) -> bool:
+    return "__pycache__" in path.parts
+
+
+def _is_bytecode(path: Path) -> bool:
+    return _is_cached(path) and path.suffix == ".pyc"
+
+
+def _files(folder: Path, is_passed_over: Callable[[Path], bool] = _is_cached) -> list[str]:
     """Return everything but folders and the manifest; bytecode, which is never read, does not count.
 
     Raises
@@ -168,7 +197,7 @@ def _files(folder: Path) -> list[str]:
         name = path.relative_to(folder).as_posix()
         if path.is_symlink() or not (path.is_file() or path.is_dir()):
             raise BundleError(folder, f"{folder} holds {name}, which is not a plain file. Remove it.")
-        if path.is_file() and name != MANIFEST and "__pycache__" not in path.relative_to(folder).parts:
+        if path.is_file() and name != MANIFEST and not is_passed_over(path.relative_to(folder)):
             found.append(name)
     return found
 

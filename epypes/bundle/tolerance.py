@@ -33,7 +33,7 @@ SAFETY: Final = 10.0
 _RUNS_OF_SUSPECTS: Final = 8
 _MEANING: Final = (
     f"{counted(RUNS, 'more run')} in the notebook gave other last digits: a replay may differ by {SAFETY:g} times as",
-    "much, and by no more than the relative part of the largest magnitude.",
+    "much, and each number by no more than the relative part of its own magnitude.",
 )
 Told = Callable[[str], None]
 
@@ -184,15 +184,13 @@ def _grows(distances: Sequence[float]) -> bool:
 
 def _is_noise(found: Sequence[Unlike]) -> bool:
     """Whether all that differs are floating-point numbers, in less than half of their digits."""
-    return all(
-        unlike.epsilon and (unlike.largest or 0.0) <= math.sqrt(unlike.epsilon) * unlike.scale for unlike in found
-    )
+    return all(unlike.epsilon and unlike.relative <= math.sqrt(unlike.epsilon) for unlike in found)
 
 
 def _widened(known: Tolerance | None, found: Sequence[Unlike]) -> Tolerance:
     """Return a tolerance that covers what was found, with the factor of safety, and what was known before."""
     absolute = SAFETY * max(unlike.largest or 0.0 for unlike in found)
-    relative = SAFETY * max((unlike.largest or 0.0) / unlike.scale if unlike.scale else 0.0 for unlike in found)
+    relative = SAFETY * max(unlike.relative for unlike in found)
     # Two digits are enough, rounded up: the file is read by people, and small changes of the noise don't change it.
     absolute, relative = _rounded_up(absolute), _rounded_up(relative)
     if known is None:

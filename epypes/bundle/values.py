@@ -13,9 +13,9 @@ from fractions import Fraction
 from operator import attrgetter, itemgetter, methodcaller
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin
 
-from epypes.bundle.classes import made_again
 from epypes.bundle.literal import literal_source
-from epypes.bundle.source import Importable, importable
+from epypes.bundle.records import made_again
+from epypes.bundle.source import Importable, Refused, importable
 from epypes.hints import Param
 from epypes.images import Image
 from epypes.run.guard import is_plain_array
@@ -146,7 +146,13 @@ def _array(gathered: Slice, array: Any, what: str) -> str:
     listed = repr(array.tolist())
     if "nan" in listed or "inf" in listed or np.array(array.tolist(), array.dtype).shape != array.shape:
         return ""
-    return f"{gathered.module_name('numpy', what)}.array({listed}, dtype={str(array.dtype)!r})".replace("'", '"')
+    if not array.flags.c_contiguous and not array.flags.f_contiguous:
+        text = (
+            f"{what} has an array that is a view of another, with gaps or reversed, which would be laid out otherwise"
+        )
+        raise Refused(f"{text}. Make it a whole one in the notebook: np.ascontiguousarray(...).")
+    order = "" if array.flags.c_contiguous else ", order='F'"
+    return f"{gathered.module_name('numpy', what)}.array({listed}, dtype={str(array.dtype)!r}{order})".replace("'", '"')
 
 
 def _mark(gathered: Slice, value: Any, what: str) -> str:

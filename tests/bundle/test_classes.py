@@ -54,6 +54,12 @@ PROMOTED = {
         "from dataclasses import dataclass\n@dataclass\nclass Cfg:\n    k: int = 3\n    t: tuple = (1, 2)\n"
         "CFG = Cfg(k=5)\ndef f(x):\n    return CFG.k + x\n"
     ),
+    "record that checks itself": (
+        "from dataclasses import dataclass\nimport numpy as np\n@dataclass(frozen=True, slots=True)\nclass Inner:\n    t: tuple\n"
+        "@dataclass\nclass Cfg:\n    k: float\n    w: np.ndarray\n    i: Inner\n    def __post_init__(self):\n"
+        "        self.k = float(self.k)\n        if self.k < 0:\n            raise ValueError\nCFG = Cfg(5, np.eye(2), Inner((1, float('nan'))))\n"
+        "def f(x):\n    return CFG.k + x + float(CFG.w.sum()) + CFG.i.t[0]\n"
+    ),
     "abstract": (
         "import abc\nimport functools\nclass A(abc.ABC):\n    @abc.abstractmethod\n    def g(self): ...\nclass B(A):\n"
         "    def g(self):\n        return 5\n    @staticmethod\n    def s(x):\n        return x\n"
@@ -65,6 +71,16 @@ PROMOTED = {
     "annotations read late": (
         "from __future__ import annotations\nfrom dataclasses import dataclass\n@dataclass\nclass P:\n    a: int = 4\n"
         "    def of(self, other: int) -> float:\n        return self.a + other\ndef f(x):\n    return P().of(x)\n"
+    ),
+    "values that are computed": (
+        "import dataclasses\nimport enum\nimport numpy as np\nGAIN = 3\nROW = np.arange(9.0)\n"
+        "class A:\n    K = GAIN * 10\n    T = np.array([1, 2], np.float32) / 3\n    U = K + 1\n    R = ROW\n    D = dict(a=1)\n"
+        "    S = [i * GAIN for i in range(3)]\n    a, b = 1, GAIN\n    _low: int = -GAIN\n    N = f'{K} of {GAIN}'\n"
+        "    Z = np.zeros((2, 3))\n    def g(self, k=GAIN, *, u=U, dtype=np.uint8):\n        return k + u + self._low\n"
+        "    alias = g\n@dataclasses.dataclass\nclass P:\n    k: int = GAIN\n"
+        "    m: list = dataclasses.field(default_factory=list)\n    n: int = dataclasses.field(default=GAIN + 1)\n"
+        "class E(enum.Enum):\n    A = GAIN\n    B = enum.auto()\n    C = (A, GAIN)\n"
+        "def f(x):\n    return A().g() + A().alias(2) + sum(A.S) + float(A.T.sum()) + P().k + P().n + E.B.value + x + len(A.N)\n"
     ),
     "in an if": "if True:\n    class A:\n        K = 4\ndef f(x):\n    return A.K + x\n",
 }
@@ -101,6 +117,45 @@ REFUSED = {
     "made by a call": (f"A = type('A', (), {{'g': lambda self: 1}})\n{USED}", "is not to be had as text"),
     "writes a global": (
         f"N = 0\nclass A:\n    def g(self):\n        global N\n        N += 1\n        return N\n{USED}", "changes the global 'N'",
+    ),
+    "a value that was computed": (f"G = 2\nclass A:\n    K = G * 10\n    def g(self): return self.K\nG = 5\n{USED}", "'K' has another"),
+    "a value that the notebook has filled": (f"class A:\n    K = dict()\n    def g(self): return len(self.K)\nA.K[1] = 2\n{USED}", "'K' has another"),
+    "an array that was written into": (
+        f"import numpy as np\nclass A:\n    K = np.array([1, 2])\n    def g(self): return self.K\nA.K[0] = 50\n{USED}", "'K' has another",
+    ),
+    "a default of a method": (f"G = 2\nclass A:\n    def g(self, k=G): return k\nG = 5\n{USED}", "'g' has another default by now than 'G'"),
+    "a default by name": (f"G = 2\nclass A:\n    @staticmethod\n    def g(*, k=G): return k\nG = 5\n{USED}", "'g' has another default"),
+    "a default that was filled": (f"class A:\n    def g(self, k=[1]): return len(k)\nA().g.__func__.__defaults__[0].append(2)\n{USED}", "'g' has another default"),
+    "a field": (
+        "import dataclasses\nG = 2\n@dataclasses.dataclass\nclass Only:\n    k: int = G\nG = 5\ndef f(x):\n    return Only().k + x\n", "'k' has another",
+    ),
+    "a field that is described": (
+        "import dataclasses\nG = 2\n@dataclasses.dataclass\nclass Other:\n    k: int = dataclasses.field(default=G)\nG = 5\n"
+        "def f(x):\n    return Other().k + x\n", "'k' has another",
+    ),
+    "a member": ("import enum\nG = 2\nclass Kinds(enum.Enum):\n    K = G\nG = 5\ndef f(x):\n    return Kinds.K.value + x\n", "'K' has another"),
+    "a value of a class above": ("G = 2\nclass Above:\n    K = G + 1\nclass A(Above):\n    def g(self): return self.K\nG = 5\n" + USED, "'K' has another"),
+    "a private value more": (f"class A:\n    def g(self): return getattr(self, '_k', 1)\nA._k = 5\n{USED}", "it has '_k', which its text"),
+    "a number of NumPy's more": (f"import numpy as np\nclass A:\n    def g(self): return self.q\nA.q = np.float64(3)\n{USED}", "it has 'q'"),
+    "a value that was read": (
+        f"class A:\n    K = id(1)\n    def g(self): return self.K\n{USED}",
+        r"has 'K' \(.*, line 2\), which its text computes by 'id\(1\)'.*Compute it above the class under a name",
+    ),
+    "a value that is made in steps": (
+        f"class A:\n    K = 1\n    for i in range(3):\n        K += i\n    def g(self): return self.K\n{USED}", "has 'K' .*which its text makes in steps",
+    ),
+    "a default that was read": (f"class A:\n    def g(self, k=id(1)): return k\n{USED}", r"has 'g' .*computes by 'id\(1\)'.*Compute it above"),
+    "a record that changes what it is given": (
+        "import dataclasses\n@dataclasses.dataclass\nclass Twice:\n    k: float\n    def __post_init__(self):\n        self.k *= 2\n"
+        "ONE = Twice(30)\ndef f(x):\n    return ONE.k + x\n", "uses 'ONE' .* of type Twice",
+    ),
+    "a record that changes its list": (
+        "import dataclasses\n@dataclasses.dataclass\nclass Longer:\n    k: list\n    def __post_init__(self):\n        self.k.append(2)\n"
+        "ONE = Longer([1])\ndef f(x):\n    return len(ONE.k) + x\n", "uses 'ONE' .* of type Longer",
+    ),
+    "a record with more": (
+        "import dataclasses\n@dataclasses.dataclass\nclass More:\n    k: int\nONE = More(3)\nONE.m = 5\ndef f(x):\n    return ONE.m + x\n",
+        "uses 'ONE' .* of type More",
     ),
     "object of the notebook": ("class A:\n    pass\nONE = A()\ndef f(x):\n    return ONE\n", "uses 'ONE' .* of type A"),
 }  # fmt: skip

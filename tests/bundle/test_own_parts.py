@@ -354,6 +354,43 @@ def test_nodes_that_cannot_be_made_again_are_refused_with_the_way_out(names, tmp
     assert "'b' has another 'more' by now than one that is made anew. Make it an argument" in told
 
 
+SET_LATER = """
+import types
+import epypes as ep
+
+class Limited(ep.Node):
+    def __init__(self, name):
+        super().__init__(name, self.work)
+        self.low, self.seen, self.settings = 10, 0, types.SimpleNamespace(high=20)
+
+    def work(self, x):
+        self.count()
+        return max(self.low, min(x, self.settings.high))
+
+    def count(self):
+        self.seen += 1
+
+    def set_low(self, low):
+        self.low = low
+"""
+
+
+@pytest.mark.parametrize("change", ["low", "high", "none"])
+def test_what_was_set_on_a_node_by_a_method_that_no_run_calls_is_refused(change, tmp_path):
+    node = cell(SET_LATER)["Limited"]("n")
+    if change == "low":
+        node.set_low(15)
+    elif change == "high":
+        node.settings.high = 50
+    runner = ep.CompGraphRunner(ep.CompGraph({"n": node}, {"n": ("x", "y")}))
+    runner.run(x=12)
+    if change == "none":
+        assert ep.promote(runner, tmp_path / "b").digest
+        return
+    named = "low" if change == "low" else "settings"
+    assert f"'n' has another '{named}' by now than one that is made anew" in refusals(runner, tmp_path / "b")
+
+
 def test_pipelines_that_cannot_serve_are_refused_with_the_way_out(tmp_path):
     names = cell(
         f"{PORTS}\n\nclass Source(ep.SourcePipeline):\n    pass\n\n\nclass Sink(ep.SinkPipeline):\n"

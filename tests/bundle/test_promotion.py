@@ -9,6 +9,7 @@ import re
 import shutil
 import threading
 import tomllib
+import types
 from pathlib import Path
 
 import cv2
@@ -285,6 +286,66 @@ def test_a_folder_that_holds_something_else_is_not_touched(runner, tmp_path):
     assert (tmp_path / "thesis.tex").read_text() == "years of work"
 
 
+@pytest.mark.parametrize(
+    ("manifest", "words"),
+    [
+        ("x", "is not a bundle"),
+        ("x  thesis.tex\n", "is not a bundle"),
+        ("", "is not a bundle"),
+        ("x  ../a\n", "is not a"),
+    ],
+)
+def test_a_folder_with_a_manifest_that_is_no_bundles_is_not_touched(manifest, words, runner, tmp_path):
+    (tmp_path / "MANIFEST.sha256").write_text(manifest)
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(PromotionRefused, match=words):
+        ep.promote(runner, tmp_path)
+    assert (tmp_path / "thesis.tex").read_text() == "years of work"
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "samples/mine.npz", "__pycache__/results.csv"])
+def test_a_bundle_with_a_file_that_is_not_its_own_is_not_replaced(name, bundle, runner):
+    (bundle.path / name).parent.mkdir(exist_ok=True)
+    (bundle.path / name).write_text("measured by hand")
+    with pytest.raises(PromotionRefused, match=f"not the bundle's: {name}.*name another folder, or move that away"):
+        ep.promote(runner, bundle.path)
+    assert (bundle.path / name).read_text() == "measured by hand"
+
+
+def test_a_bundle_with_changed_and_missing_files_and_bytecode_is_replaced(bundle, runner):
+    (bundle.path / "requirements.txt").unlink()
+    module = bundle.path / "pipeline.py"
+    module.write_text(module.read_text() + "# by hand\n")
+    py_compile.compile(str(module))
+    assert ep.promote(runner, bundle.path, outputs=["edges"]).digest
+
+
+@pytest.mark.parametrize("when", ["replaying", "exchanging"])
+@pytest.mark.parametrize("was_there", [True, False])
+def test_what_is_put_there_while_the_promotion_runs_is_kept(when, was_there, bundle, runner, monkeypatch):
+    mine = bundle.path / "mine.csv"
+    if not was_there:
+        shutil.rmtree(bundle.path)
+    exchange, told = promote_module._exchange, []
+
+    def put():
+        if not told:
+            told.append(bundle.path.mkdir(exist_ok=True))
+            mine.write_text("important")
+
+    def putting(left, right):
+        put()
+        exchange(left, right)
+
+    monkeypatch.setattr(promote_module, "_exchange", putting)
+    if when == "exchanging" and not was_there:
+        bundle.path.mkdir()
+    with pytest.raises(PromotionRefused, match=re.escape(str(bundle.path))):
+        ep.promote(runner, bundle.path, told=lambda text: put() if when in text else None)
+    assert mine.read_text() == "important"
+    assert [path.name for path in bundle.path.parent.iterdir()] == [bundle.path.name]
+
+
 def test_a_pipeline_is_promoted_too_and_other_things_are_refused_by_name(runner, photograph, tmp_path):
     pipe = ep.Pipeline("edges", runner.cg, runner.hyperparameters)
     pipe.run(image=photograph)
@@ -307,6 +368,13 @@ def test_a_pipeline_is_promoted_too_and_other_things_are_refused_by_name(runner,
         ({"a": 1}, {"b": 1}, "expected the keys"),
         ([1], [1, 2], "expected 1 items, got 2"),
         (0.0, -0.0, "expected 0.0, got -0.0"),
+        ("0x12", "0x13", "expected '0x12', got '0x13'"),
+        ("<f at 0x12>", "<f at 0x13>", "expected '<f at 0x12>'"),
+        (b"0x12", b"0x13", "expected b'0x12'"),
+        ({"id": "0x1"}, {"id": "0x2"}, "'0x2'"),
+        (types.SimpleNamespace(id="0x1"), types.SimpleNamespace(id="0x2"), "0x2"),
+        ({1: "x"}, {True: "x"}, r"expected the keys \[1\], got \[True\]"),
+        ({"0x1": 1}, {"0x2": 1}, "expected the keys"),
     ],
 )
 def test_a_difference_is_described_by_its_first_place(left, right, words):
@@ -314,10 +382,17 @@ def test_a_difference_is_described_by_its_first_place(left, right, words):
 
 
 @pytest.mark.parametrize(
-    "value", [np.nan, np.array([np.nan, 1]), None, "a", (1, [2.0]), {"k": np.eye(2)}, np.zeros((0, 3))]
+    "value", [np.nan, {np.nan: 1}, np.array([np.nan, 1]), None, "a", (1, [2.0]), {"k": np.eye(2)}, np.zeros((0, 3))]
 )
 def test_a_value_agrees_with_itself(value):
     assert first_difference(value, value) is None
+
+
+@pytest.mark.parametrize(
+    "make", [object, cv2.ORB_create, lambda: {"a": object()}, lambda: lambda: 1, lambda: [].append]
+)
+def test_where_an_object_is_in_memory_is_no_difference(make):
+    assert first_difference(make(), make()) is None
 
 
 def cells(path, *sources):

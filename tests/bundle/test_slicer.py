@@ -322,3 +322,18 @@ def test_what_the_notebook_put_into_a_dict_of_functions_that_reads_it_comes_back
     text, refusals = promoted(cell)
     assert refusals == []
     assert executed(text).func_dict["f"](3) == 0
+
+
+@pytest.mark.parametrize("made", ["np.asfortranarray(M)", "M.T", "M"])
+def test_an_array_keeps_its_layout(made):
+    source = f"M = np.arange(6.0).reshape(2, 3)\nK = {made}\ndef f(x):\n    return K\n"
+    text, refusals = promoted(source)
+    ours, theirs = executed(text).func_dict["f"](0), notebook(source)["K"]
+    assert refusals == []
+    assert (ours.tolist(), ours.strides) == (theirs.tolist(), theirs.strides)
+
+
+@pytest.mark.parametrize("made", ["M[:, ::2]", "M[::-1]", "np.broadcast_to(M[0], (2, 3))"])
+def test_an_array_that_is_part_of_another_is_refused_with_the_way_out(made):
+    _, refusals = promoted(f"M = np.arange(6.0).reshape(2, 3)\nK = {made}\ndef f(x):\n    return K\n")
+    assert "Make it a whole one in the notebook: np.ascontiguousarray(" in refusals[0]

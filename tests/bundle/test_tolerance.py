@@ -206,6 +206,25 @@ def test_no_tolerance_covers_other_kinds_of_difference(expected, got):
     assert next(differences(expected, got, Tolerance(1e9, 1e9))).text
 
 
+def test_a_small_number_beside_a_large_one_has_a_tolerance_of_its_own():
+    expected, tolerance = np.array([1e5, 0.5]), Tolerance(10.0, 1e-4)
+    assert first_difference(expected, np.array([1e5 + 9, 0.50004]), tolerance) is None
+    assert "first at [1]" in str(first_difference(expected, np.array([1e5, 0.5001]), tolerance))
+    assert first_difference(expected, np.array([1e5 + 11, 0.5]), tolerance) is not None
+
+
+def test_random_numbers_beside_a_large_one_are_no_noise():
+    functions = notebook(
+        "def beside(x):\n    return np.r_[1e5, np.random.default_rng().choice([0.5, 1.5, 2.5, 3.5, 4.5], 20)].astype('f4')\n"
+        "def cancelled(x):\n    return np.r_[1e9, np.random.default_rng().choice([1e-8, 2e-8], 20)]\n"
+    )
+    beside, cancelled = (ep.CompGraph.from_functions(functions[name]) for name in ("beside", "cancelled"))
+    assert "draws random numbers" in learnt(beside, ["beside"])[0].reasons[0]
+    found, _ = learnt(cancelled, ["cancelled"])
+    assert found.reasons == ()
+    assert found.tolerances["cancelled"].relative < 1e-6
+
+
 def test_infinities_and_nans_that_stay_are_covered():
     expected = np.array([np.nan, np.inf, 1.0, 0.0])
     assert first_difference(expected, np.array([np.nan, np.inf, 1.0 + 1e-15, -0.0]), Tolerance(1e-12, 1e-12)) is None
