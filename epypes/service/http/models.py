@@ -151,6 +151,12 @@ class Failures(BaseModel):
     failures: list[Failure]
 
 
+class Access(BaseModel):
+    """Whether changes are allowed; without the token the request is refused."""
+
+    allowed: bool
+
+
 class Deploy(BaseModel):
     """The bundle to serve from now on."""
 
