@@ -18,6 +18,9 @@ from epypes.cli.promote import promote
 from epypes.cli.record import record
 from epypes.cli.replay import replay
 from epypes.cli.serve import serve
+from epypes.cli.set import set_parameters
+from epypes.cli.status import status
+from epypes.cli.stop import stop
 from epypes.cli.verify import verify
 
 app = typer.Typer(
@@ -29,9 +32,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 _COMMANDS = (
-    *(promote, verify, serve, call, deploy, rollback, failures, replay),
+    *(promote, verify, serve, call, status, stop, deploy, rollback, failures, replay),
     *(record, play, keys, experiment, demo, lab, doctor),
 )
 for command in _COMMANDS:
     app.command()(command)
+app.command("set")(set_parameters)
 app.add_typer(export, name="export")

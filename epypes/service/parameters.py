@@ -18,6 +18,7 @@ _STEP_TOLERANCE: Final = 1e-6
 # What may be given anew as JSON has it: the kinds of `epypes.bundle.entries` that are a number, a text or a flat list.
 _KINDS: Final = (None, "none", "tuple", "numpy", "enum")
 _VALUE_KEYS: Final = ("value", "kind", "dtype", "enum", "shape")
+_TYPES: Final[Mapping[type, str]] = {bool: "bool", int: "int", float: "float", str: "text", list: "list"}
 # What TOML has no whole number for.
 _MOST_WHOLE: Final = 2**63
 
@@ -105,6 +106,27 @@ def _with_value(entries: Entries, token: str, given: Any) -> dict[str, Any]:
     return {**value_of(entry), "value": value, **rest}
 
 
+def type_of(entry: Mapping[str, Any]) -> str:
+    """Return which values an entry takes, for readers of JSON, to whom 1.0 and 1 are the same.
+
+    Returns
+    -------
+    str
+        ``int``, ``float``, ``bool``, ``text``, ``list``, ``none`` or ``other``.
+    """
+    value = entry.get("value")
+    if "value" not in entry or value is None:
+        return "none"
+    if type(value) is int and (_may_have_fraction(entry) or str(entry.get("dtype", "")).startswith("float")):
+        return "float"
+    return _TYPES.get(type(value), "other")
+
+
+def _may_have_fraction(entry: Mapping[str, Any]) -> bool:
+    """Whether the range of a whole number says that it may be another one too."""
+    return "dtype" not in entry and any(type(entry.get(key)) is float for key in ("low", "high", "step"))
+
+
 def value_of(entry: Mapping[str, Any]) -> dict[str, Any]:
     """Return what of an entry is its value, without its range."""
     return {key: entry[key] for key in _VALUE_KEYS if key in entry}
@@ -145,7 +167,7 @@ def _converted(token: str, given: Any, entry: Mapping[str, Any]) -> Any:
 
 def _whole(token: str, value: float, entry: Mapping[str, Any]) -> int | float:
     """Return a number without a fraction as an int, unless its range says that it may have one."""
-    if "dtype" not in entry and any(type(entry.get(key)) is float for key in ("low", "high", "step")):
+    if _may_have_fraction(entry):
         return value
     if not value.is_integer():
         raise ValueError(f"{token!r} is a whole number, and {value} is none.")

@@ -102,7 +102,7 @@ def home(tmp_path_factory):
 @pytest.fixture(scope="module")
 def served(bundle, photograph, home):
     with Service(bundle) as service, HttpServer(service, "127.0.0.1:*") as http, peer_of(service) as peer:
-        http.token = http.token_file.read_text().strip()
+        http.token, http.failures = http.token_file.read_text().strip(), service.info()["addresses"]["failures"]
         with Line(peer, photograph) as line:
             yield service, http, line
 
@@ -144,6 +144,7 @@ def test_the_page_shows_the_running_service(browser, served, theme):
         assert page.locator("#graph image").count() >= 4
         assert page.locator("#counts dd").first.text_content() != "0"
         assert "token=" not in page.url
+        assert http.failures in page.locator("#facts").text_content()
         page.screenshot(path=SCREENSHOTS / f"service-{theme}.png", full_page=True)
         assert not unreadable(page, "body")
         assert not page.complaints
@@ -220,6 +221,29 @@ def test_parameters_are_applied_all_at_once(browser, served):
         assert page.locator("#parameter-blur_kernel").input_value() == "5"
 
 
+def test_a_number_that_is_whole_and_may_have_a_fraction_is_given_one(browser, bundle, home, tmp_path):
+    folder = shutil.copytree(bundle, tmp_path / "edges")
+    text = (folder / "pipeline.toml").read_text()
+    text = re.sub(r"value = 200\nlow.*\nhigh.*", "value = 200.0\nsoft = [0.0, 400.0]", text)
+    (folder / "pipeline.toml").write_text(text)
+    seal(folder)
+    with Service(folder) as service, HttpServer(service, "127.0.0.1:*") as http:
+        http.token = http.token_file.read_text().strip()
+        with page_of(browser, http) as page:
+            page.wait_for_function("() => document.getElementById('graph-note').textContent.startsWith('Waiting for')")
+            address = service.info()["addresses"]["sub"]
+            assert page.locator("#graph-note").text_content() == f"Waiting for the first event at {address}."
+            for text in ("150.25", "151"):
+                page.locator("#parameter-canny_hi").fill(text)
+                page.locator("#apply").click()
+                page.wait_for_function("() => document.querySelectorAll('.field.changed').length === 0")
+                assert service.parameters().entries["canny_hi"]["value"] == float(text)
+            assert page.locator("#parameters input[type=range]").count() == 3
+            change(http, canny_hi=150)  # told by an event, which JSON takes for whole too
+            page.wait_for_function("() => document.getElementById('parameter-canny_hi').value === '150'")
+            assert page.locator("#parameter-canny_hi").get_attribute("step") == "any"
+
+
 def test_what_somebody_else_changed_is_shown_and_not_overwritten(browser, served, theme):
     service, http, _ = served
     change(http, canny_lo=70, canny_hi=200)
@@ -257,6 +281,14 @@ def test_a_failure_is_listed_with_what_opens_it_again(browser, served, theme):
         assert "grayscale" in row.text_content()
         page.screenshot(path=SCREENSHOTS / f"service-failing-{theme}.png", full_page=True)
         page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+        row.locator("th a").click()
+        page.wait_for_selector("#ask[open] pre")
+        assert "in grayscale" in page.locator("#ask-title").text_content()
+        assert "cvtColor" in page.locator("#ask pre").text_content()
+        assert "canny_lo = " in page.locator("#ask .record").text_content()
+        page.screenshot(path=SCREENSHOTS / f"service-failure-{theme}.png")
+        assert not unreadable(page, "#ask")
+        page.locator("#ask-no").click()
         row.locator("button").first.click()
         assert page.evaluate("() => navigator.clipboard.readText()") == f"epypes replay {name} {http.url}"
 
@@ -268,9 +300,9 @@ def test_without_the_token_nothing_can_be_changed_and_with_it_the_service_is_pau
         assert page.locator("#pause").is_disabled()
         page.locator("#token").fill("x" * 43)
         page.locator("#token-form button").click()
-        page.locator("#pause").click()
         page.wait_for_selector("#notice:not([hidden])")
-        assert "not the service's token" in page.locator("#notice").text_content()
+        assert "not the service's access key" in page.locator("#notice").text_content()
+        assert page.locator("#pause").is_disabled()
         page.locator("#token").fill(http.token)
         page.locator("#token-form button").click()
         page.locator("#pause").click()

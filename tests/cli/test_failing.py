@@ -46,8 +46,25 @@ ROWS = {
         (["{bundle}", "{folder}/none.png"], "Image '{folder}/none.png' can't be read"),
         (["{broken}", "image.png"], "pipeline.toml can't be read: "),
     ],
-    "deploy": [(["{bundle}", "--http", "http://127.0.0.1:9"], "No service answers at http://127.0.0.1:9. Start one: ")],
+    "deploy": [
+        (["{bundle}", "--http", "http://127.0.0.1:9"], "No service answers at http://127.0.0.1:9. Start one: "),
+        (["{bundle}"], "Which service? Say --http URL, or --service and the bundle"),
+        (["{bundle}", "--service", "{bundle}"], "No service of yours runs for {bundle}."),
+    ],
     "rollback": [(["--http", "nonsense"], "'nonsense' is no address of a service. Write it as http://127.0.0.1:8642")],
+    "status": [
+        (["{folder}/none"], "{folder}/none does not exist. Name the bundle that is served"),
+        (["{bundle}"], "No service of yours runs for {bundle}. Start it: epypes serve {bundle}"),
+        (["http://127.0.0.1:9"], "No service answers at http://127.0.0.1:9. Start one: "),
+    ],
+    "set": [
+        (["{bundle}", "lo"], "'lo' sets nothing. Write NAME=VALUE, as sigma=1.4."),
+        (["{bundle}", "lo=60"], "No service of yours runs for {bundle}."),
+    ],
+    "stop": [
+        (["{bundle}"], "No service of yours runs for {bundle}."),
+        (["http://127.0.0.1:9"], "No service of yours runs for http://127.0.0.1:9."),
+    ],
     "failures": [(["{folder}/none"], "{folder}/none does not exist")],
     "replay": [(["latest", "{folder}/none"], "{folder}/none does not exist"), (["abc"], "No failure 'abc' here")],
     "keys": [(["a/b"], "is no name for keys")],

@@ -135,6 +135,11 @@ def test_values_of_the_last_run_come_as_they_are(connection, service, photograph
     assert connection.preview("blur_kernel") == ("text/plain", b"11")
 
 
+def test_the_addresses_of_the_line_are_told(connection, service):
+    assert (connection.addresses.sub, connection.addresses.pub) == ("tcp://127.0.0.1:1", "tcp://127.0.0.1:2")
+    assert connection.addresses.failures == ""
+
+
 def test_what_happens_is_told_as_it_happens(connection, service, photograph):
     events = connection.events()
     name, _ = next(events)

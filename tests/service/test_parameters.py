@@ -8,7 +8,7 @@ import pytest
 
 from epypes.bundle.entries import Member, read
 from epypes.errors import BundleError
-from epypes.service.parameters import changed, read_entries
+from epypes.service.parameters import changed, read_entries, type_of
 
 ENTRIES = {
     "side": {"value": 5, "low": 1, "high": 31, "odd": True, "unit": "px"},
@@ -30,6 +30,16 @@ ENTRIES = {
     "table": {"value": {"a": 1}},
     "array": {"value": [1, 2], "kind": "array", "dtype": "int64"},
 }
+
+
+@pytest.mark.parametrize(
+    ("token", "name"),
+    [("side", "int"), ("share", "float"), ("whole", "float"), ("sigma", "float"), ("name", "text"), ("flag", "bool"),
+     ("size", "list"), ("mask", "none"), ("byte", "int"), ("single", "float"), ("table", "other")],
+)  # fmt: skip
+def test_an_entry_says_which_type_its_value_has_also_where_json_does_not(token, name):
+    assert type_of(ENTRIES[token]) == name
+    assert type_of({"value": 1.0}) == "float"
 
 
 @pytest.mark.parametrize(

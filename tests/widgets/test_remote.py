@@ -321,19 +321,67 @@ def test_a_worker_that_starts_again_is_told(panel: Panel, screen: FrontEnd, serv
 
 
 def test_a_service_without_any_event_yet_shows_its_first_one(
-    runner: ep.CompGraphRunner, image: Any, tmp_path: Any
+    runner: ep.CompGraphRunner, image: Any, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service = Standing(runner, tmp_path, outputs=("mask",))
     with standing(service) as server, ep.connect(server.url, token=server.token) as connection:
         panel = tune(connection)
         panel.wait(TIMEOUT_S)
-        assert "No event has been completed yet" in panel.error
+        screen = FrontEnd(panel, monkeypatch)
+        said = {"kind": "note", "text": "Waiting for the first event at tcp://127.0.0.1:1", "waits": True}
+        assert (panel.error, screen.last("note")) == ("", said)
         is_following(panel)
         service.event(image=image)
         until(lambda: panel.token == "mask")
         panel.wait(TIMEOUT_S)
         assert (panel.error, panel.result["mask"].shape) == ("", image.shape)
+        assert (screen.last("note")["text"], screen.of("error")) == ("", [])
         panel.close(TIMEOUT_S)
+
+
+def exchange(service: Standing) -> None:
+    """Serve another bundle: its parameters are its own, and no event has come since."""
+    service.completed = None
+    service.set_parameters({"gain": 5, "threshold": 9}, None)
+
+
+def test_a_panel_says_that_no_event_has_come_since_a_bundle_was_deployed(
+    panel: Panel, screen: FrontEnd, service: Standing, image: Any
+) -> None:
+    is_following(panel)
+    before = panel.result
+    exchange(service)
+    until(lambda: "No event since the bundle was deployed" in (screen.of("note") or [{"text": ""}])[-1]["text"])
+    panel.wait(TIMEOUT_S)
+    assert (panel.error, panel.result is before, screen.frames[-1]["stale"]) == ("", True, False)
+    assert panel.values == {"gain": 5, "threshold": 9}
+    service.event(image=image)
+    until(lambda: screen.last("note")["text"] == "")
+    panel.wait(TIMEOUT_S)
+    assert screen.frames[-1]["values"] == {"gain": 5, "threshold": 9}
+
+
+def test_a_panel_that_is_closed_has_the_last_picture_with_its_values_and_asks_for_nothing(
+    panel: Panel, screen: FrontEnd, service: Standing, image: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    is_following(panel)
+    panel["threshold"] = 60
+    panel.wait(TIMEOUT_S)
+    exchange(service)
+    until(lambda: panel.values == {"gain": 5, "threshold": 9})
+    panel.close(TIMEOUT_S)
+    asked = len(service.asked)
+    for view in (screen, FrontEnd(panel, monkeypatch)):  # a view may be mounted when all cells have run
+        assert view.last("setup")["closed"]
+        assert "This panel is closed" in view.last("note")["text"]
+        assert (view.frames[-1]["stale"], view.frames[-1]["values"]) == (False, {"gain": 2, "threshold": 60})
+        assert view.last("history")["code"] == "service.set(threshold=60)"
+        assert view.of("error") == []
+    assert (panel.values, panel.error) == ({"gain": 2, "threshold": 60}, "")
+    service.become("STOPPED")
+    screen.tell("stage", token="image")
+    screen.tell("set", values={"threshold": 70})
+    assert (len(service.asked), panel.error, followers()) == (asked, "", [])
 
 
 def test_a_panel_that_is_closed_leaves_no_thread(panel: Panel, service: Standing) -> None:

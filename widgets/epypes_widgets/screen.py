@@ -55,6 +55,8 @@ class Screen:
         The number of the newest entry of the history that the view was told of.
     compute_ms
         How long the run that is shown took; None before the first.
+    is_closed
+        Whether nothing follows the hand any more.
     """
 
     def __init__(
@@ -76,7 +78,8 @@ class Screen:
         self._lock = threading.Lock()
         self._seq = count(1).__next__
         self._failure: dict[str, Any] | None = None
-        self._noted = ""
+        self._noted, self._waits = "", False
+        self.is_closed = False
         self._reference: tuple[dict[str, Any], tuple[bytes, ...]] | None = None
         self._referred: tuple[object, tuple[Any, ...]] = (None, ())
         self._told: set[int] = set()
@@ -120,6 +123,8 @@ class Screen:
             return
         if failed is None:
             self._failure, self.error = None, ""
+            if self._waits:
+                self.note("")
             self.compute_ms = run.report.total_ns / 1e6
         frame = make_frame(
             run,
@@ -143,8 +148,26 @@ class Screen:
     def note(self, text: str) -> None:
         """Say something that is no failure; it stays until something else is said, or nothing."""
         if text != self._noted:
-            self._noted = text
-            self.view.tell("note", {"text": text})
+            self._noted, self._waits = text, False
+            self._tell_note()
+
+    def wait(self, text: str) -> None:
+        """Say what is waited for, which is no failure: in the picture's place if there is none yet."""
+        if self.error:
+            self._failure, self.error = None, ""
+            self.view.tell("error", {"seq": self._seq(), "text": "", "function": "", "names": []})
+        self._noted, self._waits = text, True
+        self._tell_note()
+
+    def close(self, text: str) -> None:
+        """Say that nothing follows the hand any more."""
+        self.is_closed = True
+        self.tell_setup()
+        self.tell_history()
+        self.note(text)
+
+    def _tell_note(self) -> None:
+        self.view.tell("note", {"text": self._noted, "waits": self._waits})
 
     def refers_to(self, key: object, payload: Sequence[Any]) -> bool:
         """Whether the picture is compared with this, computed from the very values of this payload."""
@@ -177,6 +200,7 @@ class Screen:
             "token": shown.token,
             "pinned": list(shown.pinned),
             "histogram": shown.has_histogram,
+            "closed": self.is_closed,
         }
         self.view.tell("setup", setup, buffers)
 
@@ -184,7 +208,7 @@ class Screen:
         """Tell the last entries; a thumbnail goes to a view once, and is empty from then on."""
         with self._lock:
             entries, current = self._history.entries, self._history.current
-            pairs = list(zip([None, *entries[:-1]], entries, strict=True))
+            pairs = list(zip([None, *entries][: len(entries)], entries, strict=True))
             # The first one is where all came from.
             pairs = pairs if len(pairs) <= _MOST_ENTRIES else [pairs[0], *pairs[1 - _MOST_ENTRIES :]]
             self.told = len(entries) and entries[-1].number
@@ -220,7 +244,7 @@ class Screen:
             self.view.tell("log", {"lines": self._log})
         self.view.frames.ready()
         if self._noted:
-            self.view.tell("note", {"text": self._noted})
+            self._tell_note()
         if self._failure is not None:
             self.view.tell("error", self._failure)
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final
 
 from epypes.display import Picture
-from epypes.errors import StillRunning
+from epypes.errors import NotComputed, StillRunning
 from epypes.graph import CompGraph
 from epypes.run import Failure, Run
 from epypes_widgets.hand import Hand
@@ -34,6 +34,7 @@ _AFTER_RELEASE_S: Final = 0.06
 _STILL_S: Final = 0.5
 # A cell that changes the runner all the time must not keep pictures from being shown, or values from counting.
 _MOST_ATTEMPTS: Final = 3
+_CLOSED: Final = "This panel is closed: the picture and the values are the last ones."
 
 
 class Tuning:
@@ -81,12 +82,26 @@ class Tuning:
 
     def close(self, timeout_s: float) -> None:
         """Follow nothing any more; StillRunning names the functions that have not returned in time."""
+        is_first = not self.worker.closed
         self._unwatch()
         self.session.close()
         try:
             self.worker.close(timeout_s)
         except StillRunning as error:
             raise StillRunning(error.name, self.runner.running, timeout_s) from None
+        finally:
+            if is_first:
+                self._rest()
+
+    def _rest(self) -> None:
+        """Leave the last picture that completed, with the values that it was made with."""
+        self.hand.release()
+        run = self.session.result
+        if run is not None:
+            self._log(self.hand.follow(run.hyperparameters))
+            self.screen.show(run, 0)
+        self.screen.close(_CLOSED)
+        self._settled()
 
     # -- from any thread ----------------------------------------------------------------------------------------
 
@@ -219,8 +234,10 @@ class Tuning:
         try:
             run, is_settled = self._tried(is_wanted)
         except Exception as error:  # what is wanted can't be run: a placeholder, a branch that is not there
-            self._is_unwell = bool(self.session.place.notice())
-            self.screen.fail(str(error), names=tuple(getattr(error, "problems", ())))
+            if not self.worker.closed:
+                self._refuse(error)
+            return
+        if self.worker.closed:
             return
         if run.failure is not None:
             self._fail(run, run.failure)
@@ -235,6 +252,16 @@ class Tuning:
             self._commits = False
             self._commit(is_final=True)
         self._compare()
+
+    def _refuse(self, error: Exception) -> None:
+        """Say why there is no run."""
+        if not (isinstance(error, NotComputed) and self.session.place.is_shared):
+            self._is_unwell = bool(self.session.place.notice())
+            self.screen.fail(str(error), names=tuple(getattr(error, "problems", ())))
+            return
+        if self.session.result is not None:
+            self.screen.show(self.session.result, 0)
+        self.screen.wait(str(error))
 
     @property
     def _has_run(self) -> bool:

@@ -24,6 +24,7 @@ from epypes.errors import (
     ServiceError,
     UnknownName,
 )
+from epypes.service.parameters import Entries, type_of
 
 if TYPE_CHECKING:
     from epypes.service.parameters import Parameters
@@ -60,7 +61,12 @@ def unavailable(detail: str) -> Response:
 
 def written(parameters: Parameters) -> dict[str, Any]:
     """Return the service's Parameters as they are answered."""
-    return {"revision": parameters.revision, "parameters": parameters.entries}
+    return {"revision": parameters.revision, "parameters": typed(parameters.entries)}
+
+
+def typed(entries: Entries) -> dict[str, Any]:
+    """Return entries that say which type their values have, which JSON doesn't."""
+    return {token: {**entry, "type": type_of(entry)} for token, entry in entries.items()}
 
 
 # The first that fits is taken.

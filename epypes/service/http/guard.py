@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Awaitable, Callable, Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from email.utils import formatdate
 from typing import Any, Final
@@ -79,15 +80,25 @@ class Guard:
     async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         headers = [(name.lower(), value) for name, value in scope["headers"]]
         try:
-            _check_size(scope, headers)
-            self._check_host([value for name, value in headers if name == b"host"])
-            if scope["method"] not in _READING:
-                self._check_token([value for name, value in headers if name == b"authorization"])
+            await self._check(scope, headers, receive)
             body = await _body(dict(headers), receive)
         except _Refused as refused:
             await refused.args[0](scope, receive, send)
             return
         await self.app(scope, _replayed(body, receive), send)
+
+    async def _check(self, scope: Scope, headers: Sequence[tuple[bytes, bytes]], receive: Receive) -> None:
+        """Refuse what is known to be refused without its body."""
+        try:
+            _check_size(scope, headers)
+            self._check_host([value for name, value in headers if name == b"host"])
+            if scope["method"] not in _READING:
+                self._check_token([value for name, value in headers if name == b"authorization"])
+        except _Refused:
+            # Who closes on a body that is still being sent resets the connection, and the answer with it.
+            with suppress(_Refused):
+                await _whole(dict(headers), receive)
+            raise
 
     def _check_host(self, given: list[bytes]) -> None:
         if self.hosts is None:
@@ -121,6 +132,13 @@ def _without_port(host: str) -> str:
 
 async def _body(headers: dict[bytes, bytes], receive: Receive) -> bytes:
     """Return the whole body, once it is known to be short, there in time, and JSON."""
+    body = await _whole(headers, receive)
+    if body:
+        _check_json(body, headers.get(b"content-type", b""))
+    return body
+
+
+async def _whole(headers: dict[bytes, bytes], receive: Receive) -> bytes:
     declared = headers.get(b"content-length", b"0")
     if declared == b"0" and b"transfer-encoding" not in headers:
         return b""
@@ -128,13 +146,10 @@ async def _body(headers: dict[bytes, bytes], receive: Receive) -> bytes:
         raise _too_long()
     try:
         async with asyncio.timeout(REQUEST_TIMEOUT_S):
-            body = await _received(receive)
+            return await _received(receive)
     except TimeoutError:
         text = f"The body did not come within {REQUEST_TIMEOUT_S:g} s. Send it at once."
         raise _Refused(refusal(408, text, _CLOSE)) from None
-    if body:
-        _check_json(body, headers.get(b"content-type", b""))
-    return body
 
 
 async def _received(receive: Receive) -> bytes:

@@ -8,9 +8,13 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 Sentence = Annotated[str, Field(description="What is wrong, and the way out.")]
 Revision = Annotated[int, Field(ge=0, description="It rises with every change of the parameters.", examples=[3])]
-Entry = Annotated[dict[str, Any], Field(examples=[{"value": 70, "low": 0, "high": 255}])]
+Entry = Annotated[dict[str, Any], Field(examples=[{"value": 70, "type": "int", "low": 0, "high": 255}])]
 Entries = Annotated[
-    dict[str, Entry], Field(description="By token: the value, and what it may be, as in pipeline.toml.")
+    dict[str, Entry],
+    Field(
+        description="By token: the value, and what it may be, as in pipeline.toml. Its type is int, float, bool, text, "
+        "list, none or other: a float may be given as 1 and as 1.5."
+    ),
 ]
 
 
@@ -145,6 +149,12 @@ class Failures(BaseModel):
     """Events that failed, the last one first."""
 
     failures: list[Failure]
+
+
+class Access(BaseModel):
+    """Whether changes are allowed; without the token the request is refused."""
+
+    allowed: bool
 
 
 class Deploy(BaseModel):

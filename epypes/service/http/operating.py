@@ -12,7 +12,7 @@ from epypes.bundle.seal import check_seal
 from epypes.errors import BundleError
 from epypes.service.http.answers import answer
 from epypes.service.http.exchanging import exchanging
-from epypes.service.http.models import Deploy, DeployRefusal, Drain, Info, Refusal
+from epypes.service.http.models import Access, Deploy, DeployRefusal, Drain, Info, Refusal
 from epypes.service.http.served import CHANGE_REFUSALS, NEEDS_TOKEN, OfRequest, Served
 
 router = APIRouter(prefix="/v1", tags=["operation"], dependencies=[NEEDS_TOKEN])
@@ -24,6 +24,12 @@ _EXCHANGE: Final = CHANGE_REFUSALS | {
 _INVALID: Final[dict[int | str, dict[str, Any]]] = {
     422: {"model": Refusal, "description": "The request is not as described here."}
 }
+
+
+@router.post("/access", response_model=Access, responses=CHANGE_REFUSALS)
+async def access() -> Response:
+    """Say whether the token is the service's, and change nothing."""
+    return answer({"allowed": True})
 
 
 @router.post("/deploy", response_model=Info, responses=_EXCHANGE)

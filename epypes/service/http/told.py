@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final
 from fastapi.sse import ServerSentEvent
 
 from epypes.errors import EpypesError, ServiceError
-from epypes.service.http.answers import json_ready, written
+from epypes.service.http.answers import json_ready, typed, written
 
 if TYPE_CHECKING:
     from epypes.service.server import Service
@@ -145,6 +145,8 @@ class Told:
         """Take what the service tells, on its thread, and return at once."""
         if not self._listeners:
             return
+        if kind == "parameters" and "parameters" in data:
+            data = {**data, "parameters": typed(data["parameters"])}
         if kind != "run":
             self._soon(self._spread, kind, data)
         elif self._hold(data):

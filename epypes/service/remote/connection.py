@@ -45,6 +45,25 @@ class WrittenBack:
     digest: str
 
 
+@dataclass(frozen=True, slots=True)
+class Addresses:
+    """Where a service takes events and gives answers, as ``ep.ZMQPublisher`` and ``ep.ZMQSubscriber`` take them.
+
+    Attributes
+    ----------
+    sub
+        Where it takes events: publish there.
+    pub
+        Where it publishes answers: subscribe there.
+    failures
+        Where it publishes events that failed.
+    """
+
+    sub: str
+    pub: str
+    failures: str
+
+
 def connect(url: str, *, token: str | None = None, timeout_s: float = 5.0) -> Connection:
     """Connect to the HTTP control of a running service.
 
@@ -99,6 +118,13 @@ class Connection:
     def url(self) -> str:
         """Where the service's HTTP control is."""
         return self._control.url
+
+    @property
+    def addresses(self) -> Addresses:
+        """Where it takes events, and publishes answers and failures; as of the last ``info()``."""
+        told = self._info.get("addresses")
+        known = told if isinstance(told, Mapping) else {}
+        return Addresses(*(str(known.get(name, "")) for name in ("sub", "pub", "failures")))
 
     # -- looking ------------------------------------------------------------------------------------------------
 

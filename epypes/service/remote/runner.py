@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from epypes.errors import (
     EpypesError,
     HyperparameterError,
+    NotComputed,
     ParametersRefused,
     PayloadError,
     RevisionConflict,
@@ -161,6 +162,22 @@ class RemoteRunner:
             if isinstance(error, ParametersRefused) or not self.notice:
                 raise
             raise ServiceError(self.connection.url, self.notice) from error
+        except NotComputed as error:
+            if self.notice:
+                raise ServiceError(self.connection.url, self.notice) from error
+            raise NotComputed("", self._waiting()) from error
+
+    def _waiting(self) -> str:
+        """Return what is waited for where the service has no run to show."""
+        try:
+            answered = self.connection.info().get("counts", {}).get("answered", 0)
+        except EpypesError:
+            answered = 0
+        address = self.connection.addresses.sub
+        if not answered and self.last is None:
+            return f"Waiting for the first event at {address}"
+        seen = "; the picture and its values are those before" if self.last is not None else ""
+        return f"No event since the bundle was deployed or its worker started again{seen}. Waiting for one at {address}"
 
     def _tried_there(self, values: Mapping[str, Any], targets: tuple[str, ...]) -> Run:
         self._require_there()

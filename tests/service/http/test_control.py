@@ -71,6 +71,7 @@ def test_a_change_that_does_not_know_the_latest_revision_changes_nothing(changin
     first = changing.patch("/v1/parameters", json={"revision": now["revision"], "values": {"lo": 33}})
     assert first.status_code == 200
     assert first.json()["parameters"]["lo"]["value"] == 33
+    assert first.json()["parameters"]["lo"]["type"] == "int"
     second = changing.patch("/v1/parameters", json={"revision": now["revision"], "values": {"lo": 44, "hi": 180}})
     assert second.status_code == 409
     assert second.json()["revision"] == first.json()["revision"]

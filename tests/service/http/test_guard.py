@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 
 import httpx
 import pytest
@@ -14,6 +15,7 @@ from tests.service.http.raw import connection, exchange, received, request, unti
 CHANGES = [
     ("PATCH", "/v1/parameters"),
     ("POST", "/v1/parameters/write-back"),
+    ("POST", "/v1/access"),
     ("POST", "/v1/deploy"),
     ("POST", "/v1/rollback"),
     ("POST", "/v1/pause"),
@@ -49,6 +51,22 @@ def test_a_change_with_another_token_is_refused(client, http, method, path, give
     answer = client.request(method, path, json={}, headers=headers)
     assert answer.status_code == 403
     assert "not the service's token" in sentence(answer)
+
+
+def test_who_still_sends_a_body_has_the_refusal_of_its_token_all_the_same(http):
+    for _ in range(10):
+        host, port = http.url.removeprefix("http://").split(":")
+        with socket.create_connection((host, int(port)), 10) as line:
+            head = f"POST /v1/deploy HTTP/1.1\r\nHost: {host}\r\nContent-Length: 60000\r\nAuthorization: Bearer wrong"
+            line.sendall(f"{head}\r\nContent-Type: application/json\r\n\r\n".encode())
+            for _ in range(60):
+                line.sendall(b" " * 1000)
+            answered = line.makefile("rb").read()
+        assert answered.startswith(b"HTTP/1.1 403"), answered[:200]
+
+
+def test_the_token_can_be_tried_without_changing_anything(changing):
+    assert changing.post("/v1/access").json() == {"allowed": True}
 
 
 def test_all_that_the_description_says_needs_a_token_needs_it_and_nothing_else_changes(client):

@@ -34,6 +34,7 @@ export function barPart(panel, parts) {
     group("Look", bars, log, marks, probed, draw),
   );
   let isLive = true;
+  let isClosed = false;
   let areMarksOn = true;
   let stages = [];
   let entries = [];
@@ -51,8 +52,9 @@ export function barPart(panel, parts) {
     press(draw, roi.isDrawing);
     log.disabled = !histogram.isOn;
     draw.disabled = !roi.exists;
-    run.disabled = isLive;
-    note(live, "aria-checked", String(isLive));
+    live.disabled = reset.disabled = select.disabled = isClosed;
+    run.disabled = isLive || isClosed;
+    note(live, "aria-checked", String(isLive && !isClosed));
     choices();
   }
 
@@ -115,8 +117,8 @@ export function barPart(panel, parts) {
   });
 
   function history(message) {
-    undo.disabled = !message.undo;
-    redo.disabled = !message.redo;
+    undo.disabled = !message.undo || isClosed;
+    redo.disabled = !message.redo || isClosed;
     const numbers = message.entries ?? (Array.isArray(message.history) ? message.history : message.history?.entries);
     if (numbers) entries = numbers.map(({ number }) => number);
     show();
@@ -126,6 +128,7 @@ export function barPart(panel, parts) {
     element: root,
     setup(message) {
       isLive = message.live;
+      isClosed = Boolean(message.closed);
       stages = message.stages.filter(({ is_picture }) => is_picture).map(({ token }) => token);
       history(message);
     },

@@ -118,8 +118,23 @@ function render({ model, el }) {
     clearTimeout(knocking);
     panel.state.token = message.token ?? "";
     all("setup", message, buffers);
+    close(Boolean(message.closed));
     const past = Array.isArray(message.history) ? { entries: message.history } : message.history;
     if (past?.entries) all("history", { code: message.code, undo: message.undo, redo: message.redo, ...past }, buffers.slice(message.images?.length ?? 0));
+  }
+
+  /** What asks the kernel to compute rests with a panel that is closed; its picture can still be looked at. */
+  function close(isClosed) {
+    figure.classList.toggle("epypes-closed", isClosed);
+    const column = figure.closest(".epypes-panel")?.querySelector(".epypes-controls");
+    for (const node of [column, chips.element, pinned.element, films.element, history.element]) if (node) node.inert = isClosed;
+  }
+
+  /** What is waited for stands where the picture will be. */
+  function tellNote({ text, waits }) {
+    const isInPlace = Boolean(waits) && figure.classList.contains("epypes-empty");
+    stage.wait(isInPlace ? text : "");
+    header.tell(isInPlace ? "" : text);
   }
 
   const handlers = {
@@ -133,7 +148,7 @@ function render({ model, el }) {
     settings: foot.settings,
     promoted: foot.promoted,
     written: foot.written,
-    note: (message) => header.tell(message.text),
+    note: tellNote,
     log: foot.log,
   };
   const onMessage = (message, buffers) => handlers[message.kind]?.(message, buffers ?? []);

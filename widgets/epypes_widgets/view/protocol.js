@@ -33,10 +33,10 @@ export function arrivals() {
     lose(seq) {
       if (received === seq) received = painted;
     },
-    /** Whether an error says something new: neither a better frame nor a later error has come. */
+    /** Whether an error says something new: neither a better frame nor a later error has come. An empty one ends it. */
     fail(error) {
       if (error.seq < good || (failure && error.seq < failure.seq)) return false;
-      failure = error;
+      failure = error.text ? error : null;
       return true;
     },
     get failure() {

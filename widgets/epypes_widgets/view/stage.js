@@ -149,6 +149,12 @@ export function stagePart(panel) {
     pixelAt: (point) => (canvas.hidden ? null : pixelAt(place, point, size)),
     onPicture: (point) => onPicture(place, point),
     inBox: (pixel) => inBox(place, pixel),
+    /** Say in the place of the first picture what is waited for. */
+    wait(said) {
+      if (!picture.hidden || text.dataset.seq) return;
+      text.textContent = said;
+      text.hidden = !said;
+    },
     /** Call back whenever the picture has moved in its box. */
     watch: (watcher) => watchers.push(watcher),
     get place() { return place; },

@@ -1,5 +1,5 @@
 // Which events failed, and how are they opened again?
-import { ask, make, part } from "./server.js";
+import { ask, confirmed, make, part, say } from "./server.js";
 
 const MOST = 50;
 const TEXT = 240;
@@ -35,6 +35,48 @@ function show() {
   part("failures").parentElement.hidden = known.size === 0;
 }
 
+/** Show what is known of a failure, with its traceback. @param {string} id */
+async function open(id) {
+  try {
+    const record = await ask(`v1/failures/${encodeURIComponent(id)}`);
+    await confirmed(`${record.exception || record.kind} in ${record.function || "the worker"}`, described(record), "");
+  } catch (error) {
+    say("notice", /** @type {Error} */ (error).message);
+  }
+}
+
+/** @param {Record<string, any>} record */
+function described(record) {
+  const facts = {
+    When: new Date(record.when_ns / 1e6).toLocaleString(),
+    "Reads and makes": record.tokens.join(", "),
+    Event: record.event_id,
+    Kind: [record.kind, `try ${record.attempt}`, record.dead_letter ? "dead letter" : ""].filter(Boolean).join(", "),
+    Parameters: Object.entries(record.hyperparameters).map(([token, entry]) => `${token} = ${JSON.stringify(entry.value ?? null)}`).join(", "),
+    Revision: String(record.revision),
+    "Its frame": record.has_event ? "was kept" : "was not kept",
+  };
+  const listed = Object.entries(facts).filter(([, text]) => text).map(([name, text]) => make("div", {}, make("dt", {}, name), make("dd", {}, text)));
+  return make(
+    "div",
+    {},
+    make("p", { class: "message" }, record.message),
+    make("dl", { class: "record" }, ...listed),
+    record.trace.length ? make("pre", { tabindex: "0", "aria-label": "Traceback" }, record.trace.map((/** @type {string} */ line) => line.replace(/\n$/, "")).join("\n")) : make("p", { class: "quiet" }, "There is no traceback."),
+    make("p", {}, make("a", { href: `v1/failures/${encodeURIComponent(record.id)}` }, "The record as JSON")),
+  );
+}
+
+/** @param {string} id */
+function opener(id) {
+  const link = make("a", { href: `v1/failures/${encodeURIComponent(id)}`, title: "Show the record and its traceback" }, make("code", {}, id));
+  link.addEventListener("click", (event) => {
+    event.preventDefault();
+    void open(id);
+  });
+  return link;
+}
+
 /** @param {Failure} failure */
 function row(failure) {
   const when = new Date(failure.when_ns / 1e6);
@@ -43,7 +85,7 @@ function row(failure) {
   return make(
     "tr",
     { "data-id": failure.id },
-    make("th", { scope: "row" }, make("a", { href: `v1/failures/${encodeURIComponent(failure.id)}` }, make("code", {}, failure.id))),
+    make("th", { scope: "row" }, opener(failure.id)),
     make("td", {}, make("time", { datetime: when.toISOString(), title: when.toISOString() }, when.toLocaleString())),
     make("td", {}, make("code", {}, failure.function || "–")),
     make("td", { class: "message" }, kind ? `${kind} — ` : "", what.length > TEXT ? `${what.slice(0, TEXT)}…` : what),

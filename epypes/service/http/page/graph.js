@@ -6,11 +6,27 @@ const LEAST_MS = 400;
 const TOKEN = "token-";
 const STYLE = /<style>([^<]*)<\/style>/;
 const LEAST_WIDTH = / style="min-width:([\d.]+px)"/;
+// What the picture of a graph says at its end of one that has not been run.
+const NOT_RUN = "not run yet";
 const style = new CSSStyleSheet();
 
 let isWanted = false;
 let isAsked = false;
 let looked = "";
+let waits = "No event yet.";
+
+/** Know where events are sent to, and whether any was answered. @param {string} address @param {boolean} isUsed */
+export function sawPlace(address, isUsed) {
+  waits = isUsed ? `No event since it was deployed, or its worker started again. They go to ${address}.` : `Waiting for the first event at ${address}.`;
+  showNote();
+}
+
+function showNote() {
+  const svg = part("graph").firstChild;
+  if (!svg || part("graph").classList.contains("old")) return;
+  const hasRun = !(svg.getAttribute("aria-label") ?? "").endsWith(NOT_RUN);
+  part("graph-note").textContent = hasRun ? "Choose a token to see it larger." : waits;
+}
 
 /** Have the picture drawn anew: one request is in flight, and the latest wish wins. */
 export function redraw() {
@@ -51,7 +67,7 @@ async function draw() {
     if (!answer.ok) throw new Error(String((await answer.json()).detail));
     await swap(await answer.text());
     part("graph").classList.remove("old");
-    part("graph-note").textContent = "Choose a token to see it larger.";
+    showNote();
   } catch (error) {
     part("graph").classList.add("old");
     part("graph-note").textContent = part("graph").firstChild ? "This picture is old: the service gives no newer one." : message(error);

@@ -1,9 +1,9 @@
 // What does the live page show, and what is done from it?
 import { loadFailures, sawFailure } from "./failures.js";
-import { redraw, watchGraph } from "./graph.js";
+import { redraw, sawPlace, watchGraph } from "./graph.js";
 import { sawParameters, showButtons, watchParameters } from "./parameters.js";
 import { sawCounts, sawRun } from "./rates.js";
-import { ask, confirmed, hasToken, hear, keepToken, make, part, Refused, say, takeToken } from "./server.js";
+import { ask, confirmed, hasToken, isTokenKnown, hear, keepToken, make, part, Refused, say, takeToken } from "./server.js";
 
 /** @type {Record<string, string>} */
 const TONES = { READY: "good", LOADING: "warn", PAUSED: "warn", DRAINING: "warn", DEGRADED: "error", FAULTED: "error" };
@@ -36,7 +36,9 @@ async function loadInfo() {
     threads: String(info.threads),
     "events at": info.addresses.sub,
     "answers at": info.addresses.pub,
+    "failures at": info.addresses.failures,
   };
+  sawPlace(info.addresses.sub, info.counts.answered > 0);
   part("facts").replaceChildren(...Object.entries(facts).map(([name, text]) => make("div", {}, make("dt", {}, name), make("dd", {}, text))));
 }
 
@@ -53,7 +55,7 @@ async function operate(path, body = undefined) {
     say("notice", "");
   } catch (error) {
     say("notice", /** @type {Error} */ (error).message);
-    if (error instanceof Refused && error.status === 403) dropToken();
+    if (error instanceof Refused && error.status === 403) refuseToken();
   }
 }
 
@@ -62,13 +64,29 @@ async function drain() {
   if (await confirmed("Drain the service?", text, "Drain")) await operate("v1/drain", {});
 }
 
-function dropToken() {
+function refuseToken() {
   keepToken("");
   showToken();
+  say("notice", "This is not the service's access key. It is in the file that epypes serve names.");
+}
+
+/** Take an access key only if the service knows it. @param {string} given */
+async function useToken(given) {
+  keepToken(given);
+  try {
+    if (given) await isTokenKnown();
+    say("notice", "");
+    showToken();
+  } catch (error) {
+    if (error instanceof Refused && [401, 403].includes(error.status)) return refuseToken();
+    keepToken("");
+    showToken();
+    say("notice", /** @type {Error} */ (error).message);
+  }
 }
 
 function showToken() {
-  part("token-hint").textContent = hasToken() ? "Changes are allowed in this tab." : "From the file that epypes serve names. It is kept until this tab is closed.";
+  part("token-hint").textContent = hasToken() ? "The access key is right: changes are allowed in this tab." : "From the file that epypes serve names. It is kept until this tab is closed.";
   part("token-form").querySelector("button").textContent = hasToken() ? "Forget" : "Use";
   part("token").hidden = hasToken();
   part("token-form").querySelector("label").hidden = hasToken();
@@ -88,19 +106,20 @@ function onHeard(isHeard) {
   }
 }
 
-takeToken();
+const takeGiven = () => {
+  const given = takeToken();
+  if (given) void useToken(given);
+};
 watchGraph();
 watchParameters();
 showToken();
-addEventListener("hashchange", () => {
-  takeToken();
-  showToken();
-});
+takeGiven();
+addEventListener("hashchange", takeGiven);
 part("token-form").addEventListener("submit", (/** @type {Event} */ event) => {
   event.preventDefault();
-  keepToken(hasToken() ? "" : part("token").value);
+  const given = hasToken() ? "" : part("token").value;
   part("token").value = "";
-  showToken();
+  void useToken(given);
 });
 part("pause").addEventListener("click", () => void operate("v1/pause"));
 part("resume").addEventListener("click", () => void operate("v1/resume"));

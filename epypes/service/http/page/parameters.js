@@ -3,7 +3,7 @@ import { ask, confirmed, hasToken, make, part, Refused, say } from "./server.js"
 
 const STEPS = 200;
 
-/** @typedef {{value?: any, kind?: string, low?: number, high?: number, step?: number, odd?: boolean, choices?: any[], unit?: string}} Entry */
+/** @typedef {{value?: any, kind?: string, type?: string, low?: number, high?: number, soft?: number[], step?: number, odd?: boolean, choices?: any[], unit?: string}} Entry */
 /** @typedef {{entry: Entry, box: HTMLElement, note: HTMLElement, read: () => any, write: (value: any) => void}} Field */
 
 /** @type {Map<string, Field>} */
@@ -190,15 +190,16 @@ function toggle(named) {
 
 /** @param {Record<string, string>} named @param {Entry} entry */
 function number(named, entry) {
-  const { low, high } = entry;
-  const isWhole = Number.isInteger(entry.value);
-  const step = entry.step ?? (entry.odd ? 2 : isWhole ? 1 : undefined);
+  const { low, high, soft = [] } = entry;
+  // A number of JavaScript doesn't say whether it may have a fraction: 1.0 is 1.
+  const step = entry.step ?? (entry.odd ? 2 : entry.type === "int" ? 1 : undefined);
+  const [from, to] = [low ?? soft[0], high ?? soft[1]];
   const limits = { ...(low === undefined ? {} : { min: String(low) }), ...(high === undefined ? {} : { max: String(high) }) };
   const box = /** @type {HTMLInputElement} */ (make("input", { ...named, ...limits, type: "number", step: String(step ?? "any"), required: "" }));
   const read = () => (box.value === "" ? undefined : Number(box.value));
-  if (low === undefined || high === undefined) return { controls: [box], read, write: (/** @type {any} */ value) => (box.value = String(value)) };
+  if (from === undefined || to === undefined) return { controls: [box], read, write: (/** @type {any} */ value) => (box.value = String(value)) };
   const slider = /** @type {HTMLInputElement} */ (
-    make("input", { ...limits, type: "range", step: String(step ?? (high - low) / STEPS), "aria-label": `${named.id.slice("parameter-".length)}, slider` })
+    make("input", { min: String(from), max: String(to), type: "range", step: String(step ?? (to - from) / STEPS), "aria-label": `${named.id.slice("parameter-".length)}, slider` })
   );
   slider.addEventListener("input", () => (box.value = slider.value));
   box.addEventListener("input", () => (slider.value = box.value));

@@ -13,13 +13,15 @@ export class Refused extends Error {
   }
 }
 
-/** Take the token from the address, where `epypes serve` prints it, and hide it there. */
+/** Return the token that is in the address, where `epypes serve` prints it, and hide it there. */
 export function takeToken() {
   const given = new URLSearchParams(location.hash.slice(1)).get("token");
-  if (!given) return;
-  keepToken(given);
-  history.replaceState(null, "", location.pathname + location.search);
+  if (given) history.replaceState(null, "", location.pathname + location.search);
+  return given;
 }
+
+/** Throws Refused if the service does not know the token. */
+export const isTokenKnown = () => ask("v1/access", "POST", {});
 
 /** @param {string} token */
 export function keepToken(token) {
