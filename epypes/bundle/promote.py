@@ -31,6 +31,10 @@ from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner, Run
 
 
+def _tell_nobody(text: str) -> None:
+    """Take what is told, where nobody wants to hear it."""
+
+
 def promote(
     runner_or_pipeline: CompGraphRunner | Pipeline,
     to: str | Path,
@@ -39,7 +43,7 @@ def promote(
     f_out: Callable[[Any], Any] | None = None,
     *,
     samples: Iterable[Any] = (),
-    told: Callable[[str], None] = lambda text: None,
+    told: Callable[[str], None] = _tell_nobody,
 ) -> Bundle:
     """Write a bundle: a folder of text that computes what the runner's last run computed, and proves it.
 
