@@ -315,7 +315,8 @@ class Slice:
         return True
 
     def _constant_source(self, name: str, value: Any, found: AnyDefinition, what: str) -> str:
-        source = self.arrays.short(lambda: expression(self, value, what))
+        called = f"{what}, by {name!r} ({found.place_of(name)}),"
+        source = self.arrays.short(lambda: expression(self, value, called))
         if not source:
             kind = f"the class {name!r}" if isinstance(value, type) else f"of type {type(value).__name__}"
             raise Refused(
