@@ -58,10 +58,13 @@ def emit_module(
     head = [_docstring(settings)]
     if needed.imports:
         head.append("\n".join(ordered_imports(list(needed.imports.values()))))
-    constants = early_constants(needed)
-    if constants:
-        head.append(constants)
-    sections = ["\n\n".join(head), *definitions(needed)]
+    sections = ["\n\n".join(head)]
+    constants, reader = early_constants(needed), needed.arrays.reader(needed)
+    if reader:
+        sections += [reader, *([constants] if constants else [])]
+    elif constants:
+        sections = ["\n\n".join([*head, constants])]
+    sections += definitions(needed)
     tail = ["\n".join(block) for block in blocks]
     tail += ["\n".join(text.functions("func_dict")), "\n".join(text.io("func_io", cg))]
     if cg.groups:

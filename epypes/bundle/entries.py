@@ -25,6 +25,10 @@ class Unwritable(ValueError):
     """A value that no entry holds to the last bit; its text says of which kind it is."""
 
 
+class LargeArray(Unwritable):
+    """An array of numbers that is too large for text."""
+
+
 @dataclass(frozen=True, slots=True)
 class Member:
     """A member of an enumeration that is known by its names alone, where the bundle's module is not executed."""
@@ -209,7 +213,7 @@ def _array(array: Any) -> dict[str, Any]:
     if array.dtype.kind not in "biuf" or array.dtype.itemsize > 8:
         raise Unwritable(f"an array of {array.dtype}")
     if array.size > MOST_NUMBERS:
-        raise Unwritable(f"an array of {array.size} numbers, and {MOST_NUMBERS} are the most that people read")
+        raise LargeArray(f"an array of {array.size} numbers")
     dtype = array.dtype.name if array.dtype.isnative else array.dtype.str
     numbers = [_of_number(number) for number in array.astype(array.dtype.newbyteorder("=")).reshape(-1)]
     value = numbers[0] if array.shape == () else _nested(numbers, array.shape)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from typing import Any
 
 from epypes.bundle.emit import emit_module
 from epypes.bundle.entries import members_in
@@ -15,9 +16,9 @@ from epypes.bundle.source import Refused
 from epypes.bundle.subject import Subject, own_lines
 
 
-def write_module(subject: Subject, settings: Settings) -> tuple[str, Settings, list[str]]:
-    """Return the text of ``pipeline.py``, the settings with what it has of its own, and the reasons against it."""
-    gathered = Slice()
+def write_module(subject: Subject, settings: Settings) -> tuple[str, Settings, Mapping[str, Any], list[str]]:
+    """Return the text of ``pipeline.py``, the settings with what it has of its own, its arrays, the reasons against."""
+    gathered = Slice(keeps_arrays=True)
     graphs = Graphs(gathered)
     ports = {f"Function {name!r}": function for name, function in subject.ports.items()}
     text = graphs.write(subject.cg, {**ports, **subject.classes})
@@ -30,8 +31,9 @@ def write_module(subject: Subject, settings: Settings) -> tuple[str, Settings, l
         blocks.append(enums)
     settings = replace(settings, own=tuple(own))
     if gathered.refusals:
-        return "", settings, list(dict.fromkeys(gathered.refusals))
-    return emit_module(settings, subject.cg, gathered, text, graphs.blocks, blocks), settings, []
+        return "", settings, {}, list(dict.fromkeys(gathered.refusals))
+    text_of_all = emit_module(settings, subject.cg, gathered, text, graphs.blocks, blocks)
+    return text_of_all, settings, gathered.arrays.by_name, []
 
 
 def _enums(gathered: Slice, settings: Settings) -> list[str]:

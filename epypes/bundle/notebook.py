@@ -7,7 +7,7 @@ import os
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ def promote_notebook(
     outputs: Sequence[str] | None = None,
     on_cell: Progress = lambda done, total: None,
     told: Told = lambda text: None,
+    samples: Sequence[str] = (),
 ) -> None:
     """Execute every cell of a notebook in a new kernel of this Python, then promote one of its objects there.
 
@@ -43,6 +44,8 @@ def promote_notebook(
         Called with the number of code cells done and their total.
     told
         Called on a thread of its own with what the promotion in the kernel is doing.
+    samples
+        The variables that hold further payloads, as ``promote`` takes them, or lists of such.
 
     Raises
     ------
@@ -57,7 +60,8 @@ def promote_notebook(
         code = (
             "from epypes.bundle.notebook import promote_here as _promote_here\n"
             f"_promote_here({name!r}, {str(Path(to).resolve())!r}, "
-            f"{None if outputs is None else list(outputs)!r}, {str(outcome)!r}, {str(Path(scratch) / 'told')!r})"
+            f"{None if outputs is None else list(outputs)!r}, {str(outcome)!r}, {str(Path(scratch) / 'told')!r}, "
+            f"{list(samples)!r})"
         )
         with _lines_of(Path(scratch) / "told", told):
             _execute(path, code, on_cell, Path(scratch))
@@ -137,7 +141,9 @@ def _execute(path: Path, last_cell: str, on_cell: Progress, scratch: Path) -> No
         raise BundleError(path, f"{path}: the kernel died in code cell {done + 1} of {total}.") from error
 
 
-def promote_here(name: str, to: str, outputs: Sequence[str] | None, outcome: str, pipe: str) -> None:
+def promote_here(
+    name: str, to: str, outputs: Sequence[str] | None, outcome: str, pipe: str, samples: Sequence[str] = ()
+) -> None:
     """Promote a variable of the notebook that this kernel runs; write the reasons against it, if any, as JSON."""
 
     def told(text: str) -> None:
@@ -149,7 +155,7 @@ def promote_here(name: str, to: str, outputs: Sequence[str] | None, outcome: str
         if name not in names:
             known = [key for key, value in names.items() if isinstance(value, CompGraphRunner | Pipeline)]
             raise UnknownName("variable", name, known, "that holds a runner or pipeline in the notebook")
-        promote(names[name], to, outputs, told=told)
+        promote(names[name], to, outputs, samples=_payloads(names, samples), told=told)
     except PromotionRefused as refused:
         reasons = list(refused.reasons)
     except EpypesError as error:
@@ -157,3 +163,14 @@ def promote_here(name: str, to: str, outputs: Sequence[str] | None, outcome: str
     else:
         reasons = []
     Path(outcome).write_text(json.dumps({"reasons": reasons}), encoding="utf-8")
+
+
+def _payloads(names: Mapping[str, Any], variables: Sequence[str]) -> list[Any]:
+    """Return the payloads that variables hold: one, or those of a list or tuple."""
+    found: list[Any] = []
+    for name in variables:
+        if name not in names:
+            known = [key for key, value in names.items() if not key.startswith("_") and not callable(value)]
+            raise UnknownName("variable", name, known, "that holds a payload in the notebook")
+        found += names[name] if isinstance(names[name], list | tuple) else [names[name]]
+    return found

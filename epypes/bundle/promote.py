@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from epypes.bundle.answers import ANSWERS, record_answer
+from epypes.bundle.arrays import write_arrays
 from epypes.bundle.compare import Tolerance
 from epypes.bundle.exchange import exchange as _exchange
 from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
@@ -30,6 +31,10 @@ from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner, Run
 
 
+def _tell_nobody(text: str) -> None:
+    """Take what is told, where nobody wants to hear it."""
+
+
 def promote(
     runner_or_pipeline: CompGraphRunner | Pipeline,
     to: str | Path,
@@ -38,7 +43,7 @@ def promote(
     f_out: Callable[[Any], Any] | None = None,
     *,
     samples: Iterable[Any] = (),
-    told: Callable[[str], None] = lambda text: None,
+    told: Callable[[str], None] = _tell_nobody,
 ) -> Bundle:
     """Write a bundle: a folder of text that computes what the runner's last run computed, and proves it.
 
@@ -82,7 +87,8 @@ def promote(
             draft = Path(scratch) / target.name
             _write(draft, target, subject, outputs, samples, told)
             told("replaying in a fresh process")
-            prove(draft, target)
+            for note in prove(draft, target).notes:
+                told(note)
             _replace(draft, target)
     except (OSError, UnicodeError) as error:
         if isinstance(error, EpypesError):
@@ -134,7 +140,7 @@ def _write(
         target.name, free, wanted, hyperparameters, rgb, writable_defaults(cg, hyperparameters), cg.types,
         attributes=subject.attributes, has_groups=bool(cg.groups),
     )  # fmt: skip
-    module, settings, refusals = write_module(subject, settings)
+    module, settings, arrays, refusals = write_module(subject, settings)
     if reasons or refusals:
         raise PromotionRefused(target, [*reasons, *refusals])
     runs = [*_runs(target, subject, samples)]
@@ -142,6 +148,7 @@ def _write(
     (draft / SAMPLES).mkdir(parents=True)
     (draft / MODULE).write_text(module, encoding="utf-8")
     write_settings(draft / SETTINGS, settings, cg)
+    write_arrays(draft, arrays)
     for number, run in enumerate(runs):
         _record(draft / SAMPLES / f"{number:03}.npz", target, run, settings)
         # An answer is compared to the last bit, which noise would change.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from epypes.bundle.causes import REQUIREMENTS
+from epypes.bundle.reach import named_here
 from epypes.bundle.replay import replay_isolated
 from epypes.bundle.report import ReplayReport
 from epypes.bundle.seal import seal
@@ -34,9 +35,13 @@ def prove(draft: Path, target: Path) -> ReplayReport:
     try:
         report = replay_isolated(draft, sealed=False)
     except BundleError as error:
-        raise PromotionRefused(target, [str(error).replace(str(draft.resolve()), str(target))]) from error
+        failed = str(error).replace(str(draft.resolve()), str(target))
+        raise PromotionRefused(target, [failed, *named_here(draft)]) from error
     if not report.identical:
-        raise PromotionRefused(target, [*map(str, report.differences), _WHY])
+        why = [*report.outside, *named_here(draft)] or [_WHY]
+        raise PromotionRefused(target, [*map(str, report.differences), *why])
+    if report.outside:
+        raise PromotionRefused(target, report.outside)
     (draft / REQUIREMENTS).write_text("".join(f"{line}\n" for line in report.requirements), encoding="utf-8")
     seal(draft, report.environment)
     return report

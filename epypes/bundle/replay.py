@@ -6,6 +6,7 @@ Run as a program (``python -I -m epypes.bundle.replay FOLDER REPORT``) it is tha
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -20,6 +21,7 @@ from epypes.bundle.compare import differences
 from epypes.bundle.environment import environment
 from epypes.bundle.importwatch import ImportWatch
 from epypes.bundle.load import SAMPLES, Bundle, pipeline_of, read_bundle
+from epypes.bundle.reach import ReachWatch
 from epypes.bundle.report import Difference, ReplayReport, difference, report_from
 from epypes.bundle.requirements import owner, requirement_lines
 from epypes.errors import BundleError, EpypesError
@@ -148,9 +150,12 @@ def _watched(folder: Path, arguments: list[str]) -> dict[str, Any]:
             except EpypesError:
                 break
         watch.mark()
-        bundle = read_bundle(folder, sealed="--unsealed" not in arguments)
-        report = replay(bundle)
+        with ReachWatch(folder) as reached:
+            bundle = read_bundle(folder, sealed="--unsealed" not in arguments)
+            reached.also_in(bundle.settings.hyperparameters)
+            report = replay(bundle)
     modules = watch.imported_by(f"epypes_bundle_{folder.name}", owner)
+    report = replace(report, outside=reached.files, notes=(*report.notes, *reached.notes))
     return replace(report, requirements=requirement_lines(modules)).to_dict()
 
 
@@ -173,6 +178,10 @@ def _told(error: BaseException, folder: Path) -> str:
     text = f"The replay of {folder} failed{where}: {type(error).__name__}: {' '.join(str(error).split())}"
     if isinstance(error, ModuleNotFoundError):
         text += ". Only installed packages can be imported in a bundle: install it, or move the code into the notebook"
+    elif (
+        isinstance(error, FileNotFoundError) and error.filename and not Path(os.fsdecode(error.filename)).is_absolute()
+    ):
+        text += ". The current folder is another one there"
     return f"{text} ({notes})" if notes else text
 
 

@@ -82,6 +82,8 @@ class ReplayReport:
         What the differences likely come from, the likeliest first.
     notes
         What else is worth knowing, as sentences.
+    outside
+        The files outside of the bundle that its functions open or name, as sentences.
     """
 
     samples: int
@@ -92,6 +94,7 @@ class ReplayReport:
     unsteady: tuple[str, ...] = ()
     causes: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    outside: tuple[str, ...] = ()
 
     @property
     def identical(self) -> bool:
@@ -114,7 +117,7 @@ class ReplayReport:
 def report_from(outcome: Mapping[str, Any]) -> ReplayReport:
     """Return the report that a process has written as JSON."""
     found = (Difference(**entry) for entry in outcome["differences"])
-    texts = {name: tuple(outcome[name]) for name in ("requirements", "unsteady", "causes", "notes")}
+    texts = {name: tuple(outcome[name]) for name in ("requirements", "unsteady", "causes", "notes", "outside")}
     return ReplayReport(
         outcome["samples"], outcome["tokens"], tuple(found), environment=outcome["environment"], **texts
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from epypes.bundle.compare import Tolerance
-from epypes.bundle.entries import Unwritable, fits, members_in, plain, read, written
+from epypes.bundle.entries import MOST_NUMBERS, LargeArray, Unwritable, fits, members_in, plain, read, written
 from epypes.bundle.ranges import range_of
 from epypes.bundle.tolerance import add_tolerances, read_tolerances
 from epypes.errors import BundleError
@@ -99,6 +99,12 @@ def unwritable(values: Mapping[str, Any], what: str = "Hyperparameter") -> list[
     for token, value in values.items():
         try:
             written(value)
+        except LargeArray as found:
+            reasons.append(
+                f"{what} {token!r} is or holds {found}; {MOST_NUMBERS} are the most that pipeline.toml holds, where "
+                "people read them. Let the function read it from a variable of the notebook, outside of it: the bundle "
+                "keeps that as a file. Or make it in a function; or unfreeze it and pass it to run()."
+            )
         except Unwritable as found:
             way_out = "or unfreeze it and pass it to run()" if what == "Hyperparameter" else "or leave it out"
             reasons.append(

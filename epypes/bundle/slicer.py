@@ -13,6 +13,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
 
+from epypes.bundle.arrays import Arrays
 from epypes.bundle.callables import found_definition, holds_functions, is_function, method_of
 from epypes.bundle.classes import class_definition, class_names
 from epypes.bundle.closures import FactoryCall, factory_call
@@ -49,6 +50,8 @@ class Slice:
     ----------
     reserved
         The names that the module keeps for the graph.
+    keeps_arrays
+        Whether large arrays are kept as files beside the module.
 
     Attributes
     ----------
@@ -66,8 +69,9 @@ class Slice:
         Why something can't be promoted.
     """
 
-    def __init__(self, reserved: Collection[str] = RESERVED) -> None:
+    def __init__(self, reserved: Collection[str] = RESERVED, *, keeps_arrays: bool = False) -> None:
         self.names = Names(reserved)
+        self.keeps_arrays, self.arrays = keeps_arrays, Arrays(keeps_arrays)
         self.imports: dict[tuple[str, str], str] = {}
         self.constants: dict[str, str] = {}
         self.remarks: dict[str, Remark] = {}
@@ -315,8 +319,9 @@ class Slice:
         return True
 
     def _constant_source(self, name: str, value: Any, found: AnyDefinition, what: str) -> str:
-        source = expression(self, value, what)
-        if not source or len(source) > _CONSTANT_CHARACTERS:
+        called = f"{what}, by {name!r} ({found.place_of(name)}),"
+        source = self.arrays.short(lambda: expression(self, value, called))
+        if not source:
             kind = f"the class {name!r}" if isinstance(value, type) else f"of type {type(value).__name__}"
             raise Refused(
                 f"{what} is defined in the notebook ({found.place_of(name)}) and uses {name!r} from it, {kind}. "
@@ -360,7 +365,7 @@ class Slice:
 
 def slice_functions(gathered: Slice, functions: Sequence[tuple[str, Callable[..., Any]]]) -> list[str]:
     """Add functions of graphs, each given with how reasons call it; return the expressions that refer to them."""
-    survey = Slice(gathered.names.reserved)
+    survey = Slice(gathered.names.reserved, keeps_arrays=gathered.keeps_arrays)
     _add_all(survey, functions)
     gathered.names.read.update(survey.names.read)
     references = _add_all(gathered, functions)

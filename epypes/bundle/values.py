@@ -106,7 +106,7 @@ def _call_of(value: Any) -> tuple[Any, tuple[Any, ...]]:
 
 def _object(gathered: Slice, value: Any, what: str, function: FunctionWriter | None) -> str:
     if is_plain_array(value):
-        return _array(gathered, value, what)
+        return gathered.arrays.written(gathered, value, what, _array(gathered, value, what))
     if type(value) is float:
         # Only what is no number has no literal.
         return f'{gathered.reference(Importable("builtins", "float"), what)}("{value!r}")'

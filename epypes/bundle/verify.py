@@ -47,7 +47,7 @@ def verify(path: str | Path, *, fresh_env: bool = False, timeout_s: float = REPL
     else:
         report = replay_isolated(folder, sealed=True, timeout_s=timeout_s)
     if report.identical:
-        return replace(report, notes=(*report.notes, *environment_notes(folder, report)))
+        return replace(report, notes=(*report.notes, *report.outside, *environment_notes(folder, report)))
     raise ReplayDiffers(path, replace(report, causes=likely_causes(folder, report)))
 
 

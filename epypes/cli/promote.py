@@ -17,13 +17,19 @@ def promote(
     output: Annotated[
         list[str] | None, typer.Option(help="A token that the service answers with; may be repeated.")
     ] = None,
+    sample: Annotated[
+        list[str] | None,
+        typer.Option(help="A variable that holds a further payload to record, or a list of them; may be repeated."),
+    ] = None,
 ) -> None:
     """Execute a notebook, write its graph as a bundle, and prove that the bundle computes the same."""
-    run_promotion(notebook, to, name, output)
+    run_promotion(notebook, to, name, output, sample)
     out.print(f"Promoted {name!r} of {notebook} to {to}: replayed identical in a fresh process.")
 
 
-def run_promotion(notebook: Path, to: Path, name: str, outputs: list[str] | None) -> None:
+def run_promotion(
+    notebook: Path, to: Path, name: str, outputs: list[str] | None, samples: list[str] | None = None
+) -> None:
     """Promote with a progress display."""
     from epypes.bundle.notebook import promote_notebook
 
@@ -36,5 +42,5 @@ def run_promotion(notebook: Path, to: Path, name: str, outputs: list[str] | None
         def told(text: str) -> None:
             shown.update(task, description=text)
 
-        promote_notebook(notebook, name, to, outputs, on_cell, told)
+        promote_notebook(notebook, name, to, outputs, on_cell, told, samples or [])
         shown.update(task, description="promoted")

@@ -59,6 +59,6 @@ def differing_ports(before: Settings, after: Settings) -> list[str]:
     for what in ("inputs", "outputs", "rgb"):
         had, has = sorted(getattr(before, what)), sorted(getattr(after, what))
         if had != has:
-            told = f"its {what} are {', '.join(has) or 'none'}, and those that are served {', '.join(had) or 'none'}"
+            told = f"its {what} are [{', '.join(has)}]; those of the bundle that is served are [{', '.join(had)}]"
             found.append(f"The bundle has other ports: {told}. Serve it as a service of its own.")
     return found

@@ -3,6 +3,7 @@ from __future__ import annotations
 import ast
 import contextlib
 import importlib
+import inspect
 import os
 import py_compile
 import re
@@ -423,6 +424,20 @@ def test_a_notebook_is_executed_fresh_and_promoted_to_the_same_bytes_each_time(t
     assert contents(tmp_path / "one" / "b") == contents(tmp_path / "two" / "b")
     assert "# Brightens.\ndef brighten(im):" in (tmp_path / "one" / "b" / "pipeline.py").read_text()
     assert verify(tmp_path / "one" / "b").identical
+
+
+@pytest.mark.notebook
+def test_a_notebook_says_by_variables_which_further_samples_are_recorded(tmp_path):
+    more = "import numpy as np\nlarger = np.ones((4, 4, 3), np.uint8)\nothers = [{'image': larger * 2}, larger * 3]"
+    path = cells(tmp_path / "n.ipynb", *NOTEBOOK, more)
+    promote_notebook(path, "runner", tmp_path / "b", ["edges"], samples=["larger", "others"])
+    assert [sample.stem for sample in read_bundle(tmp_path / "b").samples] == ["000", "001", "002", "003"]
+    with pytest.raises(PromotionRefused, match=r"No variable 'larg' .*mean 'larger'"):
+        promote_notebook(path, "runner", tmp_path / "c", ["edges"], samples=["larg"])
+
+
+def test_the_signature_of_promote_names_what_it_tells_nobody():
+    assert "lambda" not in repr(inspect.signature(ep.promote))
 
 
 @pytest.mark.notebook
