@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TextIO, cast
 
 import typer
 
 from epypes.cli.options import Allow, Keys
-from epypes.cli.terminal import err, out
+from epypes.cli.terminal import out
 
 if TYPE_CHECKING:
     from epypes.service.state import ServiceState
@@ -42,8 +42,13 @@ def serve(
 ) -> None:
     """Serve a bundle between a SUB and a PUB socket, until SIGTERM or Ctrl+C."""
     from epypes.service import serve as serve_bundle
+    from epypes.service.outlet import STANDARD_ERROR
 
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    # Nobody may read it: no thread of the service waits for that.
+    handler = logging.StreamHandler(cast("TextIO", STANDARD_ERROR))
+    logging.basicConfig(
+        level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", handlers=[handler]
+    )
 
     def on_ready(state: ServiceState) -> None:
         more = f", control at {state.http}" if state.http else ""
@@ -71,6 +76,6 @@ def serve(
         keys=keys,
         allow=allow,
         on_ready=on_ready,
-        on_fault=lambda reason: err.print(f"FAULTED {bundle}: {reason}"),
+        on_fault=lambda reason: STANDARD_ERROR.write(f"FAULTED {bundle}: {reason}\n"),
     )
     out.print("STOPPED " + ", ".join(f"{name} {count}" for name, count in counts.items()))

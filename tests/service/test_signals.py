@@ -158,3 +158,14 @@ def test_a_socket_of_systemd_that_is_not_there_is_no_trouble(monkeypatch, tmp_pa
     for address in (str(tmp_path / "none"), "@epypes-none", "tcp://127.0.0.1:1", "vsock:1"):
         monkeypatch.setenv("NOTIFY_SOCKET", address)
         assert not notify("READY=1")
+
+
+def test_a_standard_error_that_nobody_reads_holds_nothing_up(acting):
+    with served_apart(acting) as (process, peer):
+        for _ in range(2):
+            # More than a pipe holds, of the front's own words and of the worker's.
+            for _ in range(60):
+                assert peer.ask("fail:" + "x" * 2000).failure.exception == "ValueError"
+            assert peer.ask("say:" + "y" * 100_000, 4).parts["out"] == 8
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(TIMEOUT_S) == 0
