@@ -227,9 +227,10 @@ class Service:
         return state_of(Facts(*is_so, has_worker, health.was_ready, health.fault, health.trouble))
 
     def alive(self) -> str:
-        """Return why computing is stuck; empty if it is not, however busy it is."""
-        if stuck := self._supervisor.health.stuck:
-            return f"{stuck}."
+        """Return why nothing is computed, or will be; empty if something is, however busy it is."""
+        health = self._supervisor.health
+        if health.fault or health.stuck:
+            return health.fault or f"{health.stuck}."
         late = self._dispatcher.overdue(int(self.job_timeout_s * 1e9))
         return f"An event has been worked on for more than {self.job_timeout_s:g} s." if late else ""
 

@@ -109,6 +109,17 @@ def test_a_signal_while_it_loads_ends_it(tmp_path):
         assert "STOPPED received 0" in out
 
 
+def test_without_http_a_service_that_can_not_be_served_any_more_ends_with_1(tmp_path):
+    copy = acting_bundle(tmp_path / "copy")
+    with served_apart(copy) as (process, peer):
+        (copy / "pipeline.py").write_text("")
+        worker_of(process).kill()
+        _, err = ended(process)
+        assert process.returncode == 1
+        assert "pipeline.py was changed" in err
+        assert "Traceback" not in err
+
+
 def test_a_front_that_is_killed_takes_its_worker_along(acting, tmp_path):
     with served_apart(acting) as (process, peer):
         worker = worker_of(process)
