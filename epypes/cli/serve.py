@@ -59,6 +59,9 @@ def serve(
             token = f"#token={Path(state.token_file).read_text(encoding='utf-8').strip()}" if out.is_terminal else ""
             out.print(f"Live page: {state.http}/{token} (the token for changes is in {state.token_file})")
 
+    def on_fault(reason: str) -> None:
+        STANDARD_ERROR.write(f"FAULTED {bundle}: {reason}\n")
+
     counts = serve_bundle(
         bundle,
         sub,
@@ -76,6 +79,6 @@ def serve(
         keys=keys,
         allow=allow,
         on_ready=on_ready,
-        on_fault=lambda reason: STANDARD_ERROR.write(f"FAULTED {bundle}: {reason}\n"),
+        on_fault=on_fault,
     )
     out.print("STOPPED " + ", ".join(f"{name} {count}" for name, count in counts.items()))

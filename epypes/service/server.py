@@ -15,6 +15,7 @@ from epypes.service.deploying import Deployer
 from epypes.service.dispatch import Dispatcher
 from epypes.service.failures.record import FailureRecord
 from epypes.service.failures.store import FailureStore, failures_folder
+from epypes.service.intake import Intake
 from epypes.service.latency import Latency
 from epypes.service.ledger import Ledger, Policy
 from epypes.service.notify import notify
@@ -24,7 +25,6 @@ from epypes.service.served import read_served
 from epypes.service.sockets import Sockets
 from epypes.service.state import ServiceState
 from epypes.service.states import Facts, State, state_of
-from epypes.service.stuck import whereabouts
 from epypes.service.supervisor import Supervisor
 from epypes.service.tuning import Tuning
 
@@ -117,9 +117,10 @@ class Service:
             self._look,
             self._tuning.heard,
         )
-        self._asks = Asks(served.path, lambda: self._dispatcher.link)
+        self._asks = Asks(lambda: self._supervisor.served, lambda: self._dispatcher.link)
         self._sockets = Sockets(sub, pub, failures, self._dispatcher, insecure=insecure, keys=keys, allow=allow)
-        self._is_running = self._is_draining = self._is_paused = False
+        self._intake = Intake(self._dispatcher, self._sockets, self._changed)
+        self._is_running = False
         self._told: tuple[str, str] = ("STOPPED", "")
         self._started_ns = 0
         self._deployer = Deployer(self._dispatcher, self._supervisor, self._tuning, job_timeout_s)
@@ -140,7 +141,7 @@ class Service:
         with self._turn:
             if not self._is_running:
                 self._sockets.start()
-                self._is_running, self._is_draining = True, False
+                self._is_running = True
                 self._started_ns = time_ns()
                 self._dispatcher.refuse("")
                 self._supervisor.start()
@@ -163,17 +164,18 @@ class Service:
         Without it, by drain_timeout_s. What could not be worked off in time is answered with a failure.
         """
         timeout_s = self.drain_timeout_s if timeout_s is None else timeout_s
+        deadline_s = monotonic() + timeout_s
         with self._turn:
             if not self._is_running:
                 return
-            deadline_s = monotonic() + timeout_s
             notify("STOPPING=1")
-            self._drain(timeout_s * _DRAIN_SHARE)
-            self._give_up()
+            self._intake.close(timeout_s, for_good=True)
+            self._intake.work_off(timeout_s * _DRAIN_SHARE)
+            self._intake.give_up()
             self._supervisor.stop()
             self.failure_store.flush(max(deadline_s - monotonic(), 0.1))
             self._sockets.stop(max(deadline_s - monotonic(), 0.5))
-            self._is_running = self._is_draining = False
+            self._is_running = self._intake.is_draining = self._intake.is_stopping = False
             self._changed()
 
     def abandon(self) -> int:
@@ -182,25 +184,6 @@ class Service:
         count = self._dispatcher.give_up("The service was stopped at once")
         self._dispatcher.publish()
         return count
-
-    def _drain(self, timeout_s: float) -> bool:
-        """Take no more events, and work off what was accepted; return whether that was done in time."""
-        self._is_draining = True
-        # First of all, so that nobody sends more.
-        self._changed()
-        self._sockets.close_subscriber(timeout_s)
-        self._dispatcher.let_go("pause")
-        return self._dispatcher.wait_for(lambda: self._dispatcher.ledger.is_empty, timeout_s)
-
-    def _give_up(self) -> None:
-        """Report what could not be worked off, with the functions that it is in."""
-        link, running = self._dispatcher.link, [entry.seq for entry in self._dispatcher.ledger.running()]
-        functions = whereabouts(link, running).functions if link is not None and running else {}
-        if running and link is not None:
-            link.is_dismissed = True
-            link.process.kill()
-        self._dispatcher.give_up("the service stops", functions)
-        self._dispatcher.publish()
 
     def __enter__(self) -> Self:
         self.start()
@@ -223,7 +206,7 @@ class Service:
 
     def _state(self) -> tuple[State, str]:
         health, has_worker = self._supervisor.health, self._dispatcher.link is not None
-        is_so = self._is_running, self._is_draining, self._is_paused
+        is_so = self._is_running, self._intake.is_draining, self._intake.is_paused
         return state_of(Facts(*is_so, has_worker, health.was_ready, health.fault, health.trouble))
 
     def alive(self) -> str:
@@ -304,24 +287,21 @@ class Service:
 
     def pause(self) -> None:
         """Have events wait in the mailbox."""
-        self._is_paused = True
-        self._dispatcher.hold("pause")
-        self._changed()
+        self._intake.pause()
 
     def resume(self) -> None:
         """Work on events again, also after `pause` and `drain`."""
         with self._turn:
-            self._is_paused = False
-            self._dispatcher.let_go("pause")
-            if self._is_running and self._is_draining:
-                self._sockets.open_subscriber()
-                self._is_draining = False
-        self._changed()
+            self._intake.resume()
 
     def drain(self, timeout_s: float | None = None) -> bool:
         """Take no more events, until `resume`, and work off those that were accepted; return whether that was done."""
+        timeout_s = self.drain_timeout_s if timeout_s is None else timeout_s
         with self._turn:
-            return not self._is_running or self._drain(self.drain_timeout_s if timeout_s is None else timeout_s)
+            if not self._is_running:
+                return True
+            self._intake.close(timeout_s)
+        return self._intake.work_off(timeout_s)
 
     def deploy(self, path: str | Path) -> dict[str, Any]:
         """Serve another bundle from now on; return what there is to know of the service then.

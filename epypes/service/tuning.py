@@ -13,6 +13,7 @@ from epypes.service.outcome import Desk
 from epypes.service.parameters import Entries, Parameters, changed, value_of
 from epypes.service.served import Served
 
+
 class Tuning:
     """The parameters of the worker, kept over its restarts.
 

@@ -111,7 +111,7 @@ def test_a_signal_while_it_loads_ends_it(tmp_path):
 
 def test_without_http_a_service_that_can_not_be_served_any_more_ends_with_1(tmp_path):
     copy = acting_bundle(tmp_path / "copy")
-    with served_apart(copy) as (process, peer):
+    with served_apart(copy) as (process, _):
         (copy / "pipeline.py").write_text("")
         worker_of(process).kill()
         _, err = ended(process)
