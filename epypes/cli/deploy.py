@@ -33,7 +33,7 @@ def deploy(
 
 
 def rollback(http: _Http, token_file: _TokenFile = None) -> None:
-    """Have a running service serve the bundle again that it served before."""
+    """Have a running service serve the bundle again that it served before; twice is there and back."""
     with _connected(http, token_file) as service:
         out.print(_told("ROLLED BACK", service.info(), service.rollback()))
 
@@ -41,7 +41,8 @@ def rollback(http: _Http, token_file: _TokenFile = None) -> None:
 def _told(what: str, before: dict[str, Any], now: dict[str, Any]) -> str:
     """Return in one line what happened."""
     served, left = (f"{info['bundle']} ({info['digest'][:_DIGITS]})" for info in (now, before))
-    return f"{what} {served} in place of {left}: {now['state']}."
+    changed = "".join(f" {line}." for line in now.get("changed", ()))
+    return f"{what} {served} in place of {left}: {now['state']}.{changed}"
 
 
 def _connected(http: str, token_file: Path | None) -> Connection:

@@ -23,7 +23,9 @@ def serve(
     pub: Annotated[str, typer.Option(help="Where answers go; connect:ADDRESS connects.")] = _ANY_PORT,
     failures: Annotated[str, typer.Option(help="Where failures go; connect:ADDRESS connects.")] = _ANY_PORT,
     http: Annotated[str, typer.Option(help="Where it is controlled, as 127.0.0.1:8642; nowhere without.")] = "",
-    threads: Annotated[int, typer.Option(help="How many events are worked on at once, in order.", min=1)] = 1,
+    threads: Annotated[
+        int, typer.Option(help="How many events are worked on at once, in order; at most 64.", min=1, max=64)
+    ] = 1,
     job_timeout: Annotated[
         float, typer.Option(help="How long an event may take, in seconds; then the worker is replaced.", min=0.01)
     ] = 30.0,
@@ -42,7 +44,7 @@ def serve(
 ) -> None:
     """Serve a bundle between a SUB and a PUB socket, until SIGTERM or Ctrl+C."""
     from epypes.service import serve as serve_bundle
-    from epypes.service.outlet import STANDARD_ERROR
+    from epypes.service.words import STANDARD_ERROR
 
     # Nobody may read it: no thread of the service waits for that.
     handler = logging.StreamHandler(cast("TextIO", STANDARD_ERROR))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-_FIRST_PAUSE_S: Final = 0.1
+PAUSE_S: Final = 0.1
 _LONGEST_PAUSE_S: Final = 10.0
 # After so many good events the next death is a first one again.
 GOOD_EVENTS: Final = 5
@@ -58,4 +58,4 @@ class Health:
     def next_pause_s(self) -> float:
         """Return how long to wait before the next start."""
         self.pauses += 1
-        return min(_FIRST_PAUSE_S * 2.0 ** min(self.pauses - 1, 10), _LONGEST_PAUSE_S)
+        return min(PAUSE_S * 2.0 ** min(self.pauses - 1, 10), _LONGEST_PAUSE_S)

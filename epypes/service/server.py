@@ -21,7 +21,7 @@ from epypes.service.ledger import Ledger, Policy
 from epypes.service.notify import notify
 from epypes.service.outcome import Desk, Listener, Setting
 from epypes.service.parameters import Parameters
-from epypes.service.served import read_served
+from epypes.service.served import check_limits, read_served
 from epypes.service.sockets import Sockets
 from epypes.service.state import ServiceState
 from epypes.service.states import Facts, State, state_of
@@ -29,6 +29,7 @@ from epypes.service.supervisor import Supervisor
 from epypes.service.tuning import Tuning
 
 if TYPE_CHECKING:
+    from epypes.bundle.writeback import WriteBack
     from epypes.transport.keys import Keys, PublicKey
 
 # How many events wait while one is computed.
@@ -77,7 +78,7 @@ class Service:
     AddressError
         An address is not on loopback.
     ServiceError
-        The mailbox can't be.
+        The mailbox, a time or the number of threads can't be.
     """
 
     def __init__(
@@ -97,6 +98,7 @@ class Service:
         keys: Keys | str | Path | None = None,
         allow: PublicKey | Collection[PublicKey] | None = None,
     ) -> None:
+        check_limits(path, threads, job_timeout_s, drain_timeout_s)
         served = read_served(path)
         self.path, self.threads, self.job_timeout_s = served.path, threads, job_timeout_s
         self.drain_timeout_s = drain_timeout_s
@@ -123,7 +125,7 @@ class Service:
         self._is_running = False
         self._told: tuple[str, str] = ("STOPPED", "")
         self._started_ns = 0
-        self._deployer = Deployer(self._dispatcher, self._supervisor, self._tuning, job_timeout_s)
+        self._deployer = Deployer(self._dispatcher, self._supervisor, self._tuning, job_timeout_s, self._desk.tell)
         self._turn = threading.Lock()
 
     # -- beginning and end ----------------------------------------------------------------------------------------
@@ -257,8 +259,9 @@ class Service:
         Parameters
         ----------
         callback
-            Called on threads of the service with a kind (``"state"``, ``"run"``, ``"failure"``, ``"parameters"``) and
-            what there is to know. It must return at once, and change nothing of the service.
+            Called on threads of the service with a kind (``"state"``, ``"run"``, ``"failure"``, ``"parameters"``,
+            ``"deployed"``: another bundle, or other values in it) and what there is to know. It must return at once,
+            and change nothing of the service.
         """
         return self._desk.listen(callback)
 
@@ -307,7 +310,8 @@ class Service:
         """Serve another bundle from now on; return what there is to know of the service then.
 
         A second worker proves it beside the first one, and gets the events when none is worked on. It has its own
-        parameters, with the next revision.
+        parameters, with the next revision: ``changed`` of what is returned has a line for each value that is another
+        one now, as ``"sigma 1.4 -> 1.0 (tuned, not written back)"``.
 
         Raises
         ------
@@ -316,19 +320,19 @@ class Service:
         ServiceError
             Another one is being deployed.
         """
-        self._deployer.deploy(path)
-        return self.info()
+        return {"changed": self._deployer.deploy(path), **self.info()}
 
     def rollback(self) -> dict[str, Any]:
-        """Serve the bundle again that was served before; return what there is to know of the service then.
+        """Serve the bundle again that was served before; return what `deploy` returns.
+
+        The one that is left is the one before then: to roll back twice is to be where one was.
 
         Raises
         ------
         DeployRefused
             There was none, or it is not any more what it was.
         """
-        self._deployer.rollback()
-        return self.info()
+        return {"changed": self._deployer.rollback(), **self.info()}
 
     # -- its parameters ---------------------------------------------------------------------------------------------
 
@@ -356,6 +360,20 @@ class Service:
             There is no worker, or it is busy for too long.
         """
         return self._tuning.set(values, revision)
+
+    def write_back(self, *, dry_run: bool = False) -> WriteBack:
+        """Write the parameters into the pipeline.toml of the bundle that is served; return the diff and its digest.
+
+        The service goes on with the bundle that has them.
+
+        Raises
+        ------
+        BundleError
+            The bundle was changed, or can't be written.
+        ServiceError
+            Another one is being deployed.
+        """
+        return self._deployer.write_back(dry_run=dry_run)
 
     # -- what is seen of it -----------------------------------------------------------------------------------------
 

@@ -92,7 +92,7 @@ def _announce(
         on_fault(reason)
 
     def hear(kind: str, data: dict[str, Any]) -> None:
-        if kind == "state" and data["state"] == "READY":
+        if kind == "deployed" or (kind == "state" and data["state"] == "READY"):
             lock.publish(service.service_state)
         elif kind == "state" and data["state"] == "FAULTED" and give_up is not None:
             fault.append(data["reason"])

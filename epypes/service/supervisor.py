@@ -15,7 +15,7 @@ from typing import Any, Final
 from epypes.bundle.replay import REPLAY_TIMEOUT_S
 from epypes.errors import ServiceError
 from epypes.service.dispatch import Dispatcher
-from epypes.service.health import DEATHS_BEFORE_FAULT, GOOD_EVENTS, Health
+from epypes.service.health import DEATHS_BEFORE_FAULT, GOOD_EVENTS, PAUSE_S, Health
 from epypes.service.link import SETTLING, Link, Message
 from epypes.service.notify import notify, watchdog_s
 from epypes.service.served import Served
@@ -28,6 +28,8 @@ _log = logging.getLogger("epypes.service")
 
 class Supervisor:
     """Starts, watches and replaces workers.
+
+    ``is_rewritten`` is for who writes into the bundle: a worker that is started meanwhile is not used.
 
     Parameters
     ----------
@@ -59,6 +61,7 @@ class Supervisor:
         hear: Callable[[Link, Mapping[str, Any]], None],
     ) -> None:
         self.served, self.health = served, Health()
+        self.is_rewritten = False
         self.worker: Link | None = None
         self._dispatcher, self._threads = dispatcher, threads
         self._timeout_s, self._timeout_ns = job_timeout_s, int(job_timeout_s * 1e9)
@@ -170,12 +173,13 @@ class Supervisor:
             return
         with self._changed:
             if self._is_ending or self.worker is not None or served is not self.served:
-                # Another bundle has taken over while it was started.
-                link.is_dismissed = True
-                link.process.kill()
+                # Another bundle has taken over while it was started, or other values were written into it.
+                self._dismiss_for_another(link)
                 return
             self.worker, self._loading_until_s = link, monotonic() + REPLAY_TIMEOUT_S
             self.health.restarts += self.health.was_ready
+            if self.health.was_ready:
+                _log.info("the worker is started again: process %d, restart %d", link.pid, self.health.restarts)
             # It may have been ready before this thread came here.
             if link.status == "ready":
                 self._begin(link)
@@ -183,8 +187,7 @@ class Supervisor:
                 self._over(link)
 
     def _end_loading(self) -> None:
-        worker = self.worker
-        if worker is not None:
+        if (worker := self.worker) is not None:
             _log.error("the worker has not proved its bundle within %g s, so it is killed", REPLAY_TIMEOUT_S)
             worker.process.kill()
 
@@ -214,6 +217,10 @@ class Supervisor:
 
     def _begin(self, link: Link) -> None:
         """Give events to a worker that is ready. With the lock held."""
+        if link.served is not self.served or self.is_rewritten:
+            # Its values are written back meanwhile: another one reads them.
+            self._dismiss_for_another(link)
+            return
         if link.about.get("digest") != self.served.digest:
             link.is_dismissed = True
             link.process.kill()
@@ -226,9 +233,16 @@ class Supervisor:
             # It gets events once it has confirmed them.
             link.tell_parameters(*parameters)
 
+    def _dismiss_for_another(self, link: Link) -> None:
+        """End a worker of what is not served any more; start another if there is none. With the lock held."""
+        self.worker = None if self.worker is link else self.worker
+        link.is_dismissed = True
+        link.process.kill()
+        if self.worker is None and not self._is_ending:
+            self._restart_s = monotonic() + PAUSE_S
+
     def _confirmed(self, link: Link, problems: Mapping[str, str]) -> None:
-        """Give events to a worker that has taken the parameters of the one before; none, if it does not. With the lock
-        held."""
+        """Give events to a worker if it has taken the parameters of the one before. With the lock held."""
         if not problems:
             self._use(link)
             return

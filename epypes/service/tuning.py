@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Mapping
 from typing import Any
@@ -10,8 +11,10 @@ from epypes.errors import ParametersRefused, RevisionConflict, ServiceError
 from epypes.service.dispatch import Dispatcher
 from epypes.service.link import Link
 from epypes.service.outcome import Desk
-from epypes.service.parameters import Entries, Parameters, changed, value_of
+from epypes.service.parameters import Entries, Parameters, changed, differing_values, value_of
 from epypes.service.served import Served
+
+_log = logging.getLogger("epypes.service")
 
 
 class Tuning:
@@ -101,6 +104,8 @@ class Tuning:
                 return
             self._pending = None
             if header["kind"] == "parameters":
+                changes = differing_values(self.current.entries, self.current.entries, pending.entries)
+                _log.info("parameters, revision %d: %s", pending.revision, "; ".join(changes))
                 self._change(pending)
 
     def _change(self, parameters: Parameters) -> None:

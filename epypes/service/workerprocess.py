@@ -17,7 +17,7 @@ from typing import Final
 from epypes.bundle.load import MODULE
 from epypes.service.channel import channel_pair
 from epypes.service.notify import VARIABLES
-from epypes.service.outlet import STANDARD_ERROR
+from epypes.service.words import STANDARD_ERROR
 
 # What a worker said last, for the reason of its death.
 _LINES_KEPT: Final = 20

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import os
 
-from epypes.service.outlet import Outlet
+from epypes.service.words import Words
 
 TIMEOUT_S = 20.0
 
@@ -16,13 +16,13 @@ def read_until(reader, end):
 
 def test_what_nobody_reads_is_dropped_and_counted_and_what_comes_later_is_written_again():
     reader, writer = os.pipe()
-    outlet = Outlet(writer, most_bytes=200_000)
+    words = Words(writer, most_bytes=200_000)
     for number in range(300):
-        outlet.write(f"{number:03} " + "x" * 1000 + "\n")
+        words.write(f"{number:03} " + "x" * 1000 + "\n")
     data = read_until(reader, b"x\n")
-    while not outlet.wait(0.01):
+    while not words.wait(0.01):
         data += os.read(reader, 65536)
-    outlet.write("the last\n")
+    words.write("the last\n")
     data += read_until(reader, b"the last\n")
     lines = data.decode().splitlines()
     written = [line for line in lines if line.endswith("x")]
@@ -30,8 +30,8 @@ def test_what_nobody_reads_is_dropped_and_counted_and_what_comes_later_is_writte
     (told,) = (line for line in lines if "nobody read" in line)
     assert told.startswith(f"{300 - len(written)} times nothing was written")
     assert lines[-1] == "the last"
-    assert outlet.wait(TIMEOUT_S)
+    assert words.wait(TIMEOUT_S)
     os.close(reader)
-    outlet.write("to nobody\n")
-    assert outlet.wait(TIMEOUT_S)
+    words.write("to nobody\n")
+    assert words.wait(TIMEOUT_S)
     os.close(writer)

@@ -17,7 +17,7 @@ _MOST_BYTES: Final = 1024**2
 _END_S: Final = 0.5
 
 
-class Outlet:
+class Words:
     """Writes to a file by its number; takes text as a stream of `logging` does, and bytes. For any thread.
 
     Parameters
@@ -60,7 +60,7 @@ class Outlet:
         if not self._has_thread:
             self._has_thread = True
             atexit.register(self.wait, _END_S)
-            threading.Thread(target=self._write_all, name="epypes outlet", daemon=True).start()
+            threading.Thread(target=self._write_all, name="epypes words", daemon=True).start()
 
     def _write_all(self) -> None:
         while True:
@@ -86,4 +86,4 @@ def _write(number: int, data: bytes) -> None:
 
 
 # Of this process: what a worker says goes here too.
-STANDARD_ERROR: Final = Outlet(2)
+STANDARD_ERROR: Final = Words(2)
