@@ -387,16 +387,3 @@ def _add_all(gathered: Slice, functions: Sequence[tuple[str, Callable[..., Any]]
         if len(gathered.refusals) == refused:
             known[id(function)] = references[index]
     return [references[index] for index in range(len(functions))]
-
-
-def slice_graph(functions: Mapping[str, Callable[..., Any]]) -> tuple[Slice, dict[str, str]]:
-    """Slice all functions of a graph.
-
-    Returns
-    -------
-    tuple
-        What the module needs, and by function of the graph the expression that refers to it.
-    """
-    gathered = Slice()
-    references = slice_functions(gathered, [(f"Function {name!r}", function) for name, function in functions.items()])
-    return gathered, dict(zip(functions, references, strict=True))

@@ -30,7 +30,7 @@ def deploy(
 
 
 def rollback(http: _Http = "", service: _Service = "", token_file: TokenFile = None) -> None:
-    """Have a running service serve the bundle again that it served before."""
+    """Have a running service serve the bundle again that it served before; twice is there and back."""
     with connected(_one(http, service), token_file) as connection:
         out.print(_told("ROLLED BACK", connection.info(), connection.rollback()))
 
@@ -48,4 +48,5 @@ def _one(http: str, service: str) -> str:
 def _told(what: str, before: dict[str, Any], now: dict[str, Any]) -> str:
     """Return in one line what happened."""
     served, left = (f"{info['bundle']} ({info['digest'][:_DIGITS]})" for info in (now, before))
-    return f"{what} {served} in place of {left}: {now['state']}."
+    changed = "".join(f" {line}." for line in now.get("changed", ()))
+    return f"{what} {served} in place of {left}: {now['state']}.{changed}"

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 def replay(
     failure: Annotated[
-        str, typer.Argument(metavar="ID", help="The failure: its id, how it begins or ends, or latest.")
+        str, typer.Argument(metavar="ID", help="The failure: its id, how it begins or ends, its event's id, or latest.")
     ],
     source: Annotated[
         str | None,

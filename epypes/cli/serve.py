@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TextIO, cast
 
 import typer
 
 from epypes.cli.options import Allow, Keys
-from epypes.cli.terminal import err, out
+from epypes.cli.terminal import out
 
 if TYPE_CHECKING:
     from epypes.service.state import ServiceState
@@ -23,7 +23,9 @@ def serve(
     pub: Annotated[str, typer.Option(help="Where answers go; connect:ADDRESS connects.")] = _ANY_PORT,
     failures: Annotated[str, typer.Option(help="Where failures go; connect:ADDRESS connects.")] = _ANY_PORT,
     http: Annotated[str, typer.Option(help="Where it is controlled, as 127.0.0.1:8642; nowhere without.")] = "",
-    threads: Annotated[int, typer.Option(help="How many events are worked on at once, in order.", min=1)] = 1,
+    threads: Annotated[
+        int, typer.Option(help="How many events are worked on at once, in order; at most 64.", min=1, max=64)
+    ] = 1,
     job_timeout: Annotated[
         float, typer.Option(help="How long an event may take, in seconds; then the worker is replaced.", min=0.01)
     ] = 30.0,
@@ -42,8 +44,13 @@ def serve(
 ) -> None:
     """Serve a bundle between a SUB and a PUB socket, until SIGTERM or Ctrl+C."""
     from epypes.service import serve as serve_bundle
+    from epypes.service.words import STANDARD_ERROR
 
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    # Nobody may read it: no thread of the service waits for that.
+    handler = logging.StreamHandler(cast("TextIO", STANDARD_ERROR))
+    logging.basicConfig(
+        level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", handlers=[handler]
+    )
 
     def on_ready(state: ServiceState) -> None:
         more = f", control at {state.http}" if state.http else ""
@@ -53,6 +60,9 @@ def serve(
             # A log is read by others than a terminal.
             token = f"#token={Path(state.token_file).read_text(encoding='utf-8').strip()}" if out.is_terminal else ""
             out.print(f"Live page: {state.http}/{token} (the token for changes is in {state.token_file})")
+
+    def on_fault(reason: str) -> None:
+        STANDARD_ERROR.write(f"FAULTED {bundle}: {reason}\n")
 
     counts = serve_bundle(
         bundle,
@@ -71,6 +81,6 @@ def serve(
         keys=keys,
         allow=allow,
         on_ready=on_ready,
-        on_fault=lambda reason: err.print(f"FAULTED {bundle}: {reason}"),
+        on_fault=on_fault,
     )
     out.print("STOPPED " + ", ".join(f"{name} {count}" for name, count in counts.items()))

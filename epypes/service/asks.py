@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from epypes.errors import NotComputed, ServiceError, UnknownName
 from epypes.service.link import Link, Message
+from epypes.service.served import Served
 
 _MOST_KEPT: Final = 64
+_MOST_BYTES: Final = 32 * 1024**2
 
 
 class Asks:
@@ -17,15 +20,17 @@ class Asks:
 
     Parameters
     ----------
-    path
-        The bundle, for errors.
+    served
+        Returns the bundle that is served.
     worker
         Returns the worker; None while there is none.
     """
 
-    def __init__(self, path: object, worker: Callable[[], Link | None]) -> None:
-        self._path, self._worker = path, worker
+    def __init__(self, served: Callable[[], Served], worker: Callable[[], Link | None]) -> None:
+        self._served, self._worker = served, worker
+        # By the bundle's digest, what was asked, and for what. With the lock.
         self._known: OrderedDict[tuple[Any, ...], Message] = OrderedDict()
+        self._bytes, self._turn = 0, threading.Lock()
 
     def graph(self, what: str) -> bytes:
         """Return the graph with the values of the last completed run, as JSON (``"view"``) or drawn (``"svg"``)."""
@@ -43,25 +48,39 @@ class Asks:
         for before.
         """
         asked = {"tokens": list(tokens)} | ({} if revision is None else {"revision": revision})
-        return bytes(self._answer("run", asked)[1][0])
+        return bytes(self._answer("run", asked, self._worker())[1][0])
 
     def _ask(self, what: str, **more: Any) -> Message:
-        key = (what, *more.values())
+        link = self._worker()
+        digest = (self._served() if link is None else link.served).digest
+        key = (digest, what, *more.values())
         try:
-            answer = self._known[key] = self._answer(what, more)
+            answer = self._answer(what, more, link)
         except ServiceError:
-            if key not in self._known:
-                raise
-            answer = self._known[key]
-        self._known.move_to_end(key)
-        while len(self._known) > _MOST_KEPT:
-            self._known.popitem(last=False)
+            with self._turn:
+                if key not in self._known:
+                    raise
+                self._known.move_to_end(key)
+                return self._known[key]
+        with self._turn:
+            self._remember(key, answer)
         return answer
 
-    def _answer(self, what: str, more: Mapping[str, Any]) -> Message:
-        link = self._worker()
+    def _remember(self, key: tuple[Any, ...], answer: Message) -> None:
+        # Nobody asks for what another bundle has shown.
+        others = [known for known in self._known if known[0] != key[0]]
+        for known in (*others, *[key] * (key in self._known)):
+            self._bytes -= _size(self._known.pop(known))
+        self._known[key] = answer
+        self._bytes += _size(answer)
+        while len(self._known) > _MOST_KEPT or self._bytes > _MOST_BYTES:
+            self._bytes -= _size(self._known.popitem(last=False)[1])
+
+    def _answer(self, what: str, more: Mapping[str, Any], link: Link | None) -> Message:
         if link is None:
-            raise ServiceError(self._path, "There is no worker just now that could answer. Try again in a moment.")
+            raise ServiceError(
+                self._served().path, "There is no worker just now that could answer. Try again in a moment."
+            )
         answer = link.ask(what, **more)
         if "error" in answer[0]:
             raise self._error(answer[0], link, more)
@@ -76,7 +95,11 @@ class Asks:
             return UnknownName("token", unknown[0], known, "in this service")
         if reason == "not computed":
             return NotComputed(", ".join(asked), text)
-        return ServiceError(self._path, text)
+        return ServiceError(link.served.path, text)
+
+
+def _size(answer: Message) -> int:
+    return sum(frame.nbytes for frame in answer[1])
 
 
 def tokens_of(func_io: Mapping[str, Sequence[Sequence[str]]]) -> tuple[str, ...]:

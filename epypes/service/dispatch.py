@@ -113,6 +113,10 @@ class Dispatcher:
             self._holds.discard(why)
             self._flow()
 
+    def is_held(self, why: str) -> bool:
+        """Whether events wait for this reason."""
+        return why in self._holds
+
     def refuse(self, why: str) -> None:
         """Answer every event with a failure that says why it is not worked on; with an empty text, no more."""
         with self.changed:

@@ -6,6 +6,7 @@ Nothing here blocks who sends: a thread of the link's own writes to the channel,
 from __future__ import annotations
 
 import itertools
+import json
 import logging
 import queue
 import threading
@@ -22,6 +23,10 @@ _log = logging.getLogger("epypes.service")
 Status = Literal["loading", "ready", "refused", "gone"]
 Message = tuple[dict[str, Any], list[memoryview]]
 ASK_S: Final = 2.0
+# How a worker settles a change of parameters.
+SETTLING: Final = ("parameters", "parameters_refused", "parameters_withdrawn")
+# How long a worker may take to say whether a change that nobody waits for any more was made.
+_WITHDRAW_S: Final = 0.5
 
 
 class Link:
@@ -85,7 +90,13 @@ class Link:
             It is gone, or does not answer in time.
         """
         number = next(self._numbers)
-        return self._exchange(("asked", number), {"kind": "ask", "ask": number, "what": what, **more}, timeout_s)
+        header = {"kind": "ask", "ask": number, "what": what, **more}
+
+        def late(key: tuple[str, int], answers: queue.SimpleQueue[Message | None]) -> Message | None:
+            text = f"The worker has not answered within {timeout_s:g} s: it is busy. Try again."
+            raise ServiceError(self.served.path, text)
+
+        return self._exchange(("asked", number), lambda: self.post(header), timeout_s, late)
 
     def change(self, revision: int, values: Mapping[str, Any], timeout_s: float) -> dict[str, str]:
         """Have it take values of hyperparameters, by token as in pipeline.toml; return its problems, if it has any.
@@ -95,20 +106,51 @@ class Link:
         ServiceError
             It is gone, or works on an event for longer than ``timeout_s``.
         """
-        header = {"kind": "parameters", "revision": revision, "values": dict(values)}
-        answer, _ = self._exchange(("parameters", revision), header, timeout_s)
+        key = ("parameters", revision)
+        answer, _ = self._exchange(key, lambda: self.tell_parameters(revision, values), timeout_s, self._withdraw)
+        if answer["kind"] == "parameters_withdrawn":
+            text = f"The worker works on an event for longer than {timeout_s:g} s, so nothing was changed. Try again."
+            raise ServiceError(self.served.path, text)
         return dict(answer.get("problems") or {})
 
-    def _exchange(self, key: tuple[str, int], header: Mapping[str, Any], timeout_s: float) -> Message:
+    def tell_parameters(self, revision: int, values: Mapping[str, Any]) -> None:
+        """Have it take values of hyperparameters as soon as it works on no event; it says whether it has."""
+        # Not in the header, which is bounded: a table may be large.
+        self.post({"kind": "parameters", "revision": revision}, [json.dumps(values).encode()])
+
+    def _withdraw(self, key: tuple[str, int], answers: queue.SimpleQueue[Message | None]) -> Message | None:
+        """Have it forget a change that it has not made yet; return what has become of that.
+
+        Raises
+        ------
+        ServiceError
+            It does not say.
+        """
+        self.post({"kind": "withdraw", "revision": key[1]})
+        try:
+            return answers.get(timeout=_WITHDRAW_S)
+        except queue.Empty:
+            text = (
+                f"The worker does not answer. If it goes on before it is replaced, the change may be made yet, as "
+                f"revision {key[1]}: look at the parameters then."
+            )
+            raise ServiceError(self.served.path, text) from None
+
+    def _exchange(
+        self,
+        key: tuple[str, int],
+        send: Callable[[], object],
+        timeout_s: float,
+        late: Callable[[tuple[str, int], queue.SimpleQueue[Message | None]], Message | None],
+    ) -> Message:
         answers = self._asked[key] = queue.SimpleQueue[Message | None]()
         try:
             answer = None
             if not self._is_over:
-                self.post(header)
+                send()
                 answer = answers.get(timeout=timeout_s)
         except queue.Empty:
-            text = f"The worker has not answered within {timeout_s:g} s: it is busy. Try again."
-            raise ServiceError(self.served.path, text) from None
+            answer = late(key, answers)
         finally:
             del self._asked[key]
         if answer is None:
@@ -147,7 +189,7 @@ class Link:
     def _take(self, message: Message) -> None:
         header = message[0]
         kind = header.get("kind")
-        if kind in ("asked", "parameters", "parameters_refused"):
+        if kind == "asked" or kind in SETTLING:
             number = header.get("ask") if kind == "asked" else header.get("revision")
             answers = self._asked.get(("asked" if kind == "asked" else "parameters", number or 0))
             # What was settled is noted before anything that comes after it is read.

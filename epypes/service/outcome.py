@@ -20,7 +20,7 @@ from epypes.wire.failures import failure_event
 FAILURE_TOPIC: Final = "failure"
 _LOG_PAUSE_NS: Final = 5_000_000_000
 Kind = Literal["raised", "killed", "stuck", "dropped"]
-# Called with a kind of happening ("state", "run", "failure", "parameters") and what there is to know of it.
+# Called with a kind of happening ("state", "run", "failure", "parameters", "deployed") and what there is to know of it.
 Listener = Callable[[str, dict[str, Any]], None]
 
 _log = logging.getLogger("epypes.service")

@@ -132,6 +132,34 @@ def value_of(entry: Mapping[str, Any]) -> dict[str, Any]:
     return {key: entry[key] for key in _VALUE_KEYS if key in entry}
 
 
+def differing_values(written: Entries, before: Entries, after: Entries) -> list[str]:
+    """Return a line for each hyperparameter that has another value after a bundle has taken another's place.
+
+    Parameters
+    ----------
+    written
+        What the bundle before has in its pipeline.toml.
+    before, after
+        What was, and what is.
+
+    Examples
+    --------
+    >>> differing_values({"sigma": {"value": 1.0}}, {"sigma": {"value": 1.4}}, {"sigma": {"value": 1.0}})
+    ['sigma 1.4 -> 1.0 (tuned, not written back)']
+    """
+    found = []
+    for token in (token for token in before if token in after):
+        if value_of(before[token]) != value_of(after[token]):
+            is_tuned = value_of(before[token]) != value_of(written.get(token, {}))
+            note = " (tuned, not written back)" if is_tuned else ""
+            found.append(f"{token} {_shown(before[token])} -> {_shown(after[token])}{note}")
+    return found
+
+
+def _shown(entry: Mapping[str, Any]) -> str:
+    return _brief(entry.get("value"))
+
+
 def _check_plain(token: str, given: Any) -> None:
     """Raise ValueError for what is neither a scalar of JSON nor a list of them, or has no number."""
     for item in _items(given):

@@ -15,20 +15,21 @@ from epypes.service.deploying import Deployer
 from epypes.service.dispatch import Dispatcher
 from epypes.service.failures.record import FailureRecord
 from epypes.service.failures.store import FailureStore, failures_folder
+from epypes.service.intake import Intake
 from epypes.service.latency import Latency
 from epypes.service.ledger import Ledger, Policy
 from epypes.service.notify import notify
 from epypes.service.outcome import Desk, Listener, Setting
 from epypes.service.parameters import Parameters
-from epypes.service.served import read_served
+from epypes.service.served import check_limits, read_served
 from epypes.service.sockets import Sockets
 from epypes.service.state import ServiceState
 from epypes.service.states import Facts, State, state_of
-from epypes.service.stuck import whereabouts
 from epypes.service.supervisor import Supervisor
 from epypes.service.tuning import Tuning
 
 if TYPE_CHECKING:
+    from epypes.bundle.writeback import WriteBack
     from epypes.transport.keys import Keys, PublicKey
 
 # How many events wait while one is computed.
@@ -77,7 +78,7 @@ class Service:
     AddressError
         An address is not on loopback.
     ServiceError
-        The mailbox can't be.
+        The mailbox, a time or the number of threads can't be.
     """
 
     def __init__(
@@ -97,6 +98,7 @@ class Service:
         keys: Keys | str | Path | None = None,
         allow: PublicKey | Collection[PublicKey] | None = None,
     ) -> None:
+        check_limits(path, threads, job_timeout_s, drain_timeout_s)
         served = read_served(path)
         self.path, self.threads, self.job_timeout_s = served.path, threads, job_timeout_s
         self.drain_timeout_s = drain_timeout_s
@@ -117,12 +119,13 @@ class Service:
             self._look,
             self._tuning.heard,
         )
-        self._asks = Asks(served.path, lambda: self._dispatcher.link)
+        self._asks = Asks(lambda: self._supervisor.served, lambda: self._dispatcher.link)
         self._sockets = Sockets(sub, pub, failures, self._dispatcher, insecure=insecure, keys=keys, allow=allow)
-        self._is_running = self._is_draining = self._is_paused = False
+        self._intake = Intake(self._dispatcher, self._sockets, self._changed)
+        self._is_running = False
         self._told: tuple[str, str] = ("STOPPED", "")
         self._started_ns = 0
-        self._deployer = Deployer(self._dispatcher, self._supervisor, self._tuning, job_timeout_s)
+        self._deployer = Deployer(self._dispatcher, self._supervisor, self._tuning, job_timeout_s, self._desk.tell)
         self._turn = threading.Lock()
 
     # -- beginning and end ----------------------------------------------------------------------------------------
@@ -140,7 +143,7 @@ class Service:
         with self._turn:
             if not self._is_running:
                 self._sockets.start()
-                self._is_running, self._is_draining = True, False
+                self._is_running = True
                 self._started_ns = time_ns()
                 self._dispatcher.refuse("")
                 self._supervisor.start()
@@ -163,17 +166,18 @@ class Service:
         Without it, by drain_timeout_s. What could not be worked off in time is answered with a failure.
         """
         timeout_s = self.drain_timeout_s if timeout_s is None else timeout_s
+        deadline_s = monotonic() + timeout_s
         with self._turn:
             if not self._is_running:
                 return
-            deadline_s = monotonic() + timeout_s
             notify("STOPPING=1")
-            self._drain(timeout_s * _DRAIN_SHARE)
-            self._give_up()
+            self._intake.close(timeout_s, for_good=True)
+            self._intake.work_off(timeout_s * _DRAIN_SHARE)
+            self._intake.give_up()
             self._supervisor.stop()
             self.failure_store.flush(max(deadline_s - monotonic(), 0.1))
             self._sockets.stop(max(deadline_s - monotonic(), 0.5))
-            self._is_running = self._is_draining = False
+            self._is_running = self._intake.is_draining = self._intake.is_stopping = False
             self._changed()
 
     def abandon(self) -> int:
@@ -182,25 +186,6 @@ class Service:
         count = self._dispatcher.give_up("The service was stopped at once")
         self._dispatcher.publish()
         return count
-
-    def _drain(self, timeout_s: float) -> bool:
-        """Take no more events, and work off what was accepted; return whether that was done in time."""
-        self._is_draining = True
-        # First of all, so that nobody sends more.
-        self._changed()
-        self._sockets.close_subscriber(timeout_s)
-        self._dispatcher.let_go("pause")
-        return self._dispatcher.wait_for(lambda: self._dispatcher.ledger.is_empty, timeout_s)
-
-    def _give_up(self) -> None:
-        """Report what could not be worked off, with the functions that it is in."""
-        link, running = self._dispatcher.link, [entry.seq for entry in self._dispatcher.ledger.running()]
-        functions = whereabouts(link, running).functions if link is not None and running else {}
-        if running and link is not None:
-            link.is_dismissed = True
-            link.process.kill()
-        self._dispatcher.give_up("the service stops", functions)
-        self._dispatcher.publish()
 
     def __enter__(self) -> Self:
         self.start()
@@ -223,13 +208,14 @@ class Service:
 
     def _state(self) -> tuple[State, str]:
         health, has_worker = self._supervisor.health, self._dispatcher.link is not None
-        is_so = self._is_running, self._is_draining, self._is_paused
+        is_so = self._is_running, self._intake.is_draining, self._intake.is_paused
         return state_of(Facts(*is_so, has_worker, health.was_ready, health.fault, health.trouble))
 
     def alive(self) -> str:
-        """Return why computing is stuck; empty if it is not, however busy it is."""
-        if stuck := self._supervisor.health.stuck:
-            return f"{stuck}."
+        """Return why nothing is computed, or will be; empty if something is, however busy it is."""
+        health = self._supervisor.health
+        if health.fault or health.stuck:
+            return health.fault or f"{health.stuck}."
         late = self._dispatcher.overdue(int(self.job_timeout_s * 1e9))
         return f"An event has been worked on for more than {self.job_timeout_s:g} s." if late else ""
 
@@ -273,8 +259,9 @@ class Service:
         Parameters
         ----------
         callback
-            Called on threads of the service with a kind (``"state"``, ``"run"``, ``"failure"``, ``"parameters"``) and
-            what there is to know. It must return at once, and change nothing of the service.
+            Called on threads of the service with a kind (``"state"``, ``"run"``, ``"failure"``, ``"parameters"``,
+            ``"deployed"``: another bundle, or other values in it) and what there is to know. It must return at once,
+            and change nothing of the service.
         """
         return self._desk.listen(callback)
 
@@ -303,30 +290,28 @@ class Service:
 
     def pause(self) -> None:
         """Have events wait in the mailbox."""
-        self._is_paused = True
-        self._dispatcher.hold("pause")
-        self._changed()
+        self._intake.pause()
 
     def resume(self) -> None:
         """Work on events again, also after `pause` and `drain`."""
         with self._turn:
-            self._is_paused = False
-            self._dispatcher.let_go("pause")
-            if self._is_running and self._is_draining:
-                self._sockets.open_subscriber()
-                self._is_draining = False
-        self._changed()
+            self._intake.resume()
 
     def drain(self, timeout_s: float | None = None) -> bool:
         """Take no more events, until `resume`, and work off those that were accepted; return whether that was done."""
+        timeout_s = self.drain_timeout_s if timeout_s is None else timeout_s
         with self._turn:
-            return not self._is_running or self._drain(self.drain_timeout_s if timeout_s is None else timeout_s)
+            if not self._is_running:
+                return True
+            self._intake.close(timeout_s)
+        return self._intake.work_off(timeout_s)
 
     def deploy(self, path: str | Path) -> dict[str, Any]:
         """Serve another bundle from now on; return what there is to know of the service then.
 
         A second worker proves it beside the first one, and gets the events when none is worked on. It has its own
-        parameters, with the next revision.
+        parameters, with the next revision: ``changed`` of what is returned has a line for each value that is another
+        one now, as ``"sigma 1.4 -> 1.0 (tuned, not written back)"``.
 
         Raises
         ------
@@ -335,19 +320,19 @@ class Service:
         ServiceError
             Another one is being deployed.
         """
-        self._deployer.deploy(path)
-        return self.info()
+        return {"changed": self._deployer.deploy(path), **self.info()}
 
     def rollback(self) -> dict[str, Any]:
-        """Serve the bundle again that was served before; return what there is to know of the service then.
+        """Serve the bundle again that was served before; return what `deploy` returns.
+
+        The one that is left is the one before then: to roll back twice is to be where one was.
 
         Raises
         ------
         DeployRefused
             There was none, or it is not any more what it was.
         """
-        self._deployer.rollback()
-        return self.info()
+        return {"changed": self._deployer.rollback(), **self.info()}
 
     # -- its parameters ---------------------------------------------------------------------------------------------
 
@@ -375,6 +360,20 @@ class Service:
             There is no worker, or it is busy for too long.
         """
         return self._tuning.set(values, revision)
+
+    def write_back(self, *, dry_run: bool = False) -> WriteBack:
+        """Write the parameters into the pipeline.toml of the bundle that is served; return the diff and its digest.
+
+        The service goes on with the bundle that has them.
+
+        Raises
+        ------
+        BundleError
+            The bundle was changed, or can't be written.
+        ServiceError
+            Another one is being deployed.
+        """
+        return self._deployer.write_back(dry_run=dry_run)
 
     # -- what is seen of it -----------------------------------------------------------------------------------------
 

@@ -43,7 +43,8 @@ def serve(
     Raises
     ------
     ServiceError
-        The bundle is being served already, can't be served, or was stopped at once.
+        The bundle is being served already, can't be served, or not any more and there is no HTTP to mend that by; or
+        the service was stopped at once.
     BundleError, AddressError
         As for Service.
     """
@@ -51,10 +52,13 @@ def serve(
         service = Service(path, sub, pub, insecure=insecure, **options)
         if http:
             _serve_http(service, http, token_file, insecure, control)
+        fault: list[str] = []
         if signals.wait_during(service.start):
-            _announce(service, lock, bool(http), on_ready, on_fault)
+            fault = _announce(service, lock, None if http else signals.now, on_ready, on_fault)
             signals.wait()
         _stop(service, signals)
+        if fault:
+            raise ServiceError(service.path, fault[0])
         return service.counts()
 
 
@@ -71,26 +75,37 @@ def _serve_http(
 def _announce(
     service: Service,
     lock: StateLock,
-    can_be_mended: bool,
+    give_up: Callable[[], None] | None,
     on_ready: Callable[[ServiceState], None],
     on_fault: Callable[[str], None],
-) -> None:
-    """Let others find the service, and say that it is ready; or that it is not."""
-    reason = service.reason
+) -> list[str]:
+    """Let others find the service, and say that it is ready; or that it is not.
+
+    Return a list that has the reason in it once there will be no worker any more and nobody could deploy another
+    bundle; ``give_up`` is called then, so that whoever has started the service can act.
+    """
+    reason, fault = service.reason, list[str]()
     if service.state == "FAULTED":
-        if not can_be_mended:
+        if give_up is not None:
             service.stop(0.0)
             raise ServiceError(service.path, reason)
         on_fault(reason)
 
-    def republish(kind: str, data: dict[str, Any]) -> None:
-        if kind == "state" and data["state"] == "READY":
+    def hear(kind: str, data: dict[str, Any]) -> None:
+        if kind == "deployed" or (kind == "state" and data["state"] == "READY"):
             lock.publish(service.service_state)
+        elif kind == "state" and data["state"] == "FAULTED" and give_up is not None:
+            fault.append(data["reason"])
+            give_up()
 
-    service.listen(republish)
+    service.listen(hear)
     lock.publish(service.service_state)
     if service.state != "FAULTED":
         on_ready(service.service_state)
+    elif not reason:
+        # It was before anybody listened.
+        hear("state", {"state": "FAULTED", "reason": service.reason})
+    return fault
 
 
 def _stop(service: Service, signals: Signals) -> None:

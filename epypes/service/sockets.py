@@ -51,7 +51,7 @@ class Sockets:
         self._rejected_before = 0
         # Sent within put, on the thread that puts.
         self._answers, self._failures = Mailbox("drop_oldest", _KEPT_ANSWERS), Mailbox("drop_oldest", _KEPT_ANSWERS)
-        self._taken_at = sub
+        self._closed_at = ""
         self.subscriber = self._made_subscriber(sub)
         self.publisher = self._made_publisher(pub, self._answers, "")
         self.reporter = self._made_publisher(failures, self._failures, FAILURE_TOPIC)
@@ -71,6 +71,7 @@ class Sockets:
         AddressError
             An address can't be bound.
         """
+        self._closed_at = ""
         try:
             self.publisher.start()
             self.reporter.start()
@@ -88,15 +89,16 @@ class Sockets:
         self._failures.put(item)
 
     def close_subscriber(self, timeout_s: float) -> None:
-        """Take no more events."""
-        self._taken_at = self.addresses["sub"]
+        """Take no more events; may be called twice."""
+        self._closed_at = self.addresses["sub"]
         self.subscriber.stop(timeout_s)
 
     def open_subscriber(self) -> None:
         """Take events again, at the address where they were taken before."""
         self._rejected_before = self.rejected
-        self.subscriber = self._made_subscriber(self._taken_at)
+        self.subscriber = self._made_subscriber(self._closed_at)
         self.subscriber.start()
+        self._closed_at = ""
 
     def stop(self, timeout_s: float) -> None:
         """Close them; what was published still leaves."""
@@ -110,8 +112,12 @@ class Sockets:
 
     @property
     def addresses(self) -> dict[str, str]:
-        """Where they are, ``connect:`` in front of those that connect; those that are bound once they are."""
-        bound = {"sub": self.subscriber.address, "pub": self.publisher.address, "failures": self.reporter.address}
+        """Where they are, ``connect:`` in front of those that connect; those that are bound once they are.
+
+        Where events are not taken just now, it is where they were taken, and will be again.
+        """
+        sub = self._closed_at or self.subscriber.address
+        bound = {"sub": sub, "pub": self.publisher.address, "failures": self.reporter.address}
         return {name: given if given.startswith(CONNECT) else bound[name] for name, given in self._given.items()}
 
     @property

@@ -9,59 +9,27 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from time import monotonic
 from typing import Any, Final
 
 from epypes.bundle.replay import REPLAY_TIMEOUT_S
 from epypes.errors import ServiceError
 from epypes.service.dispatch import Dispatcher
-from epypes.service.link import Link, Message
+from epypes.service.health import DEATHS_BEFORE_FAULT, GOOD_EVENTS, PAUSE_S, Health
+from epypes.service.link import SETTLING, Link, Message
 from epypes.service.notify import notify, watchdog_s
 from epypes.service.served import Served
 from epypes.service.stuck import whereabouts
 
-_FIRST_PAUSE_S: Final = 0.1
-_LONGEST_PAUSE_S: Final = 10.0
-# After so many good events the next death is a first one again.
-_GOOD_EVENTS: Final = 5
-_DEATHS_BEFORE_FAULT: Final = 5
 _END_S: Final = 2.0
 
 _log = logging.getLogger("epypes.service")
 
 
-@dataclass(slots=True)
-class Health:
-    """How the worker that is served is doing; read and written with the dispatcher's lock held.
-
-    Attributes
-    ----------
-    fault
-        Why there will be no worker any more; empty if that is not so.
-    trouble
-        Why there is none just now.
-    stuck
-        What has not returned in time, until the worker that replaces it is ready.
-    restarts
-        How often a worker was started again.
-    deaths
-        How often in a row one died, without an answer in between.
-    pauses
-        How often in a row it was waited before a start, which is what each wait is twice as long for.
-    """
-
-    fault: str = ""
-    trouble: str = ""
-    stuck: str = ""
-    restarts: int = 0
-    deaths: int = 0
-    pauses: int = 0
-    was_ready: bool = False
-
-
 class Supervisor:
     """Starts, watches and replaces workers.
+
+    ``is_rewritten`` is for who writes into the bundle: a worker that is started meanwhile is not used.
 
     Parameters
     ----------
@@ -93,11 +61,11 @@ class Supervisor:
         hear: Callable[[Link, Mapping[str, Any]], None],
     ) -> None:
         self.served, self.health = served, Health()
+        self.is_rewritten = False
         self.worker: Link | None = None
         self._dispatcher, self._threads = dispatcher, threads
         self._timeout_s, self._timeout_ns = job_timeout_s, int(job_timeout_s * 1e9)
         self._parameters, self._on_change, self._hear_more = parameters, on_change, hear
-        self._most_deaths = max(_DEATHS_BEFORE_FAULT, dispatcher.ledger.retries + 2)
         self._changed = dispatcher.changed
         self._to_start: deque[tuple[Served, list[Link | Exception]]] = deque()
         self._restart_s: float | None = None
@@ -165,7 +133,7 @@ class Supervisor:
             waits.append(self._notified_s + self._watchdog_s - now_s)
         if self._restart_s is not None:
             waits.append(self._restart_s - now_s)
-        if self.worker is not None and self.worker.status == "loading":
+        if self._is_loading:
             waits.append(self._loading_until_s - now_s)
         known = [wait for wait in waits if wait is not None]
         return max(min(known), 0.0) if known else None
@@ -186,20 +154,32 @@ class Supervisor:
         due_in_s = self._dispatcher.due_in_s(self._timeout_ns)
         if self._dispatcher.link is not None and due_in_s is not None and due_in_s <= 0:
             return self._end_stuck
-        if self.worker is not None and self.worker.status == "loading" and self._loading_until_s <= now_s:
+        if self._is_loading and self._loading_until_s <= now_s:
             return self._end_loading
         return None
 
+    @property
+    def _is_loading(self) -> bool:
+        return self.worker is not None and self.worker is not self._dispatcher.link
+
     def _start_again(self) -> None:
+        with self._changed:
+            served = self.served
         try:
-            link = Link(self.served, self._threads, self._hear, self._gone)
+            link = Link(served, self._threads, self._hear, self._gone)
         except OSError as error:
             with self._changed:
-                self._died(f"The worker can't be started: {error.strerror or error}.")
+                self._died(f"The worker can't be started: {error.strerror or error}")
             return
         with self._changed:
+            if self._is_ending or self.worker is not None or served is not self.served:
+                # Another bundle has taken over while it was started, or other values were written into it.
+                self._dismiss_for_another(link)
+                return
             self.worker, self._loading_until_s = link, monotonic() + REPLAY_TIMEOUT_S
             self.health.restarts += self.health.was_ready
+            if self.health.was_ready:
+                _log.info("the worker is started again: process %d, restart %d", link.pid, self.health.restarts)
             # It may have been ready before this thread came here.
             if link.status == "ready":
                 self._begin(link)
@@ -207,8 +187,7 @@ class Supervisor:
                 self._over(link)
 
     def _end_loading(self) -> None:
-        worker = self.worker
-        if worker is not None:
+        if (worker := self.worker) is not None:
             _log.error("the worker has not proved its bundle within %g s, so it is killed", REPLAY_TIMEOUT_S)
             worker.process.kill()
 
@@ -221,10 +200,14 @@ class Supervisor:
             self._dispatcher.done(link, header, frames)
             with self._changed:
                 self.health.deaths = 0
-                if self._dispatcher.answered_in_row >= _GOOD_EVENTS:
+                if self._dispatcher.answered_in_row >= GOOD_EVENTS:
                     self.health.pauses = 0
-        elif kind in ("parameters", "parameters_refused"):
+        elif kind in SETTLING:
             self._hear_more(link, header)
+            with self._changed:
+                if link is self.worker and link is not self._dispatcher.link:
+                    self._confirmed(link, header.get("problems") or {})
+            self._dispatcher.publish()
         elif kind == "ready":
             with self._changed:
                 if link is self.worker:
@@ -234,16 +217,43 @@ class Supervisor:
 
     def _begin(self, link: Link) -> None:
         """Give events to a worker that is ready. With the lock held."""
+        if link.served is not self.served or self.is_rewritten:
+            # Its values are written back meanwhile: another one reads them.
+            self._dismiss_for_another(link)
+            return
         if link.about.get("digest") != self.served.digest:
             link.is_dismissed = True
             link.process.kill()
             self._fault(f"{self.served.path} is not the bundle any more that is served. Deploy it, or restore it.")
             return
         parameters = self._parameters()
-        if parameters is not None:
-            revision, values = parameters
-            link.post({"kind": "parameters", "revision": revision, "values": dict(values)})
-        self.health.was_ready, self.health.trouble, self.health.stuck = True, "", ""
+        if parameters is None:
+            self._use(link)
+        else:
+            # It gets events once it has confirmed them.
+            link.tell_parameters(*parameters)
+
+    def _dismiss_for_another(self, link: Link) -> None:
+        """End a worker of what is not served any more; start another if there is none. With the lock held."""
+        self.worker = None if self.worker is link else self.worker
+        link.is_dismissed = True
+        link.process.kill()
+        if self.worker is None and not self._is_ending:
+            self._restart_s = monotonic() + PAUSE_S
+
+    def _confirmed(self, link: Link, problems: Mapping[str, str]) -> None:
+        """Give events to a worker if it has taken the parameters of the one before. With the lock held."""
+        if not problems:
+            self._use(link)
+            return
+        self.worker, link.is_dismissed = None, True
+        link.process.kill()
+        why = " ".join(f"{token!r}: {problem}" for token, problem in problems.items())
+        self._fault(f"A new worker does not take the parameters of the last one. {why}")
+
+    def _use(self, link: Link) -> None:
+        health = self.health
+        health.was_ready, health.trouble, health.stuck, health.ready_s = True, "", "", monotonic()
         self._dispatcher.use(link)
         self._on_change()
 
@@ -262,22 +272,23 @@ class Supervisor:
             self._fault(" ".join(link.reasons))
         elif link.is_dismissed:
             self._dispatcher.worker_ended()
-            self._died(self.health.stuck or link.process.ending)
+            self._died(self.health.stuck or link.process.ending, has_cause=True)
         else:
+            # Of an event it may die again and again: each is put aside in the end, so that it gets on.
+            has_event = bool(self._dispatcher.ledger.running())
             self._dispatcher.worker_died(link.process.ending, link.process.died_in)
-            self._died(link.process.ending)
+            self._died(link.process.ending, has_cause=has_event)
 
-    def _died(self, why: str) -> None:
+    def _died(self, why: str, *, has_cause: bool = False) -> None:
         """Start another worker after a while, or none any more. With the lock held."""
         health = self.health
         if self._is_ending or health.fault:
             return
-        health.deaths += 1
-        if health.deaths >= self._most_deaths:
-            self._fault(f"{health.deaths} workers ended in a row without an answer. The last: {why}")
+        health.count_death(monotonic(), has_cause=has_cause)
+        if health.deaths >= DEATHS_BEFORE_FAULT:
+            self._fault(f"{health.deaths} workers ended in a row as soon as they were started. The last: {why}")
             return
-        pause_s = min(_FIRST_PAUSE_S * 2**health.pauses, _LONGEST_PAUSE_S)
-        health.pauses += 1
+        pause_s = health.next_pause_s()
         health.trouble = f"{why}. Another one is started."
         _log.warning("%s; another one is started in %g s", why, pause_s)
         self._restart_s = monotonic() + pause_s
@@ -370,7 +381,11 @@ class Supervisor:
             restarts = self.health.restarts
             self.health = Health(was_ready=True, restarts=restarts)
             self._dispatcher.refuse("")
-            self._begin(link)
+            parameters = self._parameters()
+            if parameters is not None:
+                # It has proved its own values; what it is told is their revision, which can't be refused.
+                link.tell_parameters(parameters[0], {})
+            self._use(link)
         if before is not None:
             threading.Thread(target=before.dismiss, args=(_END_S,), name="epypes last worker", daemon=True).start()
 

@@ -11,7 +11,7 @@ from epypes.errors import ParametersRefused, RevisionConflict, ServiceError
 from epypes.service.dispatch import Dispatcher
 from epypes.service.link import Link
 from epypes.service.outcome import Desk
-from epypes.service.parameters import Entries, Parameters, changed, value_of
+from epypes.service.parameters import Entries, Parameters, changed, differing_values, value_of
 from epypes.service.served import Served
 
 _log = logging.getLogger("epypes.service")
@@ -60,17 +60,19 @@ class Tuning:
             self._dispatcher.publish()
 
     def _set(self, values: Mapping[str, Any], revision: int | None) -> Parameters:
-        before = self.current
-        if revision is not None and revision != before.revision:
-            raise RevisionConflict(self._path, before)
-        after, problems = changed(before.entries, values)
-        if problems:
-            raise ParametersRefused(self._path, problems)
-        sent = {token: value_of(after[token]) for token in values if after[token] != before.entries[token]}
-        if not sent:
-            return before
-        wanted = Parameters(before.revision + 1, after)
-        link = self._begin(wanted)
+        link: Link | None = None
+        while link is None:
+            before = self.current
+            if revision is not None and revision != before.revision:
+                raise RevisionConflict(self._path, before)
+            after, problems = changed(before.entries, values)
+            if problems:
+                raise ParametersRefused(self._path, problems)
+            sent = {token: value_of(after[token]) for token in values if after[token] != before.entries[token]}
+            if not sent:
+                return before
+            wanted = Parameters(before.revision + 1, after)
+            link = self._begin(before, wanted)
         problems = link.change(wanted.revision, sent, self._timeout_s)
         if problems:
             raise ParametersRefused(self._path, problems)
@@ -79,8 +81,11 @@ class Tuning:
             raise RevisionConflict(self._path, self.current)
         return wanted
 
-    def _begin(self, wanted: Parameters) -> Link:
+    def _begin(self, before: Parameters, wanted: Parameters) -> Link | None:
+        """Return the worker that is to take a change; None if it is one of other parameters by now."""
         with self._dispatcher.changed:
+            if self.current is not before:
+                return None
             link = self._dispatcher.link
             if link is None:
                 raise ServiceError(self._path, "There is no worker just now. Try again in a moment.")
@@ -96,11 +101,11 @@ class Tuning:
             if link is not self._dispatcher.link:
                 return
             if pending is None or header.get("revision") != pending.revision:
-                if header.get("problems"):
-                    _log.error("a new worker does not take the parameters of the last one: %s", header["problems"])
                 return
             self._pending = None
-            if not header.get("problems"):
+            if header["kind"] == "parameters":
+                changes = differing_values(self.current.entries, self.current.entries, pending.entries)
+                _log.info("parameters, revision %d: %s", pending.revision, "; ".join(changes))
                 self._change(pending)
 
     def _change(self, parameters: Parameters) -> None:

@@ -17,6 +17,7 @@ from typing import Final
 from epypes.bundle.load import MODULE
 from epypes.service.channel import channel_pair
 from epypes.service.notify import VARIABLES
+from epypes.service.words import STANDARD_ERROR
 
 # What a worker said last, for the reason of its death.
 _LINES_KEPT: Final = 20
@@ -184,8 +185,7 @@ def _pass_on(said: int, lines: deque[str]) -> None:
     rest = b""
     with contextlib.suppress(OSError):
         while data := os.read(said, _CHUNK):
-            with contextlib.suppress(OSError):
-                os.write(2, data)
+            STANDARD_ERROR.write(data)
             *whole, rest = (rest + data).split(b"\n")
             lines.extend(line.decode(errors="replace") for line in whole[-_LINES_KEPT:])
             rest = rest[-_CHUNK:]

@@ -10,8 +10,8 @@ import pytest
 import epypes as ep
 from epypes.bundle.emit import emit_module
 from epypes.bundle.settings import Settings
-from epypes.bundle.slicer import slice_graph
 from tests.bundle.cells import cell
+from tests.bundle.slicing import slice_graph
 
 
 def promoted(source: str) -> tuple[str, list[str], dict]:

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.bundle.slicer import slice_graph
 from epypes.errors import PromotionRefused
 from tests.bundle.hostile import in_notebook
+from tests.bundle.slicing import slice_graph
 
 
 def sliced(monkeypatch, *cells, **functions):

@@ -17,8 +17,8 @@ from skimage.filters import gaussian
 import epypes as ep
 from epypes.bundle.emit import emit_module
 from epypes.bundle.settings import Settings
-from epypes.bundle.slicer import slice_graph
 from epypes.bundle.source import Importable, importable
+from tests.bundle.slicing import slice_graph
 from tests.seeds import printed
 
 _CELLS = 0

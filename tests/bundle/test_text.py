@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.bundle.slicer import slice_graph
 from epypes.errors import SourceRefused
+from tests.bundle.slicing import slice_graph
 from tests.bundle.test_slicer import executed as module_of
 from tests.bundle.test_slicer import notebook, promoted
 

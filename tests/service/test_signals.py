@@ -109,6 +109,17 @@ def test_a_signal_while_it_loads_ends_it(tmp_path):
         assert "STOPPED received 0" in out
 
 
+def test_without_http_a_service_that_can_not_be_served_any_more_ends_with_1(tmp_path):
+    copy = acting_bundle(tmp_path / "copy")
+    with served_apart(copy) as (process, _):
+        (copy / "pipeline.py").write_text("")
+        worker_of(process).kill()
+        _, err = ended(process)
+        assert process.returncode == 1
+        assert "pipeline.py was changed" in err
+        assert "Traceback" not in err
+
+
 def test_a_front_that_is_killed_takes_its_worker_along(acting, tmp_path):
     with served_apart(acting) as (process, peer):
         worker = worker_of(process)
@@ -158,3 +169,14 @@ def test_a_socket_of_systemd_that_is_not_there_is_no_trouble(monkeypatch, tmp_pa
     for address in (str(tmp_path / "none"), "@epypes-none", "tcp://127.0.0.1:1", "vsock:1"):
         monkeypatch.setenv("NOTIFY_SOCKET", address)
         assert not notify("READY=1")
+
+
+def test_a_standard_error_that_nobody_reads_holds_nothing_up(acting):
+    with served_apart(acting) as (process, peer):
+        for _ in range(2):
+            # More than a pipe holds, of the front's own words and of the worker's.
+            for _ in range(60):
+                assert peer.ask("fail:" + "x" * 2000).failure.exception == "ValueError"
+            assert peer.ask("say:" + "y" * 100_000, 4).parts["out"] == 8
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(TIMEOUT_S) == 0

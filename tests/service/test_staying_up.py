@@ -19,6 +19,7 @@ from epypes.errors import (
     UnknownName,
 )
 from epypes.service import Service
+from epypes.service.health import DEATHS_BEFORE_FAULT, Health
 from epypes.service.packing import unpack
 from epypes.wire import decode
 from tests.service.served import SOURCE, TIMEOUT_S, acting_bundle, check_counts, peer_of, serving, until
@@ -93,22 +94,55 @@ def test_with_three_slots_only_the_culprit_is_put_aside(acting):
 
 
 @pytest.mark.slow
-def test_five_deaths_in_a_row_are_a_fault_and_everybody_is_told(acting):
+def test_frames_that_kill_the_worker_one_after_another_are_put_aside_and_the_service_stays_up(acting):
     with serving(acting, mailbox_size=100, retries=0) as (service, peer):
-        for number in range(9):
+        for number in range(7):
             peer.send("kill", number)
-        answers = peer.take(9)
-        assert sorted(answer.correlation_id for answer in answers) == sorted(peer.sent)
-        until(lambda: service.state == "FAULTED")
-        assert (
-            "5 workers ended in a row without an answer. The last: The worker was killed by SIGKILL" in service.reason
-        )
-        counts = service.counts()
-        assert (counts["dead_letters"], counts["dropped"]) == (5, 4)
-        assert "can't be served" in peer.ask().failure.message, "who comes later is told too"
-        service.deploy(acting)
-        assert service.state == "READY"
+        service._supervisor.health.pauses = -4  # the waits are not what this is about
+        assert all("It is put aside" in answer.failure.message for answer in peer.take(7))
         assert peer.ask(number=4).parts["out"] == 8
+        assert service.state == "READY"
+        assert service.counts()["dead_letters"] == 7
+
+
+@pytest.mark.slow
+def test_events_that_do_not_return_one_after_another_are_reported_and_the_service_stays_up(acting):
+    with serving(acting, mailbox_size=100, job_timeout_s=0.1) as (service, peer):
+        for number in range(6):
+            peer.send("sleep:100", number)
+        service._supervisor.health.pauses = -4
+        assert all("did not return within 0.1 s" in answer.failure.message for answer in peer.take(6))
+        assert peer.ask(number=4).parts["out"] == 8
+
+
+def test_only_deaths_without_an_event_right_after_the_start_are_a_crash_loop():
+    health = Health()
+    for second in range(20):
+        health.ready_s = float(second)
+        health.count_death(second + 1.0, has_cause=False)
+        assert health.deaths == 0, "it had been ready for a while"
+    for _ in range(4):
+        health.count_death(0.0, has_cause=False)
+    assert health.deaths == DEATHS_BEFORE_FAULT - 1
+    health.count_death(0.0, has_cause=True)
+    assert health.deaths == 0, "it was an event's fault"
+
+
+def test_a_worker_that_ends_as_soon_as_it_is_ready_is_a_fault_and_everybody_is_told(acting, tmp_path):
+    dying = "\n    import threading\n    threading.Timer(0.2, os._exit, [9]).start()\n"
+    bundle = acting_bundle(tmp_path / "dying", source=SOURCE + dying)
+    with Service(bundle) as service:
+        service._supervisor.health.pauses = -4
+        until(lambda: service.state == "FAULTED")
+        assert "5 workers ended in a row as soon as they were started. The last: The worker ended with status 9" in (
+            service.reason
+        )
+        assert service.alive() == service.reason
+        with peer_of(service) as peer:
+            assert "can't be served" in peer.ask().failure.message
+            service.deploy(acting)
+            assert (service.state, service.alive()) == ("READY", "")
+            assert peer.ask(number=4).parts["out"] == 8
 
 
 # -- what does not return -------------------------------------------------------------------------------------------

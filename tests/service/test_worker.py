@@ -336,13 +336,7 @@ def test_parameters_hold_for_the_events_after_them_and_their_revision_is_stamped
 
 def test_parameters_are_refused_all_or_none_with_the_reason_of_each(own):
     with own() as front:
-        front.channel.send(
-            {
-                "kind": "parameters",
-                "revision": 9,
-                "values": {"k": {"value": 7}, "kk": {"value": 1}, "what": {"value": 1}, "out": {}},
-            }
-        )
+        front.send_parameters(9, {"k": {"value": 7}, "kk": {"value": 1}, "what": {"value": 1}, "out": {}})
         header, _ = front.receive("parameters_refused")
         assert header["revision"] == 9
         assert set(header["problems"]) == {"kk", "what", "out"}
@@ -370,6 +364,24 @@ def test_parameters_are_set_when_no_slot_works_and_asked_values_wait_for_that(ow
         header, (packed,) = front.receive("asked")
         assert header["ask"] == ask
         assert decode(unpack(packed)).parts["told"] == "held 8"
+
+
+def test_a_change_that_waits_for_an_event_can_be_withdrawn_and_one_that_was_made_cannot(own):
+    with own() as front:
+        front.send_event(Envelope(type="x", parts={"what": "hold"}))
+        until(front.started.exists)
+        front.set(1, k=8)
+        front.channel.send({"kind": "withdraw", "revision": 1})
+        assert front.receive("parameters_withdrawn")[0]["revision"] == 1
+        front.release.touch()
+        assert front.done()[0]["revision"] == 0
+        assert front.run(what="a")[0]["revision"] == 0
+        front.set(2, k=9)
+        assert front.receive("parameters")[0]["revision"] == 2
+        front.channel.send({"kind": "withdraw", "revision": 2})
+        header, (answer,) = front.run(what="a")
+        assert (header["revision"], answer.parts["out"]) == (2, "a 9")
+        assert not front.waiting
 
 
 def test_asked_values_are_not_computed_beside_the_events_of_the_only_slot(own):

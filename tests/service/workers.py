@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -66,9 +67,10 @@ class Front:
         return header, answers
 
     def set(self, revision, **values):
-        self.channel.send(
-            {"kind": "parameters", "revision": revision, "values": {k: {"value": v} for k, v in values.items()}}
-        )
+        self.send_parameters(revision, {k: {"value": v} for k, v in values.items()})
+
+    def send_parameters(self, revision, values):
+        self.channel.send({"kind": "parameters", "revision": revision}, [json.dumps(values).encode()])
 
     def send_ask(self, what, **content):
         ask = next(self.asks)

@@ -29,7 +29,8 @@ def load_failure(id: str, source: Any = None, *, bundle: str | Path | None = Non
     Parameters
     ----------
     id
-        The failure's id, the first or last characters of it, or ``"latest"``.
+        The failure's id, the first or last characters of it, the id of the event that failed, which is the
+        ``input_id`` of the failure in its answer, or ``"latest"``.
     source
         The path of the bundle that was served, the http URL of its service, or a Connection; without, all failures of
         this machine.

@@ -54,14 +54,28 @@ class _ByConnection:
 
 
 class _Everywhere:
-    """The failures of all bundles that were served on this machine by this user."""
+    """The failures of all bundles that were served on this machine by this user, or of one of them.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    bundle
+        The one: what failed in it is in the folder of the bundle that its service began with; and whatever failed in
+        the service that began with it. All without.
+    """
+
+    def __init__(self, bundle: Path | None = None) -> None:
         parent = failures_folder("").parent
         self._stores = [FailureStore(folder) for folder in sorted(parent.glob("*")) if folder.is_dir()]
+        self._bundle = None if bundle is None else str(bundle.resolve())
+        self._own = None if bundle is None else failures_folder(bundle)
+
+    def _of(self, store: FailureStore, limit: int | None) -> Sequence[FailureRecord]:
+        if self._bundle is None or store.folder == self._own:
+            return store.records(limit)
+        return [record for record in store.records() if record.bundle == self._bundle]
 
     def records(self, limit: int | None = None) -> Sequence[FailureRecord]:
-        found = [record for store in self._stores for record in store.records(limit)]
+        found = [record for store in self._stores for record in self._of(store, limit)]
         return sorted(found, key=lambda record: record.id, reverse=True)[:limit]
 
     def record(self, failure_id: str) -> FailureRecord:
@@ -95,11 +109,11 @@ def failures_of(source: Any = None) -> Failures:
         return _Everywhere()
     path = path_of(source)
     if path is not None:
-        store = FailureStore(failures_folder(path))
-        if not store.folder.is_dir():
+        failures = _Everywhere(path)
+        if not failures_folder(path).is_dir() and not failures.records(1):
             # A bundle without failures is one all the same; what is no bundle is said.
             check_seal(path)
-        return store
+        return failures
     return _ByConnection(connected(source))
 
 
@@ -130,7 +144,7 @@ def path_of(source: Any) -> Path | None:
 
 
 def found_by(failures: Failures, given: str) -> FailureRecord:
-    """Return the failure that is meant by its id, by the first or last characters of it, or by ``latest``.
+    """Return the failure that is meant by its id, the first or last characters of it, its event's id, or ``latest``.
 
     Raises
     ------
@@ -140,7 +154,7 @@ def found_by(failures: Failures, given: str) -> FailureRecord:
         It can't be read.
     """
     records = failures.records()
-    meant = [record for record in records if record.id == given] or _meant(records, given)
+    meant = [record for record in records if given in (record.id, record.event_id)] or _meant(records, given)
     if len(meant) == 1:
         return meant[0]
     if meant:

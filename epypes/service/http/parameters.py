@@ -57,11 +57,7 @@ async def write_back(served: OfRequest, wanted: WriteBack) -> Response:
 
 
 def _write_back(served: Served, dry_run: bool) -> dict[str, str]:
-    from epypes.bundle.entries import read
-    from epypes.bundle.writeback import write_back as write_values_back
-
-    values = {token: read(entry) for token, entry in served.service.parameters().entries.items()}
-    done = write_values_back(served.service.info()["bundle"], values, dry_run=dry_run)
+    done = served.service.write_back(dry_run=dry_run)
     return {"diff": done.diff, "digest": done.digest}
 
 

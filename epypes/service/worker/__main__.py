@@ -12,6 +12,7 @@ import argparse
 import ctypes
 import faulthandler
 import io
+import json
 import logging
 import os
 import signal
@@ -89,14 +90,26 @@ class Worker:
         KeyError
             There is no such kind of message, or it lacks something.
         """
-        hearers = {"event": self._event, "parameters": self._parameters, "ask": self._ask, "end": self._end}
+        hearers = {
+            "event": self._event,
+            "parameters": self._parameters,
+            "withdraw": self._withdraw,
+            "ask": self._ask,
+            "end": self._end,
+        }
         hearers[header["kind"]](header, frames)
 
     def _event(self, header: dict[str, Any], frames: list[memoryview]) -> None:
         self._inbox.put(Event(header["seq"], bool(header["raw"]), frames))
 
     def _parameters(self, header: dict[str, Any], frames: list[memoryview]) -> None:
-        self._inbox.put(Change(lambda: self._apply(header["revision"], header["values"])))
+        revision, values = header["revision"], json.loads(bytes(frames[0]))
+        self._inbox.put(Change(revision, lambda: self._apply(revision, values)))
+
+    def _withdraw(self, header: dict[str, Any], frames: list[memoryview]) -> None:
+        # A change that is not there any more was made or refused, which is told.
+        if self._inbox.withdraw(header["revision"]):
+            self._channel.send({"kind": "parameters_withdrawn", "revision": header["revision"]})
 
     def _apply(self, revision: int, values: dict[str, Any]) -> None:
         problems = self._changes.apply(revision, values)

@@ -35,8 +35,9 @@ class Job:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Change:
-    """Something that is done while no slot works; it must not raise."""
+    """A change of parameters, made while no slot works; it must not raise."""
 
+    revision: int
     apply: Callable[[], object]
 
 
@@ -89,6 +90,16 @@ class Inbox:
                 del self._items[0]
                 return item
         return None
+
+    def withdraw(self, revision: int) -> bool:
+        """Forget a change that has not been made; return whether it was there."""
+        with self._changed:
+            found = next((item for item in self._items if isinstance(item, Change) and item.revision == revision), None)
+            if found is not None:
+                self._items.remove(found)
+                # What came after it need not wait any more.
+                self._changed.notify_all()
+            return found is not None
 
     def finished(self) -> None:
         """Tell that what was taken has been done."""

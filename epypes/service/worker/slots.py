@@ -8,6 +8,7 @@ not at all, or failed.
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from time import perf_counter_ns
@@ -66,6 +67,7 @@ class Slot:
         self._inbox, self._channel, self._revision, self._on_completed = inbox, channel, revision, on_completed
         self._digest = bundle.digest
         self._work: _Work | None = None
+        self._pid = os.getpid()
         self.pipeline: FullPipeline = pipeline_of(bundle, self, self, detach=False)
         self.pipeline.on_error = self._failed
         # What handle itself raises, where a subclass has one of its own.
@@ -95,6 +97,9 @@ class Slot:
         queue.Empty
             None will come; without ``block``: there is none now.
         """
+        if os.getpid() != self._pid:
+            # A function has forked, and its child has come back: it is not to go on as a worker.
+            os._exit(0)
         self._finish()
         while True:
             item = self._inbox.take(block)

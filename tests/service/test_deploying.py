@@ -1,0 +1,129 @@
+"""What a deploy, a rollback and a write-back tell, and what is found afterwards."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import signal
+
+import pytest
+
+from epypes.bundle.seal import check_seal, seal
+from epypes.errors import DeployRefused, ServiceError, UnknownName
+from epypes.service import Service
+from epypes.service.failures.source import failures_of, found_by
+from epypes.service.state import read_state
+from tests.service.processes import run_cli, running
+from tests.service.served import SOURCE, acting_bundle, serving, until
+
+
+@pytest.fixture
+def better(tmp_path):
+    return acting_bundle(tmp_path / "better", k=3, expected=9)
+
+
+@pytest.fixture
+def own(acting, tmp_path):
+    return shutil.copytree(acting, tmp_path / "own")
+
+
+def test_values_that_a_deploy_replaces_are_told(acting, better):
+    with serving(acting) as (service, _):
+        service.set_parameters({"k": 14})
+        assert service.deploy(better)["changed"] == ["k 14 -> 3 (tuned, not written back)"]
+        assert service.rollback()["changed"] == ["k 3 -> 2"]
+
+
+def test_failures_of_a_bundle_that_was_deployed_are_found_by_its_path_and_by_the_event(acting, better):
+    with serving(acting) as (service, peer):
+        service.deploy(better)
+        failure = peer.ask("fail:here").failure
+        assert service.failure_store.flush()
+    (record,) = failures_of(better).records()
+    assert record.message == "here"
+    assert found_by(failures_of(better), failure.input_id) == record
+    assert failures_of(better).event(record.id).id == failure.input_id
+    with pytest.raises(UnknownName):
+        found_by(failures_of(better), "0" * 32)
+
+
+@pytest.mark.slow
+def test_values_that_were_written_back_are_those_of_the_bundle_that_is_served(own, better, caplog):
+    caplog.set_level("INFO", "epypes.service")
+    told = []
+    with serving(own) as (service, peer):
+        service.listen(lambda kind, data: told.append(data) if kind == "deployed" else None)
+        before = service.info()["digest"]
+        service.set_parameters({"k": 10})
+        written = service.write_back()
+        assert "+value = 10" in written.diff
+        assert service.info()["digest"] == written.digest != before
+        assert [data["digest"] for data in told] == [written.digest]
+        os.kill(service.info()["worker_pid"], signal.SIGKILL)
+        assert peer.ask(number=2).parts["out"] == 20
+        assert service.deploy(better)["changed"] == ["k 10 -> 3"]
+        assert service.rollback()["digest"] == written.digest
+        assert peer.ask(number=2).parts["out"] == 20
+        with (own / "pipeline.toml").open("a") as file:
+            file.write(" ")
+        service.deploy(better)
+        with pytest.raises(DeployRefused, match=r"pipeline\.toml was changed"):
+            service.rollback()
+        seal(own)
+        with pytest.raises(DeployRefused, match=rf"can't be rolled back to .*: epypes deploy {own}"):
+            service.rollback()
+    lines = [record.getMessage() for record in caplog.records if record.levelname == "INFO"]
+    for begin in (
+        "parameters, revision 1: k 2 -> 10",
+        "wrote parameters",
+        "deployed",
+        "rolled back",
+        "the worker is st",
+    ):
+        assert any(line.startswith(begin) for line in lines), begin
+
+
+@pytest.mark.slow
+def test_the_state_file_has_the_digest_of_what_is_served(acting, better):
+    with running(acting, "--http", "127.0.0.1:0"):
+        state = read_state(acting)
+        done = run_cli("deploy", better, "--http", state.http)
+        assert "k 2 -> 3" in done.stdout
+        until(lambda: read_state(acting).digest == check_seal(better))
+
+
+def test_the_child_of_a_function_that_forks_does_not_go_on_as_a_worker(tmp_path):
+    forking = SOURCE.replace(
+        "    ACTIONS = {",
+        f"""
+    def fork(more):
+        if not os.fork():
+            open({str(tmp_path / "child")!r}, "w").write(str(os.getpid()))
+
+
+    ACTIONS = {{
+        "fork": fork,""",
+    )
+    with serving(acting_bundle(tmp_path / "forking", source=forking)) as (_, peer):
+        assert peer.ask("fork", 3).parts["out"] == 6
+        until(lambda: (tmp_path / "child").exists() and (tmp_path / "child").read_text())
+        child = int((tmp_path / "child").read_text())
+        until(lambda: _has_ended(child))
+        assert peer.ask("plain", 4).parts["out"] == 8
+
+
+def _has_ended(pid):
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] == "Z"
+    except FileNotFoundError:
+        return True
+
+
+@pytest.mark.parametrize(
+    "options", [{"threads": 0}, {"threads": 65}, {"job_timeout_s": math.inf}, {"job_timeout_s": math.nan}]
+)
+def test_what_a_service_can_not_be_run_with_is_said(acting, options):
+    with pytest.raises(ServiceError, match="events at once|number of seconds"):
+        Service(acting, **options)
