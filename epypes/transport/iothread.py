@@ -197,15 +197,9 @@ class IOThread:
         self._gatekeeper.gates[gate.domain] = gate
 
     def _unguard(self, gate: Gate | None) -> None:
-        keeper = self._gatekeeper
-        if keeper is None or gate is None:
-            return
-        keeper.gates.pop(gate.domain, None)
-        if not keeper.gates:
-            self._gatekeeper = None
-            self._poller.unregister(keeper.descriptor)
-            self._readers.pop(keeper.descriptor, None)
-            keeper.close()
+        # The gatekeeper stays: its address may not be free at once, and who is guarded next would have none.
+        if self._gatekeeper is not None and gate is not None:
+            self._gatekeeper.gates.pop(gate.domain, None)
 
     def close_all(self) -> bool:
         """Close every socket; the thread ends then."""
@@ -221,6 +215,8 @@ class IOThread:
                 if self._unfinished or self._next_due_s <= monotonic():
                     self._catch_up()
         finally:
+            if self._gatekeeper is not None:
+                self._gatekeeper.close()
             self._context.term()
             self._wake_in.close()
             self._wake_out.close()
