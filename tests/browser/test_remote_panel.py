@@ -189,9 +189,10 @@ def test_a_panel_of_a_service_can_be_looked_at(open_notebook: Notebook, panel: P
     assert not open_notebook.page_errors
 
 
-def test_what_would_be_written_back_is_shown_first(panel: PanelOnScreen, bundle: Path, theme: str) -> None:
-    pytest.importorskip("epypes.bundle.writeback")
+def test_what_would_be_written_back_is_shown_first(panel: PanelOnScreen, state: Any, bundle: Path, theme: str) -> None:
     before = (bundle / "pipeline.toml").read_text()
+    with ep.connect(state.http, token=Path(state.token_file).read_text().strip()) as service:
+        service.set(canny_lo={"light": 41, "dark": 43}[theme])
     panel.page.locator(".epypes-write-back").click()
     panel.wait("() => document.querySelector('.epypes-diff').textContent.includes('+value')")
     assert (bundle / "pipeline.toml").read_text() == before
