@@ -6,7 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from epypes.transport.addresses import check_bind, is_loopback
+    from epypes.transport.addresses import check_bind, is_loopback, is_loopback_host
     from epypes.transport.keys import Keys, make_keys, read_keys
     from epypes.transport.mcapreader import RecordingInfo, recording_info
     from epypes.transport.playing import Player
@@ -23,6 +23,7 @@ __all__ = [
     "ZMQSubscriber",
     "check_bind",
     "is_loopback",
+    "is_loopback_host",
     "make_keys",
     "read_keys",
     "recording_info",
@@ -37,6 +38,7 @@ _HOME = {
     "ZMQSubscriber": "subscriber",
     "check_bind": "addresses",
     "is_loopback": "addresses",
+    "is_loopback_host": "addresses",
     "make_keys": "keys",
     "read_keys": "keys",
     "recording_info": "mcapreader",

@@ -25,7 +25,11 @@ def is_loopback(address: str) -> bool:
         return bool(rest)
     if scheme != "tcp":
         return False
-    host = rest.rpartition(":")[0]
+    return is_loopback_host(rest.rpartition(":")[0])
+
+
+def is_loopback_host(host: str) -> bool:
+    """Return whether a host, without its port, can be reached from this machine alone."""
     if host == "localhost":
         return True
     try:

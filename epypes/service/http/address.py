@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import errno
-import ipaddress
 import re
 import socket
 import sys
 from typing import Final
 
 from epypes.errors import AddressError
+from epypes.transport import is_loopback_host
 
 _ADDRESS: Final = re.compile(
     r"(?:http://)?(?:(?P<host>\[[0-9a-fA-F:.]+\]|[\w.-]+|\*):)?(?P<port>\d{1,5}|\*)/?", re.ASCII
@@ -32,7 +32,7 @@ def listening(address: str, *, insecure: bool = False) -> socket.socket:
         It is no address, is in use or isn't this machine's, or others could reach it and it is not ``insecure``.
     """
     host, port = _parted(address)
-    if not insecure and not is_loopback(host):
+    if not insecure and not is_loopback_host(host):
         raise AddressError(
             address,
             f"{address} can be reached from other machines, and HTTP has no encryption. Bind 127.0.0.1 and reach it "
@@ -66,19 +66,9 @@ def names_of(listener: socket.socket) -> frozenset[str] | None:
     A page of a foreign site whose name was made to mean 127.0.0.1 (DNS rebinding) still sends the site's name.
     """
     host = str(listener.getsockname()[0])
-    if not is_loopback(host):
+    if not is_loopback_host(host):
         return None
     return _LOOPBACK_NAMES | {f"[{host}]" if ":" in host else host}
-
-
-def is_loopback(host: str) -> bool:
-    """Whether a host, without its port, can be reached from this machine alone."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host.removeprefix("[").removesuffix("]")).is_loopback
-    except ValueError:
-        return False
 
 
 def _parted(address: str) -> tuple[str, int]:
