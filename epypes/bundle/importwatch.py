@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import builtins
+import contextlib
 import importlib.util
 import sys
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, Final, Self
 
 _OURS: Final = "epypes"
@@ -33,6 +35,23 @@ class ImportWatch:
     def mark(self) -> None:
         """Take what is loaded now for what EPypes needs itself."""
         self._before = frozenset(sys.modules)
+
+    def import_all_of(self, text: str, name: str) -> None:
+        """Import what the statements of a module say, also those that no sample has come to.
+
+        What can't be imported is passed over: the module may have two ways, of which this machine has one.
+
+        Parameters
+        ----------
+        text
+            The module's source.
+        name
+            The module's name.
+        """
+        for node in ast.walk(ast.parse(text)):
+            for module, items in _statements(node):
+                with contextlib.suppress(Exception):
+                    builtins.__import__(module, {"__name__": name}, None, items, 0)
 
     def imported_by(self, root: str, owner: Callable[[str], str]) -> frozenset[str]:
         """Return the names of the modules that a module needs, and that those need.
@@ -79,6 +98,14 @@ class ImportWatch:
             return found
 
         return note
+
+
+def _statements(node: ast.AST) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Give the modules that a statement imports, and what from each."""
+    if isinstance(node, ast.Import):
+        yield from ((alias.name, ()) for alias in node.names)
+    elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+        yield node.module, tuple(alias.name for alias in node.names)
 
 
 def _absolute(name: str, names: Mapping[str, Any], level: int) -> str:

@@ -115,9 +115,14 @@ def _identity(folder: Path) -> tuple[int, int] | None:
     return found.st_ino, found.st_ctime_ns
 
 
+def module_name(folder: Path) -> str:
+    """Return the name that the module of a bundle has while it is executed."""
+    return f"epypes_bundle_{folder.name}"
+
+
 def _execute(path: Path, source: bytes) -> Any:
     """Execute the module's source as it was checked; a cached .pyc, which the seal does not cover, is not looked at."""
-    module = types.ModuleType(f"epypes_bundle_{path.parent.name}")
+    module = types.ModuleType(module_name(path.parent))
     module.__file__ = str(path)
     # While their module runs, dataclasses look for it there.
     before = sys.modules.get(module.__name__)

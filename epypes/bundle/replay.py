@@ -20,7 +20,7 @@ from epypes.bundle.answers import answer_differences
 from epypes.bundle.compare import differences
 from epypes.bundle.environment import environment
 from epypes.bundle.importwatch import ImportWatch
-from epypes.bundle.load import SAMPLES, Bundle, pipeline_of, read_bundle
+from epypes.bundle.load import MODULE, SAMPLES, Bundle, module_name, pipeline_of, read_bundle
 from epypes.bundle.reach import ReachWatch
 from epypes.bundle.report import Difference, ReplayReport, difference, report_from
 from epypes.bundle.requirements import owner, requirement_lines
@@ -154,7 +154,9 @@ def _watched(folder: Path, arguments: list[str]) -> dict[str, Any]:
             bundle = read_bundle(folder, sealed="--unsealed" not in arguments)
             reached.also_in(bundle.settings.hyperparameters)
             report = replay(bundle)
-    modules = watch.imported_by(f"epypes_bundle_{folder.name}", owner)
+        name = module_name(folder)
+        watch.import_all_of((folder / MODULE).read_text(encoding="utf-8"), name)
+    modules = watch.imported_by(name, owner)
     report = replace(report, outside=reached.files, notes=(*report.notes, *reached.notes))
     return replace(report, requirements=requirement_lines(modules)).to_dict()
 

@@ -26,6 +26,10 @@ import numpy as np
 
 def read(x):
     import networkx  # lazily, and EPypes knows it too
+    if x < 0:  # which the sample is not
+        from skimage import color
+        import nowhere
+        return color.rgb2gray(nowhere.read())
     return np.asarray(networkx.path_graph(3).degree(1) + x)
 """
 
@@ -37,7 +41,7 @@ def test_lazy_imports_are_captured_and_imports_of_the_notebook_or_of_epypes_are_
     ep.promote(runner, tmp_path / "b")
     lines = (tmp_path / "b" / "requirements.txt").read_text().splitlines()
     found = pins(lines)
-    assert {"networkx", "numpy", "epypes"} <= set(found)
+    assert {"networkx", "numpy", "epypes", "scikit-image"} <= set(found)
     assert not {"pandas", "matplotlib", "protobuf", "typer", "rich", "opencv-python-headless"} & set(found)
     assert found["numpy"] == np.__version__
     assert list(found) == sorted(found)
