@@ -1,8 +1,10 @@
-"""Which graphs and images do many tests share, and what are kernels told that tests start?"""
+"""Which graphs and images do many tests share, and what are kernels and commands told that tests start?"""
 
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
 
 import cv2
 import numpy as np
@@ -11,9 +13,12 @@ from skimage import data
 from xdist.scheduler import LoadFileScheduling
 
 import epypes as ep
+from epypes.cli import main
 
 # They inherit it: the tutorial on the experiment asks so often where a reader asks 500 times.
 os.environ.setdefault("EPYPES_REQUESTS", "20")
+# What is started in the background of a shell ignores Ctrl+C, and so would all that tests start and interrupt.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 class _Scheduling(LoadFileScheduling):
@@ -66,3 +71,25 @@ def straight_edges(photograph) -> np.ndarray:
     """The edges as straight-line OpenCV computes them."""
     gray = cv2.cvtColor(photograph, cv2.COLOR_BGR2GRAY)
     return cv2.Canny(cv2.GaussianBlur(gray, (11, 11), 0), 70, 200)
+
+
+@pytest.fixture
+def own_folders(tmp_path_factory, monkeypatch):
+    """State files, failures and settings of a test stand apart from those of the user's services."""
+    for name in ("XDG_RUNTIME_DIR", "XDG_STATE_HOME", "XDG_CONFIG_HOME"):
+        monkeypatch.setenv(name, str(tmp_path_factory.mktemp(name)))
+
+
+@pytest.fixture
+def epypes(capsys):
+    """Run a command in this process, as far as its exit."""
+
+    def run(*arguments):
+        with pytest.raises(SystemExit) as stop:
+            main(list(map(str, arguments)))
+        said, code = capsys.readouterr(), stop.value.code
+        if isinstance(code, str):  # as the interpreter does at its end
+            return subprocess.CompletedProcess(arguments, 1, said.out, said.err + code + "\n")
+        return subprocess.CompletedProcess(arguments, code or 0, said.out, said.err)
+
+    return run

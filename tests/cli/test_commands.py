@@ -11,7 +11,6 @@ import pytest
 import epypes as ep
 from epypes.acquisition import read_image, write_image
 from epypes.bundle.load import read_bundle
-from epypes.cli import main
 from epypes.cli.call import by_token
 from epypes.errors import ServiceError, UnknownName
 from epypes.service import Service
@@ -21,11 +20,6 @@ from tests.colours import red_image, red_runner
 pytestmark = pytest.mark.slow  # each promotes or serves a bundle
 
 ANY = "tcp://127.0.0.1:*"
-
-
-@pytest.fixture(autouse=True)
-def own_runtime_folder(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("run")))
 
 
 @pytest.fixture(scope="module")
@@ -40,22 +34,6 @@ def promoted(photograph, tmp_path_factory):
 def bundle(promoted, tmp_path):
     """A copy that a test may spoil."""
     return read_bundle(shutil.copytree(promoted.path, tmp_path / "edges"))
-
-
-@pytest.fixture
-def epypes(capsys):
-    """Run a command in this process, as far as its exit."""
-
-    def run(*arguments):
-        with pytest.raises(SystemExit) as stop:
-            main(list(map(str, arguments)))
-        said = capsys.readouterr()
-        code = stop.value.code
-        if isinstance(code, str):  # as the interpreter does at its end
-            return subprocess.CompletedProcess(arguments, 1, said.out, said.err + code + "\n")
-        return subprocess.CompletedProcess(arguments, code or 0, said.out, said.err)
-
-    return run
 
 
 def one_line(done) -> str:

@@ -19,11 +19,6 @@ TUTORIAL = ROOT / "notebooks" / "01_edge_detection.ipynb"
 pytestmark = pytest.mark.notebook
 
 
-@pytest.fixture(autouse=True)
-def own_runtime_folder(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("run")))
-
-
 @pytest.fixture
 def tutorial(tmp_path):
     """A copy, since the notebook writes beside itself."""

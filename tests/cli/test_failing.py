@@ -17,7 +17,6 @@ import typer.main
 
 import epypes as ep
 from epypes.bundle.seal import seal
-from epypes.cli import main
 from epypes.cli.app import app
 from epypes.wire import load_sample, save_sample
 
@@ -116,25 +115,6 @@ def places(tmp_path_factory):
     return {name: str(path) for name, path in found.items()}
 
 
-@pytest.fixture(autouse=True)
-def own_folders(tmp_path, monkeypatch):
-    for name in ("XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
-        monkeypatch.setenv(name, str(tmp_path))
-
-
-def run(capsys, *arguments):
-    """Run a command in this process, as far as its exit."""
-    with pytest.raises(SystemExit) as stop:
-        main([*arguments])
-    said = capsys.readouterr()
-    code = stop.value.code
-    # A text is printed by the interpreter at its end.
-    is_text = isinstance(code, str)
-    return subprocess.CompletedProcess(
-        arguments, 1 if is_text else code, said.out, said.err + (code if is_text else "")
-    )
-
-
 def one_line(done):
     """Return the line that says why; what a progress display has left may stand above it."""
     lines = done.stderr.strip().splitlines()
@@ -152,15 +132,15 @@ def test_every_command_has_a_row():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("command", "row"), [(command, row) for command, rows in ROWS.items() for row in rows])
-def test_a_command_that_fails_says_so_in_one_line(command, row, places, capsys):
+def test_a_command_that_fails_says_so_in_one_line(command, row, places, epypes):
     arguments, says = row
-    done = run(capsys, command, *(argument.format(**places) for argument in arguments))
+    done = epypes(command, *(argument.format(**places) for argument in arguments))
     assert says.format(**places) in one_line(done)
 
 
 @pytest.mark.parametrize("command", sorted(typer.main.get_command(app).commands))
-def test_an_option_that_there_is_not_exits_with_2(command, capsys):
-    done = run(capsys, command, "--no-such-option")
+def test_an_option_that_there_is_not_exits_with_2(command, epypes):
+    done = epypes(command, "--no-such-option")
     assert done.returncode == 2
     assert "No such option" in done.stderr
 
@@ -178,17 +158,17 @@ def test_without_an_extra_a_command_says_what_to_install(command, module, places
 
 
 @pytest.mark.slow
-def test_verify_prints_the_report_and_as_json_every_field(places, capsys):
-    done = run(capsys, "verify", places["other"])
+def test_verify_prints_the_report_and_as_json_every_field(places, epypes):
+    done = epypes("verify", places["other"])
     assert "sample 000, token 'edges': 4800 of 4800 values differ, first at [0, 0]: expected " in done.stdout
     assert "Likely: samples/000.npz is not the file that was recorded." in done.stdout
-    done = run(capsys, "verify", places["other"], "--json")
+    done = epypes("verify", places["other"], "--json")
     found = json.loads(done.stdout)
     assert (found["identical"], found["bundle"]) == (False, places["other"])
     (difference,) = found["differences"]
     assert (difference["token"], difference["index"], difference["count"]) == ("edges", "[0, 0]", 4800)
     assert found["environment"]["opencv"]
-    done = run(capsys, "verify", places["bundle"], "--json")
+    done = epypes("verify", places["bundle"], "--json")
     assert (done.returncode, json.loads(done.stdout)["identical"]) == (0, True)
-    done = run(capsys, "verify", places["broken"], "--json")
+    done = epypes("verify", places["broken"], "--json")
     assert json.loads(done.stdout)["identical"] is False

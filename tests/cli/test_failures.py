@@ -13,7 +13,6 @@ import pytest
 
 import epypes as ep
 from epypes.bundle.seal import seal
-from epypes.cli import main
 from epypes.service import Service
 from epypes.service.http import HttpServer
 from epypes.service.state import StateLock
@@ -22,30 +21,9 @@ from tests.service.failing import CRASHES, FINE, HANGS, KILLS, RAISES, keep, pro
 WAIT_S = 60.0
 
 
-@pytest.fixture(autouse=True)
-def own_folders(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("run")))
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
-
-
 @pytest.fixture(scope="module")
 def bundle(tmp_path_factory):
     return promoted(tmp_path_factory.mktemp("bundles"))
-
-
-@pytest.fixture
-def epypes(capsys):
-    """Run a command in this process, as far as its exit."""
-
-    def run(*arguments):
-        with pytest.raises(SystemExit) as stop:
-            main(list(map(str, arguments)))
-        said, code = capsys.readouterr(), stop.value.code
-        if isinstance(code, str):  # as the interpreter does at its end
-            return subprocess.CompletedProcess(arguments, 1, said.out, said.err + code + "\n")
-        return subprocess.CompletedProcess(arguments, code or 0, said.out, said.err)
-
-    return run
 
 
 def test_failures_are_listed_the_newest_first_with_what_to_do_next(epypes, bundle):

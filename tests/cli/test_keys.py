@@ -13,7 +13,6 @@ import pytest
 
 import epypes as ep
 from epypes.acquisition import write_image
-from epypes.cli import main
 from epypes.errors import KeysError, ServiceError
 from epypes.service import Service, call
 from epypes.service.failures.news import failures_from_now_on
@@ -23,27 +22,6 @@ from tests.transport.peers import wait_until
 
 WAIT_S = 60.0
 LOCAL = "tcp://127.0.0.1:*"
-
-
-@pytest.fixture(autouse=True)
-def own_folders(tmp_path_factory, monkeypatch):
-    for name in ("XDG_RUNTIME_DIR", "XDG_STATE_HOME", "XDG_CONFIG_HOME"):
-        monkeypatch.setenv(name, str(tmp_path_factory.mktemp(name)))
-
-
-@pytest.fixture
-def epypes(capsys):
-    """Run a command in this process, as far as its exit."""
-
-    def run(*arguments):
-        with pytest.raises(SystemExit) as stop:
-            main(list(map(str, arguments)))
-        said, code = capsys.readouterr(), stop.value.code
-        if isinstance(code, str):  # as the interpreter does at its end
-            return subprocess.CompletedProcess(arguments, 1, said.out, said.err + code + "\n")
-        return subprocess.CompletedProcess(arguments, code or 0, said.out, said.err)
-
-    return run
 
 
 @pytest.fixture(scope="module")

@@ -34,7 +34,6 @@ def test_the_code_runs_from_top_to_bottom(straight_edges, tmp_path, monkeypatch)
 
 @pytest.mark.notebook
 def test_the_epypes_commands_run_in_order(tmp_path, monkeypatch, photograph, straight_edges):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     shutil.copytree(ROOT / "notebooks", tmp_path / "notebooks", ignore=shutil.ignore_patterns("edge_service"))
     Path("demo-output").mkdir()

@@ -5,13 +5,11 @@ from __future__ import annotations
 import os
 import queue
 import re
-import subprocess
 import threading
 import time
 
 import pytest
 
-from epypes.cli import main
 from epypes.transport import ZMQPublisher, ZMQSubscriber, recording_info
 from epypes.transport.mcapformat import Counts
 from epypes.transport.mcapwriter import RecordingWriter
@@ -21,21 +19,6 @@ pytestmark = pytest.mark.slow  # each runs the commands
 
 LOCAL = "tcp://127.0.0.1:*"
 WAIT_S = 5.0
-
-
-@pytest.fixture
-def epypes(capsys):
-    """Run a command in this process, as far as its exit."""
-
-    def run(*arguments):
-        with pytest.raises(SystemExit) as stop:
-            main(list(map(str, arguments)))
-        said, code = capsys.readouterr(), stop.value.code
-        if isinstance(code, str):  # as the interpreter does at its end
-            return subprocess.CompletedProcess(arguments, 1, said.out, said.err + code + "\n")
-        return subprocess.CompletedProcess(arguments, code or 0, said.out, said.err)
-
-    return run
 
 
 @pytest.fixture

@@ -10,10 +10,8 @@ from tests.service.served import acting_bundle
 
 
 @pytest.fixture(autouse=True)
-def own_runtime_folder(tmp_path_factory, monkeypatch):
-    """State files and failures of these tests stand apart from those of the user's services."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("run")))
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+def apart(own_folders):
+    """Every service of these tests has folders of its own."""
 
 
 @pytest.fixture(scope="session")

@@ -13,11 +13,6 @@ from epypes.service.doctor import examine
 from epypes.transport import make_keys
 
 
-@pytest.fixture(autouse=True)
-def own_runtime_folder(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("run")))
-
-
 def found(name, **given):
     return next(check for check in examine(**given) if check.name == name)
 

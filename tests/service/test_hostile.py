@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import random
 
@@ -57,15 +58,12 @@ def is_refused(frames):
         return True
 
 
-@pytest.mark.slow
-def test_of_10000_messages_that_nobody_should_send_each_is_counted_and_the_good_one_after_them_is_answered(
-    edge_bundle, caplog
-):
-    caplog.set_level("ERROR", "epypes.service")
-    image = np.arange(24 * 32 * 3, dtype=np.uint8).reshape(24, 32, 3)
+@contextlib.contextmanager
+def serving(bundle, **given):
+    """A service, a socket that sends it whatever one likes, and its answers."""
     answers = queue.SimpleQueue()
     with (
-        Service(edge_bundle.path, mailbox_size=2 * BATCH) as service,
+        Service(bundle, **given) as service,
         ep.ZMQSubscriber(service.service_state.pub, answers) as subscriber,
         zmq.Context() as context,
         context.socket(zmq.XPUB) as peer,
@@ -74,6 +72,16 @@ def test_of_10000_messages_that_nobody_should_send_each_is_counted_and_the_good_
         assert subscriber.wait_joined(WAIT_S)
         peer.connect(service.service_state.sub)
         assert peer.recv() == b"\x01"
+        yield service, peer, answers
+
+
+@pytest.mark.slow
+def test_of_10000_messages_that_nobody_should_send_each_is_counted_and_the_good_one_after_them_is_answered(
+    edge_bundle, caplog
+):
+    caplog.set_level("ERROR", "epypes.service")
+    image = np.arange(24 * 32 * 3, dtype=np.uint8).reshape(24, 32, 3)
+    with serving(edge_bundle.path, mailbox_size=2 * BATCH) as (service, peer, answers):
         worker = service.info()["worker_pid"]
 
         def has_taken(sent):
@@ -100,17 +108,7 @@ def test_of_10000_messages_that_nobody_should_send_each_is_counted_and_the_good_
 
 
 def test_a_message_beyond_the_limits_is_refused_before_it_is_kept_and_the_next_is_answered(edge_bundle, photograph):
-    answers = queue.SimpleQueue()
-    with (
-        Service(edge_bundle.path) as service,
-        ep.ZMQSubscriber(service.service_state.pub, answers) as subscriber,
-        zmq.Context() as context,
-        context.socket(zmq.XPUB) as peer,
-    ):
-        peer.linger, peer.rcvtimeo = 0, int(WAIT_S * 1_000)
-        assert subscriber.wait_joined(WAIT_S)
-        peer.connect(service.service_state.sub)
-        assert peer.recv() == b"\x01"
+    with serving(edge_bundle.path) as (service, peer, answers):
         peer.send_multipart([b"/", *[b""] * 5_000])
         peer.send_multipart([b"/", bytes(17 * 1024**2)])
         peer.send_multipart(encode(Envelope("epypes.request", {"image": photograph})))

@@ -13,7 +13,6 @@ import pytest
 from epypes.bundle.load import read_bundle
 from epypes.bundle.ports import REQUEST
 from epypes.bundle.seal import seal
-from epypes.cli import main
 from epypes.service import Service
 from epypes.service.http import HttpServer
 from epypes.service.packing import unpack, unpack_event
@@ -144,19 +143,10 @@ def changed(edge_bundle, tmp_path):
 
 
 @pytest.fixture
-def epypes(capsys, monkeypatch, http):
-    """Run a command in this process, as far as its exit; return its status and what it said."""
+def epypes(epypes, monkeypatch, http):
+    """The commands, with the token of the service."""
     monkeypatch.setenv("EPYPES_TOKEN", http.token)
-
-    def run(*arguments):
-        with pytest.raises(SystemExit) as stop:
-            main(list(map(str, arguments)))
-        said = capsys.readouterr()
-        if isinstance(stop.value.code, str):
-            return 1, said.out + stop.value.code
-        return stop.value.code or 0, said.out
-
-    return run
+    return epypes
 
 
 def test_a_bundle_that_computes_something_else_does_not_take_over(changing, changed, epypes, http, edge_bundle):
@@ -164,10 +154,10 @@ def test_a_bundle_that_computes_something_else_does_not_take_over(changing, chan
     answer = changing.post("/v1/deploy", json={"bundle": str(bad)})
     assert answer.status_code == 409
     assert "edges" in " ".join(answer.json()["reasons"])
-    status, said = epypes("deploy", bad, "--http", http.url)
-    assert status == 1
-    assert len(said.strip().splitlines()) == 1
-    assert "edges" in said
+    done = epypes("deploy", bad, "--http", http.url)
+    assert done.returncode == 1
+    assert len(done.stderr.splitlines()) == 1
+    assert "edges" in done.stderr
     info = changing.get("/v1/info").json()
     assert (info["digest"], info["state"]) == (edge_bundle.digest, "READY")
 
@@ -178,33 +168,33 @@ def test_a_bundle_that_was_changed_since_its_promotion_is_none(changing, edge_bu
     answer = changing.post("/v1/deploy", json={"bundle": str(folder)})
     assert answer.status_code == 422
     assert "pipeline.py was changed" in answer.json()["detail"]
-    status, said = epypes("deploy", tmp_path / "nothing", "--http", http.url)
-    assert status == 1
-    assert "no folder" in said
+    done = epypes("deploy", tmp_path / "nothing", "--http", http.url)
+    assert done.returncode == 1
+    assert "no folder" in done.stderr
 
 
 def test_a_good_bundle_takes_over_and_a_rollback_brings_the_one_before(changing, changed, epypes, http, edge_bundle):
     good = changed("good", 'name = "edges"', 'name = "edges-2"')
-    status, text = epypes("deploy", good, "--http", http.url)
-    assert status == 0
+    done = epypes("deploy", good, "--http", http.url)
+    assert done.returncode == 0
     # Values that others have tuned before are told after it.
-    assert text.startswith(
+    assert done.stdout.startswith(
         f"DEPLOYED {good} ({read_bundle(good).digest[:12]}) in place of {edge_bundle.path} ({edge_bundle.digest[:12]}): READY."
     )
     assert changing.get("/v1/info").json()["name"] == "edges-2"
-    status, said = epypes("rollback", "--http", http.url)
-    assert status == 0
-    assert said.startswith(f"ROLLED BACK {edge_bundle.path}")
+    done = epypes("rollback", "--http", http.url)
+    assert done.returncode == 0
+    assert done.stdout.startswith(f"ROLLED BACK {edge_bundle.path}")
     assert changing.get("/v1/info").json()["digest"] == edge_bundle.digest
 
 
 def test_without_a_service_or_its_token_nothing_is_deployed(epypes, http, edge_bundle, tmp_path, monkeypatch):
-    status, said = epypes("deploy", edge_bundle.path, "--http", "http://127.0.0.1:1")
-    assert (status, len(said.strip().splitlines())) == (1, 1)
+    done = epypes("deploy", edge_bundle.path, "--http", "http://127.0.0.1:1")
+    assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (1, "", 1)
     (tmp_path / "token").write_text("x" * 43)
-    status, said = epypes("deploy", edge_bundle.path, "--http", http.url, "--token-file", tmp_path / "token")
-    assert status == 1
-    assert "token" in said
+    done = epypes("deploy", edge_bundle.path, "--http", http.url, "--token-file", tmp_path / "token")
+    assert done.returncode == 1
+    assert "token" in done.stderr
 
 
 @pytest.mark.slow
