@@ -108,8 +108,10 @@ def class_definition(kind: type, around: Mapping[str, Any], what: str) -> ClassD
             if not problem:
                 return _definition(kind, around, what, file, lines, node)
             why = why or f"{problem} ({place_in(file, node.lineno)})"
-    text = f"{what} is not to be had as text: {why or 'it has no source'}."
-    raise Refused(f"{text} Define it in a cell again, and what was made of it.")
+    if not why:
+        way_out = "Write a class statement for it, as class P(typing.NamedTuple), and make again what was made of it."
+        raise Refused(f"{what} has no class statement: it was made by a call. {way_out}")
+    raise Refused(f"{what} is not to be had as text: {why}. Define it in a cell again, and what was made of it.")
 
 
 def _definition(

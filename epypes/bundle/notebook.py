@@ -103,7 +103,8 @@ def _execute(path: Path, last_cell: str, on_cell: Progress, scratch: Path) -> No
     except OSError as error:
         raise BundleError(path, f"Notebook {path} can't be read: {error.strerror or error}.") from error
     except Exception as error:  # nbformat raises its own and json's errors for what is no notebook
-        raise BundleError(path, f"{path} is not a notebook: {type(error).__name__}.") from error
+        said = f"{type(error).__name__}: {error}".replace("\n", " ")[:120]
+        raise BundleError(path, f"{path} is not a notebook that Jupyter opens: {said}") from error
     total = sum(cell.cell_type == "code" for cell in document.cells)
     document.cells.append(nbformat.v4.new_code_cell(last_cell))
     done = 0

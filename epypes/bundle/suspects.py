@@ -21,10 +21,14 @@ DRAWS: Final = "It draws random numbers."
 CLOCK: Final = "It looks at a clock."
 GROWS: Final = "Its result goes further away from run to run: it counts, keeps something, or looks at a clock."
 NOISE: Final = "Its floating-point results differ by noise, and what is made of them differs by more."
+SETTLED: Final = (
+    "It computes the same whenever it is run now, but not what it did then: an array that it takes was written into "
+    "since, or it keeps something."
+)
 UNKNOWN: Final = "It draws random numbers without a seed, or keeps something from run to run."
 
 
-def suspicion(function: Any, *, grows: bool, is_noise: bool) -> str:
+def suspicion(function: Any, *, grows: bool, is_noise: bool, is_settled: bool) -> str:
     """Return as a sentence what a function likely does that makes its results differ.
 
     Parameters
@@ -35,11 +39,15 @@ def suspicion(function: Any, *, grows: bool, is_noise: bool) -> str:
         Whether its result went further and further away.
     is_noise
         Whether its own results differ by no more than noise.
+    is_settled
+        Whether it computed the same in all runs but the one that is promoted.
     """
     if grows:
         return GROWS
     if is_noise:
         return NOISE
+    if is_settled:
+        return SETTLED
     called = {*_names(function)}
     if called & _RANDOM:
         return DRAWS
@@ -50,6 +58,8 @@ def way_out(suspected: str) -> str:
     """Return what to do about it."""
     if suspected in (GROWS, CLOCK):
         return "Pass what it reads or keeps as a token."
+    if suspected == SETTLED:
+        return "Run the graph again, on arrays that nobody writes into; what is kept is to be a token."
     if suspected == NOISE:
         return "Round the noise away before it decides anything, or compute it in one thread: cv2.setNumThreads(1)."
     return (

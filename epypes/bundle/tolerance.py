@@ -114,6 +114,8 @@ class _Seen:
         self.unlike: dict[str, list[Unlike]] = {}
         # How far each run is from the first of them, by token.
         self._distances: dict[str, list[float]] = {}
+        # The tokens in which the runs differ from each other.
+        self._unsteady: set[str] = set()
         for number in range(RUNS):
             self._run(number + 1, RUNS)
         for number in range(RUNS, _RUNS_OF_SUSPECTS):
@@ -136,7 +138,9 @@ class _Seen:
         for token in run:
             if token in sample:
                 self.unlike.setdefault(token, []).extend(differences(sample[token], run[token]))
-                self._distances.setdefault(token, []).append(_distance(self._first[token], run[token]))
+                apart = [*differences(self._first[token], run[token])]
+                self._distances.setdefault(token, []).append(_distance(apart))
+                self._unsteady |= {token} if apart else set()
         self.unlike = {token: found for token, found in self.unlike.items() if found}
 
     def growing(self) -> frozenset[str]:
@@ -157,7 +161,12 @@ class _Seen:
         name = next(name for name in cg.func_io if any(token in self.unlike for token in cg.func_outputs(name)))
         token = next(token for token in cg.func_outputs(name) if token in self.unlike)
         also = f" So {', '.join(map(repr, bad))} can't be verified." if bad != [token] else ""
-        kind = suspicion(cg.functions[name], grows=token in growing, is_noise=_is_noise(self.unlike[token]))
+        kind = suspicion(
+            cg.functions[name],
+            grows=token in growing,
+            is_noise=_is_noise(self.unlike[token]),
+            is_settled=token not in self._unsteady,
+        )
         return (
             f"Function {name!r} does not compute the same again from the same inputs: token {token!r}: "
             f"{self.unlike[token][0].text}. {kind}{also} {way_out(kind)}"
@@ -171,9 +180,9 @@ def run_failed_in(error: BaseException) -> str:
     return notes[start:].partition("'")[0] + repr(notes[start:].split("'")[1]) if start >= 0 else "a function"
 
 
-def _distance(first: Any, value: Any) -> float:
-    """Return how far a value is from that of the first run; 0.0 where that can't be told."""
-    return max((unlike.largest or 0.0 for unlike in differences(first, value)), default=0.0)
+def _distance(found: Sequence[Unlike]) -> float:
+    """Return how far apart two values are; 0.0 where that can't be told."""
+    return max((unlike.largest or 0.0 for unlike in found), default=0.0)
 
 
 def _grows(distances: Sequence[float]) -> bool:

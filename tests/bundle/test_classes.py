@@ -114,7 +114,7 @@ REFUSED = {
         f"def make():\n    class A:\n        def g(self):\n            return 1\n    return A\nA = make()\n{USED}",
         r"defined inside 'make\.<locals>'\. Define it at the margin",
     ),
-    "made by a call": (f"A = type('A', (), {{'g': lambda self: 1}})\n{USED}", "is not to be had as text"),
+    "made by a call": (f"A = type('A', (), {{'g': lambda self: 1}})\n{USED}", r"was made by a call\. Write a class statement"),
     "writes a global": (
         f"N = 0\nclass A:\n    def g(self):\n        global N\n        N += 1\n        return N\n{USED}", "changes the global 'N'",
     ),

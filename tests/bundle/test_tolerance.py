@@ -122,6 +122,17 @@ def test_what_is_no_noise_is_refused_with_the_first_function_that_differs(names,
     assert found.tolerances == {}
 
 
+def test_an_input_that_was_written_into_after_the_run_is_not_blamed_on_random_numbers():
+    runner = ep.CompGraphRunner(ep.CompGraph({"add": np.add}, {"add": (("x", "k"), "y")}), {"k": 2.0})
+    x = np.ones(4)
+    run = runner.run(x=x)
+    x[:] = 7
+    (reason,) = learn(runner.cg, runner.hyperparameters, [run], ["y"], [].append).reasons
+    assert "It computes the same whenever it is run now" in reason
+    assert "an array that it takes was written into" in reason
+    assert "random" not in reason
+
+
 def test_a_function_that_fails_the_second_time_is_named():
     with pytest.raises(BundleError, match="function 'once' raised ValueError: only once.*Make that a token"):
         learnt(graph("once"), ["once"])
