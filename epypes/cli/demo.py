@@ -68,7 +68,8 @@ def demo(
 
 
 def _step(number: int, text: str) -> None:
-    out.print(f"[bold]{number}/5[/bold] {text}")
+    out.print(f"{number}/5", end=" ", style="bold")
+    out.print(text)
 
 
 def _draw(bundle: Path, inputs: dict[str, Any], file: Path) -> None:

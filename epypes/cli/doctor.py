@@ -31,12 +31,12 @@ def doctor(
         checks.append(check)
         if not as_json:
             style = _STYLES[check.outcome]
-            out.print(f"[{style}]{check.outcome:>7}[/]", end="  ")
-            out.print(f"{check.name}: {check.found}", markup=False)
+            out.print(f"{check.outcome:>7}", end="  ", style=style)
+            out.print(f"{check.name}: {check.found}")
             if check.way_out:
-                out.print(f"{'':9}{check.way_out}", markup=False, style=style)
+                out.print(f"{'':9}{check.way_out}", style=style)
     if as_json:
-        out.print(json.dumps([asdict(check) for check in checks], indent=1), markup=False)
+        out.print(json.dumps([asdict(check) for check in checks], indent=1))
     failed = [check.name for check in checks if check.outcome == "failed"]
     if failed:
         text = f"Not ready: {', '.join(failed)}. What helps stands above, beside each."

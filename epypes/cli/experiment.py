@@ -130,9 +130,9 @@ def _print_problems(results: Results) -> None:
     """Print which requests failed and why, if any did."""
     failures = results.table["failure"]
     for text, count in failures[failures != ""].value_counts().items():
-        err.print(f"{count} of {len(failures)} requests failed: {text}", markup=False)
+        err.print(f"{count} of {len(failures)} requests failed: {text}")
     for text, count in results.counts.items():
-        err.print(f"{count} x {text}", markup=False)
+        err.print(f"{count} x {text}")
 
 
 def _write(results: Results, folder: Path, *, side_by_side: bool) -> list[Path]:

@@ -34,14 +34,14 @@ def systemd(
     _check_serve_options(bundle, options or ())
     unit = systemd_unit(bundle, options or (), user=user or getpass.getuser())
     if to is None:
-        out.print(unit, markup=False, end="")
+        out.print(unit, end="")
         return
     file = to / unit_name(bundle) if to.is_dir() else to
     try:
         file.write_text(unit, encoding="utf-8")
     except OSError as error:
         raise ServiceError(file, f"{file} can't be written: {error.strerror or error}.") from error
-    out.print(f"Wrote {file}. What to do with it stands at its top.", markup=False)
+    out.print(f"Wrote {file}. What to do with it stands at its top.")
 
 
 @export.command()
@@ -55,7 +55,7 @@ def docker(
 
     _check_serve_options(bundle, options or ())
     path = write_container(bundle, to, options or ())
-    out.print(f"Wrote {path}. What to do with it stands at its top.", markup=False)
+    out.print(f"Wrote {path}. What to do with it stands at its top.")
 
 
 def _check_serve_options(bundle: Path, options: Sequence[str]) -> None:

@@ -43,13 +43,13 @@ def failures(
     found = failures_of(source).records(limit)
     if as_json:
         for record in found:
-            out.print(json.dumps(asdict(record)), markup=False)
+            out.print(json.dumps(asdict(record)))
     elif found:
         _print_table(found)
-        out.print(f"Again, in a process of its own: epypes replay {found[0].id}", markup=False)
-        out.print(f"In a notebook: ep.load_failure({found[0].id!r})", markup=False)
+        out.print(f"Again, in a process of its own: epypes replay {found[0].id}")
+        out.print(f"In a notebook: ep.load_failure({found[0].id!r})")
     else:
-        out.print(f"No failures of {source} were kept." if source else "No failures were kept.", markup=False)
+        out.print(f"No failures of {source} were kept." if source else "No failures were kept.")
 
 
 def _follow(source: str | None, as_json: bool, keys: Path | None, allow: list[Path] | None) -> None:
@@ -61,13 +61,13 @@ def _follow(source: str | None, as_json: bool, keys: Path | None, allow: list[Pa
     try:
         for record in failures_from_now_on(source, keys=keys, allow=allow):
             if record is None:
-                err.print(f"Listening for failures of {source}. Ctrl+C ends it.", markup=False)
+                err.print(f"Listening for failures of {source}. Ctrl+C ends it.")
             elif as_json:
-                out.print(json.dumps(asdict(record)), markup=False)
+                out.print(json.dumps(asdict(record)))
             else:
                 dead = ", dead letter" if record.dead_letter else ""
                 told = f"{record.function}: {_raised(record)} (attempt {record.attempt}{dead})"
-                out.print(f"{record.id} {_when(record)} {told}", markup=False)
+                out.print(f"{record.id} {_when(record)} {told}")
     except KeyboardInterrupt:
         return
 
@@ -86,7 +86,6 @@ def _raised(record: FailureRecord) -> str:
 def _print_table(records: Iterable[FailureRecord]) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
-    from rich.text import Text
 
     # In one line each, whatever the width: the exception gets what the others leave.
     table = Table(box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True, expand=True)
@@ -99,5 +98,5 @@ def _print_table(records: Iterable[FailureRecord]) -> None:
     for record in records:
         dead = "yes" if record.dead_letter else ""
         cells = (record.id, _when(record), record.function, _raised(record), str(record.attempt), dead)
-        table.add_row(*map(Text, cells))
+        table.add_row(*cells)
     out.print(table)

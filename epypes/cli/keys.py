@@ -34,14 +34,13 @@ def keys(
         raise KeysError(name, f"{name!r} is no name for keys. {text}")
     made = make_keys(folder / name)
     public, secret = folder / f"{name}.key", folder / f"{name}.key_secret"
-    out.print(f"Made the keys of {name}: {made.public}", markup=False)
-    out.print(f"  {public}  is public: copy it to every machine that shall talk to {name},", markup=False)
-    out.print("    and name it there, or the folder it is in, as --allow.", markup=False)
-    out.print(f"  {secret}  is secret: it stays here; name it here as --keys.", markup=False)
+    out.print(f"Made the keys of {name}: {made.public}")
+    out.print(f"  {public}  is public: copy it to every machine that shall talk to {name},")
+    out.print("    and name it there, or the folder it is in, as --allow.")
+    out.print(f"  {secret}  is secret: it stays here; name it here as --keys.")
     out.print(
         f"A service and its caller: epypes serve BUNDLE --keys {secret} --allow CALLER.key, "
         f"epypes call BUNDLE IMAGE --keys CALLER.key_secret --allow {public.name}",
-        markup=False,
     )
 
 

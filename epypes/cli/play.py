@@ -58,21 +58,21 @@ def play(
             on_end=signals.now,
         ).start()
         try:
-            out.print(f"PLAYING {file} at {player.address}. Ctrl+C ends it.", markup=False)
+            out.print(f"PLAYING {file} at {player.address}. Ctrl+C ends it.")
             signals.wait()
         finally:
             try:
                 player.stop()
             finally:
-                out.print(f"PLAYED {file}: sent {player.sent}.", markup=False)
+                out.print(f"PLAYED {file}: sent {player.sent}.")
 
 
 def _print_info(file: Path, found: RecordingInfo) -> None:
     source = f" from {found.about['address']}" if "address" in found.about else ""
-    out.print(f"{file}: {counted(found.messages, 'message')}{source} in {found.duration_s:.3f} s", markup=False)
+    out.print(f"{file}: {counted(found.messages, 'message')}{source} in {found.duration_s:.3f} s")
     if found.messages:
         begun = datetime.fromtimestamp(found.first_ns / 1e9).astimezone()
-        out.print(f"first message on {begun:%Y-%m-%d at %H:%M:%S %z}", markup=False)
-    out.print(str(found.counts or "The recorder did not finish it: what it had not written is missing."), markup=False)
+        out.print(f"first message on {begun:%Y-%m-%d at %H:%M:%S %z}")
+    out.print(str(found.counts or "The recorder did not finish it: what it had not written is missing."))
     for topic, count in sorted(found.topics.items()):
-        out.print(f"  {topic or '(no topic)'}: {counted(count, 'message')}", markup=False)
+        out.print(f"  {topic or '(no topic)'}: {counted(count, 'message')}")

@@ -55,10 +55,10 @@ def record(
         recorder.start()
         try:
             joined = "" if recorder.wait_joined(_JOIN_S) else " (nobody has confirmed yet)"
-            out.print(f"RECORDING {recorder.address}{joined} to {file}. Ctrl+C ends it.", markup=False)
+            out.print(f"RECORDING {recorder.address}{joined} to {file}. Ctrl+C ends it.")
             signals.wait(seconds)
         finally:
             try:
                 recorder.stop(_STOP_S)
             finally:
-                out.print(f"RECORDED {file}: {recorder.counts}.", markup=False)
+                out.print(f"RECORDED {file}: {recorder.counts}.")

@@ -37,11 +37,11 @@ def replay(
     event = failures.event(record.id)
     folder, changed = bundle_of(record, bundle or path_of(source))
     if changed:
-        out.print(f"{changed}.", markup=False)
+        out.print(f"{changed}.")
     found = reproduce(record, event, folder, timeout_s=timeout)
     if trace:
-        out.print("\n".join(found.trace), markup=False)
-    out.print(_sentence(record, found), markup=False)
+        out.print("\n".join(found.trace))
+    out.print(_sentence(record, found))
     if found.ending != "fine":
         raise typer.Exit(1)
 

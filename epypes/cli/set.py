@@ -23,7 +23,7 @@ def set_parameters(
         before = service.parameters().entries
         now = service.set(**wanted)
     told = (f"{name} {_text(before[name])} -> {_text(now.entries[name])}" for name in wanted)
-    out.print(f"SET {', '.join(told)}: revision {now.revision}.", markup=False, soft_wrap=True)
+    out.print(f"SET {', '.join(told)}: revision {now.revision}.")
 
 
 def _read(text: str) -> tuple[str, Any]:

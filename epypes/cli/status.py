@@ -29,10 +29,10 @@ def status(
             values = service.parameters().entries
             found["parameters"] = {token: entry.get("value") for token, entry in values.items()}
     if as_json:
-        out.print(json.dumps(found), markup=False)
+        out.print(json.dumps(found))
         return
     for line in _lines(found):
-        out.print(line, markup=False, soft_wrap=True)
+        out.print(line)
 
 
 def _lines(found: dict[str, Any]) -> list[str]:

@@ -42,7 +42,7 @@ def stop(
         ) from error
     finally:
         os.close(process)
-    out.print(f"STOPPED {source}, process {pid}.", markup=False, soft_wrap=True)
+    out.print(f"STOPPED {source}, process {pid}.")
 
 
 def _ended(pid: int, timeout_s: float) -> bool:

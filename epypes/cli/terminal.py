@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 from rich.console import Console
 
@@ -16,8 +16,10 @@ if TYPE_CHECKING:
 
     from epypes.service import Answer
 
-out = Console(highlight=False, soft_wrap=True)
-err = Console(stderr=True, highlight=False, soft_wrap=True)
+# What is printed may hold anything: a [word] or :word: in it is no markup.
+_PLAIN: Final[dict[str, Any]] = {"highlight": False, "soft_wrap": True, "markup": False, "emoji": False}
+out = Console(**_PLAIN)
+err = Console(stderr=True, **_PLAIN)
 
 
 @contextmanager
@@ -25,7 +27,7 @@ def progress(*, auto_refresh: bool = True, disable: bool = False) -> Iterator[Pr
     """Show a progress display while the block runs; without ``auto_refresh`` it is drawn when it is told to."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn())
     with Progress(*columns, TimeElapsedColumn(), console=err, auto_refresh=auto_refresh, disable=disable) as shown:
         yield shown
 

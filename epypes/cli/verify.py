@@ -32,17 +32,17 @@ def verify(
         found = error.report if isinstance(error, ReplayDiffers) else None
         if as_json:
             fields = found.to_dict() if found else {"identical": False}
-            out.print(json.dumps({**fields, "bundle": str(bundle), "error": str(error)}, indent=1), markup=False)
+            out.print(json.dumps({**fields, "bundle": str(bundle), "error": str(error)}, indent=1))
         elif found:
-            out.print(str(found), markup=False)
+            out.print(str(found))
         raise BundleError(bundle, _in_one_line(bundle, found) if found else str(error)) from error
     if as_json:
-        out.print(json.dumps({**report.to_dict(), "bundle": str(bundle)}, indent=1), markup=False)
+        out.print(json.dumps({**report.to_dict(), "bundle": str(bundle)}, indent=1))
         return
     where = " in a new environment" if fresh_env else ""
-    out.print(f"{bundle}: {report}{where}.", markup=False)
+    out.print(f"{bundle}: {report}{where}.")
     for note in report.notes:
-        err.print(f"Note: {note}", markup=False)
+        err.print(f"Note: {note}")
 
 
 def _in_one_line(bundle: Path, report: ReplayReport) -> str:

@@ -7,10 +7,12 @@ import sys
 import cv2
 import numpy as np
 import pytest
+from rich.table import Table
 
 import epypes as ep
 from epypes.acquisition import read_image, write_image
 from epypes.bundle.load import read_bundle
+from epypes.cli import terminal
 from epypes.cli.call import by_token
 from epypes.errors import ServiceError, UnknownName
 from epypes.service import Service
@@ -43,6 +45,18 @@ def one_line(done) -> str:
     assert "Traceback" not in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
     return done.stderr
+
+
+@pytest.mark.parametrize("console", [terminal.out, terminal.err])
+def test_what_looks_like_markup_is_printed_as_it_is(console, capsys):
+    key = "4]a>O]PvB[)ZdSU8ZPY?0+]c[r5vV]7Gr>oaju/f :dog:"
+    table = Table(title=key)
+    table.add_column(key)
+    table.add_row(key)
+    console.print(key)
+    console.print(table)
+    said = capsys.readouterr()
+    assert (said.out + said.err).count(key) == 4
 
 
 def test_call_writes_the_answer_and_prints_the_times(epypes, bundle, photograph, tmp_path):
