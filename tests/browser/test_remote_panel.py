@@ -209,3 +209,14 @@ def test_a_service_that_ends_leaves_its_last_picture(panel: PanelOnScreen, state
         panel.page.locator(".epypes-panel").screenshot(path=SCREENSHOTS / f"remote-paused-{theme}.png")
         service.resume()
     panel.wait_for_status("")
+
+
+def test_a_closed_panel_takes_no_orders_and_its_code_can_be_copied(
+    open_notebook: Notebook, panel: PanelOnScreen, theme: str
+) -> None:
+    open_notebook.execute("panel.close()")
+    panel.wait("() => document.querySelector('.epypes-write-back').closest('[inert]')")
+    for name in ("save", "load", "write-back"):
+        assert panel.page.locator(f"[inert] .epypes-{name}").count() == 1
+    assert panel.page.locator("[inert] .epypes-copy").count() == 0
+    panel.page.locator(".epypes-panel").screenshot(path=SCREENSHOTS / f"remote-closed-{theme}.png")

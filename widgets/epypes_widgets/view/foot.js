@@ -33,6 +33,7 @@ export function footPart(panel) {
   const promote = textButton("Promote", onPromote, "epypes-promote", "Write the graph with these values as a folder of plain text, and check it");
   const outcome = element("span", "epypes-outcome", { role: "status" });
   const promoting = element("div", "epypes-foot-line", {}, element("span", "epypes-with", {}, to, promote), outcome);
+  const settings = element("div", "epypes-foot-line", {}, element("span", "epypes-with", {}, list, name, save, load), said);
   const back = writeBackPart(panel);
   const lines = element("ol", "epypes-lines");
   const summary = element("summary", "");
@@ -42,7 +43,7 @@ export function footPart(panel) {
     "epypes-foot",
     {},
     element("div", "epypes-foot-line epypes-code-line", {}, code, copied, copyButton),
-    element("div", "epypes-foot-line", {}, element("span", "epypes-with", {}, list, name, save, load), said),
+    settings,
     promoting,
     back.line,
     back.diff,
@@ -89,6 +90,8 @@ export function footPart(panel) {
 
   return {
     element: root,
+    /** The lines that ask the kernel for something; the code can be copied and the log read without it. */
+    asking: [settings, promoting, back.line],
     setup(message) {
       tellCode(message.code);
       offer(message.settings ?? []);

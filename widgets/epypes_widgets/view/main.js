@@ -127,7 +127,7 @@ function render({ model, el }) {
   function close(isClosed) {
     figure.classList.toggle("epypes-closed", isClosed);
     const column = figure.closest(".epypes-panel")?.querySelector(".epypes-controls");
-    for (const node of [column, chips.element, pinned.element, films.element, history.element]) if (node) node.inert = isClosed;
+    for (const node of [column, chips.element, pinned.element, films.element, history.element, ...foot.asking]) if (node) node.inert = isClosed;
   }
 
   /** What is waited for stands where the picture will be. */
