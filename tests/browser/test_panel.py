@@ -250,6 +250,8 @@ def test_stages_are_compared_probed_and_zoomed(panel: PanelOnScreen, theme: str)
 
 
 def test_zoom_and_place_stay_when_values_and_images_change(panel: PanelOnScreen) -> None:
+    panel.wait("() => document.querySelector('.epypes-second').hidden")
+    panel.page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
     panel.page.locator(".epypes-box").focus()
     for key in ("+", "+", "ArrowRight", "ArrowDown"):
         panel.page.keyboard.press(key)

@@ -155,10 +155,11 @@ def test_no_more_runs_are_fetched_than_frames_are_painted(
     panel.wait(TIMEOUT_S)
     is_slow.set()
     before = len(screen.frames)
+    service.event(image=image)
+    until(lambda: len(answers) == 1)
     for number in range(20):
         service.event(image=np.full_like(image, number))
         panel.wait(TIMEOUT_S)
-    until(lambda: len(answers) == 1)
     assert len(screen.frames) == before + 1
     is_slow.clear()
     answers.pop()()
