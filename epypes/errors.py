@@ -33,6 +33,7 @@ Everything an error's text mentions is an attribute of it::
     |   +-- RevisionConflict    parameters were changed by somebody else meanwhile; .current
     |   +-- ParametersRefused   a running service does not take new values; .problems
     |   +-- DeployRefused       a running service does not take a bundle; .reasons
+    +-- StoreError              a database can't be opened, read or written; .place
     +-- FailureNotKept          a failure of a service, or its event, can't be had; .id, .path
 
 The user's own exceptions are never wrapped: they keep their type and traceback and get a note.
@@ -363,6 +364,14 @@ class DeployRefused(ServiceError):
     def __init__(self, path: object, reasons: Sequence[str]) -> None:
         self.reasons = tuple(reasons)
         super().__init__(path, f"{path} is not deployed: {' '.join(self.reasons)}")
+
+
+class StoreError(EpypesError):
+    """A database that can't be opened, read or written; ``place`` is its path, or its URL without the password."""
+
+    def __init__(self, place: str, text: str) -> None:
+        self.place = place
+        super().__init__(text)
 
 
 class FailureNotKept(EpypesError):
