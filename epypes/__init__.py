@@ -55,6 +55,7 @@ if TYPE_CHECKING:
         summarize,
     )
     from epypes.run.guard import unguarded
+    from epypes.scale import MapResult, map  # noqa: A004 - as in ep.map(runner, images)
     from epypes.service.failures.reopen import load_failure
     from epypes.service.remote.connection import connect
     from epypes.store import Store
@@ -109,6 +110,8 @@ _HOMES = {
     "load": "epypes.bundle",
     "load_failure": "epypes.service.failures.reopen",
     "load_pipeline": "epypes.bundle",
+    "MapResult": "epypes.scale",
+    "map": "epypes.scale",
     "promote": "epypes.bundle",
     "to_source": "epypes.bundle",
     "verify": "epypes.bundle",
@@ -127,6 +130,7 @@ __all__ = [
     "ImageAcquisition",
     "LogNormal",
     "Mailbox",
+    "MapResult",
     "Node",
     "NodeBasedCompGraph",
     "Param",
@@ -154,6 +158,7 @@ __all__ = [
     "load",
     "load_failure",
     "load_pipeline",
+    "map",
     "outputs",
     "promote",
     "register_preview",
