@@ -10,8 +10,8 @@ The rooms, from the bottom up; imports point downwards only (checked by ``lint-i
 - ``run``: which functions must run, and running them
 - ``pipeline``: the paper's ladder of nodes and pipelines; ``acquisition``: where images come from;
   ``display``: how a graph, a run and a value look; ``wire``: how a value travels
-- ``bundle``: from notebook to a folder of text; ``transport``: sockets
-- ``service``: a bundle as a running process; ``experiment``: the paper's own
+- ``bundle``: from notebook to a folder of text; ``transport``: sockets; ``store``: results and history in a database
+- ``scale``: many images and settings; ``service``: a bundle as a running process; ``experiment``: the paper's own
 - ``cli``: the commands; ``epypes_widgets``: the notebook front end
 
 Names are loaded when they are first used, so ``import epypes`` costs little and imports no other package.
@@ -55,8 +55,10 @@ if TYPE_CHECKING:
         summarize,
     )
     from epypes.run.guard import unguarded
+    from epypes.scale import MapResult, map  # noqa: A004 - as in ep.map(runner, images)
     from epypes.service.failures.reopen import load_failure
     from epypes.service.remote.connection import connect
+    from epypes.store import Store
     from epypes.transport import ZMQPublisher, ZMQSubscriber
 
 _HOMES = {
@@ -101,12 +103,15 @@ _HOMES = {
     "SourcePipeline": "epypes.pipeline",
     "Stage": "epypes.pipeline",
     "Stages": "epypes.pipeline",
+    "Store": "epypes.store",
     "ZMQPublisher": "epypes.transport",
     "ZMQSubscriber": "epypes.transport",
     "connect": "epypes.service.remote.connection",
     "load": "epypes.bundle",
     "load_failure": "epypes.service.failures.reopen",
     "load_pipeline": "epypes.bundle",
+    "MapResult": "epypes.scale",
+    "map": "epypes.scale",
     "promote": "epypes.bundle",
     "to_source": "epypes.bundle",
     "verify": "epypes.bundle",
@@ -125,6 +130,7 @@ __all__ = [
     "ImageAcquisition",
     "LogNormal",
     "Mailbox",
+    "MapResult",
     "Node",
     "NodeBasedCompGraph",
     "Param",
@@ -139,6 +145,7 @@ __all__ = [
     "SourcePipeline",
     "Stage",
     "Stages",
+    "Store",
     "TimingSummary",
     "TokenManager",
     "ZMQPublisher",
@@ -151,6 +158,7 @@ __all__ = [
     "load",
     "load_failure",
     "load_pipeline",
+    "map",
     "outputs",
     "promote",
     "register_preview",
