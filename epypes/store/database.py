@@ -163,7 +163,7 @@ def _set_up_sqlite(connection: Any, _record: object) -> None:
 def _said(error: SQLAlchemyError) -> str:
     """Return what the driver says, in one line, without the statement."""
     text = str(getattr(error, "orig", None) or error)
-    return re.sub(r"\s+", " ", text).strip()[:500].rstrip(".")
+    return re.sub(r"\s+", " ", text).strip()[:500].rstrip(".?")
 
 
 def _may_be_another(error: SQLAlchemyError) -> bool:

@@ -43,7 +43,7 @@ def _parsed(given: str) -> URL:
     try:
         url = make_url(given)
     except (ArgumentError, ValueError):
-        scheme = given.partition("://")[0]
+        scheme = given.partition("://")[0] or "postgresql"
         text = (
             f"The URL {scheme}://... can't be read. It is {scheme}://user:password@host:port/database; "
             "special characters of a password are written as %40 for @, %3A for : and %2F for /."
