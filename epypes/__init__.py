@@ -55,6 +55,7 @@ if TYPE_CHECKING:
         summarize,
     )
     from epypes.run.guard import unguarded
+    from epypes.scale.sweeping import SweepResult, sweep
     from epypes.service.failures.reopen import load_failure
     from epypes.service.remote.connection import connect
     from epypes.store import Store
@@ -110,6 +111,8 @@ _HOMES = {
     "load_failure": "epypes.service.failures.reopen",
     "load_pipeline": "epypes.bundle",
     "promote": "epypes.bundle",
+    "SweepResult": "epypes.scale.sweeping",
+    "sweep": "epypes.scale.sweeping",
     "to_source": "epypes.bundle",
     "verify": "epypes.bundle",
 }
@@ -142,6 +145,7 @@ __all__ = [
     "Stage",
     "Stages",
     "Store",
+    "SweepResult",
     "TimingSummary",
     "TokenManager",
     "ZMQPublisher",
@@ -163,6 +167,7 @@ __all__ = [
     "subgraph",
     "suffix",
     "summarize",
+    "sweep",
     "switch",
     "to_source",
     "unguarded",

@@ -131,7 +131,8 @@ def _listed(runner: CompGraphRunner, grid: Sequence[Setting]) -> Grid:
 def _values(runner: CompGraphRunner, name: str, given: Any) -> Sequence[Any]:
     """Return the values of one hyperparameter, sized, and not copied if they are."""
     if given is None or isinstance(given, Param):
-        return values_of(name, _hint(runner, name) if given is None else given, runner.hyperparameters[name])
+        param = _hint(runner, name) if given is None else given
+        return values_of(name, param, runner.hyperparameters[name], MOST_OUTCOMES)
     if isinstance(given, tuple):
         listed = f"[{', '.join(map(repr, given[:4]))}{', ...' * (len(given) > 4)}]"
         raise ScaleError(

@@ -38,36 +38,35 @@ class Span:
     log: bool
     whole: bool
 
-    def __len__(self) -> int:
-        """Return how many values there are; 0 if they can't be counted."""
+    @property
+    def size(self) -> int:
+        """How many values there are; 0 if they can't be counted."""
         return 0 if self.step is None else math.floor((self.high - self.low) / self.step + _SLACK) + 1
 
-    def __getitem__(self, place: int) -> float:
+    def value(self, place: int) -> float:
         """Return the value of this place, for a span that has steps."""
-        if not 0 <= place < len(self):
-            raise IndexError(place)
-        return self._value(self.low + place * (self.step or 0))
+        return self._told(self.low + place * (self.step or 0))
 
     def at(self, share: float) -> float:
         """Return the value that lies so far, from 0 to below 1, on the way from low to high."""
         if self.step is not None and not self.log:
-            return self[min(int(share * len(self)), len(self) - 1)]
+            return self.value(min(int(share * self.size), self.size - 1))
         value = self._between(share)
         if self.step is None:
-            return self._value(value)
-        return self[min(max(round((value - self.low) / self.step), 0), len(self) - 1)]
+            return self._told(value)
+        return self.value(min(max(round((value - self.low) / self.step), 0), self.size - 1))
 
     def _between(self, share: float) -> float:
         if self.log:
             return min(self.low * math.exp(share * math.log(self.high / self.low)), self.high)
         return self.low + share * (self.high - self.low)
 
-    def _value(self, value: float) -> float:
+    def _told(self, value: float) -> float:
         return round(value) if self.whole else float(f"{value:.12g}")
 
 
-def values_of(name: str, param: Param, present: Any) -> Sequence[Any]:
-    """Return all values that a hyperparameter may take, without writing them out.
+def values_of(name: str, param: Param, present: Any, most: int) -> Sequence[Any]:
+    """Return all values that a hyperparameter may take; of more than ``most`` only as many as there are.
 
     Raises
     ------
@@ -82,7 +81,7 @@ def values_of(name: str, param: Param, present: Any) -> Sequence[Any]:
             f"Between {span.low:g} and {span.high:g} there is no end of values for {name!r}. Give a list, as "
             f"{name}=[...], a step, as ep.Param({span.low:g}, {span.high:g}, step=...), or how='random' with n=..."
         )
-    return span
+    return tuple(map(span.value, range(span.size))) if span.size <= most else range(span.size)
 
 
 def drawn_by(name: str, param: Param, present: Any) -> Callable[[float], Any]:

@@ -150,8 +150,8 @@ def sheet_of(
     rest = tuple(name for name in axes if name not in laid)
     has_blocks = is_full and laid != (None, None)
     plan = _Plan(axes, laid, rest if has_blocks else (), () if has_blocks else rest, shown)
-    lines = tuple(tuple(axes[name].values()) if name else () for name in laid)
-    return Sheet(shown, *laid, *lines, _blocks(outcomes, plan))
+    row_labels, column_labels = (tuple(axes[name].values()) if name else () for name in laid)
+    return Sheet(shown, *laid, row_labels, column_labels, _blocks(outcomes, plan))
 
 
 # By hyperparameter, what each of its values is called.
@@ -233,7 +233,7 @@ def _tile(place: int, outcome: Outcome, plan: _Plan) -> Tile:
     thumbnail = None if plan.token is None else outcome.thumbnails.get(plan.token)
     if outcome.trouble is not None:
         return Tile(place, label, str(outcome.trouble), True, thumbnail)
-    values = outcome.values if plan.token not in outcome.values else {plan.token: outcome.values[plan.token]}
+    values = {token: value for token, value in outcome.values.items() if plan.token in (None, token)} or outcome.values
     told = ", ".join(f"{token} {said(value)}" for token, value in values.items())
     return Tile(place, label, thumbnail.caption if thumbnail else told, False, thumbnail)
 

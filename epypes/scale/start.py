@@ -27,17 +27,17 @@ class Start:
         self._runner: CompGraphRunner | None = None
 
     def go_on(self, begin: Callable[[], CompGraphRunner | None]) -> CompGraphRunner | None:
-        """Return a runner of its own that has run the item, for all but who comes first.
+        """Return a runner that has run the item.
 
-        Who comes first gets None, and ``begin`` has been called: it returns a runner that has run the item, or None if
-        that can't be; then who comes next is the first one.
+        For who comes first that is what ``begin`` returns, which is called meanwhile: a runner that has run the item,
+        or None if that can't be; who comes next is then the first one. All others get one of their own.
         """
         with self._lock:
             if self._runner is not None:
                 return branched(self._runner)
             begun = begin()
             self._runner = None if begun is None else branched(begun)
-            return None
+            return begun
 
     def leave(self, runner: CompGraphRunner) -> None:
         """Let the next one begin where this runner stands."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 from epypes.display.paint.thumbnails import THUMB_HEIGHT, THUMB_WIDTH, paint_thumbnail
 from epypes.display.previews.preview import Preview, finished, sketch
@@ -20,13 +20,6 @@ _CHART_STYLE: Final = (
     "<style>.paper{fill:none}.chart polyline,.bars,.dots{fill:none;stroke:#7a8490;stroke-width:2}"
     ".dots{stroke-width:4;stroke-linecap:round}</style>"
 )
-
-
-def thumbnails_of(run: Run, tokens: Iterable[str] | None) -> dict[str, Thumbnail]:
-    """Return pictures of tokens, of all that have one if None; what was not computed has none. Never raises."""
-    wanted = run.cg.tokens if tokens is None else tokens
-    found = {token: thumbnail_of(run, token) for token in wanted if run.tokens.is_readable(token)}
-    return {token: shown for token, shown in found.items() if shown is not None}
 
 
 def thumbnail_of(run: Run, token: str) -> Thumbnail | None:
@@ -54,7 +47,10 @@ class Album:
         self._made: dict[str, tuple[Any, Thumbnail | None]] = {}
 
     def thumbnails_of(self, run: Run, tokens: Iterable[str] | None) -> dict[str, Thumbnail]:
-        """Return what ``thumbnails_of`` does. Threads may ask for several runs at once."""
+        """Return pictures of tokens, of all that have one if None; what was not computed has none. Never raises.
+
+        Threads may ask for several runs at once.
+        """
         wanted = run.cg.tokens if tokens is None else tokens
         found = {token: self._thumbnail_of(run, token) for token in wanted if run.tokens.is_readable(token)}
         return {token: shown for token, shown in found.items() if shown is not None}
