@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     )
     from epypes.run.guard import unguarded
     from epypes.scale import MapResult, map  # noqa: A004 - as in ep.map(runner, images)
+    from epypes.scale.sweeping import SweepResult, sweep
     from epypes.service.failures.reopen import load_failure
     from epypes.service.remote.connection import connect
     from epypes.store import Store
@@ -113,6 +114,8 @@ _HOMES = {
     "MapResult": "epypes.scale",
     "map": "epypes.scale",
     "promote": "epypes.bundle",
+    "SweepResult": "epypes.scale.sweeping",
+    "sweep": "epypes.scale.sweeping",
     "to_source": "epypes.bundle",
     "verify": "epypes.bundle",
 }
@@ -146,6 +149,7 @@ __all__ = [
     "Stage",
     "Stages",
     "Store",
+    "SweepResult",
     "TimingSummary",
     "TokenManager",
     "ZMQPublisher",
@@ -168,6 +172,7 @@ __all__ = [
     "subgraph",
     "suffix",
     "summarize",
+    "sweep",
     "switch",
     "to_source",
     "unguarded",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from time import perf_counter_ns
@@ -14,7 +15,8 @@ from epypes.errors import EpypesError
 from epypes.run import CompGraphRunner, Failure, Run
 from epypes.scale.items import Item, opened
 from epypes.scale.outcome import Outcome, Trouble, plain_number
-from epypes.scale.thumbnails import thumbnails_of
+from epypes.scale.start import Start
+from epypes.scale.thumbnails import Album
 
 Setting = Mapping[str, Any]
 
@@ -33,12 +35,15 @@ class Job:
         Tokens whose values are kept.
     show
         Tokens of which thumbnails are made; None: of every token that has a picture.
+    start
+        What jobs with the same one item have in common; None for what travels to another process.
     """
 
     items: tuple[Item, ...]
     settings: tuple[Setting, ...] = ({},)
     keep: tuple[str, ...] = ()
     show: tuple[str, ...] | None = ()
+    start: Start | None = None
 
 
 def do(runner: CompGraphRunner, job: Job, stop: threading.Event | None = None) -> list[Outcome]:
@@ -69,23 +74,35 @@ def do(runner: CompGraphRunner, job: Job, stop: threading.Event | None = None) -
 
 
 def _of_item(runner: CompGraphRunner, item: Item, job: Job, varied: Setting) -> Iterator[Outcome]:
-    try:
-        payload = opened(item, runner.cg)
-    except (EpypesError, OSError) as error:
-        trouble = Trouble("", type(error).__name__, str(error))
-        for setting in job.settings:
-            yield Outcome(item.number, item.name, setting, trouble=trouble)
-        return
-    is_begun = False
-    for setting in job.settings:
-        begun_ns = perf_counter_ns()
-        run, trouble_before = _run(runner, None if is_begun else payload, {**varied, **setting})
-        is_begun = is_begun or run is not None
+    album = Album() if job.start is None else job.start.album
+    waiting, begun = deque(job.settings), list[Outcome]()
+
+    def outcome_of(own: CompGraphRunner, payload: Mapping[str, Any] | None) -> Outcome:
+        setting, start_ns = waiting.popleft(), perf_counter_ns()
+        run, trouble = _run(own, payload, {**varied, **setting})
         if run is None:
-            spent_ns = perf_counter_ns() - begun_ns
-            yield Outcome(item.number, item.name, setting, total_ns=spent_ns, trouble=trouble_before)
-        else:
-            yield _outcome(item, setting, job, run)
+            return Outcome(item.number, item.name, setting, total_ns=perf_counter_ns() - start_ns, trouble=trouble)
+        return _outcome(item, setting, job, run, album)
+
+    def begin() -> CompGraphRunner | None:
+        try:
+            payload = opened(item, runner.cg)
+        except (EpypesError, OSError) as error:
+            trouble = Trouble("", type(error).__name__, str(error))
+            begun.extend(Outcome(item.number, item.name, setting, trouble=trouble) for setting in waiting)
+            waiting.clear()
+            return None
+        before = runner.last
+        while waiting and runner.last is before:
+            begun.append(outcome_of(runner, payload))
+        return None if runner.last is before else runner
+
+    own = begin() if job.start is None else job.start.go_on(begin)
+    yield from begun
+    while own is not None and waiting:
+        yield outcome_of(own, None)
+    if own is not None and job.start is not None:
+        job.start.leave(own)
 
 
 def _run(
@@ -104,7 +121,7 @@ def _run(
         return None, Trouble("", type(error).__name__, str(error))
 
 
-def _outcome(item: Item, setting: Setting, job: Job, run: Run) -> Outcome:
+def _outcome(item: Item, setting: Setting, job: Job, run: Run, album: Album) -> Outcome:
     report, tokens = run.report, run.tokens
     return Outcome(
         item.number,
@@ -114,7 +131,7 @@ def _outcome(item: Item, setting: Setting, job: Job, run: Run) -> Outcome:
         report.durations_ns,
         report.total_ns,
         None if run.failure is None else _trouble(run.failure),
-        thumbnails_of(run, job.show) if job.show != () else {},
+        album.thumbnails_of(run, job.show) if job.show != () else {},
         {token: run[token] for token in job.keep if tokens.is_readable(token)},
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 from epypes.display.paint.thumbnails import THUMB_HEIGHT, THUMB_WIDTH, paint_thumbnail
 from epypes.display.previews.preview import Preview, finished, sketch
@@ -20,13 +20,6 @@ _CHART_STYLE: Final = (
     "<style>.paper{fill:none}.chart polyline,.bars,.dots{fill:none;stroke:#7a8490;stroke-width:2}"
     ".dots{stroke-width:4;stroke-linecap:round}</style>"
 )
-
-
-def thumbnails_of(run: Run, tokens: Iterable[str] | None) -> dict[str, Thumbnail]:
-    """Return pictures of tokens, of all that have one if None; what was not computed has none. Never raises."""
-    wanted = run.cg.tokens if tokens is None else tokens
-    found = {token: thumbnail_of(run, token) for token in wanted if run.tokens.is_readable(token)}
-    return {token: shown for token, shown in found.items() if shown is not None}
 
 
 def thumbnail_of(run: Run, token: str) -> Thumbnail | None:
@@ -45,3 +38,26 @@ def _as_file(shown: Preview) -> Thumbnail | None:
     size, painted = f'width="{THUMB_WIDTH}" height="{THUMB_HEIGHT}"', paint_thumbnail(shown, (THUMB_WIDTH / 2, 0))
     chart = f'<svg xmlns="http://www.w3.org/2000/svg" {size}>{_CHART_STYLE}{painted}</svg>'
     return Thumbnail("image/svg+xml", chart.encode(), shown.text)
+
+
+class Album:
+    """The thumbnails of one item; those of values that stay from run to run are made once."""
+
+    def __init__(self) -> None:
+        self._made: dict[str, tuple[Any, Thumbnail | None]] = {}
+
+    def thumbnails_of(self, run: Run, tokens: Iterable[str] | None) -> dict[str, Thumbnail]:
+        """Return pictures of tokens, of all that have one if None; what was not computed has none. Never raises.
+
+        Threads may ask for several runs at once.
+        """
+        wanted = run.cg.tokens if tokens is None else tokens
+        found = {token: self._thumbnail_of(run, token) for token in wanted if run.tokens.is_readable(token)}
+        return {token: shown for token, shown in found.items() if shown is not None}
+
+    def _thumbnail_of(self, run: Run, token: str) -> Thumbnail | None:
+        value = run.tokens.values[run.tokens.program.slots[token]]
+        made = self._made.get(token)
+        if made is None or made[0] is not value:
+            self._made[token] = made = value, thumbnail_of(run, token)
+        return made[1]

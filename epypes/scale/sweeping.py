@@ -1,0 +1,273 @@
+"""What do many settings make of one image, or of many?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Final
+
+from epypes.errors import PayloadError, ScaleError, run_call
+from epypes.run import CompGraphRunner
+from epypes.scale.grids import Grid, Setting, grid_of
+from epypes.scale.items import Item, count_of, items_of
+from epypes.scale.job import Job
+from epypes.scale.order import functions_after, running_order, steps
+from epypes.scale.outcome import Outcome
+from epypes.scale.progress import progress_bar
+from epypes.scale.sheet import Sheet, sheet_of
+from epypes.scale.spreading import spread, worker_count
+from epypes.scale.start import Start
+from epypes.scale.table import frame_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from epypes.store import Store
+
+# Each of at most 5 KB, and some belong to several outcomes.
+_MOST_PICTURES: Final = 200_000
+# Progress is seen, and a stop is heard, between two parts; and workers are done at about the same time.
+_PARTS: Final = 16
+_MOST_SETTINGS: Final = 256
+_TAKEN: Final = ("name", "failure", "total_ms")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SweepResult:
+    """What a sweep has made; shows itself as a contact sheet.
+
+    Attributes
+    ----------
+    outcomes
+        Image by image, in each the settings in the order of the grid.
+    names
+        The hyperparameters that were varied.
+    runner
+        The one that was given, for whoever picks a setting.
+    """
+
+    outcomes: tuple[Outcome, ...]
+    names: tuple[str, ...]
+    runner: CompGraphRunner = field(repr=False)
+
+    def __len__(self) -> int:
+        return len(self.outcomes)
+
+    def __getitem__(self, place: int) -> Outcome:
+        return self.outcomes[place]
+
+    def __iter__(self) -> Iterator[Outcome]:
+        return iter(self.outcomes)
+
+    @property
+    def failures(self) -> tuple[Outcome, ...]:
+        """The outcomes in which something failed."""
+        return tuple(outcome for outcome in self.outcomes if outcome.trouble is not None)
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return a table with a row per outcome.
+
+        Its columns are name, the hyperparameters that were varied, failure (None, or what failed), the sink tokens,
+        total_ms and the milliseconds of each function that ran: what did not depend on what changed has none.
+        """
+        varied = {
+            f"{name} (hyperparameter)" if name in _TAKEN else name: [one.setting.get(name) for one in self.outcomes]
+            for name in self.names
+        }
+        return frame_of(self.outcomes, self.runner.cg, varied)
+
+    def sheet(self, token: str | None = None, rows: str | None = None, columns: str | None = None) -> Sheet:
+        """Return the contact sheet of a token.
+
+        Parameters
+        ----------
+        token
+            Any that has pictures; None: the last sink token that has some, else the last token.
+        rows, columns
+            Hyperparameters by which the pictures are laid out; None: the first two that vary. What else varies, and
+            several images, give further blocks.
+
+        Raises
+        ------
+        UnknownName
+            A name is none of a token, or of a hyperparameter that was varied.
+        ScaleError
+            The token has no pictures, or rows and columns are the same.
+        """
+        return sheet_of(self.runner.cg, self.outcomes, token, rows, columns)
+
+    def __repr__(self) -> str:
+        failed = f"{len(self.failures)} failed"
+        return f"<SweepResult: {len(self.outcomes)} settings of {', '.join(self.names)!s:.40}; {failed}>"
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
+        return {**self.sheet()._repr_mimebundle_(), "text/plain": repr(self)}
+
+
+def sweep(
+    runner: CompGraphRunner,
+    grid: Any,
+    images: Any = None,
+    executor: Executor | None = None,
+    *,
+    how: str = "product",
+    n: int | None = None,
+    seed: int = 0,
+    keep: Sequence[str] = (),
+    show: Sequence[str] | None = None,
+    store: str | Store | None = None,
+    name: str | None = None,
+    progress: bool | None = None,
+) -> SweepResult:
+    """Run a graph with many settings, on one image or many; functions that depend on none of them run once an image.
+
+    Parameters
+    ----------
+    runner
+        Its graph and hyperparameters are used; it is left as it was.
+    grid
+        Values by hyperparameter: lists, arrays, or an ``ep.Param`` whose values can be counted; None for those that
+        its hint allows. Or a list of settings, each a dict, taken as they are.
+    images
+        As for ``map``; None: the runner's last payload.
+    executor
+        Any of ``concurrent.futures``, as for ``map``. Threads share what the settings have in common; processes that
+        run parts of the grid on one image compute it each.
+    how
+        ``"product"``: each value with each other; ``"zip"``: the first values of all, then the second ones, and so on;
+        ``"random"``: ``n`` settings drawn from ranges ``(low, high)``, ``ep.Param``, lists of choices, or None for the
+        hint's; ``"latin"``: the same by Latin hypercubes, which spread more evenly.
+    n
+        How many settings are drawn.
+    seed
+        The same one draws the same settings.
+    keep
+        Tokens whose values are kept in ``outcome.kept``; of all others only thumbnails, numbers and texts are.
+    show
+        Tokens of which thumbnails are made; None: all that have a picture.
+    store, name
+        As for ``map``: settings that are stored already are not run again.
+    progress
+        As for ``map``.
+
+    Returns
+    -------
+    SweepResult
+        Its contact sheet, its table, its outcomes. A setting that fails is an outcome with its trouble.
+
+    Raises
+    ------
+    ScaleError
+        The grid says nothing, or is too large to hold; there is no image; a package is missing.
+    UnknownName
+        A name is none of a hyperparameter or token.
+    PayloadError
+        ``images`` is None and nothing has been run yet.
+
+    Examples
+    --------
+    >>> from epypes import CompGraph, CompGraphRunner
+    >>> runner = CompGraphRunner(CompGraph({"add": lambda x, y: x + y}, {"add": (("x", "y"), "total")}), {"y": 1})
+    >>> result = sweep(runner, {"y": [10, 20]}, images=[1, 2])
+    >>> [outcome.values["total"] for outcome in result]
+    [11, 21, 12, 22]
+    """
+    kept, shown = _tokens(runner, keep), None if show is None else _tokens(runner, show)
+    plan = grid_of(runner, grid, how=how, n=n, seed=seed)
+    count = 1 if images is None else count_of(images)
+    _require_room(runner, plan, shown, count or 1)
+    settings = plan.settings()
+    # By object: a setting comes back as the very mapping that was sent.
+    places = {id(setting): place for place, setting in enumerate(settings)}
+    in_order = tuple(settings[place] for place in running_order(runner.cg, settings))
+    grid_job = Job((), in_order, kept, shown)
+    jobs = _jobs(_items(runner, images, plan), grid_job, _cuts(runner, in_order, executor, count), executor)
+    found: list[Outcome] = []
+    with progress_bar(progress, None if count is None else count * plan.size, "sweep", unit="setting") as advance:
+        for outcomes in spread(runner, jobs, executor):
+            found += outcomes
+            advance(len(outcomes), sum(outcome.has_failed for outcome in outcomes))
+    found.sort(key=lambda outcome: (outcome.number, places[id(outcome.setting)]))
+    return SweepResult(tuple(found), plan.names, runner)
+
+
+def _tokens(runner: CompGraphRunner, given: str | Sequence[str]) -> tuple[str, ...]:
+    tokens = (given,) if isinstance(given, str) else tuple(given)
+    for token in tokens:
+        runner.cg.require_token(token)
+    return tokens
+
+
+def _require_room(runner: CompGraphRunner, plan: Grid, shown: Sequence[str] | None, images: int) -> None:
+    plan.require_room(images)
+    varying = {name for varied in plan.names for name in _made_after(runner, varied)}
+    tokens = varying if shown is None else varying.intersection(shown)
+    pictures = plan.size * images * len(tokens)
+    if pictures > _MOST_PICTURES:
+        raise ScaleError(
+            f"Thumbnails of {len(tokens)} tokens with {plan.size:,} settings on {images:,} images are up to "
+            f"{pictures:,} pictures, and at most {_MOST_PICTURES:,} can be held. Name fewer, as show=(), or take "
+            "fewer values."
+        )
+
+
+def _made_after(runner: CompGraphRunner, name: str) -> Iterator[str]:
+    """Yield the tokens that depend on a hyperparameter."""
+    for function in functions_after(runner.cg, name):
+        yield from runner.cg.func_outputs(function)
+
+
+def _items(runner: CompGraphRunner, images: Any, plan: Grid) -> Iterator[Item]:
+    if images is None:
+        yield Item(0, "last payload", _last_payload(runner))
+        return
+    for item in items_of(images, runner):
+        # How many a generator gives is known when it gives them.
+        plan.require_room(item.number + 1)
+        yield item
+        del item
+
+
+def _last_payload(runner: CompGraphRunner) -> dict[str, Any]:
+    free, last = runner.free_source_tokens, runner.last
+    missing = free if last is None else tuple(token for token in free if not last.tokens.is_computed(token))
+    if missing:
+        raise PayloadError(missing, f"Nothing has been run yet. Give images=..., or call {run_call(free)} first.")
+    return {} if last is None else {token: last[token] for token in free}
+
+
+# -- parts of a grid ------------------------------------------------------------------------------------------------
+
+
+def _jobs(items: Iterator[Item], grid: Job, cuts: Sequence[int], executor: Executor | None) -> Iterator[Job]:
+    """Give the jobs of each item: its settings in parts, which in this process have their beginning in common."""
+    is_shared = len(cuts) > 2 and _is_here(executor)
+    for item in items:
+        start = Start() if is_shared else None
+        for first, end in pairwise(cuts):
+            yield replace(grid, items=(item,), settings=grid.settings[first:end], start=start)
+        del item, start
+
+
+def _is_here(executor: Executor | None) -> bool:
+    return executor is None or isinstance(executor, ThreadPoolExecutor)
+
+
+def _cuts(
+    runner: CompGraphRunner, settings: Sequence[Setting], executor: Executor | None, images: int | None
+) -> list[int]:
+    """Return where the settings of an item are cut into parts: from 0 to their number."""
+    workers = 1 if executor is None else worker_count(executor)
+    # Of the parts of one image each that begins elsewhere than in this process computes what all have in common: there
+    # are only as many as keep all workers at work.
+    parts = -(-workers // max(images or workers, 1))
+    if _is_here(executor) and (parts > 1 or executor is None):
+        parts *= _PARTS
+    parts = max(parts, -(-len(settings) // _MOST_SETTINGS))
+    # What the slowest hyperparameter has made is computed once if no part begins in the midst of one of its values.
+    places = steps(runner.cg, settings)
+    places = places if len(places) >= workers else list(range(len(settings)))
+    parts = min(parts, len(places))
+    return [*(places[len(places) * part // parts] for part in range(parts)), len(settings)]
