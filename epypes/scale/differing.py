@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, Final
 
 from epypes.display import is_image
+from epypes.display.previews.raster import THUMBNAIL_PX
 from epypes.graph import CompGraph, colour_order
 from epypes.scale.outcome import Thumbnail
 from epypes.scale.thumbnails import thumbnail_of_value
@@ -60,8 +61,18 @@ def _is_mask(image: Any) -> bool:
 def _three_colours(got: Any, wanted: Any) -> Any:
     import numpy as np
 
-    picture = np.zeros((*got.shape, 3), np.uint8)
-    picture[got & wanted] = _AGREE
-    picture[wanted & ~got] = _MISSING
-    picture[got & ~wanted] = _EXTRA
+    # One pixel that differs is to be seen, so it is not averaged with those around it.
+    both, missing, extra = (_coarser(mask) for mask in (got & wanted, wanted & ~got, got & ~wanted))
+    picture = np.zeros((*both.shape, 3), np.uint8)
+    for mask, colour in ((both, _AGREE), (missing, _MISSING), (extra, _EXTRA)):
+        picture[mask] = colour
     return picture
+
+
+def _coarser(mask: Any) -> Any:
+    """Return a mask of about the size of a thumbnail; what is in one pixel is in the coarse one around it."""
+    import numpy as np
+
+    side = -(-max(mask.shape) // THUMBNAIL_PX)
+    starts = [np.arange(0, length, side) for length in mask.shape]
+    return np.logical_or.reduceat(np.logical_or.reduceat(mask, starts[0], axis=0), starts[1], axis=1)

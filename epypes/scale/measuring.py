@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from epypes.bundle.compare import first_difference
-from epypes.errors import ScaleError
+from epypes.errors import EpypesError, ScaleError
 from epypes.graph import CompGraph
 from epypes.scale.cases import ABSENT, Case, Check, with_labels_read
 from epypes.scale.differing import pictures_of
@@ -85,48 +85,51 @@ def measured(outcome: Outcome, case: Case, checks: tuple[Check, ...], cg: CompGr
     return tuple(_outcome(outcome, case, check, cg) for check in checks)
 
 
+@dataclass(frozen=True, slots=True)
+class _Verdict:
+    """What was measured, why it does not do, what failed, and how it looks; passed where there is no reason."""
+
+    value: float | None
+    reason: str = ""
+    trouble: Trouble | None = None
+    pictures: Mapping[str, Thumbnail] = field(default_factory=dict)
+
+
 def _outcome(outcome: Outcome, case: Case, check: Check, cg: CompGraph) -> CheckOutcome:
-    number, reason, trouble, pictures = _judged(outcome, case, check, cg)
-    seen = outcome.thumbnails.get(check.token) if check.token is not None else None
-    if seen is not None and "got" not in pictures:
-        pictures = {**pictures, "got": seen}
-    name = case.name or outcome.name
-    passed, reason = not reason and trouble is None, reason or str(trouble or "")
+    verdict = _judged(outcome, case, check, cg)
+    seen = {"got": shown for token, shown in outcome.thumbnails.items() if token == check.token}
     return CheckOutcome(
         outcome.number,
-        name,
+        case.name or outcome.name,
         check.name,
         check.token,
-        number,
+        verdict.value,
         check.threshold,
-        passed,
-        " ".join(reason.split())[:_REASON_CHARACTERS],
-        trouble,
+        not verdict.reason,
+        " ".join(verdict.reason.split())[:_REASON_CHARACTERS],
+        verdict.trouble,
         outcome.total_ns,
-        pictures,
+        # That of the run has what was found drawn over its image.
+        {**verdict.pictures, **seen},
     )
 
 
-def _judged(
-    outcome: Outcome, case: Case, check: Check, cg: CompGraph
-) -> tuple[float | None, str, Trouble | None, Mapping[str, Thumbnail]]:
+def _judged(outcome: Outcome, case: Case, check: Check, cg: CompGraph) -> _Verdict:
     """Return the number, why it does not do, what failed, and pictures of the difference."""
     if outcome.trouble is not None:
-        return None, "", outcome.trouble, {}
+        return _Verdict(None, str(outcome.trouble), outcome.trouble)
     if check.metric == RUNS:
-        return None, "", None, {}
+        return _Verdict(None)
+    value = expected = None
     try:
         value, expected = _compared(outcome, check, cg)
-        given = _measure(outcome, case, check, cg, value, expected)
-        number = _number(given, check)
+        number = _number(_measure(outcome, case, check, cg, value, expected), check)
+        verdict = _Verdict(number, _shortfall(number, check, value, expected))
     except (Exception, SystemExit) as error:  # whatever a user's metric raises
-        return None, "", _trouble(error, check), {}
-    reason = _shortfall(number, check)
-    if not reason or check.token is None:
-        return number, reason, None, {}
-    has_expected = expected is not None and outcome.thumbnails
-    pictures = pictures_of(value, expected, cg, check.token) if has_expected else {}
-    return number, _differing(check, value, expected) or reason, None, pictures
+        verdict = _failed(error, check)
+    if check.token is None or expected is None or not verdict.reason or not outcome.thumbnails:
+        return verdict
+    return replace(verdict, pictures=pictures_of(value, expected, cg, check.token))
 
 
 def _compared(outcome: Outcome, check: Check, cg: CompGraph) -> tuple[Any, Any]:
@@ -166,7 +169,7 @@ def _number(given: Any, check: Check) -> float:
     return float(item)
 
 
-def _shortfall(number: float, check: Check) -> str:
+def _shortfall(number: float, check: Check, value: Any, expected: Any) -> str:
     """Return why a number does not pass; empty if it does."""
     if not check.threshold:
         return "" if number else "the metric says False"
@@ -174,24 +177,28 @@ def _shortfall(number: float, check: Check) -> str:
     is_high = check.at_most is not None and number > check.at_most
     if not (is_low or is_high):
         return ""
+    if check.metric == "equal" and check.at_least == 1:
+        return _differing(value, expected)
     bound = f"at least {check.at_least:g}" if is_low else f"at most {check.at_most:g}"
     # 0.9999999 is not to read as 1.
     shown = f"{number:.6g}" if f"{number:g}" not in bound else repr(number)
     return f"{shown} is not {bound}"
 
 
-def _differing(check: Check, value: Any, expected: Any) -> str:
-    """Return what differs where all must be equal, which the share that does not tell; else nothing."""
-    if check.metric != "equal" or check.at_least != 1:
-        return ""
+def _differing(value: Any, expected: Any) -> str:
+    """Return what differs where all must be equal, which the share that does does not tell."""
     if getattr(value, "size", 0) > 1:
         differing = round((1 - METRICS["equal"].function(value, expected)) * value.size)
         return f"{differing} of {value.size} values differ"
     return first_difference(expected, value) or "they differ"
 
 
-def _trouble(error: BaseException, check: Check) -> Trouble:
+def _failed(error: BaseException, check: Check) -> _Verdict:
+    """Return the verdict where nothing could be measured."""
     message = str(error)
     if isinstance(error, KeyError) and check.token is None:
         message = f"no token {message} is kept. If the graph has it, give the metric keep=[{message}]."
-    return Trouble("", type(error).__name__, message)
+    trouble = Trouble("", type(error).__name__, message)
+    # Our own sentences say all; of a user's metric the kind of error does.
+    is_ours = isinstance(error, EpypesError) or not callable(check.metric)
+    return _Verdict(None, message if is_ours else str(trouble), trouble)
