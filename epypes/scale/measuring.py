@@ -97,7 +97,7 @@ class _Verdict:
 
 def _outcome(outcome: Outcome, case: Case, check: Check, cg: CompGraph) -> CheckOutcome:
     verdict = _judged(outcome, case, check, cg)
-    seen = {"got": shown for token, shown in outcome.thumbnails.items() if token == check.token}
+    seen = outcome.thumbnails.get(check.token or "")
     return CheckOutcome(
         outcome.number,
         case.name or outcome.name,
@@ -110,7 +110,7 @@ def _outcome(outcome: Outcome, case: Case, check: Check, cg: CompGraph) -> Check
         verdict.trouble,
         outcome.total_ns,
         # That of the run has what was found drawn over its image.
-        {**verdict.pictures, **seen},
+        verdict.pictures if seen is None else {**verdict.pictures, "got": seen},
     )
 
 
