@@ -56,6 +56,8 @@ if TYPE_CHECKING:
     )
     from epypes.run.guard import unguarded
     from epypes.scale import MapResult, map  # noqa: A004 - as in ep.map(runner, images)
+    from epypes.scale.cases import Case
+    from epypes.scale.checking import check
     from epypes.scale.sweeping import SweepResult, sweep
     from epypes.service.failures.reopen import load_failure
     from epypes.service.remote.connection import connect
@@ -94,6 +96,8 @@ _HOMES = {
     "Mailbox": "epypes.pipeline",
     "Node": "epypes.pipeline",
     "NodeBasedCompGraph": "epypes.pipeline",
+    "Case": "epypes.scale.cases",
+    "check": "epypes.scale.checking",
     "Param": "epypes.hints",
     "Roi": "epypes.hints",
     "Preview": "epypes.display",
@@ -123,6 +127,7 @@ _HOMES = {
 __version__ = "1.0.0.dev0"
 
 __all__ = [
+    "Case",
     "CompGraph",
     "CompGraphRunner",
     "EventLoop",
@@ -155,6 +160,7 @@ __all__ = [
     "ZMQPublisher",
     "ZMQSubscriber",
     "camera",
+    "check",
     "connect",
     "errors",
     "extend",
