@@ -11,7 +11,7 @@ The rooms, from the bottom up; imports point downwards only (checked by ``lint-i
 - ``pipeline``: the paper's ladder of nodes and pipelines; ``acquisition``: where images come from;
   ``display``: how a graph, a run and a value look; ``wire``: how a value travels
 - ``bundle``: from notebook to a folder of text; ``transport``: sockets
-- ``service``: a bundle as a running process; ``experiment``: the paper's own
+- ``scale``: many images and settings; ``service``: a bundle as a running process; ``experiment``: the paper's own
 - ``cli``: the commands; ``epypes_widgets``: the notebook front end
 
 Names are loaded when they are first used, so ``import epypes`` costs little and imports no other package.
