@@ -10,7 +10,7 @@ The rooms, from the bottom up; imports point downwards only (checked by ``lint-i
 - ``run``: which functions must run, and running them
 - ``pipeline``: the paper's ladder of nodes and pipelines; ``acquisition``: where images come from;
   ``display``: how a graph, a run and a value look; ``wire``: how a value travels
-- ``bundle``: from notebook to a folder of text; ``transport``: sockets
+- ``bundle``: from notebook to a folder of text; ``transport``: sockets; ``store``: results and history in a database
 - ``scale``: many images and settings; ``service``: a bundle as a running process; ``experiment``: the paper's own
 - ``cli``: the commands; ``epypes_widgets``: the notebook front end
 
@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from epypes.run.guard import unguarded
     from epypes.service.failures.reopen import load_failure
     from epypes.service.remote.connection import connect
+    from epypes.store import Store
     from epypes.transport import ZMQPublisher, ZMQSubscriber
 
 _HOMES = {
@@ -101,6 +102,7 @@ _HOMES = {
     "SourcePipeline": "epypes.pipeline",
     "Stage": "epypes.pipeline",
     "Stages": "epypes.pipeline",
+    "Store": "epypes.store",
     "ZMQPublisher": "epypes.transport",
     "ZMQSubscriber": "epypes.transport",
     "connect": "epypes.service.remote.connection",
@@ -139,6 +141,7 @@ __all__ = [
     "SourcePipeline",
     "Stage",
     "Stages",
+    "Store",
     "TimingSummary",
     "TokenManager",
     "ZMQPublisher",

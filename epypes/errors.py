@@ -35,6 +35,7 @@ Everything an error's text mentions is an attribute of it::
     |   +-- DeployRefused       a running service does not take a bundle; .reasons
     +-- ScaleError              a set of images or settings can't be run
     |   +-- ExecutorBroken      whoever ran the jobs is gone; .done
+    +-- StoreError              a database can't be opened, read or written; .place
     +-- FailureNotKept          a failure of a service, or its event, can't be had; .id, .path
 
 The user's own exceptions are never wrapped: they keep their type and traceback and get a note.
@@ -376,6 +377,14 @@ class ExecutorBroken(ScaleError):
 
     def __init__(self, done: int, text: str) -> None:
         self.done = done
+        super().__init__(text)
+
+
+class StoreError(EpypesError):
+    """A database that can't be opened, read or written; ``place`` is its path, or its URL without the password."""
+
+    def __init__(self, place: str, text: str) -> None:
+        self.place = place
         super().__init__(text)
 
 
