@@ -55,6 +55,7 @@ if TYPE_CHECKING:
         summarize,
     )
     from epypes.run.guard import unguarded
+    from epypes.scale.optimizing import optimize
     from epypes.service.failures.reopen import load_failure
     from epypes.service.remote.connection import connect
     from epypes.store import Store
@@ -109,6 +110,7 @@ _HOMES = {
     "load": "epypes.bundle",
     "load_failure": "epypes.service.failures.reopen",
     "load_pipeline": "epypes.bundle",
+    "optimize": "epypes.scale.optimizing",
     "promote": "epypes.bundle",
     "to_source": "epypes.bundle",
     "verify": "epypes.bundle",
@@ -154,6 +156,7 @@ __all__ = [
     "load",
     "load_failure",
     "load_pipeline",
+    "optimize",
     "outputs",
     "promote",
     "register_preview",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -59,16 +59,16 @@ class Scoring:
         The graph has no such token.
     """
 
-    def __init__(
-        self, cg: CompGraph, metric: Metric, cases: Sequence[Case], keep: Sequence[str] | None = None
-    ) -> None:
+    def __init__(self, cg: CompGraph, metric: Metric, cases: Sequence[Case], keep: Sequence[str] | None = None) -> None:
         self.cases = tuple(cases)
         if isinstance(metric, str):
             cg.require_token(metric)
             self.name, self.keep, self._measure = metric, (metric,), lambda tokens, _: tokens[metric]
             return
         if not callable(metric):
-            text = f"metric is a function metric(tokens, case), or the name of a token, not a {type(metric).__name__!r}."
+            text = (
+                f"metric is a function metric(tokens, case), or the name of a token, not a {type(metric).__name__!r}."
+            )
             raise ScaleError(text)
         for token in keep or ():
             cg.require_token(token)
@@ -76,11 +76,12 @@ class Scoring:
         self.name: str = getattr(metric, "__name__", "metric")
         self._measure: Callable[[Mapping[str, Any], Case], Any] = metric
 
-    def of_outcomes(self, outcomes: Sequence[Outcome]) -> Score:
-        """Return the score of a setting by what it gave, in the order of the cases."""
+    def of_outcomes(self, outcomes: Iterable[Outcome]) -> Score:
+        """Return the score of a setting by what it gave, in the order of the cases; after a failure none is taken."""
         values: list[float] = []
-        spent_ns = sum(outcome.total_ns for outcome in outcomes)
+        spent_ns = 0
         for case, outcome in zip(self.cases, outcomes, strict=True):
+            spent_ns += outcome.total_ns
             value, failure = self.of_one(case, outcome)
             if value is None:
                 return Score(None, failure, spent_ns)

@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING, Any, Literal
 from epypes.errors import ScaleError
 from epypes.scale.needed import needed
 from epypes.scale.ranging import Axis, Choices, setting_of, suggestion_of
+from epypes.store.place import connect_options
 
 if TYPE_CHECKING:
     import optuna
+    from sqlalchemy import URL
 
 Direction = Literal["maximize", "minimize"]
 _FAILURE, _NANOSECONDS = "failure", "total_ns"
-# How long a trial that is to be written waits for others who write to the same SQLite file.
-_BUSY_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ class Search:
     at_once
         How many trials are run at a time; with several, those that are still under way count as bad ones.
     url
-        Of a database, as SQLAlchemy takes it; None for none.
+        Of a database; None for none.
     name
         Of the study in there. If it is there, it goes on.
 
@@ -94,7 +94,7 @@ class Search:
         *,
         seed: int = 0,
         at_once: int = 1,
-        url: str | None = None,
+        url: URL | None = None,
         name: str = "",
     ) -> None:
         optuna = needed("optuna")
@@ -151,19 +151,17 @@ class Search:
         failure = noted.get(_FAILURE, "") or ("" if frozen.value is not None else "it was given up")
         return Trial(frozen.number, setting, frozen.value, failure, noted.get(_NANOSECONDS, 0))
 
-    def _opened(self, url: str, name: str) -> optuna.Study:
+    def _opened(self, url: URL, name: str) -> optuna.Study:
         import optuna
-        import sqlalchemy
+        import sqlalchemy.exc
 
-        options = {"connect_args": {"timeout": _BUSY_S}} if url.startswith("sqlite") else {}
+        refusals = (RuntimeError, sqlalchemy.exc.SQLAlchemyError, optuna.exceptions.StorageInternalError)
+        given = url.render_as_string(hide_password=False)
         try:
-            storage = optuna.storages.RDBStorage(url, engine_kwargs=options)
-            return optuna.create_study(
-                storage=storage, study_name=name, direction=self.direction, load_if_exists=True
-            )
-        except (RuntimeError, ImportError, sqlalchemy.exc.SQLAlchemyError, optuna.exceptions.StorageInternalError) as error:
-            shown = sqlalchemy.make_url(url).render_as_string()
-            text = f"The trials can't be kept in {shown}: {str(error).splitlines()[0]}"
+            storage = optuna.storages.RDBStorage(given, engine_kwargs={"connect_args": connect_options(url)})
+            return optuna.create_study(storage=storage, study_name=name, direction=self.direction, load_if_exists=True)
+        except refusals as error:
+            text = f"The trials can't be kept in {url.render_as_string()}: {str(error).splitlines()[0]}"
             raise ScaleError(f"{text} Give another store=, or none.") from error
 
     def _done_before(self, written: optuna.Study, name: str) -> list[optuna.trial.FrozenTrial]:

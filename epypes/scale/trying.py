@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from time import perf_counter_ns
 from typing import Any, Final
 
-from epypes.errors import EpypesError
 from epypes.run import CompGraphRunner, Run
 from epypes.run.stopped import stop_at
 from epypes.scale.items import Item, opened
@@ -18,7 +17,7 @@ from epypes.scale.spreading import own_runner
 _MOST_BYTES: Final = 2**30
 
 
-class Stopped(Exception):  # noqa: N818 - nothing has failed
+class Stopped(Exception):
     """Somebody has asked to stop, and the function that ran then has returned."""
 
 
@@ -73,7 +72,7 @@ class Bench:
             if runner is None:
                 runner = self._loaded(item)
             begun_ns = perf_counter_ns()  # files are not what is measured
-            run = self._run(runner, {**self._own[index], **setting})
+            run = self._run(runner, {**setting, **self._own[index]})
             kept = {token: run[token] for token in self._keep}
         except Stopped:
             raise
@@ -116,7 +115,5 @@ def _bytes_of(run: Run) -> int:
 
 def _trouble(runner: CompGraphRunner | None, error: BaseException) -> Trouble:
     failure = None if runner is None or runner.last is None else runner.last.failure
-    is_of_function = failure is not None and failure.exception is error
-    where = failure.function if failure is not None and is_of_function else ""
-    message = str(error) if isinstance(error, EpypesError) or str(error) else ""
-    return Trouble(where, type(error).__name__, message)
+    where = failure.function if failure is not None and failure.exception is error else ""
+    return Trouble(where, type(error).__name__, str(error))
