@@ -55,6 +55,8 @@ if TYPE_CHECKING:
         summarize,
     )
     from epypes.run.guard import unguarded
+    from epypes.scale.cases import Case
+    from epypes.scale.checking import check
     from epypes.scale.optimizing import optimize
     from epypes.service.failures.reopen import load_failure
     from epypes.service.remote.connection import connect
@@ -93,6 +95,8 @@ _HOMES = {
     "Mailbox": "epypes.pipeline",
     "Node": "epypes.pipeline",
     "NodeBasedCompGraph": "epypes.pipeline",
+    "Case": "epypes.scale.cases",
+    "check": "epypes.scale.checking",
     "Param": "epypes.hints",
     "Roi": "epypes.hints",
     "Preview": "epypes.display",
@@ -119,6 +123,7 @@ _HOMES = {
 __version__ = "1.0.0.dev0"
 
 __all__ = [
+    "Case",
     "CompGraph",
     "CompGraphRunner",
     "EventLoop",
@@ -149,6 +154,7 @@ __all__ = [
     "ZMQPublisher",
     "ZMQSubscriber",
     "camera",
+    "check",
     "connect",
     "errors",
     "extend",

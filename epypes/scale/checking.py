@@ -1,0 +1,1 @@
+"""Does a graph still do on a labelled set what it must?"""
