@@ -58,9 +58,9 @@ def optimize(
     runner
         Its graph is run; hyperparameters that do not vary have the values that it has.
     metric
-        ``metric(tokens, case)`` returns a number: how good the values of a run, by token, are for its case. It is called
-        in this process, by the thread that calls this. Or the name of a token that is a number itself. What counts is
-        the mean over all cases.
+        ``metric(tokens, case)`` returns a number: how good the values of a run, by token, are for its case. It is
+        called in this process, by the thread that calls this. Or the name of a token that is a number itself. What
+        counts is the mean over all cases.
     cases
         ``ep.Case``, dicts or inputs alone; the path of a file of cases; or a folder or glob of images. Without labels a
         case is its inputs.

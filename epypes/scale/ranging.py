@@ -242,7 +242,8 @@ def _token_below(runner: CompGraphRunner, token: str, name: str) -> str:
 def _called(cg: CompGraph, token: str, name: str) -> Iterator[str]:
     for function in cg.digraph.consumers.get(token, ()):
         inputs = cg.func_inputs(function)
-        yield from (given for given, called in zip(inputs, parameter_names(cg.functions[function])) if called == name)
+        names = parameter_names(cg.functions[function])
+        yield from (given for given, called in zip(inputs, names, strict=False) if called == name)
 
 
 def _labels(param: Param) -> tuple[str, ...]:
