@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -193,12 +193,12 @@ class _Work:
         """The hyperparameters of each case that are its own."""
         return [case.hyperparameters or {} for case in self.scoring.cases]
 
-    def scores(self, search: Search, count: int) -> Iterator[tuple[Asked, Score]]:
+    def scores(self, search: Search, count: int) -> Generator[tuple[Asked, Score]]:
         """Give the scores of the next settings as they come; fewer if it is stopped."""
         asked = (search.ask() for _ in range(count))
         return self._here(asked) if self.executor is None else self._spread(asked)
 
-    def _here(self, asked: Iterator[Asked]) -> Iterator[tuple[Asked, Score]]:
+    def _here(self, asked: Iterator[Asked]) -> Generator[tuple[Asked, Score]]:
         bench = Bench(self.runner, self.items, self.own, self.scoring.keep, self.stop)
         while not self.is_stopped and (one := next(asked, None)) is not None:
             try:
@@ -207,18 +207,17 @@ class _Work:
                 return
             yield one, score
 
-    def _spread(self, asked: Iterator[Asked]) -> Iterator[tuple[Asked, Score]]:
+    def _spread(self, asked: Iterator[Asked]) -> Generator[tuple[Asked, Score]]:
         pending: dict[int, _Pending] = {}
         jobs = self._jobs(asked, pending)
         ahead = None if self.executor is None else worker_count(self.executor)
-        with contextlib.closing(spread(self.runner, jobs, self.executor, ahead=ahead, stop=self.stop)) as coming:
-            for outcomes in coming:
-                for outcome in outcomes:
-                    number, index = divmod(outcome.number, len(self.items))
-                    pending[number].outcomes[index] = outcome
-                    if len(pending[number].outcomes) == len(self.items):
-                        done = pending.pop(number)
-                        yield done.asked, self.scoring.of_outcomes([done.outcomes[i] for i in sorted(done.outcomes)])
+        for outcomes in spread(self.runner, jobs, self.executor, ahead=ahead, stop=self.stop):
+            for outcome in outcomes:
+                number, index = divmod(outcome.number, len(self.items))
+                pending[number].outcomes[index] = outcome
+                if len(pending[number].outcomes) == len(self.items):
+                    done = pending.pop(number)
+                    yield done.asked, self.scoring.of_outcomes([done.outcomes[i] for i in sorted(done.outcomes)])
 
     def _jobs(self, asked: Iterator[Asked], pending: dict[int, _Pending]) -> Iterator[Job]:
         """Give a job for each case of each trial, when there is room for it; a trial is asked for with its first."""

@@ -221,10 +221,10 @@ def _stepped(span: Span, *, is_odd: bool) -> Span:
     """Return a span whose ends are on its grid."""
     low, high, step = span.low, span.high, span.step
     if span.is_integer:
-        low, high = math.ceil(low), math.floor(high)
-        step = max(1, round(step or 1))
-    if span.is_integer and is_odd:
-        low, step = low + (low % 2 == 0), step if step % 2 == 0 else 2 * step
+        low, high, whole = math.ceil(low), math.floor(high), max(1, round(step or 1))
+        step = whole
+        if is_odd:
+            low, step = low + (low % 2 == 0), whole if whole % 2 == 0 else 2 * whole
     if low > high:
         raise ScaleError(f"There is no {'odd' if is_odd else 'whole'} number in the range of {span.token!r}.")
     if step is not None:

@@ -13,7 +13,8 @@ from epypes.graph import CompGraph
 from epypes.scale.cases import Case
 from epypes.scale.outcome import Outcome
 
-Metric = Callable[[Mapping[str, Any], Case], float] | str
+Measure = Callable[[Mapping[str, Any], Case], Any]
+Metric = Measure | str
 _REASON_CHARACTERS = 300
 
 
@@ -60,21 +61,19 @@ class Scoring:
     """
 
     def __init__(self, cg: CompGraph, metric: Metric, cases: Sequence[Case], keep: Sequence[str] | None = None) -> None:
+        if not isinstance(metric, str) and not callable(metric):
+            kind = type(metric).__name__
+            raise ScaleError(f"metric is a function metric(tokens, case), or the name of a token, not a {kind!r}.")
         self.cases = tuple(cases)
+        self.name: str = metric if isinstance(metric, str) else getattr(metric, "__name__", "metric")
+        self.keep: tuple[str, ...] = cg.sink_tokens if keep is None else tuple(keep)
+        self._measure: Measure
         if isinstance(metric, str):
-            cg.require_token(metric)
-            self.name, self.keep, self._measure = metric, (metric,), lambda tokens, _: tokens[metric]
-            return
-        if not callable(metric):
-            text = (
-                f"metric is a function metric(tokens, case), or the name of a token, not a {type(metric).__name__!r}."
-            )
-            raise ScaleError(text)
-        for token in keep or ():
+            self.keep, self._measure = (metric,), _value_of(metric)
+        else:
+            self._measure = metric
+        for token in self.keep:
             cg.require_token(token)
-        self.keep = cg.sink_tokens if keep is None else tuple(keep)
-        self.name: str = getattr(metric, "__name__", "metric")
-        self._measure: Callable[[Mapping[str, Any], Case], Any] = metric
 
     def of_outcomes(self, outcomes: Iterable[Outcome]) -> Score:
         """Return the score of a setting by what it gave, in the order of the cases; after a failure none is taken."""
@@ -107,3 +106,7 @@ class Scoring:
     def _said(self, case: Case, reason: str) -> str:
         where = f"{case.name}: " if len(self.cases) > 1 and case.name else ""
         return f"{where}{reason}"[:_REASON_CHARACTERS]
+
+
+def _value_of(token: str) -> Measure:
+    return lambda tokens, _: tokens[token]

@@ -26,9 +26,9 @@ _INCH_PER_BAR: Final = 0.32
 def history_figure(result: OptimizeResult) -> Figure:
     """Draw the value of each trial as a dot, the best so far as a line, and failed trials as crosses below."""
     figure, axes = _blank(7.2, 3.4)
-    done = [trial for trial in result.trials if trial.value is not None]
+    done = [(trial.number, trial.value) for trial in result.trials if trial.value is not None]
     failed = [trial.number for trial in result.failures]
-    axes.plot([trial.number for trial in done], [trial.value for trial in done], "o", ms=4, color=_BLUE, label="trial")
+    axes.plot([number for number, _ in done], [value for _, value in done], "o", ms=4, color=_BLUE, label="trial")
     best = [
         (trial.number, value)
         for trial, value in zip(result.trials, best_so_far(result.trials, result.direction), strict=True)

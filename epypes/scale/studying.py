@@ -97,7 +97,7 @@ class Search:
         url: URL | None = None,
         name: str = "",
     ) -> None:
-        optuna = needed("optuna")
+        found = needed("optuna")
         self.axes, self.direction = tuple(axes), direction
         self._present = dict(present)
         self._distributions = {axis.token: _distribution(axis) for axis in axes}
@@ -106,8 +106,8 @@ class Search:
             self._written = None if url is None else self._opened(url, name)
             before = () if self._written is None else self._done_before(self._written, name)
             # Who goes on begins anew with chance: the same numbers again would be the same trials again.
-            sampler = optuna.samplers.TPESampler(seed=seed + len(before), constant_liar=at_once > 1)
-            self.study = optuna.create_study(sampler=sampler, study_name=name or None, direction=direction)
+            sampler = found.samplers.TPESampler(seed=seed + len(before), constant_liar=at_once > 1)
+            self.study: optuna.Study = found.create_study(sampler=sampler, study_name=name or None, direction=direction)
         if before:
             self.study.add_trials(before)
         else:
