@@ -22,7 +22,7 @@ from epypes.scale.outcome import Outcome
 from epypes.scale.progress import progress_bar
 from epypes.scale.ranging import Axis, axes_of
 from epypes.scale.scoring import Metric, Score, Scoring
-from epypes.scale.spreading import spread, worker_count
+from epypes.scale.spreading import own_runner, spread, worker_count
 from epypes.scale.studying import Asked, Direction, Search, Trial
 from epypes.scale.trying import Bench, Stopped
 from epypes.store import opened_store
@@ -114,6 +114,7 @@ def optimize(
     {'y': 0}
     """
     _check(n, direction)
+    runner = own_runner(runner)  # whoever sets values on theirs meanwhile does not change what is searched
     axes = axes_of(runner, ranges)
     labelled = _cases(cases, runner)
     scoring = Scoring(runner.cg, metric, labelled, keep)

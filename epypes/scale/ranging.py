@@ -104,7 +104,8 @@ def axes_of(runner: CompGraphRunner, ranges: Mapping[str, Any] | None = None) ->
     ranges
         By hyperparameter: an ``ep.Param``, a tuple as a range (low, high[, step]), or a list of choices; only these
         vary. Without, all those vary for which an annotation, a switch, or the tables of OpenCV and scikit-image give
-        choices or both ends of a range, hard or usual. A range that is usual is widened to hold the present value.
+        choices or both ends of a range, hard or usual. A range that is usual is widened to hold the present value. Values
+        are whole numbers where the present one is.
 
     Raises
     ------
@@ -207,7 +208,8 @@ def _axis(runner: CompGraphRunner, token: str, param: Param, *, is_given: bool) 
     low, high = _ends(param)
     if param.soft is not None and not is_given:
         low, high = min(low, value), max(high, value)
-    is_whole = isinstance(value, numbers.Integral) and not (is_given and _has_floats(low, high, param.step))
+    # 1.0 is a float on purpose, and so is what it ranges over.
+    is_whole = isinstance(value, numbers.Integral)
     span = _stepped(Span(token, low, high, param.step, param.log, is_whole), is_odd=param.odd)
     return replace(span, below=_token_below(runner, token, param.below))
 
@@ -275,10 +277,6 @@ def _is_closed(param: Param) -> bool:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _has_floats(*given: Any) -> bool:
-    return any(isinstance(number, float) for number in given)
 
 
 def _why_none(present: Iterable[str]) -> str:

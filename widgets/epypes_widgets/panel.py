@@ -25,12 +25,14 @@ from epypes_widgets.plain import plain_values
 from epypes_widgets.promotion import proposal
 from epypes_widgets.route import listen_beside_cells
 from epypes_widgets.screen import Screen
+from epypes_widgets.searching import Searching, movable_ranges, told
 from epypes_widgets.session import Session
 from epypes_widgets.static import static_html
 from epypes_widgets.still import Still
 from epypes_widgets.tuning import Tuning
 
 if TYPE_CHECKING:
+    from epypes.scale.studying import Direction
     from epypes.service.remote.connection import Connection
     from epypes_widgets.historyframe import HistoryFrame
 
@@ -41,6 +43,9 @@ def tune(
     *,
     images: Iterable[Any] | None = None,
     token: str | None = None,
+    cases: Any = None,
+    metric: Any = None,
+    direction: Direction = "maximize",
     **hints: Any,
 ) -> Panel:
     """Show controls for the hyperparameters of a runner or a running service, and the picture that they make.
@@ -56,11 +61,18 @@ def tune(
     token
         The token whose picture is shown at first; without, the last sink token that is an image, else the last
         image.
+    cases
+        What a search of hyperparameters looks at, as for ``ep.optimize``; without, the ``images``, else the last
+        payload.
+    metric, direction
+        What the "Optimise" button makes as large (``"maximize"``) or as small (``"minimize"``) as it can, within the
+        ranges of the controls: ``metric(tokens, case)``, or the name of a token that is a number. Without, there is no
+        such button. The search runs beside the panel; "Use best" sets what it has found, and undo goes back.
     hints
         By hyperparameter: an ``ep.Param``, an ``ep.Roi``, a tuple as a range (low, high[, step]), a list of choices.
         Without, the annotation of the function that takes it says it, then the table of OpenCV's and scikit-image's
-        parameters, then its value; what can't be moved is shown. A hyperparameter called ``images`` or ``token`` gets
-        its hint from its annotation.
+        parameters, then its value; what can't be moved is shown. A hyperparameter that is called
+        like a parameter above gets its hint from its annotation.
 
     Returns
     -------
@@ -105,8 +117,20 @@ def tune(
     elif given:
         runner.trial({}, payload=given[0].values)  # refuses it
     hand = Hand(controls(runner, hints))
+    search = None if metric is None else _search(runner, hand, metric, direction, cases, given)
     session.begin()
-    return Panel(hand, session, token)
+    return Panel(hand, session, token, search)
+
+
+def _search(
+    runner: Tunable, hand: Hand, metric: Any, direction: Direction, cases: Any, films: Sequence[Payload]
+) -> Searching:
+    if not isinstance(runner, CompGraphRunner):
+        raise TypeError(
+            "metric is for a runner: a running service has one image at a time. Optimise where it was made."
+        )
+    looked_at = [film.values for film in films] if cases is None and films else cases
+    return Searching(runner, metric, direction, looked_at, lambda: movable_ranges(hand.params))
 
 
 def _require_payload(runner: Tunable, given: Sequence[Payload]) -> None:
@@ -131,9 +155,17 @@ class Panel:
         Its runner is run by the panel.
     token
         The token to show first; None for the best one.
+    search
+        Of hyperparameters; None if there is no metric.
+
+    Attributes
+    ----------
+    search
+        What the "Optimise" button starts: ``start(n)``, ``stop()``, ``wait(timeout_s)``, ``result``; None without a
+        metric.
     """
 
-    def __init__(self, hand: Hand, session: Session, token: str | None) -> None:
+    def __init__(self, hand: Hand, session: Session, token: str | None, search: Searching | None = None) -> None:
         self._hand, self._session, self._runner = hand, session, session.runner
         self._history = history_of(self._runner)
         if session.payloads:
@@ -141,7 +173,8 @@ class Panel:
         self._column = column(self._runner.cg, hand.controls)
         self._still = Still(self._static)
         self._tuning = tuning = Tuning(hand, session, self._history, self._still.update)
-        self._messages = Messages(tuning, self.save, self.load)
+        self.search = search
+        self._messages = Messages(tuning, self.save, self.load, search)
         view = PictureView(tuning.worker.later, self._messages.handlers, tuning.report)
         self._screen = tuning.screen = Screen(view, session, self._history, token, self._setup, self.code)
         self._cuts = _cuts(hand)
@@ -302,7 +335,11 @@ class Panel:
         for control in self._hand.controls:
             if control.widget.has_trait("disabled"):
                 control.widget.disabled = True
+        if self.search is not None:
+            self.search.stop()
         self._tuning.close(timeout_s)
+        if self.search is not None:
+            self.search.close(timeout_s)
 
     def _require_open(self) -> None:
         if self._tuning.worker.closed:
@@ -351,6 +388,7 @@ class Panel:
             "promote_to": proposal(self.token),
             "writes_back": self._session.place.is_written_back,
             "settings": list(settings.names(".")),
+            "optimise": told(self.search),
         }
         return content, [film.thumbnail for film in films]
 
