@@ -104,8 +104,8 @@ def axes_of(runner: CompGraphRunner, ranges: Mapping[str, Any] | None = None) ->
     ranges
         By hyperparameter: an ``ep.Param``, a tuple as a range (low, high[, step]), or a list of choices; only these
         vary. Without, all those vary for which an annotation, a switch, or the tables of OpenCV and scikit-image give
-        choices or both ends of a range, hard or usual. A range that is usual is widened to hold the present value. Values
-        are whole numbers where the present one is.
+        choices or both ends of a range, hard or usual. A range that is usual is widened to hold the present value.
+        Values are whole numbers where the present one is.
 
     Raises
     ------

@@ -72,7 +72,7 @@ class Messages:
             "promote": self._promote,
             "write_back": self._write_back,
             "optimise": self._optimise,
-            "optimise_stop": lambda _: self.search and self.search.stop(),
+            "optimise_stop": self._stop,
             "optimise_use": lambda _: self._use_best(),
             "seen": lambda _: tuning.seen(),
             "left": lambda _: tuning.leave(),
@@ -160,6 +160,10 @@ class Messages:
     def _optimise(self, message: Message) -> None:
         if self.search is not None:
             self.search.start(int(message["n"]))
+
+    def _stop(self, _message: Message) -> None:
+        if self.search is not None:
+            self.search.stop()
 
     def _use_best(self) -> None:
         setting = None if self.search is None else self.search.found.setting

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import ipywidgets
 
 from epypes.errors import NotComputed, PayloadError, run_call
-from epypes.graph import CompGraph
-from epypes.hints import Param, Roi
+from epypes.hints import Roi
 from epypes.run import CompGraphRunner, Run
 from epypes_widgets import code, settings
 from epypes_widgets.controls import column, controls
+from epypes_widgets.controls.roi import made_from
 from epypes_widgets.hand import Hand
 from epypes_widgets.history import history_of
 from epypes_widgets.latency import Latency, latency_of
@@ -25,7 +25,7 @@ from epypes_widgets.plain import plain_values
 from epypes_widgets.promotion import proposal
 from epypes_widgets.route import listen_beside_cells
 from epypes_widgets.screen import Screen
-from epypes_widgets.searching import Searching, movable_ranges, told
+from epypes_widgets.searching import Searching, search_of, told
 from epypes_widgets.session import Session
 from epypes_widgets.static import static_html
 from epypes_widgets.still import Still
@@ -117,20 +117,10 @@ def tune(
     elif given:
         runner.trial({}, payload=given[0].values)  # refuses it
     hand = Hand(controls(runner, hints))
-    search = None if metric is None else _search(runner, hand, metric, direction, cases, given)
+    looked_at = [film.values for film in given] if cases is None and given else cases
+    search = search_of(runner, metric, direction, looked_at, lambda: hand.params)
     session.begin()
     return Panel(hand, session, token, search)
-
-
-def _search(
-    runner: Tunable, hand: Hand, metric: Any, direction: Direction, cases: Any, films: Sequence[Payload]
-) -> Searching:
-    if not isinstance(runner, CompGraphRunner):
-        raise TypeError(
-            "metric is for a runner: a running service has one image at a time. Optimise where it was made."
-        )
-    looked_at = [film.values for film in films] if cases is None and films else cases
-    return Searching(runner, metric, direction, looked_at, lambda: movable_ranges(hand.params))
 
 
 def _require_payload(runner: Tunable, given: Sequence[Payload]) -> None:
@@ -177,7 +167,7 @@ class Panel:
         self._messages = Messages(tuning, self.save, self.load, search)
         view = PictureView(tuning.worker.later, self._messages.handlers, tuning.report)
         self._screen = tuning.screen = Screen(view, session, self._history, token, self._setup, self.code)
-        self._cuts = _cuts(hand)
+        self._cuts = hand.cuts
         tuning.screen.change(cut=tuple(self._cuts), has_histogram=bool(self._cuts))
         columns = ipywidgets.HBox([self._column.widget, view], _dom_classes=("epypes-columns",))
         self._widget = ipywidgets.VBox([columns], _dom_classes=("epypes-panel",))
@@ -381,7 +371,7 @@ class Panel:
             "live": self._tuning.is_live,
             "cuts": [{"token": token, "names": names} for token, names in self._cuts.items()],
             "rois": [
-                {"name": name, "token": param.on, "cuts_out": _made_from(self._runner.cg, name)}
+                {"name": name, "token": param.on, "cuts_out": made_from(self._runner.cg, name)}
                 for name, param in params.items()
                 if isinstance(param, Roi)
             ],
@@ -391,21 +381,3 @@ class Panel:
             "optimise": told(self.search),
         }
         return content, [film.thumbnail for film in films]
-
-
-def _cuts(hand: Hand) -> dict[str, list[str]]:
-    """Return the hyperparameters that are thresholds, by the token that they cut."""
-    cuts: dict[str, list[str]] = {}
-    for name, param in hand.params.items():
-        if isinstance(param, Param) and param.cuts:
-            cuts.setdefault(param.cuts, []).append(name)
-    return cuts
-
-
-def _made_from(cg: CompGraph, token: str) -> list[str]:
-    """Return the tokens that a token has to do with: on a picture that it has cut out, it means something else."""
-    found = {token}
-    for function in cg.functions:
-        if found.intersection(cg.func_inputs(function)):
-            found.update(cg.func_outputs(function))
-    return sorted(found)

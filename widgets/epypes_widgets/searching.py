@@ -13,6 +13,7 @@ from epypes.errors import EpypesError, ScaleError, StillRunning
 from epypes.hints import Param
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
+from epypes_widgets.places import Tunable
 from epypes_widgets.values import said
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ class Searching:
     metric, direction, cases
         As for ``ep.optimize``; without cases, the payload of the last run is the one case.
     ranges
-        Returns what varies, and within which values.
+        Returns what hyperparameters may be, by token; those vary that are choices, or numbers between two ends.
 
     Attributes
     ----------
@@ -88,7 +89,7 @@ class Searching:
         metric: Any,
         direction: Direction,
         cases: Any,
-        ranges: Callable[[], Mapping[str, Param]],
+        ranges: Callable[[], Mapping[str, Any]],
     ) -> None:
         self.metric: str = metric if isinstance(metric, str) else getattr(metric, "__name__", "metric")
         self.direction = direction
@@ -157,7 +158,7 @@ class Searching:
                 self._of_last_run() if self._cases is None else self._cases,
                 n,
                 direction=self.direction,
-                ranges=self._ranges(),
+                ranges={name: param for name, param in self._ranges().items() if isinstance(param, Param)},
                 stop=self._stop,
                 on_trial=self._tried,
                 progress=False,
@@ -216,9 +217,23 @@ def told(search: Searching | None) -> dict[str, Any] | None:
     }
 
 
-def movable_ranges(params: Mapping[str, Any]) -> dict[str, Param]:
-    """Return what varies in a search: all that is a choice, or whose slider has two ends."""
-    return {name: param for name, param in params.items() if isinstance(param, Param)}
+def search_of(
+    runner: Tunable, metric: Any, direction: Direction, cases: Any, ranges: Callable[[], Mapping[str, Any]]
+) -> Searching | None:
+    """Return what searches the hyperparameters of a runner; None without a metric.
+
+    Raises
+    ------
+    TypeError
+        It is a running service that is tuned.
+    """
+    if metric is None:
+        return None
+    if not isinstance(runner, CompGraphRunner):
+        raise TypeError(
+            "metric is for a runner: a running service has one image at a time. Optimise where it was made."
+        )
+    return Searching(runner, metric, direction, cases, ranges)
 
 
 def _so_far(trials: Sequence[Trial], direction: Direction, n: int, state: State) -> Found:
