@@ -7,6 +7,7 @@ from typing import Any
 from ipywidgets.widgets.widget_string import HTMLStyle
 
 from epypes.display.previews.short import short_repr
+from epypes.graph import CompGraph
 from epypes.hints import Roi
 from epypes_widgets.controls.control import Control
 from epypes_widgets.controls.look import Look
