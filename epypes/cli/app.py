@@ -5,6 +5,7 @@ from __future__ import annotations
 import typer
 
 from epypes.cli.call import call
+from epypes.cli.check import check
 from epypes.cli.demo import demo
 from epypes.cli.deploy import deploy, rollback
 from epypes.cli.doctor import doctor
@@ -32,7 +33,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 _COMMANDS = (
-    *(promote, verify, serve, call, status, stop, deploy, rollback, failures, replay),
+    *(promote, verify, check, serve, call, status, stop, deploy, rollback, failures, replay),
     *(record, play, keys, experiment, demo, lab, doctor),
 )
 for command in _COMMANDS:

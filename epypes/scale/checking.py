@@ -1,1 +1,231 @@
 """Does a graph still do on a labelled set what it must?"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from epypes.errors import UnknownName
+from epypes.run import CompGraphRunner
+from epypes.scale.cases import Case, Check, cases_of, checks_of
+from epypes.scale.items import items_of
+from epypes.scale.job import Job
+from epypes.scale.labels import is_file
+from epypes.scale.measuring import CheckOutcome, measured
+from epypes.scale.needed import needed
+from epypes.scale.progress import progress_bar
+from epypes.scale.spreading import spread
+from epypes.wording import counted
+
+if TYPE_CHECKING:
+    import os
+
+    import pandas as pd
+
+Checks = Sequence[tuple[Case, tuple[Check, ...]]]
+
+
+def check(
+    runner: CompGraphRunner,
+    cases: str | os.PathLike[str] | Iterable[Any],
+    executor: Executor | None = None,
+    *,
+    progress: bool | None = None,
+) -> CheckResult:
+    """Run a labelled set and say which cases pass.
+
+    Parameters
+    ----------
+    runner
+        Its graph and hyperparameters are used; it is left as it is.
+    cases
+        ``ep.Case``s, dicts with the parts of one, or the path of a CASES.toml.
+    executor
+        None runs the cases in this thread; any ``concurrent.futures.Executor`` elsewhere. Metrics are computed here.
+    progress
+        Whether a bar is shown; None: in a terminal or a notebook.
+
+    Returns
+    -------
+    CheckResult
+        True if every check of every case has passed. A case that fails, whose metric raises or gives NaN, or whose
+        file of what was expected can't be read, has not, with its reason; the others go on.
+
+    Raises
+    ------
+    ScaleError
+        There are no cases, or one can't be understood.
+    UnknownName
+        A case names a token, a hyperparameter or a metric that is not there.
+
+    Examples
+    --------
+    >>> from epypes import Case, CompGraph, CompGraphRunner
+    >>> cg = CompGraph({"double": lambda x, k: x * k}, {"double": (("x", "k"), "y")})
+    >>> result = check(CompGraphRunner(cg, {"k": 2}), [Case(2, {"y": 4}), Case(3, {"y": 7}, name="odd")])
+    >>> print(result)
+    1 of 2 cases failed: odd
+    >>> result.failures[0].reason
+    'expected 7, got 6'
+    """
+    found = prepared(runner, cases)
+    outcomes: list[CheckOutcome] = []
+    with progress_bar(progress, len(found), "check", unit="case") as advance:
+        for of_case in checked(runner, found, executor):
+            outcomes += of_case
+            advance(1, int(not all(outcome.passed for outcome in of_case)))
+    outcomes.sort(key=lambda outcome: outcome.number)
+    return CheckResult(tuple(outcomes))
+
+
+def prepared(runner: CompGraphRunner, cases: Any) -> Checks:
+    """Return cases with their checks.
+
+    Raises
+    ------
+    ScaleError, UnknownName
+        As ``check`` does.
+    """
+    found = [(case, checks_of(case, runner.cg)) for case in cases_of(cases)]
+    for case, _ in found:
+        for token in case.hyperparameters or {}:
+            if token not in runner.hyperparameters:
+                raise UnknownName("hyperparameter", token, runner.hyperparameters, f"for {case}")
+    return found
+
+
+def checked(
+    runner: CompGraphRunner,
+    cases: Checks,
+    executor: Executor | None = None,
+    *,
+    has_pictures: bool = True,
+    stop: threading.Event | None = None,
+) -> Iterator[tuple[CheckOutcome, ...]]:
+    """Give what came of the cases, case by case as they come.
+
+    Parameters
+    ----------
+    runner, cases, executor
+        As of ``check``; the cases with their checks.
+    has_pictures
+        Whether pictures are made of what is measured.
+    stop
+        Ends it in bounded time, once it is set.
+    """
+    jobs = _jobs(runner, cases, has_pictures=has_pictures)
+    for outcomes in spread(runner, jobs, executor, stop=stop):
+        for outcome in outcomes:
+            case, checks = cases[outcome.number]
+            yield measured(outcome, case, checks, runner.cg)
+
+
+def _jobs(runner: CompGraphRunner, cases: Checks, *, has_pictures: bool) -> Iterator[Job]:
+    """Give a job per case, when it is asked for."""
+    items = items_of((_inputs(case) for case, _ in cases), runner)
+    for item, (case, checks) in zip(items, cases, strict=True):
+        looked_at = tuple(dict.fromkeys(check.token for check in checks if check.token is not None))
+        keep = tuple(dict.fromkeys(token for check in checks for token in check.keep))
+        named = replace(item, name=case.name or item.name)
+        yield Job((named,), (dict(case.hyperparameters or {}),), keep, looked_at if has_pictures else ())
+
+
+def _inputs(case: Case) -> Any:
+    if not isinstance(case.inputs, Mapping):
+        return _input(case.inputs)
+    return {token: _input(value) for token, value in case.inputs.items()}
+
+
+def _input(value: Any) -> Any:
+    return Path(value) if is_file(value) else value
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class CheckResult:
+    """What came of a labelled set; true if all of it has passed.
+
+    Attributes
+    ----------
+    outcomes
+        Check by check, in the order of the cases.
+    """
+
+    outcomes: tuple[CheckOutcome, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether every check of every case has passed."""
+        return all(outcome.passed for outcome in self.outcomes)
+
+    @property
+    def failures(self) -> tuple[CheckOutcome, ...]:
+        """The checks that have not passed."""
+        return tuple(outcome for outcome in self.outcomes if not outcome.passed)
+
+    @property
+    def cases(self) -> dict[str, bool]:
+        """Whether each case has passed, by name."""
+        found: dict[str, bool] = {}
+        for outcome in self.outcomes:
+            found[outcome.case] = found.get(outcome.case, True) and outcome.passed
+        return found
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return a pandas table with a row per check: case, check, token, value, threshold, passed, failure, run_ms."""
+        rows = [
+            {
+                "case": outcome.case,
+                "check": outcome.check,
+                "token": outcome.token,
+                "value": float("nan") if outcome.value is None else outcome.value,
+                "threshold": outcome.threshold,
+                "passed": outcome.passed,
+                "failure": outcome.reason or None,
+                "run_ms": outcome.total_ns / 1e6,
+            }
+            for outcome in self.outcomes
+        ]
+        frame: pd.DataFrame = needed("pandas").DataFrame(rows)
+        return frame
+
+    def to_junit(self, path: str | os.PathLike[str], name: str = "epypes check") -> Path:
+        """Write JUnit XML, as continuous integration reads it, and return its path.
+
+        A case is a class, a check a test case; what could not be measured is an error, what falls short a failure.
+
+        Raises
+        ------
+        ScaleError
+            The file can't be written, or junitparser is missing.
+        """
+        from epypes.scale.junit import write_junit
+
+        return write_junit(Path(path), self.outcomes, name)
+
+    def __bool__(self) -> bool:
+        return self.passed
+
+    def __len__(self) -> int:
+        return len(self.outcomes)
+
+    def __str__(self) -> str:
+        cases = self.cases
+        failed = [name for name, has_passed in cases.items() if not has_passed]
+        if not failed:
+            return f"{counted(len(cases), 'case')} passed"
+        named = ", ".join(failed[:5])
+        return f"{len(failed)} of {counted(len(cases), 'case')} failed: {named}{', ...' if len(failed) > 5 else ''}"
+
+    def __repr__(self) -> str:
+        cases = self.cases
+        failed = sum(not passed for passed in cases.values())
+        return f"<CheckResult: {counted(len(cases), 'case')}, {f'{failed} failed' if failed else 'all passed'}>"
+
+    def _repr_html_(self) -> str:
+        from epypes.scale.checkshown import check_html
+
+        return check_html(self)

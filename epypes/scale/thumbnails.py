@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 from epypes.display.paint.thumbnails import THUMB_HEIGHT, THUMB_WIDTH, paint_thumbnail
-from epypes.display.previews.preview import Preview, finished, sketch
+from epypes.display.previews.preview import Preview, finished, preview, sketch
 from epypes.display.previews.ranges import kept_range
 from epypes.display.previews.shown import Look
 from epypes.display.views.backdrops import RunSurroundings
 from epypes.graph import colour_order
+from epypes.images import Order
 from epypes.run import Run
 from epypes.scale.outcome import Thumbnail
 
@@ -35,6 +36,11 @@ def thumbnail_of(run: Run, token: str) -> Thumbnail | None:
     look = Look(colour_order(run.cg, token), partial(kept_range, program, token), RunSurroundings(run, token))
     sketched = sketch(run.tokens.values[program.slots[token]], look)
     return _as_file(finished(sketched)) if sketched.may_be_drawn else None
+
+
+def thumbnail_of_value(value: Any, order: Order = "bgr") -> Thumbnail | None:
+    """Return a picture of any value of at most 5 KB; ``order`` is that of its colours. None if it has none."""
+    return _as_file(preview(value, order))
 
 
 def _as_file(shown: Preview) -> Thumbnail | None:
