@@ -55,10 +55,10 @@ if TYPE_CHECKING:
         summarize,
     )
     from epypes.run.guard import unguarded
+    from epypes.scale import MapResult, map  # noqa: A004 - as in ep.map(runner, images)
     from epypes.scale.cases import Case
     from epypes.scale.checking import check
     from epypes.scale.optimizing import optimize
-    from epypes.scale import MapResult, map  # noqa: A004 - as in ep.map(runner, images)
     from epypes.service.failures.reopen import load_failure
     from epypes.service.remote.connection import connect
     from epypes.store import Store
@@ -166,8 +166,8 @@ __all__ = [
     "load",
     "load_failure",
     "load_pipeline",
-    "optimize",
     "map",
+    "optimize",
     "outputs",
     "promote",
     "register_preview",

@@ -15,6 +15,7 @@ from epypes.bundle import to_source
 from epypes.errors import EpypesError, ScaleError
 from epypes.run import CompGraphRunner
 from epypes.scale.cases import Case, cases_of, with_labels_read
+from epypes.scale.hands import own_runner
 from epypes.scale.items import Item, items_of
 from epypes.scale.job import Job
 from epypes.scale.optimized import OptimizeResult
@@ -22,7 +23,7 @@ from epypes.scale.outcome import Outcome
 from epypes.scale.progress import progress_bar
 from epypes.scale.ranging import Axis, axes_of
 from epypes.scale.scoring import Metric, Score, Scoring
-from epypes.scale.spreading import own_runner, spread, worker_count
+from epypes.scale.spreading import spread, worker_count
 from epypes.scale.studying import Asked, Direction, Search, Trial
 from epypes.scale.trying import Bench, Stopped
 from epypes.store import opened_store
