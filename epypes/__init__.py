@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from epypes.scale import MapResult, map  # noqa: A004 - as in ep.map(runner, images)
     from epypes.scale.cases import Case
     from epypes.scale.checking import check
+    from epypes.scale.optimizing import optimize
     from epypes.scale.sweeping import SweepResult, sweep
     from epypes.service.failures.reopen import load_failure
     from epypes.service.remote.connection import connect
@@ -115,6 +116,7 @@ _HOMES = {
     "load": "epypes.bundle",
     "load_failure": "epypes.service.failures.reopen",
     "load_pipeline": "epypes.bundle",
+    "optimize": "epypes.scale.optimizing",
     "MapResult": "epypes.scale",
     "map": "epypes.scale",
     "promote": "epypes.bundle",
@@ -169,6 +171,7 @@ __all__ = [
     "load_failure",
     "load_pipeline",
     "map",
+    "optimize",
     "outputs",
     "promote",
     "register_preview",

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import ipywidgets
 
 from epypes.errors import NotComputed, PayloadError, run_call
-from epypes.graph import CompGraph
-from epypes.hints import Param, Roi
+from epypes.hints import Roi
 from epypes.run import CompGraphRunner, Run
 from epypes_widgets import code, settings
 from epypes_widgets.controls import column, controls
+from epypes_widgets.controls.roi import made_from
 from epypes_widgets.hand import Hand
 from epypes_widgets.history import history_of
 from epypes_widgets.latency import Latency, latency_of
@@ -25,12 +25,14 @@ from epypes_widgets.plain import plain_values
 from epypes_widgets.promotion import proposal
 from epypes_widgets.route import listen_beside_cells
 from epypes_widgets.screen import Screen
+from epypes_widgets.searching import Searching, search_of, told
 from epypes_widgets.session import Session
 from epypes_widgets.static import static_html
 from epypes_widgets.still import Still
 from epypes_widgets.tuning import Tuning
 
 if TYPE_CHECKING:
+    from epypes.scale.studying import Direction
     from epypes.service.remote.connection import Connection
     from epypes_widgets.historyframe import HistoryFrame
 
@@ -41,6 +43,9 @@ def tune(
     *,
     images: Iterable[Any] | None = None,
     token: str | None = None,
+    cases: Any = None,
+    metric: Any = None,
+    direction: Direction = "maximize",
     **hints: Any,
 ) -> Panel:
     """Show controls for the hyperparameters of a runner or a running service, and the picture that they make.
@@ -56,11 +61,18 @@ def tune(
     token
         The token whose picture is shown at first; without, the last sink token that is an image, else the last
         image.
+    cases
+        What a search of hyperparameters looks at, as for ``ep.optimize``; without, the ``images``, else the last
+        payload.
+    metric, direction
+        What the "Optimise" button makes as large (``"maximize"``) or as small (``"minimize"``) as it can, within the
+        ranges of the controls: ``metric(tokens, case)``, or the name of a token that is a number. Without, there is no
+        such button. The search runs beside the panel; "Use best" sets what it has found, and undo goes back.
     hints
         By hyperparameter: an ``ep.Param``, an ``ep.Roi``, a tuple as a range (low, high[, step]), a list of choices.
         Without, the annotation of the function that takes it says it, then the table of OpenCV's and scikit-image's
-        parameters, then its value; what can't be moved is shown. A hyperparameter called ``images`` or ``token`` gets
-        its hint from its annotation.
+        parameters, then its value; what can't be moved is shown. A hyperparameter that is called
+        like a parameter above gets its hint from its annotation.
 
     Returns
     -------
@@ -105,8 +117,10 @@ def tune(
     elif given:
         runner.trial({}, payload=given[0].values)  # refuses it
     hand = Hand(controls(runner, hints))
+    looked_at = [film.values for film in given] if cases is None and given else cases
+    search = search_of(runner, metric, direction, looked_at, lambda: hand.params)
     session.begin()
-    return Panel(hand, session, token)
+    return Panel(hand, session, token, search)
 
 
 def _require_payload(runner: Tunable, given: Sequence[Payload]) -> None:
@@ -131,9 +145,17 @@ class Panel:
         Its runner is run by the panel.
     token
         The token to show first; None for the best one.
+    search
+        Of hyperparameters; None if there is no metric.
+
+    Attributes
+    ----------
+    search
+        What the "Optimise" button starts: ``start(n)``, ``stop()``, ``wait(timeout_s)``, ``result``; None without a
+        metric.
     """
 
-    def __init__(self, hand: Hand, session: Session, token: str | None) -> None:
+    def __init__(self, hand: Hand, session: Session, token: str | None, search: Searching | None = None) -> None:
         self._hand, self._session, self._runner = hand, session, session.runner
         self._history = history_of(self._runner)
         if session.payloads:
@@ -141,10 +163,11 @@ class Panel:
         self._column = column(self._runner.cg, hand.controls)
         self._still = Still(self._static)
         self._tuning = tuning = Tuning(hand, session, self._history, self._still.update)
-        self._messages = Messages(tuning, self.save, self.load)
+        self.search = search
+        self._messages = Messages(tuning, self.save, self.load, search)
         view = PictureView(tuning.worker.later, self._messages.handlers, tuning.report)
         self._screen = tuning.screen = Screen(view, session, self._history, token, self._setup, self.code)
-        self._cuts = _cuts(hand)
+        self._cuts = hand.cuts
         tuning.screen.change(cut=tuple(self._cuts), has_histogram=bool(self._cuts))
         columns = ipywidgets.HBox([self._column.widget, view], _dom_classes=("epypes-columns",))
         self._widget = ipywidgets.VBox([columns], _dom_classes=("epypes-panel",))
@@ -302,7 +325,11 @@ class Panel:
         for control in self._hand.controls:
             if control.widget.has_trait("disabled"):
                 control.widget.disabled = True
+        if self.search is not None:
+            self.search.stop()
         self._tuning.close(timeout_s)
+        if self.search is not None:
+            self.search.close(timeout_s)
 
     def _require_open(self) -> None:
         if self._tuning.worker.closed:
@@ -344,30 +371,13 @@ class Panel:
             "live": self._tuning.is_live,
             "cuts": [{"token": token, "names": names} for token, names in self._cuts.items()],
             "rois": [
-                {"name": name, "token": param.on, "cuts_out": _made_from(self._runner.cg, name)}
+                {"name": name, "token": param.on, "cuts_out": made_from(self._runner.cg, name)}
                 for name, param in params.items()
                 if isinstance(param, Roi)
             ],
             "promote_to": proposal(self.token),
             "writes_back": self._session.place.is_written_back,
             "settings": list(settings.names(".")),
+            "optimise": told(self.search),
         }
         return content, [film.thumbnail for film in films]
-
-
-def _cuts(hand: Hand) -> dict[str, list[str]]:
-    """Return the hyperparameters that are thresholds, by the token that they cut."""
-    cuts: dict[str, list[str]] = {}
-    for name, param in hand.params.items():
-        if isinstance(param, Param) and param.cuts:
-            cuts.setdefault(param.cuts, []).append(name)
-    return cuts
-
-
-def _made_from(cg: CompGraph, token: str) -> list[str]:
-    """Return the tokens that a token has to do with: on a picture that it has cut out, it means something else."""
-    found = {token}
-    for function in cg.functions:
-        if found.intersection(cg.func_inputs(function)):
-            found.update(cg.func_outputs(function))
-    return sorted(found)
