@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any, Final
 
 from epypes.errors import ScaleError
 from epypes.scale.needed import needed
@@ -15,7 +16,7 @@ Advance = Callable[[int, int], None]
 
 @contextmanager
 def progress_bar(progress: bool | None, total: int | None, what: str, *, unit: str = "image") -> Iterator[Advance]:
-    """Show a bar on standard error, or in the notebook, and yield what moves it on.
+    """Show a bar on standard error, or below the cell of a notebook, and yield what moves it on.
 
     Parameters
     ----------
@@ -32,14 +33,14 @@ def progress_bar(progress: bool | None, total: int | None, what: str, *, unit: s
         yield _tell_nobody
         return
     try:
-        tqdm = needed("tqdm.auto").tqdm
+        tqdm = needed("tqdm").tqdm
     except ScaleError:
         if progress:
             raise
         yield _tell_nobody
         return
     failed = 0
-    with tqdm(total=total, desc=what, unit=unit) as bar:
+    with tqdm(total=total, desc=what, unit=unit, file=_Cell() if _is_in_notebook() else sys.stderr) as bar:
 
         def advance(count: int, failures: int) -> None:
             nonlocal failed
@@ -49,6 +50,34 @@ def progress_bar(progress: bool | None, total: int | None, what: str, *, unit: s
             bar.update(count)
 
         yield advance
+
+
+class _Cell:
+    """A file below a cell of a notebook, of which the last line is seen.
+
+    Text, and no widget: a saved notebook shows how it ended, without a kernel.
+    """
+
+    # So that the bar is drawn in blocks.
+    encoding: Final = "utf-8"
+
+    def __init__(self) -> None:
+        self._shown: Any = None
+
+    def write(self, text: str) -> None:
+        """Show a line in the place of the one before."""
+        import IPython.display
+
+        line = {"text/plain": text.strip()}
+        if not line["text/plain"]:
+            return
+        if self._shown is None:
+            self._shown = IPython.display.display(line, raw=True, display_id=True)  # type: ignore[no-untyped-call]
+        else:
+            self._shown.update(line, raw=True)
+
+    def flush(self) -> None:
+        """Do nothing: each line is shown at once."""
 
 
 def _tell_nobody(count: int, failures: int) -> None:
