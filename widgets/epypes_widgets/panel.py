@@ -12,6 +12,7 @@ from epypes.errors import NotComputed, PayloadError, run_call
 from epypes.graph import CompGraph
 from epypes.hints import Param, Roi
 from epypes.run import CompGraphRunner, Run
+from epypes.store import Store
 from epypes_widgets import code, settings
 from epypes_widgets.controls import column, controls
 from epypes_widgets.hand import Hand
@@ -28,9 +29,12 @@ from epypes_widgets.screen import Screen
 from epypes_widgets.session import Session
 from epypes_widgets.static import static_html
 from epypes_widgets.still import Still
+from epypes_widgets.stored import StoredHistory
 from epypes_widgets.tuning import Tuning
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from epypes.service.remote.connection import Connection
     from epypes_widgets.historyframe import HistoryFrame
 
@@ -41,6 +45,8 @@ def tune(
     *,
     images: Iterable[Any] | None = None,
     token: str | None = None,
+    store: str | Path | Store | None = None,
+    name: str | None = None,
     **hints: Any,
 ) -> Panel:
     """Show controls for the hyperparameters of a runner or a running service, and the picture that they make.
@@ -56,10 +62,14 @@ def tune(
     token
         The token whose picture is shown at first; without, the last sink token that is an image, else the last
         image.
+    store
+        Where each committed setting is kept: a SQLite file, a database's URL, or an ``ep.Store``. Nothing waits for it.
+    name
+        The name of the series there; without, those of the sink tokens.
     hints
         By hyperparameter: an ``ep.Param``, an ``ep.Roi``, a tuple as a range (low, high[, step]), a list of choices.
         Without, the annotation of the function that takes it says it, then the table of OpenCV's and scikit-image's
-        parameters, then its value; what can't be moved is shown. A hyperparameter called ``images`` or ``token`` gets
+        parameters, then its value; what can't be moved is shown. A hyperparameter called as one of the above gets
         its hint from its annotation.
 
     Returns
@@ -81,6 +91,8 @@ def tune(
         A hint can't be read, or the hyperparameter's value lies outside of it.
     ServiceError
         The service is gone.
+    StoreError
+        There can be no such database. One that is away for now is told in the panel's log.
 
     Examples
     --------
@@ -104,9 +116,10 @@ def tune(
         _require_payload(runner, given)
     elif given:
         runner.trial({}, payload=given[0].values)  # refuses it
+    stored = StoredHistory(runner, store, name)
     hand = Hand(controls(runner, hints))
     session.begin()
-    return Panel(hand, session, token)
+    return Panel(hand, session, token, stored)
 
 
 def _require_payload(runner: Tunable, given: Sequence[Payload]) -> None:
@@ -131,9 +144,11 @@ class Panel:
         Its runner is run by the panel.
     token
         The token to show first; None for the best one.
+    stored
+        Where the history is kept, if it is.
     """
 
-    def __init__(self, hand: Hand, session: Session, token: str | None) -> None:
+    def __init__(self, hand: Hand, session: Session, token: str | None, stored: StoredHistory) -> None:
         self._hand, self._session, self._runner = hand, session, session.runner
         self._history = history_of(self._runner)
         if session.payloads:
@@ -150,6 +165,8 @@ class Panel:
         self._widget = ipywidgets.VBox([columns], _dom_classes=("epypes-panel",))
         listen_beside_cells(self._widget)
         tuning.begin()
+        self._stored = stored
+        stored.follow(self._history, self._screen.log)
 
     # -- values -------------------------------------------------------------------------------------------------
 
@@ -256,6 +273,11 @@ class Panel:
         """The values that were committed, a row each, with the pictures that they made; the pandas table is a copy."""
         return self._history.to_frame()
 
+    @property
+    def stored(self) -> pd.DataFrame:
+        """What was committed under this panel's name, in earlier sessions too, as a pandas table; needs a store."""
+        return self._stored.to_frame()
+
     def undo(self) -> bool:
         """Go back to the values before; False if there are none."""
         self._require_open()
@@ -303,6 +325,7 @@ class Panel:
             if control.widget.has_trait("disabled"):
                 control.widget.disabled = True
         self._tuning.close(timeout_s)
+        self._stored.close(timeout_s)
 
     def _require_open(self) -> None:
         if self._tuning.worker.closed:
