@@ -23,6 +23,7 @@
 What is remembered:
 
 - ``history``, ``historyframe``: at which values did the hand stop
+- ``stored``: how that is kept in a database
 - ``settings``: how values get into a file, and back
 - ``code``: which line of code does the same
 - ``promotion``, ``writeback``: what becomes of a promotion, and of values that are written back

@@ -11,6 +11,7 @@ import ipywidgets
 from epypes.errors import NotComputed, PayloadError, run_call
 from epypes.hints import Roi
 from epypes.run import CompGraphRunner, Run
+from epypes.store import Store
 from epypes_widgets import code, settings
 from epypes_widgets.controls import column, controls
 from epypes_widgets.controls.roi import made_from
@@ -29,9 +30,12 @@ from epypes_widgets.searching import Searching, search_of, told
 from epypes_widgets.session import Session
 from epypes_widgets.static import static_html
 from epypes_widgets.still import Still
+from epypes_widgets.stored import StoredHistory
 from epypes_widgets.tuning import Tuning
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from epypes.scale.studying import Direction
     from epypes.service.remote.connection import Connection
     from epypes_widgets.historyframe import HistoryFrame
@@ -46,6 +50,8 @@ def tune(
     cases: Any = None,
     metric: Any = None,
     direction: Direction = "maximize",
+    store: str | Path | Store | None = None,
+    name: str | None = None,
     **hints: Any,
 ) -> Panel:
     """Show controls for the hyperparameters of a runner or a running service, and the picture that they make.
@@ -68,11 +74,15 @@ def tune(
         What the "Optimise" button makes as large (``"maximize"``) or as small (``"minimize"``) as it can, within the
         ranges of the controls: ``metric(tokens, case)``, or the name of a token that is a number. Without, there is no
         such button. The search runs beside the panel; "Use best" sets what it has found, and undo goes back.
+    store
+        Where each committed setting is kept: a SQLite file, a database's URL, or an ``ep.Store``. Nothing waits for it.
+    name
+        The name of the series there; without, those of the sink tokens.
     hints
         By hyperparameter: an ``ep.Param``, an ``ep.Roi``, a tuple as a range (low, high[, step]), a list of choices.
         Without, the annotation of the function that takes it says it, then the table of OpenCV's and scikit-image's
-        parameters, then its value; what can't be moved is shown. A hyperparameter that is called
-        like a parameter above gets its hint from its annotation.
+        parameters, then its value; what can't be moved is shown. A hyperparameter called as one of the above gets
+        its hint from its annotation.
 
     Returns
     -------
@@ -93,6 +103,8 @@ def tune(
         A hint can't be read, or the hyperparameter's value lies outside of it.
     ServiceError
         The service is gone.
+    StoreError
+        There can be no such database. One that is away for now is told in the panel's log.
 
     Examples
     --------
@@ -116,11 +128,12 @@ def tune(
         _require_payload(runner, given)
     elif given:
         runner.trial({}, payload=given[0].values)  # refuses it
+    stored = StoredHistory(runner, store, name)
     hand = Hand(controls(runner, hints))
     looked_at = [film.values for film in given] if cases is None and given else cases
     search = search_of(runner, metric, direction, looked_at, lambda: hand.params)
     session.begin()
-    return Panel(hand, session, token, search)
+    return Panel(hand, session, token, stored, search)
 
 
 def _require_payload(runner: Tunable, given: Sequence[Payload]) -> None:
@@ -145,6 +158,8 @@ class Panel:
         Its runner is run by the panel.
     token
         The token to show first; None for the best one.
+    stored
+        Where the history is kept, if it is.
     search
         Of hyperparameters; None if there is no metric.
 
@@ -155,7 +170,9 @@ class Panel:
         metric.
     """
 
-    def __init__(self, hand: Hand, session: Session, token: str | None, search: Searching | None = None) -> None:
+    def __init__(
+        self, hand: Hand, session: Session, token: str | None, stored: StoredHistory, search: Searching | None
+    ) -> None:
         self._hand, self._session, self._runner = hand, session, session.runner
         self._history = history_of(self._runner)
         if session.payloads:
@@ -173,6 +190,8 @@ class Panel:
         self._widget = ipywidgets.VBox([columns], _dom_classes=("epypes-panel",))
         listen_beside_cells(self._widget)
         tuning.begin()
+        self._stored = stored
+        stored.follow(self._history, self._screen.log)
 
     # -- values -------------------------------------------------------------------------------------------------
 
@@ -279,6 +298,11 @@ class Panel:
         """The values that were committed, a row each, with the pictures that they made; the pandas table is a copy."""
         return self._history.to_frame()
 
+    @property
+    def stored(self) -> pd.DataFrame:
+        """What was committed under this panel's name, in earlier sessions too, as a pandas table; needs a store."""
+        return self._stored.to_frame()
+
     def undo(self) -> bool:
         """Go back to the values before; False if there are none."""
         self._require_open()
@@ -330,6 +354,7 @@ class Panel:
         self._tuning.close(timeout_s)
         if self.search is not None:
             self.search.close(timeout_s)
+        self._stored.close(timeout_s)
 
     def _require_open(self) -> None:
         if self._tuning.worker.closed:
