@@ -24,6 +24,7 @@ What is remembered:
 
 - ``history``, ``historyframe``: at which values did the hand stop
 - ``settings``: how values get into a file, and back
+- ``verdicts``: which test images pass
 - ``code``: which line of code does the same
 - ``promotion``, ``writeback``: what becomes of a promotion, and of values that are written back
 - ``still``, ``static``, ``pictures``: what stays in a saved notebook
@@ -34,6 +35,7 @@ What is looked at, and moved:
 - ``controls``: what moves a hyperparameter
 - ``tips``: what is said about it
 - ``ranges``, ``pairs``, ``guesses``, ``movable``: which values may it take
+- ``cuts``: which of them have to do with which picture
 - ``values``: when are two values the same, and how are they said
 """
 

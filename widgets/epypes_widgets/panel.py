@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 import ipywidgets
 
 from epypes.errors import NotComputed, PayloadError, run_call
-from epypes.graph import CompGraph
-from epypes.hints import Param, Roi
+from epypes.hints import Roi
 from epypes.run import CompGraphRunner, Run
+from epypes.scale.checking import CheckResult, Checks
 from epypes_widgets import code, settings
 from epypes_widgets.controls import column, controls
+from epypes_widgets.cuts import cuts_of, made_from
 from epypes_widgets.hand import Hand
 from epypes_widgets.history import history_of
 from epypes_widgets.latency import Latency, latency_of
@@ -29,6 +30,7 @@ from epypes_widgets.session import Session
 from epypes_widgets.static import static_html
 from epypes_widgets.still import Still
 from epypes_widgets.tuning import Tuning
+from epypes_widgets.verdicts import Verdicts, case_payloads, cases_to_show
 
 if TYPE_CHECKING:
     from epypes.service.remote.connection import Connection
@@ -40,6 +42,7 @@ def tune(
     /,
     *,
     images: Iterable[Any] | None = None,
+    cases: Any = None,
     token: str | None = None,
     **hints: Any,
 ) -> Panel:
@@ -53,14 +56,17 @@ def tune(
         what somebody else sets at the same time is never overwritten unseen.
     images
         Test images to switch between: values of the one free source token, or dicts by token. A service has none.
+    cases
+        A labelled set as ``ep.check`` takes it, in the place of ``images``: the inputs are the test images, and each
+        says whether it passes with the values that were committed last. A service has none.
     token
         The token whose picture is shown at first; without, the last sink token that is an image, else the last
         image.
     hints
         By hyperparameter: an ``ep.Param``, an ``ep.Roi``, a tuple as a range (low, high[, step]), a list of choices.
         Without, the annotation of the function that takes it says it, then the table of OpenCV's and scikit-image's
-        parameters, then its value; what can't be moved is shown. A hyperparameter called ``images`` or ``token`` gets
-        its hint from its annotation.
+        parameters, then its value; what can't be moved is shown. A hyperparameter called ``images``, ``cases`` or
+        ``token`` gets its hint from its annotation.
 
     Returns
     -------
@@ -77,8 +83,10 @@ def tune(
         Whatever a function raises on the first image, if the runner has not been run.
     UnknownName
         A hint is for no hyperparameter of the runner, or ``token`` is not in its graph.
+    ScaleError, ImageFileError
+        The cases can't be understood, or the file of an input can't be read.
     TypeError, ValueError
-        A hint can't be read, or the hyperparameter's value lies outside of it.
+        There are images and cases; a hint can't be read, or the hyperparameter's value lies outside of it.
     ServiceError
         The service is gone.
 
@@ -98,7 +106,8 @@ def tune(
     runner = tunable(tuned)
     if token is not None:
         runner.cg.require_token(token)
-    given = () if images is None else payloads(runner, images)
+    found = cases_to_show(runner, images, cases)
+    given = case_payloads(runner, found) if found else () if images is None else payloads(runner, images)
     session = Session(runner, given)
     if not session.place.is_shared:
         _require_payload(runner, given)
@@ -106,7 +115,7 @@ def tune(
         runner.trial({}, payload=given[0].values)  # refuses it
     hand = Hand(controls(runner, hints))
     session.begin()
-    return Panel(hand, session, token)
+    return Panel(hand, session, token, found)
 
 
 def _require_payload(runner: Tunable, given: Sequence[Payload]) -> None:
@@ -131,9 +140,11 @@ class Panel:
         Its runner is run by the panel.
     token
         The token to show first; None for the best one.
+    cases
+        With their checks; their inputs are the payloads of the session.
     """
 
-    def __init__(self, hand: Hand, session: Session, token: str | None) -> None:
+    def __init__(self, hand: Hand, session: Session, token: str | None, cases: Checks = ()) -> None:
         self._hand, self._session, self._runner = hand, session, session.runner
         self._history = history_of(self._runner)
         if session.payloads:
@@ -142,14 +153,17 @@ class Panel:
         self._still = Still(self._static)
         self._tuning = tuning = Tuning(hand, session, self._history, self._still.update)
         self._messages = Messages(tuning, self.save, self.load)
-        view = PictureView(tuning.worker.later, self._messages.handlers, tuning.report)
+        self._verdicts = Verdicts(self._runner, cases, self._history, tuning)
+        handlers = self._verdicts.beside(self._messages.handlers)
+        view = PictureView(tuning.worker.later, handlers, tuning.report)
         self._screen = tuning.screen = Screen(view, session, self._history, token, self._setup, self.code)
-        self._cuts = _cuts(hand)
+        self._cuts = cuts_of(hand)
         tuning.screen.change(cut=tuple(self._cuts), has_histogram=bool(self._cuts))
         columns = ipywidgets.HBox([self._column.widget, view], _dom_classes=("epypes-columns",))
         self._widget = ipywidgets.VBox([columns], _dom_classes=("epypes-panel",))
         listen_beside_cells(self._widget)
         tuning.begin()
+        self._verdicts.begin()
 
     # -- values -------------------------------------------------------------------------------------------------
 
@@ -230,6 +244,14 @@ class Panel:
         """
         self._tuning.worker.wait(timeout_s)
 
+    def check(self, timeout_s: float) -> CheckResult | None:
+        """Return what came of the cases with the values that were committed last; None if there is nothing to check.
+
+        TimeoutError if that takes longer.
+        """
+        self.wait(timeout_s)
+        return self._verdicts.wait(timeout_s)
+
     # -- looking ------------------------------------------------------------------------------------------------
 
     @property
@@ -302,6 +324,7 @@ class Panel:
         for control in self._hand.controls:
             if control.widget.has_trait("disabled"):
                 control.widget.disabled = True
+        self._verdicts.close(timeout_s)
         self._tuning.close(timeout_s)
 
     def _require_open(self) -> None:
@@ -344,7 +367,7 @@ class Panel:
             "live": self._tuning.is_live,
             "cuts": [{"token": token, "names": names} for token, names in self._cuts.items()],
             "rois": [
-                {"name": name, "token": param.on, "cuts_out": _made_from(self._runner.cg, name)}
+                {"name": name, "token": param.on, "cuts_out": made_from(self._runner.cg, name)}
                 for name, param in params.items()
                 if isinstance(param, Roi)
             ],
@@ -353,21 +376,3 @@ class Panel:
             "settings": list(settings.names(".")),
         }
         return content, [film.thumbnail for film in films]
-
-
-def _cuts(hand: Hand) -> dict[str, list[str]]:
-    """Return the hyperparameters that are thresholds, by the token that they cut."""
-    cuts: dict[str, list[str]] = {}
-    for name, param in hand.params.items():
-        if isinstance(param, Param) and param.cuts:
-            cuts.setdefault(param.cuts, []).append(name)
-    return cuts
-
-
-def _made_from(cg: CompGraph, token: str) -> list[str]:
-    """Return the tokens that a token has to do with: on a picture that it has cut out, it means something else."""
-    found = {token}
-    for function in cg.functions:
-        if found.intersection(cg.func_inputs(function)):
-            found.update(cg.func_outputs(function))
-    return sorted(found)
