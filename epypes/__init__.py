@@ -10,7 +10,7 @@ The rooms, from the bottom up; imports point downwards only (checked by ``lint-i
 - ``run``: which functions must run, and running them
 - ``pipeline``: the paper's ladder of nodes and pipelines; ``acquisition``: where images come from;
   ``display``: how a graph, a run and a value look; ``wire``: how a value travels
-- ``bundle``: from notebook to a folder of text; ``transport``: sockets
+- ``bundle``: from notebook to a folder of text; ``transport``: sockets; ``store``: results and history in a database
 - ``scale``: many images and settings; ``service``: a bundle as a running process; ``experiment``: the paper's own
 - ``cli``: the commands; ``epypes_widgets``: the notebook front end
 
@@ -55,10 +55,12 @@ if TYPE_CHECKING:
         summarize,
     )
     from epypes.run.guard import unguarded
+    from epypes.scale import MapResult, map  # noqa: A004 - as in ep.map(runner, images)
     from epypes.scale.cases import Case
     from epypes.scale.checking import check
     from epypes.service.failures.reopen import load_failure
     from epypes.service.remote.connection import connect
+    from epypes.store import Store
     from epypes.transport import ZMQPublisher, ZMQSubscriber
 
 _HOMES = {
@@ -105,12 +107,15 @@ _HOMES = {
     "SourcePipeline": "epypes.pipeline",
     "Stage": "epypes.pipeline",
     "Stages": "epypes.pipeline",
+    "Store": "epypes.store",
     "ZMQPublisher": "epypes.transport",
     "ZMQSubscriber": "epypes.transport",
     "connect": "epypes.service.remote.connection",
     "load": "epypes.bundle",
     "load_failure": "epypes.service.failures.reopen",
     "load_pipeline": "epypes.bundle",
+    "MapResult": "epypes.scale",
+    "map": "epypes.scale",
     "promote": "epypes.bundle",
     "to_source": "epypes.bundle",
     "verify": "epypes.bundle",
@@ -130,6 +135,7 @@ __all__ = [
     "ImageAcquisition",
     "LogNormal",
     "Mailbox",
+    "MapResult",
     "Node",
     "NodeBasedCompGraph",
     "Param",
@@ -144,6 +150,7 @@ __all__ = [
     "SourcePipeline",
     "Stage",
     "Stages",
+    "Store",
     "TimingSummary",
     "TokenManager",
     "ZMQPublisher",
@@ -157,6 +164,7 @@ __all__ = [
     "load",
     "load_failure",
     "load_pipeline",
+    "map",
     "outputs",
     "promote",
     "register_preview",

@@ -36,6 +36,7 @@ Everything an error's text mentions is an attribute of it::
     +-- ScaleError              a set of images or settings can't be run
     |   +-- ExecutorBroken      whoever ran the jobs is gone; .done
     |   +-- CasesError          a file of cases can't be read, or says something else; .path, .reasons
+    +-- StoreError              a database can't be opened, read or written; .place
     +-- FailureNotKept          a failure of a service, or its event, can't be had; .id, .path
 
 The user's own exceptions are never wrapped: they keep their type and traceback and get a note.
@@ -386,6 +387,14 @@ class CasesError(ScaleError):
     def __init__(self, path: object, reasons: Sequence[str]) -> None:
         self.path, self.reasons = str(path), tuple(reasons)
         super().__init__(self.reasons[0] if len(self.reasons) == 1 else f"{path}: {' '.join(self.reasons)}")
+
+
+class StoreError(EpypesError):
+    """A database that can't be opened, read or written; ``place`` is its path, or its URL without the password."""
+
+    def __init__(self, place: str, text: str) -> None:
+        self.place = place
+        super().__init__(text)
 
 
 class FailureNotKept(EpypesError):

@@ -1,0 +1,191 @@
+"""How is a database opened, written to and read, and what is said when that fails?"""
+
+from __future__ import annotations
+
+import random
+import re
+import sqlite3
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from epypes.errors import StoreError
+from epypes.store.place import connect_options, shown, url_of
+
+if TYPE_CHECKING:
+    from sqlalchemy import Connection, Engine
+    from sqlalchemy.exc import SQLAlchemyError
+
+_T = TypeVar("_T")
+
+# Two that make the tables, or write one key, at the same moment: one of them begins again.
+_TRIES: Final = 8
+_AGAIN_S: Final = 0.02
+
+
+class Database:
+    """An opened database in which the tables are.
+
+    Parameters
+    ----------
+    given
+        A path or a URL.
+
+    Raises
+    ------
+    StoreError
+        It can't be opened, or was made by a newer EPypes.
+    """
+
+    def __init__(self, given: str | Path) -> None:
+        try:
+            import sqlalchemy  # noqa: F401 - so that what is missing is told by its own name
+        except ImportError:
+            text = "A store needs SQLAlchemy, which is not installed. Run: pip install 'epypes[scale]'"
+            raise StoreError("", text) from None
+        self._url = url_of(given)
+        self.place = shown(self._url)
+        self.engine = self._engine()
+        try:
+            self.write(self._make_tables)
+        except BaseException:
+            self.engine.dispose()
+            raise
+
+    def _engine(self) -> Engine:
+        from sqlalchemy import create_engine, event
+        from sqlalchemy.exc import ArgumentError, NoSuchModuleError
+
+        try:
+            engine = create_engine(
+                self._url,
+                connect_args=connect_options(self._url),
+                hide_parameters=True,
+                # So that a server that was restarted is found again.
+                pool_pre_ping=True,
+            )
+        except (NoSuchModuleError, ImportError, ArgumentError) as error:
+            raise StoreError(self.place, self._no_driver(error)) from None
+        if engine.dialect.name == "sqlite":
+            event.listen(engine, "connect", _set_up_sqlite)
+        return engine
+
+    def _no_driver(self, error: Exception) -> str:
+        kind, driver = self._url.get_backend_name(), self._url.drivername.partition("+")[2]
+        way_out = "pip install 'epypes[postgres]'" if driver == "psycopg" else f"Install a driver of {kind}"
+        missing = getattr(error, "name", None)
+        what = f"module {missing!r} is not installed" if missing else f"SQLAlchemy knows no {self._url.drivername!r}"
+        return f"{self.place} can't be opened: {what}. {way_out}, or store in a file: 'results.sqlite'."
+
+    def _make_tables(self, connection: Connection) -> None:
+        from sqlalchemy import insert, select
+
+        from epypes.store import tables
+
+        tables.metadata.create_all(connection)
+        version = connection.execute(select(tables.schema.c.version)).scalar()
+        if version is None:
+            connection.execute(insert(tables.schema).values(id=1, version=tables.SCHEMA))
+        elif version != tables.SCHEMA:
+            raise StoreError(self.place, self._other_version(version, tables.SCHEMA))
+
+    def _other_version(self, found: int, known: int) -> str:
+        who, way_out = "an older", "Store in another one, or use that EPypes."
+        if found > known:
+            who, way_out = "a newer", "Update: pip install --upgrade epypes"
+        return f"{self.place} was made by {who} EPypes: its tables have version {found}, here it is {known}. {way_out}"
+
+    def write(self, work: Callable[[Connection], _T]) -> _T:
+        """Do something in one transaction: all of it is written, or nothing; again if another came in between.
+
+        Raises
+        ------
+        StoreError
+            It can't be written.
+        """
+        from sqlalchemy.exc import SQLAlchemyError
+
+        tries = 0
+        while True:
+            tries += 1
+            try:
+                with self.engine.begin() as connection:
+                    return work(connection)
+            except SQLAlchemyError as error:
+                if tries == _TRIES or not _may_be_another(error):
+                    raise self._told(error) from None
+            time.sleep(tries * _AGAIN_S * random.random())  # noqa: S311 - so that two don't meet again
+
+    def read(self, work: Callable[[Connection], _T]) -> _T:
+        """Read something.
+
+        Raises
+        ------
+        StoreError
+            It can't be read.
+        """
+        from sqlalchemy.exc import SQLAlchemyError
+
+        try:
+            with self.engine.connect() as connection:
+                return work(connection)
+        except SQLAlchemyError as error:
+            raise self._told(error) from None
+
+    def _told(self, error: SQLAlchemyError) -> StoreError:
+        said = _said(error)
+        if self._url.password:
+            said = said.replace(str(self._url.password), "***")
+        return StoreError(self.place, f"{self.place} {_plainly(said)}")
+
+
+def _set_up_sqlite(connection: Any, _record: object) -> None:
+    """Have readers not wait for writers; what a power failure may take is the last rows, never the file."""
+    connection.execute("PRAGMA synchronous=NORMAL")
+    for tries in range(1, _TRIES + 1):
+        if connection.execute("PRAGMA journal_mode").fetchone()[0] == "wal":
+            return
+        try:
+            connection.execute("PRAGMA journal_mode=WAL")
+        except sqlite3.OperationalError as error:
+            # SQLite does not wait here for another that changes it just now.
+            if tries == _TRIES or "locked" not in str(error):
+                raise
+            time.sleep(tries * _AGAIN_S)
+
+
+def _said(error: SQLAlchemyError) -> str:
+    """Return what the driver says, in one line, without the statement."""
+    text = str(getattr(error, "orig", None) or error)
+    return re.sub(r"\s+", " ", text).strip()[:500].rstrip(".")
+
+
+def _may_be_another(error: SQLAlchemyError) -> bool:
+    """Whether it was another writer who came in between: the same key or table, or a deadlock."""
+    from sqlalchemy.exc import IntegrityError
+
+    cause = getattr(error, "orig", None)
+    state = str(getattr(cause, "sqlstate", None) or "")
+    # 40...: deadlocks; 42P07 and 42710: the table has just been made.
+    is_state = state.startswith("40") or state in ("42P07", "42710")
+    return is_state or isinstance(error, IntegrityError) or "already exists" in str(cause)
+
+
+# What drivers say, and what that means.
+_MEANINGS: Final = (
+    (r"not a database|malformed|encrypted", "is no SQLite file, or a damaged one: {}. Restore it, or name another."),
+    (r"disk is full|No space|disk I/O|could not extend", "can't be written: {}. Make room on the disk."),
+    (r"read-?only|unable to open|[Pp]ermission denied", "can't be opened or written: {}. Check who may."),
+    (r"database is locked", "is locked by another process: {}. End it, or wait."),
+    (r"password|authentication|role .* does not exist", "does not let you in: {}. Check user and password."),
+    (r"database .* does not exist", "is not there: {}. Make it: createdb NAME"),
+    (r"connect|resolve|host|server|closed|shut", "can't be reached: {}. Check that it runs, and the URL."),
+)
+
+
+def _plainly(said: str) -> str:
+    for pattern, meaning in _MEANINGS:
+        if re.search(pattern, said):
+            return meaning.format(said)
+    return f"refused: {said}."

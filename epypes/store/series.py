@@ -1,0 +1,214 @@
+"""What is a series: rows under keys, each written once?"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from epypes.errors import StoreError
+from epypes.store.jsontext import from_text, from_word, to_text, to_word
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from sqlalchemy import Connection
+
+    from epypes.store.database import Database
+
+# Read at a time, so that a long series is never in memory as a whole.
+_PAGE: Final = 500
+
+
+class Series:
+    """Rows of one kind under one name; `Store.series` makes it.
+
+    A row is a mapping under a key: numbers (NaN and infinities too), texts, truth values, None, lists and dicts.
+    Written under a key that is there already, it takes the place of the earlier one. Any thread may use it, and many
+    processes may write to one series at the same time.
+    """
+
+    def __init__(self, database: Database, kind: str, name: str, about: Mapping[str, Any] | None = None) -> None:
+        self._database, self.kind, self.name = database, kind, name
+        self._id, self._about = database.write(lambda connection: self._found(connection, about or {}))
+
+    def _found(self, connection: Connection, about: Mapping[str, Any]) -> tuple[int, str]:
+        """Return number and description of this series; it is made if it is not there."""
+        from sqlalchemy import insert, select
+
+        from epypes.store.tables import digest_of, series
+
+        kind, name = to_word(self.kind), to_word(self.name)
+        wanted = select(series.c.id, series.c.about).where(series.c.digest == digest_of(kind, name))
+        found = connection.execute(wanted).one_or_none()
+        if found is None:
+            values = {"kind": kind, "name": name, "digest": digest_of(kind, name)}
+            text = self._text("about", about)
+            connection.execute(insert(series).values(**values, about=text, made_ns=time.time_ns()))
+            found = connection.execute(wanted).one()
+        return found[0], found[1]
+
+    @property
+    def about(self) -> Mapping[str, Any]:
+        """What was said of the series when it was made."""
+        about: dict[str, Any] = from_text(self._about)
+        return about
+
+    # -- writing ------------------------------------------------------------------------------------------------
+
+    def append(self, key: str, data: Mapping[str, Any]) -> None:
+        """Write a row under a key; if there is one, it is replaced.
+
+        Raises
+        ------
+        StoreError
+            It can't be written: the database is away, the disk full, or data is nothing that JSON can say.
+        """
+        self.append_all([(key, data)])
+
+    def append_all(self, rows: Iterable[tuple[str, Mapping[str, Any]]]) -> None:
+        """Write several rows, as pairs of key and data: all of them, or none.
+
+        Raises
+        ------
+        StoreError
+            As `append`.
+        """
+        # The last one of a key is the one that stays.
+        found = {row["digest"]: row for row in (self._row(key, data) for key, data in rows)}
+        if not found:
+            return
+        self._database.write(lambda connection: _put(connection, self._id, found))
+
+    def _row(self, key: str, data: Mapping[str, Any]) -> dict[str, Any]:
+        from epypes.store.tables import digest_of
+
+        word, text = to_word(key), self._text(key, data)
+        stamp = {"series_id": self._id, "written_ns": time.time_ns()}
+        return {**stamp, "digest": digest_of(word), "key": word, "data": text}
+
+    def _text(self, key: str, data: Mapping[str, Any]) -> str:
+        try:
+            return to_text(dict(data))
+        except (TypeError, ValueError, RecursionError) as error:
+            text = f"Row {key!r:.200} of {self.kind} {self.name!r} can't be stored: {error}."
+            raise StoreError(self._database.place, text) from error
+
+    # -- reading ------------------------------------------------------------------------------------------------
+
+    def get(self, key: str) -> Mapping[str, Any] | None:
+        """Return the row under a key; None if there is none."""
+        from sqlalchemy import select
+
+        from epypes.store.tables import digest_of, rows
+
+        wanted = select(rows.c.data).where(rows.c.series_id == self._id, rows.c.digest == digest_of(to_word(key)))
+        text = self._database.read(lambda connection: connection.execute(wanted).scalar())
+        return None if text is None else self._data(key, text)
+
+    def keys(self) -> frozenset[str]:
+        """Return all keys."""
+        from sqlalchemy import select
+
+        from epypes.store.tables import rows
+
+        wanted = select(rows.c.key).where(rows.c.series_id == self._id)
+        found = self._database.read(lambda connection: connection.execute(wanted).scalars().all())
+        return frozenset(from_word(word) for word in found)
+
+    def items(self) -> Iterator[tuple[str, Mapping[str, Any]]]:
+        """Yield keys with their rows in the order of writing, a page at a time; what comes meanwhile may come too."""
+        from sqlalchemy import select
+
+        from epypes.store.tables import rows
+
+        last = 0
+        while True:
+            wanted = (
+                select(rows.c.id, rows.c.key, rows.c.data)
+                .where(rows.c.series_id == self._id, rows.c.id > last)
+                .order_by(rows.c.id)
+                .limit(_PAGE)
+            )
+            page = self._page(wanted)
+            if not page:
+                return
+            for last, word, text in page:  # noqa: B007 - where the next page begins
+                yield from_word(word), self._data(word, text)
+
+    def _page(self, wanted: Any) -> list[Any]:
+        return self._database.read(lambda connection: list(connection.execute(wanted)))
+
+    def rows(self) -> Iterator[Mapping[str, Any]]:
+        """Yield the rows in the order of writing."""
+        return (data for _, data in self.items())
+
+    def _data(self, key: str, text: str) -> dict[str, Any]:
+        try:
+            data: dict[str, Any] = from_text(text)
+        except (ValueError, TypeError, RecursionError) as error:
+            place = self._database.place
+            raise StoreError(place, f"Row {key!r:.200} of {self.kind} {self.name!r} in {place} is damaged.") from error
+        return data
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return the series as a pandas table: a row by key, a column by name; of dicts in it ``values.canny_lo``."""
+        import pandas as pd
+
+        found = list(self.items())
+        index = pd.Index([key for key, _ in found], name="key", dtype="object")
+        return pd.DataFrame([dict(_flat(data)) for _, data in found], index=index)
+
+    def __len__(self) -> int:
+        from sqlalchemy import func, select
+
+        from epypes.store.tables import rows
+
+        wanted = select(func.count()).select_from(rows).where(rows.c.series_id == self._id)
+        return int(self._database.read(lambda connection: connection.execute(wanted).scalar()) or 0)
+
+    def __bool__(self) -> bool:
+        # An empty series is one all the same; and to ask costs no look into the database.
+        return True
+
+    def __contains__(self, key: object) -> bool:
+        return isinstance(key, str) and self.get(key) is not None
+
+    def __repr__(self) -> str:
+        return f"<Series {self.kind} {self.name[:60]!r}>"
+
+
+def _flat(data: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in data.items():
+        if isinstance(value, Mapping) and value:
+            yield from _flat(value, f"{before}{name}.")
+        else:
+            yield before + name, value
+
+
+def _put(connection: Connection, series_id: int, found: Mapping[str, Mapping[str, Any]]) -> None:
+    """Write rows by digest; whoever writes one of them at the same moment makes this fail, to be tried again."""
+    from sqlalchemy import insert, update
+
+    from epypes.store.tables import rows
+
+    there = _there(connection, series_id, list(found))
+    new = [dict(row) for digest, row in found.items() if digest not in there]
+    if new:
+        connection.execute(insert(rows), new)
+    for digest in there:
+        mine = (rows.c.series_id == series_id, rows.c.digest == digest)
+        changed = {name: found[digest][name] for name in ("data", "written_ns")}
+        connection.execute(update(rows).where(*mine).values(**changed))
+
+
+def _there(connection: Connection, series_id: int, digests: list[str]) -> list[str]:
+    """Return which of these are there already."""
+    from sqlalchemy import select
+
+    from epypes.store.tables import rows
+
+    there: list[str] = []
+    for first in range(0, len(digests), _PAGE):
+        asked = rows.c.digest.in_(digests[first : first + _PAGE])
+        there += connection.execute(select(rows.c.digest).where(rows.c.series_id == series_id, asked)).scalars()
+    return there
