@@ -19,6 +19,7 @@ import epypes as ep
 from epypes.errors import ScaleError, UnknownName
 from epypes.scale import trying
 from epypes.scale.optimized import OptimizeResult
+from tests.store.postgres import PASSWORD, server
 
 
 class Method(enum.Enum):
@@ -419,6 +420,17 @@ def test_a_study_of_something_else_is_left_alone(runner: ep.CompGraphRunner, tmp
     with pytest.raises(ScaleError, match=r"something else \(to maximize\)"):
         ep.optimize(runner, "score", [0], 2, direction="minimize", **options)
     assert len(ep.optimize(runner, "score", [0], 1, **options)) == 1
+
+
+@pytest.mark.slow
+def test_trials_are_kept_in_postgresql_whatever_the_password(runner: ep.CompGraphRunner) -> None:
+    with server() as postgres:
+        url = postgres.url("trials")
+        first = ep.optimize(runner, "score", [0], 3, store=url, name="s")
+        assert list(ep.optimize(runner, "score", [0], 4, store=url, name="s"))[:3] == list(first)
+        with pytest.raises(ScaleError) as refused:
+            ep.optimize(runner, "score", [0], 4, store=url, name="s", direction="minimize")
+        assert PASSWORD not in str(refused.value)
 
 
 # -- how it is seen ---------------------------------------------------------------------------------------------
