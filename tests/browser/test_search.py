@@ -67,13 +67,31 @@ def test_a_search_is_followed_and_its_best_is_used_and_undone(searched: Notebook
     ).split() == ["True", "True"]
 
 
-def test_a_search_is_stopped_while_the_panel_goes_on(searched: Notebook) -> None:
+def test_a_search_that_can_not_be_begun_says_why(searched: Notebook, theme: str) -> None:
+    panel = PanelOnScreen(searched)
+    panel.page.locator(".epypes-trials").fill("0")
+    panel.page.locator(".epypes-search-start").click()
+    said = panel.page.locator(".epypes-search-said")
+    assert said.inner_text() == "! Give a number of trials from 1 to 10000."
+    searched.execute("k = panel.search._measure; panel.search._measure = 'no token'")
+    panel.page.locator(".epypes-trials").fill("5")
+    panel.page.locator(".epypes-search-start").click()
+    panel.wait(_STATE, "refused")
+    assert "No token 'no token'" in said.inner_text()
+    panel.page.locator(".epypes-search").scroll_into_view_if_needed()
+    panel.page.locator(".epypes-panel").screenshot(path=SCREENSHOTS / f"panel-search-refused-{theme}.png")
+    searched.execute("panel.search._measure = k")
+
+
+def test_a_search_is_stopped_while_the_panel_goes_on(searched: Notebook, theme: str) -> None:
     panel = PanelOnScreen(searched)
     panel.page.locator(".epypes-trials").fill("5000")
     panel.page.locator(".epypes-search-start").click()
     panel.wait(_STATE, "running")
     panel.focus("lo")
     panel.press("ArrowRight", "lo", panel.values["lo"] + 1)
+    panel.page.locator(".epypes-search").scroll_into_view_if_needed()
+    panel.page.locator(".epypes-search").screenshot(path=SCREENSHOTS / f"panel-searches-{theme}.png")
     panel.page.locator(".epypes-search-stop").click()
     panel.wait(_STATE, "done")
     assert "Stopped after" in panel.page.locator(".epypes-search-said").inner_text()
