@@ -102,9 +102,9 @@ class Case:
       the metric: ``{"token": "points", "min": 100}``.
 
     Without ``token`` a metric that compares looks at the one token of ``expected``, any other one at the one sink
-    token. A function is called as ``metric(value, expected)`` if there is a ``token`` (``expected`` is None if there is none),
-    else as ``metric(run, case)``: a dict of the sink tokens' values, and of those that ``keep`` names, and this case
-    with the files of ``expected`` read. It returns a number, or True or False if there is no threshold.
+    token. A function is called as ``metric(value, expected)`` if there is a ``token`` (``expected`` is None if nothing
+    is), else as ``metric(run, case)``: a dict of the sink tokens' values, and of those that ``keep`` names, and this
+    case with the files of ``expected`` read. It returns a number, or True or False if there is no threshold.
 
     Raises
     ------
@@ -318,5 +318,5 @@ def _meant(check: Check, case: Case, cg: CompGraph) -> str:
         return tokens[0]
     among = ", ".join(map(repr, tokens))
     raise ScaleError(
-        f"Metric {check.name!r} of {case} does not say which token it looks at. Give token: one of {among}."
+        f"Metric {check.name!r} of {case} does not say which token it looks at. Give token, one of: {among}."
     )

@@ -14,6 +14,8 @@ from epypes.scale.thumbnails import thumbnail_of_value
 _AGREE: Final = (150, 150, 150)
 _MISSING: Final = (40, 110, 220)
 _EXTRA: Final = (240, 140, 20)
+# JPEG has colours for squares of so many pixels.
+_COARSE_PX: Final = 2
 LEGEND: Final = "blue: expected and missing, orange: there and not expected, grey: both"
 
 
@@ -70,9 +72,10 @@ def _three_colours(got: Any, wanted: Any) -> Any:
 
 
 def _coarser(mask: Any) -> Any:
-    """Return a mask of about the size of a thumbnail; what is in one pixel is in the coarse one around it."""
+    """Return a mask of about the size of a thumbnail; what is in one pixel is in all of the coarse one around it."""
     import numpy as np
 
-    side = -(-max(mask.shape) // THUMBNAIL_PX)
+    side = -(-max(mask.shape) * _COARSE_PX // THUMBNAIL_PX)
     starts = [np.arange(0, length, side) for length in mask.shape]
-    return np.logical_or.reduceat(np.logical_or.reduceat(mask, starts[0], axis=0), starts[1], axis=1)
+    coarse = np.logical_or.reduceat(np.logical_or.reduceat(mask, starts[0], axis=0), starts[1], axis=1)
+    return coarse if side == 1 else coarse.repeat(_COARSE_PX, axis=0).repeat(_COARSE_PX, axis=1)

@@ -103,8 +103,9 @@ def iou(value: Any, expected: Any, *, boxes: BoxForm = "xywh") -> float:
     ----------
     value, expected
         Two masks: arrays of one shape (y, x), of which all that is not zero is in. Or boxes: arrays (n, 4) and (m, 4)
-        of another dtype than bool and uint8, or sequences of four numbers; they are paired so that the sum of their IoU is largest (the Hungarian method),
-        and what is returned is that sum divided by max(n, m), so that each box too many or too few costs.
+        of another dtype than bool and uint8, or sequences of four numbers; they are paired so that the sum of their IoU
+        is largest (the Hungarian method), and what is returned is that sum divided by max(n, m), so that each box too
+        many or too few costs.
     boxes
         What the four numbers are: ``"xywh"``, a corner with width and height as in OpenCV, or ``"xyxy"``, two corners.
 
