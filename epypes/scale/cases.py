@@ -101,10 +101,10 @@ class Case:
     - a dict with ``min``, ``max`` or both, and if need be ``token``, ``metric``, ``expected``, ``keep`` and options of
       the metric: ``{"token": "points", "min": 100}``.
 
-    Without ``token`` a built-in metric looks at the one token of ``expected``, or else at the one sink token. A
-    function is called as ``metric(value, expected)`` if there is a ``token`` (``expected`` is None if there is none),
-    else as ``metric(run, case)``: a dict of the sink tokens' values, and of those that ``keep`` names, and this case
-    with the files of ``expected`` read. It returns a number, or True or False if there is no threshold.
+    Without ``token`` a metric that compares looks at the one token of ``expected``, any other one at the one sink
+    token. A function is called as ``metric(value, expected)`` if there is a ``token`` (``expected`` is None if nothing
+    is), else as ``metric(run, case)``: a dict of the sink tokens' values, and of those that ``keep`` names, and this
+    case with the files of ``expected`` read. It returns a number, or True or False if there is no threshold.
 
     Raises
     ------
@@ -312,10 +312,11 @@ def _placed(check: Check, case: Case, cg: CompGraph) -> Check:
 
 
 def _meant(check: Check, case: Case, cg: CompGraph) -> str:
-    for tokens in (tuple(case.expected or ()), cg.sink_tokens):
-        if len(tokens) == 1:
-            return tokens[0]
-    among = ", ".join(map(repr, case.expected or cg.sink_tokens))
+    compares = not callable(check.metric) and METRICS[check.metric].compares
+    tokens = tuple(case.expected) if compares and case.expected else cg.sink_tokens
+    if len(tokens) == 1:
+        return tokens[0]
+    among = ", ".join(map(repr, tokens))
     raise ScaleError(
-        f"Metric {check.name!r} of {case} does not say which token it looks at. Give token: one of {among}."
+        f"Metric {check.name!r} of {case} does not say which token it looks at. Give token, one of: {among}."
     )

@@ -126,7 +126,7 @@ def checked(
 
 def _jobs(runner: CompGraphRunner, cases: Checks, *, has_pictures: bool) -> Iterator[Job]:
     """Give a job per case, when it is asked for."""
-    items = items_of((_inputs(case) for case, _ in cases), runner)
+    items = items_of((inputs_of(case) for case, _ in cases), runner)
     for item, (case, checks) in zip(items, cases, strict=True):
         looked_at = tuple(dict.fromkeys(check.token for check in checks if check.token is not None))
         keep = tuple(dict.fromkeys(token for check in checks for token in check.keep))
@@ -134,7 +134,8 @@ def _jobs(runner: CompGraphRunner, cases: Checks, *, has_pictures: bool) -> Iter
         yield Job((named,), (dict(case.hyperparameters or {}),), keep, looked_at if has_pictures else ())
 
 
-def _inputs(case: Case) -> Any:
+def inputs_of(case: Case) -> Any:
+    """Return the inputs of a case as ``ep.map`` takes them: what names a file is its path."""
     if not isinstance(case.inputs, Mapping):
         return _input(case.inputs)
     return {token: _input(value) for token, value in case.inputs.items()}

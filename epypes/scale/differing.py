@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from typing import Any, Final
 
 from epypes.display import is_image
@@ -11,6 +12,7 @@ from epypes.scale.outcome import Thumbnail
 from epypes.scale.thumbnails import thumbnail_of_value
 
 # Blue and orange are told apart by everybody; the legend says which is which.
+_NEITHER: Final = (0, 0, 0)
 _AGREE: Final = (150, 150, 150)
 _MISSING: Final = (40, 110, 220)
 _EXTRA: Final = (240, 140, 20)
@@ -41,7 +43,7 @@ def _difference(value: Any, expected: Any) -> Thumbnail | None:
     if got.shape != wanted.shape:
         return None
     if _is_mask(got) and _is_mask(wanted):
-        return thumbnail_of_value(_three_colours(got != 0, wanted != 0), "rgb")
+        return _three_colours(got != 0, wanted != 0)
     distance = np.abs(got.astype(np.float32) - wanted.astype(np.float32))
     distance = distance.max(axis=2) if distance.ndim == 3 else distance
     largest = float(np.nanmax(distance, initial=0.0))
@@ -58,15 +60,21 @@ def _is_mask(image: Any) -> bool:
     return image.dtype.kind == "b" or (image.dtype.kind in "iu" and len(np.unique(image)) <= 2)
 
 
-def _three_colours(got: Any, wanted: Any) -> Any:
+def _three_colours(got: Any, wanted: Any) -> Thumbnail:
+    """Return a PNG: as JPEG, a single pixel that differs would be grey, as if it did not."""
     import numpy as np
+    from PIL import Image
 
-    # One pixel that differs is to be seen, so it is not averaged with those around it.
     both, missing, extra = (_coarser(mask) for mask in (got & wanted, wanted & ~got, got & ~wanted))
-    picture = np.zeros((*both.shape, 3), np.uint8)
-    for mask, colour in ((both, _AGREE), (missing, _MISSING), (extra, _EXTRA)):
-        picture[mask] = colour
-    return picture
+    places = np.zeros(both.shape, np.uint8)
+    for place, mask in enumerate((both, missing, extra), start=1):
+        places[mask] = place
+    picture = Image.fromarray(places).convert("P")
+    picture.putpalette(bytes((*_NEITHER, *_AGREE, *_MISSING, *_EXTRA)))
+    data = io.BytesIO()
+    picture.save(data, "PNG", bits=2)
+    pixels = np.count_nonzero(got != wanted)
+    return Thumbnail("image/png", data.getvalue(), f"{pixels} of {got.size} pixels differ")
 
 
 def _coarser(mask: Any) -> Any:

@@ -148,7 +148,8 @@ def _measure(outcome: Outcome, case: Case, check: Check, cg: CompGraph, value: A
         return metric.function(*((value, expected) if metric.compares else (value,)), **check.options)
     if check.token is not None:
         return check.metric(value, expected)
-    return check.metric(dict(outcome.kept), with_labels_read(case, cg))
+    kept = {token: outcome.kept[token] for token in check.keep if token in outcome.kept}
+    return check.metric(kept, with_labels_read(case, cg))
 
 
 def _number(given: Any, check: Check) -> float:

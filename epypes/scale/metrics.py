@@ -102,9 +102,10 @@ def iou(value: Any, expected: Any, *, boxes: BoxForm = "xywh") -> float:
     Parameters
     ----------
     value, expected
-        Two masks: arrays of one shape (y, x), of which all that is not zero is in. Or boxes: arrays (n, 4) and (m, 4),
-        or sequences of four numbers; they are paired so that the sum of their IoU is largest (the Hungarian method),
-        and what is returned is that sum divided by max(n, m), so that each box too many or too few costs.
+        Two masks: arrays of one shape (y, x), of which all that is not zero is in. Or boxes: arrays (n, 4) and (m, 4)
+        of another dtype than bool and uint8, or sequences of four numbers; they are paired so that the sum of their IoU
+        is largest (the Hungarian method), and what is returned is that sum divided by max(n, m), so that each box too
+        many or too few costs.
     boxes
         What the four numbers are: ``"xywh"``, a corner with width and height as in OpenCV, or ``"xyxy"``, two corners.
 
@@ -303,9 +304,11 @@ def _kind(value: Any) -> str:
 
 
 def _is_boxes(value: Any) -> bool:
-    """Whether these are four numbers each; no image is four pixels wide."""
+    """Whether these are four numbers each, and no mask that is four pixels wide."""
     if _is_array(value):
-        return (value.ndim == 2 and value.shape[1] == 4) or value.shape in ((4,), (0,))
+        return value.dtype not in ("bool", "uint8") and (
+            (value.ndim == 2 and value.shape[1] == 4) or value.shape in ((4,), (0,))
+        )
     return isinstance(value, list | tuple) and (
         all(hasattr(box, "__len__") and len(box) == 4 for box in value) or _is_one_box(value)
     )

@@ -83,7 +83,8 @@ def optimize(
     store
         Path, URL or ``ep.Store`` of a database that keeps the trials, in Optuna's own tables. A second call goes on.
     name
-        Of the study in the store; without, it follows from the graph, what is searched and the other hyperparameters.
+        Of the study in the store; without, it follows from the graph and its other hyperparameters, from what is
+        searched, from the metric's source, and from the names of the cases and the state of their files.
     stop
         Ends the search once it is set: when the function that runs has returned. So does Ctrl+C, at once. What has
         been found until then is returned.
@@ -119,10 +120,11 @@ def optimize(
     axes = axes_of(runner, ranges)
     labelled = _cases(cases, runner)
     scoring = Scoring(runner.cg, metric, labelled, keep)
-    work = _Work(runner, scoring, tuple(_items(labelled, runner)), executor, stop)
+    items = tuple(_items(labelled, runner))
+    work = _Work(runner, scoring, items, executor, stop)
     with opened_store(store) as opened:
         url = None if opened is None else opened.url
-        known = name or ("" if url is None else _name(runner, axes, scoring, direction))
+        known = name or ("" if url is None else _name(runner, axes, scoring, items, direction))
         at_once = 1 if executor is None else worker_count(executor)
         search = Search(axes, runner.hyperparameters, direction, seed=seed, at_once=at_once, url=url, name=known)
         with contextlib.closing(search):
@@ -151,7 +153,9 @@ def _items(cases: Sequence[Case], runner: CompGraphRunner) -> Iterator[Item]:
         yield Item(number, cases[number].name or item.name, item.payload, item.stamp)
 
 
-def _name(runner: CompGraphRunner, axes: Sequence[Axis], scoring: Scoring, direction: Direction) -> str:
+def _name(
+    runner: CompGraphRunner, axes: Sequence[Axis], scoring: Scoring, items: Sequence[Item], direction: Direction
+) -> str:
     """Return what a search is called in a store if the user does not say: a digest of what it computes."""
     varied = {axis.token for axis in axes}
     fixed = {token: value for token, value in runner.hyperparameters.items() if token not in varied}
@@ -160,8 +164,7 @@ def _name(runner: CompGraphRunner, axes: Sequence[Axis], scoring: Scoring, direc
     except EpypesError as error:
         text = f"What is searched has no name for the store: {error}"
         raise ScaleError(f"{text}\nGive one: name='...'.") from error
-    names = [case.name for case in scoring.cases]
-    said = repr((source, axes, scoring.name, direction, names))
+    said = repr((source, axes, scoring.source, direction, [(item.name, item.stamp) for item in items]))
     return f"optimize {scoring.name} {hashlib.sha256(said.encode()).hexdigest()[:12]}"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -74,6 +75,14 @@ class Scoring:
             self._measure = metric
         for token in self.keep:
             cg.require_token(token)
+
+    @property
+    def source(self) -> str:
+        """What the metric computes, as text: its source, or only its name where that can't be had."""
+        try:
+            return self.name if self.keep == (self.name,) else inspect.getsource(self._measure)
+        except (OSError, TypeError):
+            return self.name
 
     def of_outcomes(self, outcomes: Iterable[Outcome]) -> Score:
         """Return the score of a setting by what it gave, in the order of the cases; after a failure none is taken."""

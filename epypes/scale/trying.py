@@ -9,9 +9,9 @@ from typing import Any, Final
 
 from epypes.run import CompGraphRunner, Run
 from epypes.run.stopped import stop_at
+from epypes.scale.hands import own_runner
 from epypes.scale.items import Item, opened
 from epypes.scale.outcome import Outcome, Trouble
-from epypes.scale.hands import own_runner
 
 # Of what the runners of cases hold between settings; cases beyond are run from their files or arrays each time.
 _MOST_BYTES: Final = 2**30

@@ -8,7 +8,7 @@ from pathlib import Path
 from time import perf_counter_ns, time_ns
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.service.outcome import Result, event_id
+from epypes.service.outcome import Result, Setting, event_id
 from epypes.store.later import SeriesWriter
 
 if TYPE_CHECKING:
@@ -29,8 +29,8 @@ class EventLog:
         A path, a URL or a Store; None to keep nothing.
     name
         Of the bundle.
-    digest
-        Returns which state of it is served.
+    setting
+        Returns what events are worked on with.
 
     Raises
     ------
@@ -38,14 +38,14 @@ class EventLog:
         There can be no such database. One that is away is told in the log.
     """
 
-    def __init__(self, store: str | Path | None, name: str, digest: Callable[[], str]) -> None:
-        self._digest, self._began_ns = digest, time_ns()
+    def __init__(self, store: str | Path | None, name: str, setting: Callable[[], Setting]) -> None:
+        self._setting, self._began_ns = setting, time_ns()
         self._writer = None if store is None else SeriesWriter(store, KIND, name)
 
     def keep(self, entry: Entry, result: Result, failure: FailureRecord | None) -> None:
         """Have a row of an event written; returns at once and raises nothing."""
         if self._writer is not None:
-            self._writer.append(f"{self._began_ns}-{entry.seq}", _row(entry, result, failure, self._digest()))
+            self._writer.append(f"{self._began_ns}-{entry.seq}", _row(entry, result, failure, self._setting().digest))
 
     def counts(self) -> Mapping[str, int]:
         """Return how many rows were written, skipped and so on, as `SeriesWriter.counts`; none without a store."""

@@ -80,10 +80,8 @@ class Service:
         The folder is not the bundle that was promoted.
     AddressError
         An address is not on loopback.
-    ServiceError
-        The mailbox, a time or the number of threads can't be.
-    StoreError
-        There can be no such database.
+    ServiceError, StoreError
+        The mailbox, a time or the number of threads can't be; or the database.
     """
 
     def __init__(
@@ -106,14 +104,18 @@ class Service:
     ) -> None:
         check_limits(path, threads, job_timeout_s, drain_timeout_s)
         served = read_served(path)
-        self.path, self.threads, self.job_timeout_s = served.path, threads, job_timeout_s
-        self.drain_timeout_s = drain_timeout_s
-        self.http, self.token_file = "", ""
+        self.path, self.threads = served.path, threads
+        self.job_timeout_s, self.drain_timeout_s = job_timeout_s, drain_timeout_s
+        self.http = self.token_file = ""
         self.failure_store = FailureStore(failures_folder(served.path))
         ledger = Ledger(mailbox_policy, mailbox_size, threads, retries)
-        self.event_log = EventLog(store, served.settings.name, lambda: self._supervisor.served.digest)
-        told = lambda item: self._sockets.answer(item), lambda item: self._sockets.report(item)
-        self._desk = Desk(*told, lambda: self.failure_store, self.event_log)
+        self.event_log = EventLog(store, served.settings.name, self._setting)
+        self._desk = Desk(
+            lambda item: self._sockets.answer(item),
+            lambda item: self._sockets.report(item),
+            lambda: self.failure_store,
+            self.event_log,
+        )
         self._dispatcher = Dispatcher(ledger, self._desk, self._setting)
         self._tuning = Tuning(served, self._dispatcher, self._desk, min(job_timeout_s, _CHANGE_S))
         settling = self._tuning.for_new_worker, self._look, self._tuning.heard

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
@@ -16,7 +16,7 @@ from typing import Any, Final
 from epypes.errors import StoreError
 from epypes.store.database import check_place
 from epypes.store.series import Series
-from epypes.store.store import Store
+from epypes.store.store import Store, as_store
 from epypes.store.writer import Writer
 
 _log = logging.getLogger(__name__)
@@ -86,6 +86,8 @@ class SeriesWriter:
         As for `Store.series`.
     most
         How many rows may wait.
+    told
+        Called on the thread with what goes wrong, a sentence; without, it goes to the log.
 
     Raises
     ------
@@ -105,12 +107,16 @@ class SeriesWriter:
         *,
         about: Mapping[str, Any] | None = None,
         most: int = MOST,
+        told: Callable[[str], object] = _log.warning,
     ) -> None:
         self._given, self._kind, self._name, self._about = store, kind, name, about
-        self._store = store if isinstance(store, Store) else None
-        if self._store is None:
+        self._store: Store | None = None
+        if isinstance(store, Store):
+            self._store = store
+        else:
             check_place(store)
         self._series: Series | None = None
+        self._told = told
         self._line = Line(most)
         self._writer = Writer(f"epypes {kind}", self._line, self._write)
         self._counts = {"written": 0, "skipped": 0, "unwritten": 0}
@@ -138,6 +144,7 @@ class SeriesWriter:
         is_done = self.flush(timeout_s)
         if is_done and self._store is not None and self._store is not self._given:
             self._store.close()
+            # What comes later opens it again.
             self._store = self._series = None
         return is_done
 
@@ -148,7 +155,7 @@ class SeriesWriter:
             unwritten = self._put(rows)
         except StoreError as error:
             if self._writer.put(self._line.failed):
-                _log.warning("%s Rows of %s %r wait for it.", error, self._kind, self._name)
+                self._told(f"{error} Rows of {self._kind} {self._name!r} wait for it.")
             return
         if self._writer.put(lambda _now_s: self._done(len(rows), unwritten)):
             _log.info("Rows of %s %r are written again.", self._kind, self._name)
@@ -171,13 +178,13 @@ class SeriesWriter:
         try:
             series.append(*row)
         except TypeError as error:
-            _log.warning("%s", error)
+            self._told(str(error))
             return False
         return True
 
     def _opened(self) -> Series:
         if self._series is None:
             if self._store is None:
-                self._store = Store(self._given) if not isinstance(self._given, Store) else self._given
+                self._store = as_store(self._given)
             self._series = self._store.series(self._kind, self._name, about=self._about)
         return self._series

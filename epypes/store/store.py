@@ -6,7 +6,7 @@ import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, overload
 
 from epypes.store.database import Database
 from epypes.store.jsontext import from_word
@@ -97,6 +97,18 @@ class Store:
 
     def __repr__(self) -> str:
         return f"<Store {self.place[-70:]!r}>"
+
+
+@overload
+def as_store(given: str | Path | Store) -> Store: ...
+
+
+@overload
+def as_store(given: None) -> None: ...
+
+
+@overload
+def as_store(given: str | Path | Store | None) -> Store | None: ...
 
 
 def as_store(given: str | Path | Store | None) -> Store | None:

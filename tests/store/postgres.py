@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import glob
 import os
 import shutil
@@ -25,6 +26,12 @@ def _binary(name: str) -> str:
     if found is None:
         raise RuntimeError("No PostgreSQL was found. Install your system's package 'postgresql': sh .ci/postgres")
     return found
+
+
+def _die_with_me() -> None:
+    """Have the server end with the process of the tests, however that ends."""
+    set_death_signal = 1
+    ctypes.CDLL(None).prctl(set_death_signal, signal.SIGQUIT)
 
 
 def _account() -> dict[str, Any]:
@@ -62,7 +69,9 @@ class Server:
         told = [word for name, value in options.items() for word in ("-c", f"{name}={value}")]
         with (self._folder / "log").open("ab") as log:
             command = [_binary("postgres"), "-D", f"{self._folder}/data", *told]
-            self._process = subprocess.Popen(command, cwd=self._folder, stdout=log, stderr=log, **_account())
+            self._process = subprocess.Popen(
+                command, cwd=self._folder, stdout=log, stderr=log, preexec_fn=_die_with_me, **_account()
+            )
         end_s = monotonic() + _DEADLINE_S
         while True:
             try:

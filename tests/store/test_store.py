@@ -12,9 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import epypes as ep
 from epypes.store import Store, as_store, opened_store
+from epypes.store.jsontext import from_text, to_text
 
 ODD = {
     "nan": math.nan,
@@ -69,6 +72,28 @@ def test_names_and_keys_may_be_any_text_of_any_length(store):
         assert series.get(name) == {"name": name}
     assert len(store.names("map")) == 5
     assert store.names("map")[1] == "grün\x00図"
+
+
+def test_a_key_or_a_name_that_is_no_text_is_refused(store):
+    series = store.series("map", "edges")
+    for wrong in (lambda: store.series("map", 3), lambda: series.append(3, {}), lambda: series.get(None)):
+        with pytest.raises(TypeError, match="keys of series are texts, not"):
+            wrong()
+    assert len(series) == 0
+
+
+_TEXTS = st.sampled_from(["$float", "$dict", "nan", "a", "\x00", "\udc80"]) | st.text(max_size=3)
+_ITEMS = st.none() | st.booleans() | st.integers() | st.floats() | _TEXTS
+
+
+@settings(deadline=None)
+@given(st.recursive(_ITEMS, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(_TEXTS, inner, max_size=3)))
+def test_whatever_json_can_say_comes_back_through_text_that_databases_take(value):
+    text = to_text(value)
+    assert "\x00" not in text
+    text.encode()
+    json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
+    assert alike(from_text(text), value)
 
 
 def test_what_is_no_json_is_refused_with_its_row_and_nothing_of_the_batch_is_written(store):

@@ -23,7 +23,10 @@
 What is remembered:
 
 - ``history``, ``historyframe``: at which values did the hand stop
+- ``stored``: how that is kept in a database
 - ``settings``: how values get into a file, and back
+- ``verdicts``: which test images pass
+- ``searching``: what becomes of a search of hyperparameters
 - ``code``: which line of code does the same
 - ``promotion``, ``writeback``: what becomes of a promotion, and of values that are written back
 - ``still``, ``static``, ``pictures``: what stays in a saved notebook
@@ -34,11 +37,13 @@ What is looked at, and moved:
 - ``controls``: what moves a hyperparameter
 - ``tips``: what is said about it
 - ``ranges``, ``pairs``, ``guesses``, ``movable``: which values may it take
+- ``cuts``: which of them have to do with which picture
 - ``values``: when are two values the same, and how are they said
 """
 
 from __future__ import annotations
 
-from epypes_widgets.panel import Panel, tune
+from epypes_widgets.making import tune
+from epypes_widgets.panel import Panel
 
 __all__ = ["Panel", "tune"]

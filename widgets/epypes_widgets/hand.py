@@ -53,15 +53,6 @@ class Hand:
         }
 
     @property
-    def cuts(self) -> dict[str, list[str]]:
-        """The hyperparameters that are thresholds, by the token that they cut."""
-        cuts: dict[str, list[str]] = {}
-        for name, param in self.params.items():
-            if isinstance(param, Param) and param.cuts:
-                cuts.setdefault(param.cuts, []).append(name)
-        return cuts
-
-    @property
     def is_holding(self) -> bool:
         """Whether any control is held."""
         return bool(self._held)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from types import MappingProxyType
@@ -91,6 +91,18 @@ class History:
         self._committed = 0
         self._images: tuple[Any, ...] = ()
         self._images_from = 1
+        self._watchers: tuple[Callable[[Entry], object], ...] = ()
+
+    def watch(self, callback: Callable[[Entry], object]) -> Callable[[], None]:
+        """Call something with each entry that is added or gone to, on that thread; return what ends that."""
+
+        def forget() -> None:
+            with self._lock:
+                self._watchers = tuple(watcher for watcher in self._watchers if watcher is not callback)
+
+        with self._lock:
+            self._watchers = (*self._watchers, callback)
+        return forget
 
     def commit(
         self,
@@ -121,7 +133,7 @@ class History:
             walked = self._path[: self._place + 1]
             self._path = (*(old for old in walked if old.number >= oldest), entry)
             self._place = len(self._path) - 1
-            return entry
+        return self._told(entry)
 
     def undo(self) -> Entry | None:
         """Go one entry back and return it; None if there is none."""
@@ -146,7 +158,7 @@ class History:
             if entry not in self._path:
                 self._path = (*self._path[: self._place + 1], entry)
             self._place = self._path.index(entry)
-            return entry
+        return self._told(entry)
 
     def use_images(self, images: tuple[Any, ...]) -> None:
         """Know which images the indices of entries mean from now on; earlier ones go on meaning these very images."""
@@ -206,7 +218,13 @@ class History:
             if not 0 <= self._place + by < len(self._path):
                 return None
             self._place += by
-            return self._path[self._place]
+            entry = self._path[self._place]
+        return self._told(entry)
+
+    def _told(self, entry: Entry) -> Entry:
+        for watcher in self._watchers:
+            watcher(entry)
+        return entry
 
     def _range(self) -> str:
         if not self._entries:

@@ -85,6 +85,7 @@ class Screen:
         self._told: set[int] = set()
         self.told = 0
         self._log: list[dict[str, str]] = []
+        self._verdicts: dict[str, Any] | None = None
 
     # -- what is shown ------------------------------------------------------------------------------------------
 
@@ -219,6 +220,11 @@ class Screen:
         state = {"undo": self._history.can_undo, "redo": self._history.can_redo, "code": self._code()}
         self.view.tell("history", {"entries": content, **state}, buffers)
 
+    def tell_verdicts(self, content: dict[str, Any]) -> None:
+        """Tell which test images pass."""
+        self._verdicts = content
+        self.view.tell("cases", content)
+
     def log(self, text: str) -> None:
         """Add a line to the log drawer."""
         line = {"at": f"{datetime.now().astimezone():%H:%M:%S}", "text": text[:_LINE_CHARACTERS]}
@@ -238,6 +244,8 @@ class Screen:
             self._told.clear()
         self.tell_setup()
         self.tell_history()
+        if self._verdicts is not None:
+            self.view.tell("cases", self._verdicts)
         if self._reference is not None:
             self.view.tell("reference", *self._reference)
         if self._log:

@@ -7,7 +7,6 @@ from typing import Any
 from ipywidgets.widgets.widget_string import HTMLStyle
 
 from epypes.display.previews.short import short_repr
-from epypes.graph import CompGraph
 from epypes.hints import Roi
 from epypes_widgets.controls.control import Control
 from epypes_widgets.controls.look import Look
@@ -39,12 +38,3 @@ def in_words(value: Any) -> str:
         x, y, width, height = value
         return f"x {x}, y {y}, {width} x {height}"
     return "the whole picture" if value is None else said(value)
-
-
-def made_from(cg: CompGraph, token: str) -> list[str]:
-    """Return the tokens that a token has to do with: on a picture that it has cut out, it means something else."""
-    found = {token}
-    for function in cg.functions:
-        if found.intersection(cg.func_inputs(function)):
-            found.update(cg.func_outputs(function))
-    return sorted(found)

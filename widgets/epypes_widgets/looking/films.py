@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import Any, Final
@@ -41,7 +41,7 @@ class Payload:
     thumbnail: bytes = field(default=b"", repr=False)
 
 
-def payloads(runner: Tunable, images: Iterable[Any]) -> tuple[Payload, ...]:
+def payloads(runner: Tunable, images: Iterable[Any], titles: Sequence[str] = ()) -> tuple[Payload, ...]:
     """Return what ``tune(runner, images=...)`` was given as payloads.
 
     Parameters
@@ -50,6 +50,8 @@ def payloads(runner: Tunable, images: Iterable[Any]) -> tuple[Payload, ...]:
         Its free source tokens are what a payload has values for.
     images
         Values of the one free source token, or mappings by token. A generator is read to its end.
+    titles
+        What they are called; without, their files say it, or their numbers.
 
     Raises
     ------
@@ -66,7 +68,8 @@ def payloads(runner: Tunable, images: Iterable[Any]) -> tuple[Payload, ...]:
     free = runner.free_source_tokens
     values = [_values(runner, free, item, f"images[{place}]") for place, item in enumerate(given)]
     return tuple(
-        Payload(_title(payload, place), payload, _thumbnail(runner, payload)) for place, payload in enumerate(values)
+        Payload(titles[place] if titles else _title(payload, place), payload, _thumbnail(runner, payload))
+        for place, payload in enumerate(values)
     )
 
 

@@ -75,7 +75,7 @@ function render({ model, el }) {
 
   figure.append(
     bar.element, chips.element, header.element, stage.element, header.status,
-    histogram.element, pinned.element, films.element, history.element, optimise.element, foot.element,
+    histogram.element, pinned.element, films.tally, films.element, history.element, optimise.element, foot.element,
   );
   el.append(figure);
 
@@ -146,6 +146,7 @@ function render({ model, el }) {
     error: (message) => order.fail(message) && tellFailure(),
     latency: header.latency,
     history: (message, buffers) => all("history", message, buffers),
+    cases: films.cases,
     probe: probe.message,
     settings: foot.settings,
     promoted: foot.promoted,

@@ -6,6 +6,7 @@ const CURVE = { width: 600, height: 96, side: 8, above: 10, below: 10 };
 // More can't be told apart.
 const MOST_DOTS = 500;
 const MOST_N = 10000;
+const LEAST_REACH = 20;
 
 /** The line that starts a search, what it has found as a curve, and what matters most; hidden without a metric. */
 export function optimisePart(panel) {
@@ -79,7 +80,7 @@ export function optimisePart(panel) {
     plot.hidden = known.length === 0;
     if (plot.hidden) return;
     const [least, most] = [Math.min(...known), Math.max(...known)];
-    const last = Math.max(n - 1, values.length - 1, 1);
+    const last = Math.max(reach(values.length, n) - 1, 1);
     const x = (index) => CURVE.side + ((CURVE.width - 2 * CURVE.side) * index) / last;
     const share = (value) => (most > least ? (value - least) / (most - least) : 0.5);
     const y = (value) => CURVE.height - CURVE.below - (CURVE.height - CURVE.above - CURVE.below) * share(value);
@@ -123,6 +124,13 @@ export function optimisePart(panel) {
     },
     optimised: (message) => show(message),
   };
+}
+
+/** How many trials the curve has room for: as many as there are to be, if that is not far more than there are. */
+function reach(done, n) {
+  let room = LEAST_REACH;
+  while (room < done) room *= 2;
+  return Math.max(done, Math.min(room, n));
 }
 
 /** The best so far: a step wherever it gets better. */

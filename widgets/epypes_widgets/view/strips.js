@@ -58,18 +58,49 @@ export function pinnedPart(panel) {
   };
 }
 
+const VERDICTS = { passed: "✓ pass", failed: "✗ fail", waiting: "… waits" };
+
+function tallied(verdicts) {
+  if (verdicts.some(({ state }) => state === "failed")) return "failed";
+  return verdicts.some(({ state }) => state === "waiting") ? "waiting" : "passed";
+}
+
 /** The test images that the graph can be tuned on. */
 export function filmsPart(panel) {
   const root = element("div", "epypes-strip epypes-filmstrip", { role: "group", "aria-label": "Test images", hidden: "" });
+  const tally = element("p", "epypes-tally", { role: "status", hidden: "" });
   let films = [];
+  let verdicts = [];
   moveAlong(root);
 
   function choose(chosen) {
     for (const { index, button } of films) note(button, "aria-current", String(index === chosen));
   }
 
+  /** Said by sign and word, since not everybody tells their colours apart. */
+  function judge() {
+    for (const { index, title, button, badge } of films) {
+      const verdict = verdicts[index];
+      badge.hidden = !verdict;
+      if (!verdict) continue;
+      note(badge, "data-state", verdict.state);
+      say(badge, VERDICTS[verdict.state]);
+      const said = `${title}: ${verdict.state === "waiting" ? "" : `${verdict.state}, `}${verdict.text}`;
+      note(button, "title", said);
+      note(button, "aria-label", said);
+    }
+  }
+
   return {
     element: root,
+    tally,
+    cases(message) {
+      verdicts = message.verdicts;
+      say(tally, message.text);
+      note(tally, "data-state", tallied(verdicts));
+      tally.hidden = false;
+      judge();
+    },
     setup(message, buffers) {
       const images = message.images ?? [];
       panel.blobs.drop(films.map(({ img }) => img));
@@ -77,13 +108,16 @@ export function filmsPart(panel) {
         const img = thumbnail(title);
         panel.blobs.fill(img, buffers[at]);
         const button = element("button", "epypes-small", { type: "button", title }, img, element("span", "epypes-caption", {}, title));
+        const badge = element("span", "epypes-verdict", { hidden: "" });
+        button.append(badge);
         button.addEventListener("click", () => {
           choose(index);
           panel.send({ kind: "image", index });
         });
-        return { index, button, img };
+        return { index, title, button, img, badge };
       });
       root.replaceChildren(...films.map(({ button }) => button));
+      judge();
       root.hidden = images.length === 0;
     },
     frame: ({ frame }) => choose(frame.image),
