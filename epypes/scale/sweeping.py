@@ -20,6 +20,7 @@ from epypes.scale.sheet import Sheet, sheet_of
 from epypes.scale.spreading import spread, worker_count
 from epypes.scale.start import Start
 from epypes.scale.table import frame_of
+from epypes.wording import counted
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -100,7 +101,8 @@ class SweepResult:
 
     def __repr__(self) -> str:
         failed = f"{len(self.failures)} failed"
-        return f"<SweepResult: {len(self.outcomes)} settings of {', '.join(self.names)!s:.40}; {failed}>"
+        varied = ", ".join(self.names)
+        return f"<SweepResult: {counted(len(self), 'outcome')} of {varied:.40}; {failed}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         return {**self.sheet()._repr_mimebundle_(), "text/plain": repr(self)}
