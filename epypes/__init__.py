@@ -55,6 +55,7 @@ if TYPE_CHECKING:
         summarize,
     )
     from epypes.run.guard import unguarded
+    from epypes.scale import MapResult, map  # noqa: A004 - as in ep.map(runner, images)
     from epypes.scale.sweeping import SweepResult, sweep
     from epypes.service.failures.reopen import load_failure
     from epypes.service.remote.connection import connect
@@ -110,6 +111,8 @@ _HOMES = {
     "load": "epypes.bundle",
     "load_failure": "epypes.service.failures.reopen",
     "load_pipeline": "epypes.bundle",
+    "MapResult": "epypes.scale",
+    "map": "epypes.scale",
     "promote": "epypes.bundle",
     "SweepResult": "epypes.scale.sweeping",
     "sweep": "epypes.scale.sweeping",
@@ -130,6 +133,7 @@ __all__ = [
     "ImageAcquisition",
     "LogNormal",
     "Mailbox",
+    "MapResult",
     "Node",
     "NodeBasedCompGraph",
     "Param",
@@ -158,6 +162,7 @@ __all__ = [
     "load",
     "load_failure",
     "load_pipeline",
+    "map",
     "outputs",
     "promote",
     "register_preview",

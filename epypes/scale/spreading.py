@@ -3,22 +3,31 @@
 from __future__ import annotations
 
 import os
-import queue
 import threading
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
-from itertools import islice
-from typing import Final
+from collections.abc import Iterable, Iterator
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
+from typing import Any, Final
 
+from epypes.errors import ExecutorBroken
 from epypes.run import CompGraphRunner
+from epypes.scale.hands import Bundles, Hands, Threads, own_runner
 from epypes.scale.job import Job, do
 from epypes.scale.outcome import Outcome
+from epypes.wording import counted
 
 # How soon a stop that somebody asks for is seen while nothing is done.
 _LOOK_S: Final = 0.05
 _JOBS_PER_WORKER: Final = 2
-
-Submit = Callable[[Executor, Job], "Future[list[Outcome]]"]
+# How long it is waited, once it was stopped, for what is at work.
+_GRACE_S: Final = 2.0
 
 
 def spread(
@@ -55,12 +64,9 @@ def spread(
         return _done_here(runner, jobs, stop)
     if not isinstance(executor, Executor):
         raise TypeError(f"executor must be a concurrent.futures.Executor, not {type(executor).__name__!r}.")
-    return _handed_out(jobs, executor, _on_threads(runner), ahead, stop)
-
-
-def own_runner(runner: CompGraphRunner) -> CompGraphRunner:
-    """Return another runner of the same graph, with the same hyperparameters."""
-    return CompGraphRunner(runner.cg, runner.hyperparameters, workers=runner.workers, guard=runner.guard)
+    over = threading.Event()
+    hands = Threads(runner, executor, over) if isinstance(executor, ThreadPoolExecutor) else Bundles(runner, executor)
+    return _handed_out(hands, jobs, ahead or _JOBS_PER_WORKER * worker_count(executor), over, stop)
 
 
 def _done_here(runner: CompGraphRunner, jobs: Iterable[Job], stop: threading.Event | None) -> Iterator[list[Outcome]]:
@@ -74,64 +80,59 @@ def _done_here(runner: CompGraphRunner, jobs: Iterable[Job], stop: threading.Eve
 # -- executors --------------------------------------------------------------------------------------------------
 
 
-class _Threads:
-    """Does jobs on threads, each on a runner that no other thread uses meanwhile."""
-
-    def __init__(self, runner: CompGraphRunner, stop: threading.Event) -> None:
-        self._runner, self._stop = runner, stop
-        self._idle: queue.SimpleQueue[CompGraphRunner] = queue.SimpleQueue()
-
-    def do(self, job: Job) -> list[Outcome]:
-        """Do a job on the thread that calls this."""
-        if self._stop.is_set():
-            return []
-        try:
-            own = self._idle.get_nowait()
-        except queue.Empty:
-            own = own_runner(self._runner)
-        try:
-            return do(own, job, self._stop)
-        finally:
-            self._idle.put(own)
-
-
-def _on_threads(runner: CompGraphRunner) -> Callable[[threading.Event], Submit]:
-    def begin(over: threading.Event) -> Submit:
-        threads = _Threads(runner, over)
-        return lambda executor, job: executor.submit(threads.do, job)
-
-    return begin
-
-
 def _handed_out(
-    jobs: Iterable[Job],
-    executor: Executor,
-    begin: Callable[[threading.Event], Submit],
-    ahead: int | None,
-    stop: threading.Event | None,
+    hands: Hands, jobs: Iterable[Job], most: int, over: threading.Event, stop: threading.Event | None
 ) -> Iterator[list[Outcome]]:
     """Keep so many jobs at work; give what comes; leave none behind, however it ends."""
-    over, source = threading.Event(), iter(jobs)
-    submit = begin(over)
-    most = ahead or _JOBS_PER_WORKER * worker_count(executor)
-    at_work: set[Future[list[Outcome]]] = set()
+    at_work: dict[Future[Any], Job] = {}
+    source, done = iter(jobs), 0
     try:
         while stop is None or not stop.is_set():
             # One at a time, so that what has come decides about what is taken next.
-            at_work |= {submit(executor, job) for job in islice(source, most - len(at_work))}
+            while len(at_work) < most and (job := next(source, None)) is not None:
+                at_work[hands.submit(job)] = job
+                del job
             if not at_work:
                 return
-            done, at_work = wait(at_work, None if stop is None else _LOOK_S, FIRST_COMPLETED)
-            for future in done:
-                yield future.result()
+            ready, _ = wait(at_work, None if stop is None else _LOOK_S, FIRST_COMPLETED)
+            for future in ready:
+                outcomes, again = hands.read(future, at_work.pop(future))
+                at_work |= again
+                done += len(outcomes)
+                yield outcomes
+        over.set()
+        yield from _last(hands, at_work)
+    except (BrokenExecutor, CancelledError) as error:
+        raise ExecutorBroken(done, _broken(done, error)) from error
     finally:
         over.set()
         for future in at_work:
             future.cancel()
 
 
+def _last(hands: Hands, at_work: dict[Future[Any], Job]) -> Iterator[list[Outcome]]:
+    """Give what is still being done; what waits is not begun any more."""
+    begun = {future for future in at_work if not future.cancel()}
+    ready, _ = wait(begun, _GRACE_S)
+    for future in ready:
+        outcomes, again = hands.read(future, at_work.pop(future))
+        at_work |= again
+        yield outcomes
+
+
+def _broken(done: int, error: BaseException) -> str:
+    said = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    return (
+        f"The executor broke after {counted(done, 'outcome')}, most likely since one of its processes died ({said}). "
+        "Make a new one and run again: with store= what was done is taken from there. A Dask cluster goes on by itself."
+    )
+
+
 def worker_count(executor: Executor) -> int:
     """Return how many jobs an executor does at once, as far as that can be known."""
-    if isinstance(executor, ThreadPoolExecutor):
-        return executor._max_workers
-    return os.cpu_count() or 1
+    # Neither Python's pools nor Dask's executor say it in public.
+    most = getattr(executor, "_max_workers", None)
+    if isinstance(most, int):
+        return most
+    cores = getattr(getattr(executor, "_client", None), "ncores", None)
+    return max(sum(cores().values()), 1) if callable(cores) else os.cpu_count() or 1

@@ -1,0 +1,66 @@
+"""How many items make one job, so that handing it out costs little beside doing it?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any, Final
+
+from epypes.scale.items import Item
+from epypes.scale.outcome import Outcome
+
+# As long a job takes, about: long beside the millisecond of its way, short beside a person's patience and the last
+# job's, for which all others wait.
+_JOB_NS: Final = 50_000_000
+_MOST_ITEMS: Final = 64
+# Of arrays that wait in memory, in one job.
+_MOST_BYTES: Final = 4_000_000
+# One more outcome changes what is expected by so much.
+_SHARE: Final = 0.2
+
+
+class Batches:
+    """Groups of items; the time that items take decides how many are in the next one.
+
+    Parameters
+    ----------
+    items
+        Taken one by one, when a group is asked for.
+    are_single
+        Whether each group has one item only.
+    """
+
+    def __init__(self, items: Iterable[Item], are_single: bool = False) -> None:
+        self._items, self._are_single = iter(items), are_single
+        self._item_ns = 0.0
+
+    def learn(self, outcomes: Iterable[Outcome]) -> None:
+        """Take note of how long items took."""
+        for outcome in outcomes:
+            last_ns = max(outcome.total_ns, 1)
+            self._item_ns = self._item_ns + _SHARE * (last_ns - self._item_ns) if self._item_ns else last_ns
+
+    def __iter__(self) -> Iterator[tuple[Item, ...]]:
+        while batch := self._next():
+            yield tuple(batch)
+            # The items are in memory as long as somebody holds them.
+            del batch
+
+    def _next(self) -> list[Item]:
+        batch: list[Item] = []
+        most, size = self._most(), 0
+        while len(batch) < most and size < _MOST_BYTES:
+            item = next(self._items, None)
+            if item is None:
+                break
+            batch.append(item)
+            size += _bytes_of(item.payload.values())
+        return batch
+
+    def _most(self) -> int:
+        if self._are_single or not self._item_ns:
+            return 1
+        return max(1, min(_MOST_ITEMS, int(_JOB_NS / self._item_ns)))
+
+
+def _bytes_of(values: Iterable[Any]) -> int:
+    return sum(size for value in values if isinstance(size := getattr(value, "nbytes", 0), int))
