@@ -229,7 +229,9 @@ class Picker:
         return f"<Picker: {len(self.result)} outcomes of {', '.join(self.result.names):.40}; chosen: {self.chosen}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, Any]:
-        return {**(self._view._repr_mimebundle_() or {}), "text/plain": repr(self)}
+        shown = self._view._repr_mimebundle_()
+        bundle: dict[str, Any] = (shown[0] if isinstance(shown, tuple) else shown) or {}
+        return {**bundle, "text/plain": repr(self)}
 
     def _ipython_display_(self) -> None:
         from IPython.display import display
