@@ -13,8 +13,8 @@ from epypes.graph import CompGraph
 def running_order(cg: CompGraph, settings: Sequence[Mapping[str, Any]]) -> list[int]:
     """Return the places of settings in the order in which they are best run.
 
-    There is one at least. Each is run after the one before by running only what depends on what is different. So the hyperparameter on which
-    most functions depend changes least often.
+    There is one at least. Each is run after the one before by running only what depends on what is different. So the
+    hyperparameter on which most functions depend changes least often.
     """
     slowest_first = _slowest_first(cg, settings)
     ranks: dict[str, dict[Hashable, int]] = {name: {} for name in slowest_first}

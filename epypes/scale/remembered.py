@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from time import monotonic
 from typing import Any, Final
@@ -20,7 +20,9 @@ from epypes.store import Series, Store
 _WRITE_EVERY_S: Final = 0.5
 
 
-def series_of(store: Store, kind: str, runner: CompGraphRunner, name: str | None) -> Series:
+def series_of(
+    store: Store, kind: str, runner: CompGraphRunner, name: str | None, varied: Collection[str] = ()
+) -> Series:
     """Return the series in which outcomes of a runner are kept.
 
     Parameters
@@ -33,6 +35,8 @@ def series_of(store: Store, kind: str, runner: CompGraphRunner, name: str | None
         Its graph and hyperparameters are what the series is of.
     name
         What it is called; a digest of graph and hyperparameters without.
+    varied
+        The hyperparameters that each outcome has its own values of.
 
     Raises
     ------
@@ -40,7 +44,8 @@ def series_of(store: Store, kind: str, runner: CompGraphRunner, name: str | None
         There is no name and the graph can't be written as text; or the series is of another graph or of other
         hyperparameters.
     """
-    source, hyperparameters = _source_of(runner), _texts_of(runner.hyperparameters)
+    fixed = {token: value for token, value in runner.hyperparameters.items() if token not in varied}
+    source, hyperparameters = _source_of(runner), _texts_of(fixed)
     if name is None:
         if source is None:
             text = "What this graph computes can't be written as text, which would tell it from others. Give name=."
@@ -102,23 +107,30 @@ class Remembered:
     def __init__(self, series: Series, how: str = "", are_whole: bool = True) -> None:
         self._series, self._how = series, how
         self._known = series.keys() if are_whole else frozenset()
-        self._keys: dict[int, str] = {}
+        self._keys: dict[tuple[int, str], str] = {}
+        self._of_item = -1, ""
         self._waiting: list[tuple[str, dict[str, Any]]] = []
         self._written_s = monotonic()
 
-    def recall(self, item: Item) -> Outcome | None:
-        """Return the outcome of an item that was run before; None if it has to be run."""
-        key = f"{item.name} {item.stamp or _contents_of(item.payload)} {self._how}"
+    def recall(self, item: Item, setting: Mapping[str, Any] | None = None) -> Outcome | None:
+        """Return the outcome of an item, under a setting, that was run before; None if it has to be run."""
+        told = _setting_text(setting or {})
+        key = f"{self._item_text(item)} {self._how}{told}"
         found = self._series.get(key) if key in self._known else None
         if found is None:
-            self._keys[item.number] = key
+            self._keys[item.number, told] = key
             return None
-        return replace(Outcome.from_json(found), number=item.number, name=item.name)
+        return replace(Outcome.from_json(found), number=item.number, name=item.name, setting=setting or {})
+
+    def _item_text(self, item: Item) -> str:
+        if self._of_item[0] != item.number:
+            self._of_item = item.number, f"{item.name} {item.stamp or _contents_of(item.payload)}"
+        return self._of_item[1]
 
     def add(self, outcomes: Iterable[Outcome]) -> None:
         """Take outcomes of items that had to be run."""
         for outcome in outcomes:
-            key = self._keys.pop(outcome.number)
+            key = self._keys.pop((outcome.number, _setting_text(outcome.setting)))
             # A file that could not be read may be there the next time.
             if outcome.trouble is None or outcome.trouble.function:
                 self._waiting.append((key, outcome.to_json()))
@@ -131,6 +143,10 @@ class Remembered:
         if waiting:
             self._series.append_all(waiting)
         self._written_s = monotonic()
+
+
+def _setting_text(setting: Mapping[str, Any]) -> str:
+    return f" {_texts_of(setting)}" if setting else ""
 
 
 def _contents_of(payload: Mapping[str, Any]) -> str:

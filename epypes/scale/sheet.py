@@ -18,6 +18,7 @@ from epypes.errors import ScaleError, UnknownName
 from epypes.graph import CompGraph
 from epypes.scale.order import identity
 from epypes.scale.outcome import Outcome, Thumbnail
+from epypes.wording import counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +92,7 @@ class Sheet:
     def __repr__(self) -> str:
         tiles = self.tiles
         failed = sum(tile.has_failed for tile in tiles)
-        return f"<Sheet of {str(self.token)!r:.30}: {len(tiles)} settings, {failed} failed>"
+        return f"<Sheet of {str(self.token)!r:.30}: {counted(len(tiles), 'outcome')}, {failed} failed>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         from epypes.scale.sheetpage import page_of

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import base64
 import io
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 from epypes.display.limits import CHARACTERS, THUMBNAIL_CHARACTERS
@@ -17,6 +17,7 @@ from epypes.display.markup import content, escape, fitted, size
 from epypes.display.previews.raster import encode_small
 from epypes.scale.outcome import Thumbnail
 from epypes.scale.sheet import Block, Sheet, Tile
+from epypes.wording import counted
 
 # So many tiles at most; fewer if their texts are long.
 _MOST_TILES: Final = (120, 80, 50, 25, 10, 3)
@@ -27,6 +28,9 @@ _LABEL_ROOM: Final = 64
 _MESSAGE_ROOM: Final = 96
 _TITLE_ROOM: Final = 160
 _SIDE_PX: Final = 128
+# Where there are many, so that they are compared at a glance; and what of their files is left is as sharp.
+_SMALL_PX: Final = 80
+_MANY: Final = 40
 
 # Text has the colour of the page, lines and tints are mixed from it: readable on any ground.
 _STYLE: Final = (
@@ -37,34 +41,48 @@ _STYLE: Final = (
     "color:inherit}"
     ".epypes-contact tr{background:none!important}"
     ".epypes-contact th{font-weight:600;text-align:center!important;padding:2px 6px;white-space:nowrap}"
-    ".epypes-contact .cell{box-sizing:border-box;width:136px;max-width:136px;padding:3px;text-align:center!important;"
+    ".epypes-contact .cell{box-sizing:border-box;width:calc(var(--side) + 8px);min-width:calc(var(--side) + 8px);"
+    "max-width:calc(var(--side) + 8px);padding:3px;text-align:center!important;"
     "vertical-align:top;border:1px solid #8885;white-space:normal}"
     ".epypes-contact div.cell{display:inline-block;margin:0 4px 4px 0}"
-    ".epypes-contact img{display:block;margin:0 auto;width:128px;height:auto;max-height:128px;object-fit:contain}"
-    ".epypes-contact span{display:block;overflow-wrap:anywhere;line-height:1.3;padding-top:2px}"
+    ".epypes-contact img{display:block;margin:0 auto;width:var(--side);height:auto;max-height:var(--side);"
+    "object-fit:contain}"
+    ".epypes-contact span{display:-webkit-box;-webkit-box-orient:vertical;-webkit-line-clamp:7;overflow:hidden;"
+    "overflow-wrap:anywhere;line-height:1.3;margin-top:2px}"
     ".epypes-contact b{color:var(--epypes-failed)}"
     ".epypes-contact .failed{outline:2px solid var(--epypes-failed);outline-offset:-2px;background:#e5484d22;"
-    "text-align:left!important}</style>"
+    "text-align:left!important}"
+    ".epypes-contact .chosen{outline:3px solid var(--jp-brand-color1,#1976d2);outline-offset:-2px}</style>"
 )
 
 
-def page_of(sheet: Sheet) -> str:
-    """Return a contact sheet for a page, within the size of other pictures."""
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """How many bytes a picture has at most, and which outcome is marked."""
+
+    most_bytes: int
+    chosen: int | None
+
+
+def page_of(sheet: Sheet, chosen: int | None = None) -> str:
+    """Return a contact sheet for a page, within the size of other pictures; ``chosen`` is the place that is marked."""
     page = ""
     for most in _MOST_TILES:
-        page = _page(sheet, sheet.first(most))
+        page = _page(sheet, sheet.first(most), chosen)
         if size(page) <= CHARACTERS + THUMBNAIL_CHARACTERS:
             break
     return page
 
 
-def _page(sheet: Sheet, shown: Sheet) -> str:
+def _page(sheet: Sheet, shown: Sheet, chosen: int | None) -> str:
     tiles, total = shown.tiles, len(sheet.tiles)
     pictures = sum(tile.thumbnail is not None for tile in tiles)
     most_bytes = (THUMBNAIL_CHARACTERS // max(pictures, 1) - _ELEMENT_CHARACTERS) * 3 // 4
-    blocks = "".join(_block(shown, block, most_bytes) for block in shown.blocks)
+    look = _Look(most_bytes, chosen)
+    blocks = "".join(_block(shown, block, look) for block in shown.blocks)
     more = f"<p>{_left_out(total - len(tiles))}</p>" if len(tiles) < total else ""
-    return f'<div class="epypes-contact">{_heading(sheet)}{blocks}{more}{_STYLE}</div>'
+    side_px = _SIDE_PX if pictures <= _MANY else _SMALL_PX
+    return f'<div class="epypes-contact" style="--side:{side_px}px">{_heading(sheet)}{blocks}{more}{_STYLE}</div>'
 
 
 def _left_out(number: int) -> str:
@@ -76,18 +94,18 @@ def _left_out(number: int) -> str:
 
 def _heading(sheet: Sheet) -> str:
     failed = sum(tile.has_failed for tile in sheet.tiles)
-    of = f"{content(fitted(sheet.token, _LABEL_ROOM))} of " if sheet.token else ""
+    token = f"{content(fitted(sheet.token, _LABEL_ROOM))}: " if sheet.token else ""
     failures = f", <b>{failed:,} failed</b>" if failed else ""
-    return f"<p>{of}{len(sheet.tiles):,} settings{failures}</p>"
+    return f"<p>{token}{counted(len(sheet.tiles), 'outcome')}{failures}</p>"
 
 
-def _block(sheet: Sheet, block: Block, most_bytes: int) -> str:
+def _block(sheet: Sheet, block: Block, look: _Look) -> str:
     title = content(fitted(block.title, _TITLE_ROOM))
     if sheet.rows is sheet.columns is None:
-        tiles = "".join(_cell("div", cell, most_bytes) for row in block.rows for cell in row)
+        tiles = "".join(_cell("div", cell, look) for row in block.rows for cell in row)
         return (f"<h4>{title}</h4>" if title else "") + tiles
     rows = "".join(
-        f"<tr>{_head(label, 'row') if sheet.rows else ''}{''.join(_cell('td', cell, most_bytes) for cell in row)}</tr>"
+        f"<tr>{_head(label, 'row') if sheet.rows else ''}{''.join(_cell('td', cell, look) for cell in row)}</tr>"
         for label, row in zip(sheet.row_labels or [""], block.rows, strict=False)
     )
     caption = f"<caption>{title}</caption>" if title else ""
@@ -110,21 +128,23 @@ def _head(label: str, scope: str) -> str:
     return f'<th scope="{scope}">{content(fitted(label, _LABEL_ROOM))}</th>'
 
 
-def _cell(tag: str, tiles: tuple[Tile, ...], most_bytes: int) -> str:
-    failed = " failed" if any(tile.has_failed for tile in tiles) else ""
-    return f'<{tag} class="cell{failed}">{"".join(_tile(tile, most_bytes) for tile in tiles)}</{tag}>'
+def _cell(tag: str, tiles: tuple[Tile, ...], look: _Look) -> str:
+    state = " failed" if any(tile.has_failed for tile in tiles) else ""
+    state += " chosen" if any(tile.place == look.chosen for tile in tiles) else ""
+    return f'<{tag} class="cell{state}">{"".join(_tile(tile, look) for tile in tiles)}</{tag}>'
 
 
-def _tile(tile: Tile, most_bytes: int) -> str:
-    label = f"<span>{content(fitted(tile.label, _LABEL_ROOM))}</span>" if tile.label else ""
+def _tile(tile: Tile, look: _Look) -> str:
+    words = "✓ chosen " * (tile.place == look.chosen) + tile.label
+    label = f"<span>{content(fitted(words, _LABEL_ROOM))}</span>" if words else ""
     if tile.has_failed:
         return f"{label}<span><b>failed</b> {content(fitted(tile.text, _MESSAGE_ROOM))}</span>"
-    picture = None if tile.thumbnail is None else smaller(tile.thumbnail, most_bytes)
+    picture = None if tile.thumbnail is None else smaller(tile.thumbnail, look.most_bytes)
     if picture is None:
         return f"{label}<span>{content(fitted(tile.text, _MESSAGE_ROOM))}</span>"
     data = base64.b64encode(picture.data).decode()
     alt = escape(fitted(tile.text, _LABEL_ROOM))
-    return f'<img src="data:{picture.media_type};base64,{data}" width="{_SIDE_PX}" alt="{alt}">{label}'
+    return f'<img src="data:{picture.media_type};base64,{data}" alt="{alt}">{label}'
 
 
 def smaller(thumbnail: Thumbnail, most_bytes: int) -> Thumbnail | None:

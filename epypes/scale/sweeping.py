@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import PayloadError, ScaleError, run_call
@@ -15,16 +17,17 @@ from epypes.scale.items import Item, count_of, items_of
 from epypes.scale.job import Job
 from epypes.scale.order import functions_after, running_order, steps
 from epypes.scale.outcome import Outcome
-from epypes.scale.progress import progress_bar
+from epypes.scale.progress import Advance, progress_bar
+from epypes.scale.remembered import Remembered, series_of
 from epypes.scale.sheet import Sheet, sheet_of
 from epypes.scale.spreading import spread, worker_count
 from epypes.scale.start import Start
 from epypes.scale.table import frame_of
+from epypes.store import Store, opened_store
+from epypes.wording import counted
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from epypes.store import Store
 
 # Each of at most 5 KB, and some belong to several outcomes.
 _MOST_PICTURES: Final = 200_000
@@ -100,7 +103,8 @@ class SweepResult:
 
     def __repr__(self) -> str:
         failed = f"{len(self.failures)} failed"
-        return f"<SweepResult: {len(self.outcomes)} settings of {', '.join(self.names)!s:.40}; {failed}>"
+        varied = ", ".join(self.names)
+        return f"<SweepResult: {counted(len(self), 'outcome')} of {varied:.40}; {failed}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         return {**self.sheet()._repr_mimebundle_(), "text/plain": repr(self)}
@@ -117,7 +121,7 @@ def sweep(
     seed: int = 0,
     keep: Sequence[str] = (),
     show: Sequence[str] | None = None,
-    store: str | Store | None = None,
+    store: str | Path | Store | None = None,
     name: str | None = None,
     progress: bool | None = None,
 ) -> SweepResult:
@@ -182,15 +186,56 @@ def sweep(
     # By object: a setting comes back as the very mapping that was sent.
     places = {id(setting): place for place, setting in enumerate(settings)}
     in_order = tuple(settings[place] for place in running_order(runner.cg, settings))
-    grid_job = Job((), in_order, kept, shown)
-    jobs = _jobs(_items(runner, images, plan), grid_job, _cuts(runner, in_order, executor, count), executor)
-    found: list[Outcome] = []
-    with progress_bar(progress, None if count is None else count * plan.size, "sweep", unit="setting") as advance:
-        for outcomes in spread(runner, jobs, executor):
-            found += outcomes
-            advance(len(outcomes), sum(outcome.has_failed for outcome in outcomes))
-    found.sort(key=lambda outcome: (outcome.number, places[id(outcome.setting)]))
+    with ExitStack() as stack:
+        advance = stack.enter_context(progress_bar(progress, count and count * plan.size, "sweep", unit="setting"))
+        memory = None
+        if (opened := stack.enter_context(opened_store(store))) is not None:
+            series = series_of(opened, "sweep", runner, name, plan.names)
+            memory = Remembered(series, f"show={shown and list(shown)}", not kept)
+            stack.callback(memory.write)
+        work = _Sweep(runner, Job((), in_order, kept, shown), memory, advance)
+        work.run(_items(runner, images, plan), executor, count)
+    found = sorted(work.outcomes, key=lambda outcome: (outcome.number, places[id(outcome.setting)]))
     return SweepResult(tuple(found), plan.names, runner)
+
+
+class _Sweep:
+    """One sweep: the outcomes that have come."""
+
+    def __init__(self, runner: CompGraphRunner, grid: Job, memory: Remembered | None, advance: Advance) -> None:
+        self._runner, self._grid, self._memory, self._advance = runner, grid, memory, advance
+        self.outcomes: list[Outcome] = []
+
+    def run(self, items: Iterator[Item], executor: Executor | None, images: int | None) -> None:
+        """Run what has to be run of each item."""
+        for outcomes in spread(self._runner, self._jobs(items, executor, images), executor):
+            if self._memory is not None:
+                self._memory.add(outcomes)
+            self._take(outcomes)
+
+    def _jobs(self, items: Iterator[Item], executor: Executor | None, images: int | None) -> Iterator[Job]:
+        """Give the jobs of each item: its settings in parts, which in this process have their beginning in common."""
+        for item in items:
+            settings = self._unknown(item)
+            cuts = _cuts(self._runner, settings, executor, images) if settings else []
+            start = Start() if len(cuts) > 2 and _is_here(executor) else None
+            for first, end in pairwise(cuts):
+                yield replace(self._grid, items=(item,), settings=settings[first:end], start=start)
+            # Whoever waits for the next one must not keep this one alive.
+            del item, start
+
+    def _unknown(self, item: Item) -> tuple[Setting, ...]:
+        """Return the settings with which an item has to be run; take the outcomes of the others."""
+        if self._memory is None:
+            return self._grid.settings
+        found = [self._memory.recall(item, setting) for setting in self._grid.settings]
+        self._take([outcome for outcome in found if outcome is not None])
+        pairs = zip(self._grid.settings, found, strict=True)
+        return tuple(setting for setting, outcome in pairs if outcome is None)
+
+    def _take(self, outcomes: list[Outcome]) -> None:
+        self.outcomes += outcomes
+        self._advance(len(outcomes), sum(outcome.has_failed for outcome in outcomes))
 
 
 def _tokens(runner: CompGraphRunner, given: str | Sequence[str]) -> tuple[str, ...]:
@@ -239,16 +284,6 @@ def _last_payload(runner: CompGraphRunner) -> dict[str, Any]:
 
 
 # -- parts of a grid ------------------------------------------------------------------------------------------------
-
-
-def _jobs(items: Iterator[Item], grid: Job, cuts: Sequence[int], executor: Executor | None) -> Iterator[Job]:
-    """Give the jobs of each item: its settings in parts, which in this process have their beginning in common."""
-    is_shared = len(cuts) > 2 and _is_here(executor)
-    for item in items:
-        start = Start() if is_shared else None
-        for first, end in pairwise(cuts):
-            yield replace(grid, items=(item,), settings=grid.settings[first:end], start=start)
-        del item, start
 
 
 def _is_here(executor: Executor | None) -> bool:

@@ -31,6 +31,10 @@ What is remembered:
 - ``promotion``, ``writeback``: what becomes of a promotion, and of values that are written back
 - ``still``, ``static``, ``pictures``: what stays in a saved notebook
 
+What is chosen from a sweep:
+
+- ``picking``: which of many settings does the runner get
+
 What is looked at, and moved:
 
 - ``looking``: what can be looked at in a run
@@ -45,5 +49,6 @@ from __future__ import annotations
 
 from epypes_widgets.making import tune
 from epypes_widgets.panel import Panel
+from epypes_widgets.picking import Picker, pick
 
-__all__ = ["Panel", "tune"]
+__all__ = ["Panel", "Picker", "pick", "tune"]

@@ -1,0 +1,240 @@
+"""Does a sweep run what it must, once, and leave everything else as it was?"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import epypes as ep
+from epypes.errors import PayloadError, ScaleError, UnknownName
+
+
+class Calls:
+    """Counts calls, from any thread."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self._lock = threading.Lock()
+
+    def of(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        def counted(*args: Any) -> Any:
+            with self._lock:
+                self.counts[function.__name__] += 1
+            return function(*args)
+
+        return counted
+
+
+def load(image: Any) -> Any:
+    return image.astype(np.int32)
+
+
+def blur(loaded: Any, kernel: int) -> Any:
+    return loaded // kernel
+
+
+def above(blurred: Any, threshold: int) -> Any:
+    if threshold == 13:
+        raise ValueError("13 is not a threshold")
+    return np.where(blurred > threshold, 255, 0).astype(np.uint8)
+
+
+def area(mask: Any) -> int:
+    return int((mask > 0).sum())
+
+
+IO = {
+    "load": ("image", "loaded"),
+    "blur": (("loaded", "kernel"), "blurred"),
+    "above": (("blurred", "threshold"), "mask"),
+    "area": ("mask", "size"),
+}
+
+
+@pytest.fixture
+def calls() -> Calls:
+    return Calls()
+
+
+@pytest.fixture
+def image() -> Any:
+    return np.arange(64 * 48, dtype=np.uint32).reshape(48, 64).astype(np.uint8)
+
+
+@pytest.fixture
+def runner(calls: Calls, image: Any) -> ep.CompGraphRunner:
+    cg = ep.CompGraph({name: calls.of(globals()[name]) for name in IO}, IO)
+    runner = ep.CompGraphRunner(cg, {"kernel": 1, "threshold": 100})
+    runner.run(image=image)
+    calls.counts.clear()
+    return runner
+
+
+def by_hand(image: Any, kernel: int, threshold: int) -> int:
+    return area(above(blur(load(image), kernel), threshold))
+
+
+EXECUTORS = [None, 1, 4]
+
+
+@pytest.mark.parametrize("threads", EXECUTORS)
+@pytest.mark.parametrize("count", [None, 1, 3, 9])
+def test_what_does_not_depend_on_what_varies_runs_once_an_image(
+    runner: ep.CompGraphRunner, calls: Calls, image: Any, threads: int | None, count: int | None
+) -> None:
+    images = None if count is None else [image + place for place in range(count)]
+    thresholds = list(range(20, 70))
+    result = sweep_on(threads, runner, {"threshold": thresholds}, images)
+    once = count or 1
+    assert calls.counts == {"load": once, "blur": once, "above": 50 * once, "area": 50 * once}
+    found = [(one.number, one.setting["threshold"], one.values["size"]) for one in result]
+    every = images or [image]
+    assert found == [(at, one, by_hand(every[at], 1, one)) for at in range(once) for one in thresholds]
+
+
+def sweep_on(threads: int | None, *given: Any, **how: Any) -> ep.SweepResult:
+    if threads is None:
+        return ep.sweep(*given, **how)
+    with ThreadPoolExecutor(threads) as executor:
+        return ep.sweep(*given, executor=executor, **how)
+
+
+def test_what_depends_on_the_slowest_runs_once_for_each_of_its_values_whatever_the_order_of_the_grid(
+    runner: ep.CompGraphRunner, calls: Calls, image: Any
+) -> None:
+    result = ep.sweep(runner, {"threshold": list(range(20, 60)), "kernel": [1, 2, 3]})
+    assert calls.counts["load"] == 1
+    assert calls.counts["blur"] == 3
+    assert [(one.setting["threshold"], one.setting["kernel"]) for one in result][:4] == [(20, 1), (20, 2), (20, 3), (21, 1)]
+    assert all(one.values["size"] == by_hand(image, one.setting["kernel"], one.setting["threshold"]) for one in result)
+
+
+def test_the_given_runner_is_left_as_it_was(runner: ep.CompGraphRunner, image: Any) -> None:
+    before = (dict(runner.hyperparameters), runner.last, runner.revision, len(runner.reports), runner.stale)
+    told: list[None] = []
+    runner.watch(lambda: told.append(None))
+    ep.sweep(runner, {"threshold": [10, 13, 20]})
+    sweep_on(3, runner, {"threshold": [10, 13, 20]}, [image])
+    after = (dict(runner.hyperparameters), runner.last, runner.revision, len(runner.reports), runner.stale)
+    assert after == before
+    assert told == []
+
+
+@pytest.mark.parametrize("threads", EXECUTORS)
+def test_a_failing_setting_is_a_row_with_its_failure_and_the_others_go_on(
+    runner: ep.CompGraphRunner, image: Any, threads: int | None
+) -> None:
+    result = sweep_on(threads, runner, {"threshold": [13, 20, 13, 30], "kernel": [1, 2]})
+    frame = result.to_frame()
+    assert list(frame["failure"].notna()) == [True, True, False, False, True, True, False, False]
+    assert set(frame["failure"].dropna()) == {"above: ValueError: 13 is not a threshold"}
+    assert list(frame["threshold"]) == [13, 13, 20, 20, 13, 13, 30, 30]
+    assert frame["size"][2] == by_hand(image, 1, 20)
+    assert [one.setting["threshold"] for one in result.failures] == [13] * 4
+
+
+def test_images_of_a_folder_are_swept_and_one_that_can_not_be_read_is_a_row_for_each_setting(
+    runner: ep.CompGraphRunner, tmp_path: Path
+) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((20, 20, 3), 90, np.uint8))
+    (tmp_path / "b.png").write_bytes(b"no image")
+    result = ep.sweep(runner, {"threshold": [50, 100]}, tmp_path)
+    assert [(one.name, one.setting["threshold"], one.has_failed) for one in result] == [
+        ("a.png", 50, False), ("a.png", 100, False), ("b.png", 50, True), ("b.png", 100, True),
+    ]  # fmt: skip
+    assert {one.trouble.function for one in result.failures if one.trouble} == {""}
+
+
+def test_only_thumbnails_and_short_values_are_kept_unless_tokens_are_named(runner: ep.CompGraphRunner) -> None:
+    plain = ep.sweep(runner, {"threshold": [50, 100]})[0]
+    assert not plain.kept
+    assert set(plain.values) == {"size"}
+    assert {"image", "mask"} <= set(plain.thumbnails)
+    assert all(len(shown.data) <= 5_000 for shown in plain.thumbnails.values())
+    kept = ep.sweep(runner, {"threshold": [50, 100]}, keep=["mask"], show=())
+    assert not kept[0].thumbnails
+    assert [int((one.kept["mask"] > 0).sum()) for one in kept] == [one.values["size"] for one in kept]
+
+
+def test_a_picture_of_what_stays_is_made_once(runner: ep.CompGraphRunner) -> None:
+    result = ep.sweep(runner, {"threshold": [50, 100, 150]})
+    assert len({id(one.thumbnails["image"]) for one in result}) == 1
+    assert len({id(one.thumbnails["mask"]) for one in result}) == 3
+
+
+def test_without_images_nothing_can_be_swept_before_a_run(runner: ep.CompGraphRunner) -> None:
+    new = ep.CompGraphRunner(runner.cg, runner.hyperparameters)
+    with pytest.raises(PayloadError, match=r"images=\.\.\., or call run\(image=\.\.\.\)"):
+        ep.sweep(new, {"threshold": [1]})
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"grid": {"threshold": range(100_001)}}, "100,001 settings.*at most 100,000"),
+        ({"grid": {"threshold": range(50_001)}, "images": [0, 0], "show": ()}, "on 2 images: 100,002 outcomes"),
+        ({"grid": {"kernel": range(1, 90_000)}}, "up to 269,997 pictures.*show="),
+        ({"grid": {"threshold": [1]}, "images": []}, "empty"),
+    ],
+    ids=["settings", "images", "pictures", "empty"],
+)
+def test_what_is_too_large_to_hold_or_empty_is_refused_before_anything_runs(
+    runner: ep.CompGraphRunner, calls: Calls, given: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(ScaleError, match=said):
+        ep.sweep(runner, **given)
+    assert not calls.counts
+
+
+def test_a_token_that_is_not_there_is_named(runner: ep.CompGraphRunner) -> None:
+    for name in ("keep", "show"):
+        with pytest.raises(UnknownName, match="Did you mean 'mask'"):
+            ep.sweep(runner, {"threshold": [1]}, **{name: ["masc"]})
+
+
+def test_what_is_in_a_store_is_not_run_again(runner: ep.CompGraphRunner, calls: Calls, tmp_path: Path) -> None:
+    place = str(tmp_path / "results.sqlite")
+    first = ep.sweep(runner, {"threshold": [10, 13, 20], "kernel": [1, 2]}, store=place, name="tried")
+    calls.counts.clear()
+    more = ep.sweep(runner, {"threshold": [10, 13, 20, 30], "kernel": [1, 2]}, store=place, name="tried")
+    assert calls.counts == {"load": 1, "blur": 2, "above": 2, "area": 2}
+    assert [one.values for one in more[:6]] == [one.values for one in first]
+    assert [str(one.trouble) for one in more[:6]] == [str(one.trouble) for one in first]
+    assert [one.thumbnails["mask"] for one in more[:2]] == [one.thumbnails["mask"] for one in first[:2]]
+    assert [one.setting["threshold"] for one in more] == [10, 10, 13, 13, 20, 20, 30, 30]
+    # What varies is set otherwise when one of the settings has been taken over.
+    runner.set(threshold=20)
+    calls.counts.clear()
+    ep.sweep(runner, {"threshold": [10, 13]}, store=place, name="more")
+    ep.sweep(runner, {"threshold": [10, 13], "kernel": [1, 2]}, store=place, name="tried")
+    assert calls.counts["load"] == 1
+
+
+def test_an_interrupted_sweep_goes_on_where_it_was(runner: ep.CompGraphRunner, calls: Calls, tmp_path: Path) -> None:
+    place, is_broken = str(tmp_path / "results.sqlite"), True
+
+    def interrupted(blurred: Any, threshold: int) -> Any:
+        if is_broken and threshold == 90:
+            raise KeyboardInterrupt
+        return above(blurred, threshold)
+
+    cg = ep.CompGraph({**runner.cg.functions, "above": calls.of(interrupted)}, IO)
+    mine = ep.CompGraphRunner(cg, runner.hyperparameters)
+    images = [np.full((9, 9), 100, np.uint8)]
+    grid = {"threshold": list(range(60, 120))}
+    with pytest.raises(KeyboardInterrupt):
+        ep.sweep(mine, grid, images, store=place, name="n")
+    is_broken = False
+    calls.counts.clear()
+    result = ep.sweep(mine, grid, images, store=place, name="n")
+    # It went to 90, and what was done before in whole parts of the grid is there.
+    assert 30 <= calls.counts["interrupted"] < 40
+    assert [one.values["size"] for one in result] == [81 * (one < 100) for one in grid["threshold"]]

@@ -1,0 +1,263 @@
+"""How is one setting of a sweep chosen by looking at what all of them make?"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import weakref
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import anywidget
+
+from epypes.display.markup import cut
+from epypes.errors import EpypesError
+from epypes.scale.sheet import Block, Sheet, Tile
+from epypes.scale.sheetpage import page_of
+from epypes.scale.sweeping import SweepResult
+from epypes_widgets.route import listen_beside_cells
+from epypes_widgets.still import Still
+from epypes_widgets.values import is_same, said
+from epypes_widgets.worker import Worker
+
+_LOG: Final = logging.getLogger(__name__)
+_HERE: Final = Path(__file__).parent
+# More are no overview, and each is a picture of up to 5 KB.
+_MOST_TILES: Final = 400
+_TEXT_CHARACTERS: Final = 160
+# Whoever else changes the runner has done so after a few attempts.
+_ATTEMPTS: Final = 5
+_STILL_S: Final = 0.5
+
+Message = Mapping[str, Any]
+
+
+class SheetView(anywidget.AnyWidget):
+    """The contact sheet in the browser; to its kernel it says ``ready``, ``pick`` and ``show``."""
+
+    _esm = (_HERE / "picking.js").read_text(encoding="utf-8")
+    _css = (_HERE / "picking.css").read_text(encoding="utf-8")
+
+
+def pick(result: SweepResult, token: str | None = None, rows: str | None = None, columns: str | None = None) -> Picker:
+    """Return the contact sheet of a sweep as a widget: a click on a tile sets the runner to that setting.
+
+    Parameters
+    ----------
+    result
+        What ``ep.sweep`` has returned. Its runner is set, and runs what is then stale on its last payload, so that
+        open panels follow.
+    token, rows, columns
+        As for ``result.sheet``.
+
+    Raises
+    ------
+    TypeError
+        It is no result of a sweep.
+    UnknownName, ScaleError
+        As ``result.sheet`` does.
+    """
+    if not isinstance(result, SweepResult):
+        raise TypeError(f"pick takes what ep.sweep has returned, not {type(result).__name__!r}: pick(ep.sweep(...)).")
+    return Picker(result, result.sheet(token, rows, columns))
+
+
+class Picker:
+    """A contact sheet that is clicked; made by ``pick``.
+
+    Attributes
+    ----------
+    result
+        The sweep.
+    """
+
+    def __init__(self, result: SweepResult, sheet: Sheet) -> None:
+        self.result, self._sheet = result, sheet
+        self._lock = threading.Lock()
+        self._wanted: int | None = None
+        self._clicked: int | None = None
+        self._text = ""
+        self._is_seen = False
+        self._worker = Worker(self._compute, self._failed, "epypes-pick")
+        self._still = Still(lambda: page_of(self._sheet, self.chosen))
+        self._view = SheetView()
+        self._view.on_msg(self._answer)
+        listen_beside_cells(self._view)
+        # The runner must not keep alive what nobody looks at any more.
+        changed = weakref.WeakMethod(self._runner_changed)
+        self._unwatch = weakref.finalize(self, result.runner.watch(lambda: (method := changed()) and method()))
+
+    @property
+    def chosen(self) -> int | None:
+        """The place in the result of the setting that the runner has; None if it has none of them."""
+        now, names = self.result.runner.hyperparameters, self.result.names
+        is_now = [
+            place
+            for place in dict.fromkeys((self._clicked or 0, *range(len(self.result))))
+            if all(name in now and is_same(self.result[place].setting.get(name), now[name]) for name in names)
+        ]
+        return is_now[0] if is_now else None
+
+    @property
+    def text(self) -> str:
+        """What is said below the sheet: what was set, or why nothing was."""
+        return self._text
+
+    @property
+    def widget(self) -> Any:
+        """The widget, to be put into a layout of one's own."""
+        return self._view
+
+    def choose(self, place: int) -> None:
+        """Set the runner to the setting of an outcome, as a click on its tile does; returns at once.
+
+        Raises
+        ------
+        IndexError
+            There is no such outcome.
+        """
+        if not 0 <= place < len(self.result):
+            raise IndexError(f"There is no outcome {place}; the sweep has {len(self.result)}.")
+        with self._lock:
+            self._wanted = place
+        self._worker.ask()
+
+    def wait(self, timeout_s: float) -> None:
+        """Return when the runner has what was chosen.
+
+        Raises
+        ------
+        TimeoutError
+            It took longer.
+        """
+        self._worker.wait(timeout_s)
+
+    def close(self, timeout_s: float = 5.0) -> None:
+        """Stop following clicks and the runner; the sheet stays. May be called twice.
+
+        Raises
+        ------
+        StillRunning
+            A function did not return in time.
+        """
+        self._unwatch()
+        self._worker.close(timeout_s)
+
+    # -- on the worker's thread ---------------------------------------------------------------------------------
+
+    def _compute(self, _asked_ns: int) -> None:
+        with self._lock:
+            place, self._wanted = self._wanted, None
+        if place is not None:
+            self._tell({"kind": "state", "chosen": place, "busy": True, "text": ""})
+            self._clicked, self._text = place, self._set(self.result[place].setting)
+        self._tell_state()
+        self._worker.later("still", _STILL_S, self._still.update)
+
+    def _set(self, setting: Mapping[str, Any]) -> str:
+        """Set the runner and run what is stale, all or nothing; return what is to be said."""
+        runner, named = self.result.runner, _named(setting)
+        if runner.last is None:
+            runner.set(**setting)
+            return f"Set: {named}. Nothing has been run yet."
+        for _ in range(_ATTEMPTS):
+            run = runner.trial(setting)
+            if run.failure is not None:
+                return f"Not set, since it fails: {run.failure}"
+            if runner.adopt(run):
+                return f"Set: {named}"
+        return "Not set, since the runner is being changed by something else. Try again."
+
+    def _failed(self, error: BaseException) -> None:
+        if not isinstance(error, EpypesError):
+            _LOG.error("A setting could not be picked", exc_info=error)
+        self._text = f"Not set: {error}"
+        self._tell_state()
+
+    def _runner_changed(self) -> None:
+        self._worker.ask()
+
+    # -- the view -----------------------------------------------------------------------------------------------
+
+    def _answer(self, _view: object, content: Any, _buffers: object) -> None:
+        kind = content.get("kind")
+        if kind == "ready":
+            self._is_seen = True
+            self._tell_sheet()
+        elif kind == "pick":
+            self.choose(int(content["place"]))
+        elif kind == "show" and content["token"] in self._tokens:
+            self._sheet = self.result.sheet(content["token"], self._sheet.rows, self._sheet.columns)
+            self._tell_sheet()
+
+    @property
+    def _tokens(self) -> list[str]:
+        pictured = {token for outcome in self.result for token in outcome.thumbnails}
+        return [token for token in self.result.runner.cg.tokens if token in pictured]
+
+    def _tell(self, content: Message, buffers: Sequence[bytes] = ()) -> None:
+        if self._is_seen:
+            self._view.send(content, list(buffers))
+
+    def _tell_state(self) -> None:
+        self._tell(
+            {"kind": "state", "chosen": self.chosen, "busy": False, "text": cut(self._text, 2 * _TEXT_CHARACTERS)}
+        )
+
+    def _tell_sheet(self) -> None:
+        shown = self._sheet.first(_MOST_TILES)
+        pictures: dict[bytes, int] = {}
+        blocks = [_block(block, self.result, pictures) for block in shown.blocks]
+        content = {
+            "kind": "sheet",
+            "token": self._sheet.token,
+            "tokens": self._tokens,
+            "rows": shown.rows,
+            "columns": shown.columns,
+            "row_labels": list(shown.row_labels),
+            "column_labels": list(shown.column_labels),
+            "blocks": blocks,
+            "left_out": len(self._sheet.tiles) - len(shown.tiles),
+        }
+        self._tell(content, list(pictures))
+        self._tell_state()
+
+    # -- itself -------------------------------------------------------------------------------------------------
+
+    def __repr__(self) -> str:
+        return f"<Picker: {len(self.result)} outcomes of {', '.join(self.result.names):.40}; chosen: {self.chosen}>"
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, Any]:
+        shown = self._view._repr_mimebundle_()
+        bundle: dict[str, Any] = (shown[0] if isinstance(shown, tuple) else shown) or {}
+        return {**bundle, "text/plain": repr(self)}
+
+    def _ipython_display_(self) -> None:
+        from IPython.display import display
+
+        display(self._repr_mimebundle_(), raw=True)
+        self._still.display()
+
+
+def _block(block: Block, result: SweepResult, pictures: dict[bytes, int]) -> dict[str, Any]:
+    """Return a block as the view knows it; ``pictures`` gets those that are not in it."""
+    rows = [[[_tile(tile, result, pictures) for tile in cell] for cell in row] for row in block.rows]
+    return {"title": block.title, "rows": rows}
+
+
+def _tile(tile: Tile, result: SweepResult, pictures: dict[bytes, int]) -> dict[str, Any]:
+    shown = tile.thumbnail
+    return {
+        "place": tile.place,
+        "label": tile.label,
+        "text": cut(tile.text, _TEXT_CHARACTERS),
+        "failed": tile.has_failed,
+        "setting": _named(result[tile.place].setting),
+        "picture": None if shown is None else pictures.setdefault(shown.data, len(pictures)),
+        "media_type": "" if shown is None else shown.media_type,
+    }
+
+
+def _named(setting: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} {said(value)}" for name, value in setting.items())
