@@ -72,7 +72,7 @@ class _Cell:
         if not line["text/plain"]:
             return
         if self._shown is None:
-            self._shown = IPython.display.display(line, raw=True, display_id=True)  # type: ignore[no-untyped-call]
+            self._shown = IPython.display.display(line, raw=True, display_id=True)
         else:
             self._shown.update(line, raw=True)
 
