@@ -93,10 +93,24 @@ def test_tokens_that_are_named_are_kept_for_the_metric(runner: ep.CompGraphRunne
     assert result.best_value > 15
 
 
-def test_a_case_may_have_hyperparameters_of_its_own(runner: ep.CompGraphRunner) -> None:
-    cases = [ep.Case(0, hyperparameters={"b": 1.5}), ep.Case(0)]
-    result = ep.optimize(runner, "score", cases, 1, ranges={"a": (7, 7)})
-    assert result.best_value == (0 - 2.25) / 2
+@pytest.mark.parametrize("has_executor", [False, True])
+def test_a_case_may_have_hyperparameters_of_its_own_which_vary_for_the_others_alone(
+    runner: ep.CompGraphRunner, has_executor: bool
+) -> None:
+    cases = [ep.Case(0, hyperparameters={"a": 7, "b": 1.5}), ep.Case(0)]
+    with ThreadPoolExecutor(1) as threads:
+        result = ep.optimize(
+            runner, "score", cases, 3, executor=threads if has_executor else None, ranges={"a": (-9, 9)}
+        )
+    assert [trial.value for trial in result] == [(0 - (trial.setting["a"] - 7) ** 2 - 2.25) / 2 for trial in result]
+
+
+def test_who_sets_values_meanwhile_does_not_change_what_is_searched(runner: ep.CompGraphRunner) -> None:
+    def metric(tokens: Mapping[str, Any], _case: ep.Case) -> float:
+        runner["b"] = 100.0
+        return float(tokens["score"])
+
+    assert ep.optimize(runner, metric, [0, 0], 1, ranges={"a": (7, 7)}).best_value == -2.25
 
 
 # -- which values are tried -------------------------------------------------------------------------------------
@@ -373,7 +387,7 @@ def test_a_search_goes_on_where_it_was_stopped(runner: ep.CompGraphRunner, tmp_p
     more = ep.optimize(runner, "score", [0], 5, store=store, name="s", on_trial=told.append)
     assert list(more)[:3] == list(first)
     assert [trial.number for trial in told] == [3, 4]
-    assert settings_of(more)[3:] != settings_of(first)[:2], "chance does not begin anew"
+    assert settings_of(more)[3:] != settings_of(first)[1:], "chance does not begin anew"
     again = ep.optimize(runner, "score", [0], 5, store=store, name="s", on_trial=told.append)
     assert (list(again), len(told)) == (list(more), 2)
     assert again.to_frame().equals(more.to_frame())
