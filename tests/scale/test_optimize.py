@@ -13,12 +13,15 @@ from typing import Annotated, Any
 
 import cv2
 import numpy as np
+import optuna
 import pytest
 
 import epypes as ep
 from epypes.errors import ScaleError, UnknownName
 from epypes.scale import trying
 from epypes.scale.optimized import OptimizeResult
+from epypes.scale.ranging import Span
+from epypes.scale.studying import Trial
 from tests.store.postgres import PASSWORD, server
 
 
@@ -478,6 +481,15 @@ def test_it_shows_itself_as_a_curve_and_the_values_found() -> None:
     assert len(page) < 20_000
 
 
+def test_the_page_of_a_long_search_stays_small() -> None:
+    trials = tuple(Trial(number, {"k": number}, None if number % 7 == 0 else number % 50) for number in range(5_000))
+    axes = (Span("k", 0, 5_000, 1, False, True),)
+    result = OptimizeResult(trials, "maximize", "metric", axes, optuna.create_study(direction="maximize"))
+    page = result._repr_mimebundle_()["text/html"]
+    assert len(page) < 40_000
+    ET.fromstring(page[page.index("<svg") : page.index("</svg>") + 6])
+
+
 def test_figures_are_matplotlibs_without_pyplot(runner: ep.CompGraphRunner) -> None:
     result = ep.optimize(runner, "score", [0], 30)
     history, importance = result.history_plot(), result.importance_plot()
@@ -493,8 +505,6 @@ def test_figures_are_matplotlibs_without_pyplot(runner: ep.CompGraphRunner) -> N
 def test_nothing_is_printed_and_optunas_logging_is_as_it_was(
     runner: ep.CompGraphRunner, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    import optuna
-
     before = optuna.logging.get_verbosity()
     _ = ep.optimize(runner, "score", [0], 12, store=tmp_path / "s.sqlite", name="s").importances
     assert optuna.logging.get_verbosity() == before
