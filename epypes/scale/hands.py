@@ -5,6 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 import uuid
+from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from dataclasses import replace
@@ -34,6 +35,9 @@ class Hands(Protocol):
 
     def read(self, future: Future[Any], job: Job) -> tuple[list[Outcome], Again]:
         """Return the outcomes of a job that is done, and what was submitted again in place of it."""
+
+    def suspect(self) -> Job | None:
+        """Return a job that is to be done again while no other one is; None if there is none."""
 
 
 def own_runner(runner: CompGraphRunner) -> CompGraphRunner:
@@ -78,6 +82,10 @@ class Threads:
         """Return the outcomes of a job."""
         return future.result(), _NONE
 
+    def suspect(self) -> Job | None:
+        """Return None: a thread that dies takes this process with it."""
+        return None
+
 
 class Bundles:
     """Other processes, on this machine or others: what travels is a bundle, made of the first item that can be run.
@@ -95,6 +103,8 @@ class Bundles:
         self._hyperparameters = packed_values(runner.hyperparameters, "Hyperparameter")
         self._parcel: Parcel | None = None
         self._sent: dict[Future[Any], Sent] = {}
+        self._suspects: deque[Job] = deque()
+        self._alone: Job | None = None
 
     def submit(self, job: Job) -> Future[Any]:
         """Send a job; do it here as long as nothing could be run that proves the bundle."""
@@ -135,7 +145,7 @@ class Bundles:
             raise
         except Exception as error:
             if type(error).__name__ == "KilledWorker":
-                return self._after_deaths(job)
+                return self._after_deaths(job), _NONE
             raise _unable(error) from error
         if not isinstance(found, Refusal):
             return unpacked_outcomes(found, job), _NONE
@@ -143,13 +153,19 @@ class Bundles:
             return [], {self._send(replace(sent, parcel=self._parcel or sent.parcel)): job}
         raise ScaleError(found.text)
 
-    def _after_deaths(self, job: Job) -> tuple[list[Outcome], Again]:
-        """Have the items of a job whose workers died again and again tried one by one; who is alone has killed them."""
-        if len(job.items) > 1:
-            return [], {self.submit(one): one for one in (replace(job, items=(item,)) for item in job.items)}
+    def suspect(self) -> Job | None:
+        """Return an item whose workers died, which is to be tried while nobody else could be the one who kills them."""
+        self._alone = self._suspects.popleft() if self._suspects else None
+        return self._alone
+
+    def _after_deaths(self, job: Job) -> list[Outcome]:
+        if job is not self._alone:
+            self._suspects.extend(replace(job, items=(item,)) for item in job.items)
+            return []
         trouble = Trouble("", "KilledWorker", "every worker that ran it died")
-        (item,) = job.items
-        return [Outcome(item.number, item.name, setting, trouble=trouble) for setting in job.settings], _NONE
+        return [
+            Outcome(item.number, item.name, setting, trouble=trouble) for item in job.items for setting in job.settings
+        ]
 
 
 def _unable(error: Exception) -> EpypesError:

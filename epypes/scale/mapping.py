@@ -17,7 +17,7 @@ from epypes.scale.outcome import Outcome
 from epypes.scale.progress import Advance, progress_bar
 from epypes.scale.remembered import Remembered, series_of
 from epypes.scale.shown import rows_shown
-from epypes.scale.spreading import spread
+from epypes.scale.spreading import spread, worker_count
 from epypes.scale.table import frame_of
 from epypes.store import Store, opened_store
 from epypes.wording import counted
@@ -159,7 +159,8 @@ class _Map:
 
     def run(self, runner: CompGraphRunner, images: Any, executor: Executor | None, ahead: int | None) -> None:
         """Run what has to be run."""
-        batches = Batches(self._unknown(items_of(images, runner)), are_single=executor is None)
+        workers = 0 if executor is None else worker_count(executor)
+        batches = Batches(self._unknown(items_of(images, runner)), workers, count_of(images))
         jobs = (Job(batch, keep=self._keep, show=self._show) for batch in batches)
         for outcomes in spread(runner, jobs, executor, ahead=ahead):
             batches.learn(outcomes)

@@ -93,7 +93,9 @@ def _handed_out(
                 at_work[hands.submit(job)] = job
                 del job
             if not at_work:
-                return
+                if (job := hands.suspect()) is None:
+                    return
+                at_work[hands.submit(job)] = job
             ready, _ = wait(at_work, None if stop is None else _LOOK_S, FIRST_COMPLETED)
             for future in ready:
                 outcomes, again = hands.read(future, at_work.pop(future))
