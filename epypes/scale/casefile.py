@@ -38,7 +38,7 @@ from typing import Any, Final
 from epypes.bundle.entries import read
 from epypes.errors import EpypesError, ScaleError, UnknownName
 from epypes.scale.cases import Case
-from epypes.scale.labels import is_file
+from epypes.scale.files import is_file
 
 _CASE_KEYS: Final = ("name", "inputs", "hyperparameters", "check")
 _HEADER: Final = re.compile(r"^[ \t]*\[\[[ \t]*case[ \t]*\]\]", re.MULTILINE)

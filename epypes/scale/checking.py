@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 from epypes.errors import UnknownName
 from epypes.run import CompGraphRunner
 from epypes.scale.cases import Case, Check, cases_of, checks_of
+from epypes.scale.files import is_file
 from epypes.scale.items import items_of
 from epypes.scale.job import Job
-from epypes.scale.labels import is_file
 from epypes.scale.measuring import CheckOutcome, measured
 from epypes.scale.needed import needed
 from epypes.scale.progress import progress_bar

@@ -9,7 +9,7 @@ import epypes as ep
 from epypes.acquisition import write_image
 from epypes.errors import ScaleError, UnknownName
 from epypes.scale.cases import cases_of, checks_of, with_labels_read
-from epypes.scale.labels import labelled
+from epypes.scale.files import read_value
 
 CG = ep.CompGraph(
     {"cut": lambda image, level: image > level, "count": lambda mask: int(mask.sum())},
@@ -115,11 +115,11 @@ def test_files_of_what_is_expected_are_read_when_they_are_asked_for(tmp_path):
     np.savez(tmp_path / "c.npz", image)
     np.savez(tmp_path / "d.npz", one=image, two=image + 1)
     for name in ("a.png", "b.npy", "c.npz"):
-        assert np.array_equal(labelled(str(tmp_path / name), CG, "mask"), image)
-    assert np.array_equal(labelled(tmp_path / "d.npz", CG, "mask")["two"], image + 1)
+        assert np.array_equal(read_value(str(tmp_path / name), CG, "mask"), image)
+    assert np.array_equal(read_value(tmp_path / "d.npz", CG, "mask")["two"], image + 1)
     case = ep.Case(0, {"mask": tmp_path / "b.npy", "n": 3})
     assert np.array_equal(with_labels_read(case, CG).expected["mask"], image)
-    assert labelled("a text", CG, "mask") == "a text"
+    assert read_value("a text", CG, "mask") == "a text"
 
 
 @pytest.mark.parametrize(
@@ -129,13 +129,13 @@ def test_a_file_that_is_no_array_is_refused(tmp_path, name, content):
     if content is not None:
         (tmp_path / name).write_bytes(content)
     with pytest.raises(ScaleError, match=f"{name}' can't be read as an array: .* Check the path"):
-        labelled(tmp_path / name, CG, "mask")
+        read_value(tmp_path / name, CG, "mask")
 
 
 def test_a_pickle_is_never_read(tmp_path):
     np.save(tmp_path / "objects.npy", np.array([{}, []], object), allow_pickle=True)
     with pytest.raises(ScaleError, match="can't be read as an array"):
-        labelled(tmp_path / "objects.npy", CG, "mask")
+        read_value(tmp_path / "objects.npy", CG, "mask")
 
 
 # -- CASES.toml -------------------------------------------------------------------------------------------------

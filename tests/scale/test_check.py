@@ -137,6 +137,14 @@ def test_what_goes_wrong_in_a_case_fails_that_case_alone(runner, coins, tmp_path
     assert str(result) == "5 of 6 cases failed: shapes, no file, no input, fails, metrics"
 
 
+def test_inputs_may_be_files_of_arrays(runner, coins, tmp_path):
+    np.save(tmp_path / "coins.npy", coins)
+    mask = coins > 100
+    assert ep.check(runner, [ep.Case(str(tmp_path / "coins.npy"), {"mask": mask}, name="a")])
+    result = ep.check(runner, [ep.Case({"image": tmp_path / "none.npy"}, {"mask": mask}, name="b")])
+    assert "none.npy' can't be read as an array" in reasons(result)["b", "equal of mask"]
+
+
 def test_a_function_that_fails_is_named(runner, coins):
     [outcome] = ep.check(runner, [ep.Case(np.zeros((2, 2, 2, 2)), {"n": 3})]).outcomes
     assert outcome.reason.startswith("corners: error: ")

@@ -16,8 +16,8 @@ from epypes.errors import EpypesError, PayloadError
 from epypes.run import CompGraphRunner
 from epypes.scale.cases import Case, Check
 from epypes.scale.checking import CheckResult, Checks, checked, inputs_of, prepared
+from epypes.scale.files import read_value
 from epypes.scale.items import items_of, opened
-from epypes.scale.labels import labelled
 from epypes.scale.measuring import CheckOutcome
 from epypes.wording import counted
 from epypes_widgets.history import Entry, History
@@ -220,7 +220,7 @@ def _with_label(checks: Sequence[Check], runner: CompGraphRunner) -> tuple[Check
 
 def _label(value: Any, runner: CompGraphRunner, token: str) -> Any:
     try:
-        return labelled(value, runner.cg, token)
+        return read_value(value, runner.cg, token)
     except (EpypesError, OSError):
         return value
 
