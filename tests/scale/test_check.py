@@ -301,3 +301,12 @@ def test_junit_that_can_t_be_written_is_told(result, tmp_path):
 
 def test_a_result_of_nothing_that_failed_is_true():
     assert CheckResult(())
+
+
+def test_of_many_cases_not_all_pictures_are_kept(runner):
+    image = np.full((8, 8), 200, np.uint8)
+    mask = np.ones((8, 8), bool)
+    cases = [ep.Case(image, {"mask": wanted}) for wanted in (mask, ~mask) for _ in range(210)]
+    result = ep.check(runner, cases)
+    assert sum(bool(one.pictures) for one in result.outcomes if one.passed) == 200
+    assert sum(bool(one.pictures) for one in result.failures) == 200

@@ -324,8 +324,10 @@ class Panel:
         for control in self._hand.controls:
             if control.widget.has_trait("disabled"):
                 control.widget.disabled = True
-        self._verdicts.close(timeout_s)
-        self._tuning.close(timeout_s)
+        try:
+            self._verdicts.close(timeout_s)
+        finally:
+            self._tuning.close(timeout_s)
 
     def _require_open(self) -> None:
         if self._tuning.worker.closed:

@@ -147,8 +147,6 @@ class Verdicts:
         told_s = 0.0
         self._tuning.screen.tell_verdicts(self._content(came))
         for outcomes in checked(own, self._cases, has_pictures=False, stop=over):
-            if over.is_set():
-                return
             came[outcomes[0].number] = outcomes
             if monotonic() - told_s >= _TELL_S:
                 self._tuning.screen.tell_verdicts(self._content(came))
