@@ -38,10 +38,9 @@ class Batches:
         self._item_ns, self._taken = 0.0, 0
 
     def learn(self, outcomes: Iterable[Outcome]) -> None:
-        """Take note of how long items took."""
-        for outcome in outcomes:
-            last_ns = max(outcome.total_ns, 1)
-            self._item_ns = self._item_ns + _SHARE * (last_ns - self._item_ns) if self._item_ns else last_ns
+        """Take note of how long items took; those that could not be read tell nothing."""
+        for took_ns in (outcome.total_ns for outcome in outcomes if outcome.total_ns):
+            self._item_ns = self._item_ns + _SHARE * (took_ns - self._item_ns) if self._item_ns else took_ns
 
     def __iter__(self) -> Iterator[tuple[Item, ...]]:
         while batch := self._next():

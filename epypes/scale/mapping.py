@@ -65,10 +65,14 @@ class MapResult(Sequence[Outcome]):
         return len(self.outcomes)
 
     def __repr__(self) -> str:
-        return f"<MapResult: {counted(len(self), 'image')}, {len(self.failures)} failed>"
+        return f"<MapResult: {self._caption}>"
+
+    @property
+    def _caption(self) -> str:
+        return f"{counted(len(self), 'image')}, {len(self.failures)} failed"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        return {"text/plain": repr(self), "text/html": rows_shown(self.outcomes, self.cg, repr(self)[1:-1])}
+        return {"text/plain": repr(self), "text/html": rows_shown(self.outcomes, self.cg, self._caption)}
 
 
 def map_images(
