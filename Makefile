@@ -1,5 +1,5 @@
 # Set-up and checks. Everything happens in .venv; nothing else on the machine is changed, except that `make test`
-# installs Chromium with apt when it is missing and you are root.
+# installs Chromium and PostgreSQL with apt when they are missing and you are root.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m uv pip install --quiet --python $(BIN)/python
 demo: $(VENV)/.all
 	$(BIN)/epypes demo notebooks/01_edge_detection.ipynb --name runner --output edges --to demo-output
 
-test: $(VENV)/.test chromium
+test: $(VENV)/.test chromium postgres
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -49,6 +49,8 @@ $(VENV)/.bench: pyproject.toml | $(BIN)/python
 	$(PIP) --editable '.[all,test,bench]'
 	touch $@ $(VENV)/.test $(VENV)/.all
 
-.PHONY: chromium
+.PHONY: chromium postgres
 chromium:
 	@sh .ci/chromium
+postgres:
+	@sh .ci/postgres

@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from epypes.scale import MapResult, map  # noqa: A004 - as in ep.map(runner, images)
     from epypes.scale.cases import Case
     from epypes.scale.checking import check
+    from epypes.scale.optimizing import optimize
     from epypes.service.failures.reopen import load_failure
     from epypes.service.remote.connection import connect
     from epypes.store import Store
@@ -114,6 +115,7 @@ _HOMES = {
     "load": "epypes.bundle",
     "load_failure": "epypes.service.failures.reopen",
     "load_pipeline": "epypes.bundle",
+    "optimize": "epypes.scale.optimizing",
     "MapResult": "epypes.scale",
     "map": "epypes.scale",
     "promote": "epypes.bundle",
@@ -165,6 +167,7 @@ __all__ = [
     "load_failure",
     "load_pipeline",
     "map",
+    "optimize",
     "outputs",
     "promote",
     "register_preview",

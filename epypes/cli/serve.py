@@ -41,6 +41,9 @@ def serve(
     keys: Keys = None,
     allow: Allow = None,
     token_file: Annotated[Path | None, typer.Option(help="The token for HTTP; one is made without.")] = None,
+    store: Annotated[
+        str | None, typer.Option(help="Where a row of each event is kept: a SQLite file, or a database's URL.")
+    ] = None,
 ) -> None:
     """Serve a bundle between a SUB and a PUB socket, until SIGTERM or Ctrl+C."""
     from epypes.service import serve as serve_bundle
@@ -80,6 +83,7 @@ def serve(
         insecure=insecure,
         keys=keys,
         allow=allow,
+        store=store,
         on_ready=on_ready,
         on_fault=on_fault,
     )

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from time import perf_counter_ns, time_ns
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.errors import MailboxOverflow, MessageError, ServiceError
 from epypes.run import Failure
@@ -16,6 +16,9 @@ from epypes.service.latency import Stopwatch
 from epypes.service.ledger import Entry, Outcome
 from epypes.wire import Envelope
 from epypes.wire.failures import failure_event
+
+if TYPE_CHECKING:
+    from epypes.service.eventlog import EventLog
 
 FAILURE_TOPIC: Final = "failure"
 _LOG_PAUSE_NS: Final = 5_000_000_000
@@ -138,12 +141,18 @@ class Desk:
         Publish an answer, and a failure event on the failures' own socket.
     store
         Where failures are kept.
+    event_log
+        Where what has become of each event is kept.
     """
 
     def __init__(
-        self, answer: Callable[[Any], object], report: Callable[[Any], object], store: Callable[[], FailureStore]
+        self,
+        answer: Callable[[Any], object],
+        report: Callable[[Any], object],
+        store: Callable[[], FailureStore],
+        event_log: EventLog,
     ) -> None:
-        self._answer, self._report, self._store = answer, report, store
+        self._answer, self._report, self._store, self._event_log = answer, report, store, event_log
         self._listeners: list[Listener] = []
         self.latency = Stopwatch()
         self._logged_ns, self._unlogged = -_LOG_PAUSE_NS, 0
@@ -171,8 +180,9 @@ class Desk:
         for answer in result.answers:
             self._answer(answer)
         if result.failure is not None:
-            self._settle_failure(entry, result, result.failure)
+            self._event_log.keep(entry, result, self._settle_failure(entry, result, result.failure))
             return
+        self._event_log.keep(entry, result, None)
         self.latency.observe(perf_counter_ns() - entry.accepted_ns, result.total_ns, result.durations_ns)
         if self._listeners:
             told = {"seq": entry.seq, "event_id": event_id(entry.event), "revision": result.revision}
@@ -190,7 +200,7 @@ class Desk:
             return
         _log.warning("event %s failed in %s: %s", failure.event_id or "without id", failure.function, failure.summary)
 
-    def _settle_failure(self, entry: Entry, result: Result, failure: FailureRecord) -> None:
+    def _settle_failure(self, entry: Entry, result: Result, failure: FailureRecord) -> FailureRecord:
         self._log(failure)
         # In a storm dropped events would fill the store's memory with images of no interest.
         kept = self._store().keep(failure, None if failure.kind == "dropped" else entry.event)
@@ -200,3 +210,4 @@ class Desk:
             if isinstance(answer, Envelope) and answer.failure is not None:
                 self._report(replace(answer, attributes={**answer.attributes, **more}))
         self.tell("failure", asdict(kept))
+        return kept

@@ -13,6 +13,7 @@ from epypes.service.about import about
 from epypes.service.asks import Asks
 from epypes.service.deploying import Deployer
 from epypes.service.dispatch import Dispatcher
+from epypes.service.eventlog import EventLog
 from epypes.service.failures.record import FailureRecord
 from epypes.service.failures.store import FailureStore, failures_folder
 from epypes.service.intake import Intake
@@ -65,6 +66,8 @@ class Service:
         the new one. Each that is dropped is counted and answered.
     insecure, keys, allow
         As for ZMQSubscriber and ZMQPublisher.
+    store
+        Where a row of each event is kept: a SQLite file or a database's URL. Nothing waits for it.
 
     Attributes
     ----------
@@ -77,8 +80,8 @@ class Service:
         The folder is not the bundle that was promoted.
     AddressError
         An address is not on loopback.
-    ServiceError
-        The mailbox, a time or the number of threads can't be.
+    ServiceError, StoreError
+        The mailbox, a time or the number of threads can't be; or the database.
     """
 
     def __init__(
@@ -97,28 +100,26 @@ class Service:
         insecure: bool = False,
         keys: Keys | str | Path | None = None,
         allow: PublicKey | Collection[PublicKey] | None = None,
+        store: str | Path | None = None,
     ) -> None:
         check_limits(path, threads, job_timeout_s, drain_timeout_s)
         served = read_served(path)
-        self.path, self.threads, self.job_timeout_s = served.path, threads, job_timeout_s
-        self.drain_timeout_s = drain_timeout_s
-        self.http, self.token_file = "", ""
+        self.path, self.threads = served.path, threads
+        self.job_timeout_s, self.drain_timeout_s = job_timeout_s, drain_timeout_s
+        self.http = self.token_file = ""
         self.failure_store = FailureStore(failures_folder(served.path))
         ledger = Ledger(mailbox_policy, mailbox_size, threads, retries)
+        self.event_log = EventLog(store, served.settings.name, self._setting)
         self._desk = Desk(
-            lambda item: self._sockets.answer(item), lambda item: self._sockets.report(item), lambda: self.failure_store
+            lambda item: self._sockets.answer(item),
+            lambda item: self._sockets.report(item),
+            lambda: self.failure_store,
+            self.event_log,
         )
         self._dispatcher = Dispatcher(ledger, self._desk, self._setting)
         self._tuning = Tuning(served, self._dispatcher, self._desk, min(job_timeout_s, _CHANGE_S))
-        self._supervisor = Supervisor(
-            self._dispatcher,
-            served,
-            threads,
-            job_timeout_s,
-            self._tuning.for_new_worker,
-            self._look,
-            self._tuning.heard,
-        )
+        settling = self._tuning.for_new_worker, self._look, self._tuning.heard
+        self._supervisor = Supervisor(self._dispatcher, served, threads, job_timeout_s, *settling)
         self._asks = Asks(lambda: self._supervisor.served, lambda: self._dispatcher.link)
         self._sockets = Sockets(sub, pub, failures, self._dispatcher, insecure=insecure, keys=keys, allow=allow)
         self._intake = Intake(self._dispatcher, self._sockets, self._changed)
@@ -176,6 +177,7 @@ class Service:
             self._intake.give_up()
             self._supervisor.stop()
             self.failure_store.flush(max(deadline_s - monotonic(), 0.1))
+            self.event_log.close(max(deadline_s - monotonic(), 0.1))
             self._sockets.stop(max(deadline_s - monotonic(), 0.5))
             self._is_running = self._intake.is_draining = self._intake.is_stopping = False
             self._changed()

@@ -14,7 +14,7 @@ from epypes.errors import StoreError
 from epypes.store.place import connect_options, shown, url_of
 
 if TYPE_CHECKING:
-    from sqlalchemy import Connection, Engine
+    from sqlalchemy import URL, Connection, Engine
     from sqlalchemy.exc import SQLAlchemyError
 
 _T = TypeVar("_T")
@@ -39,44 +39,14 @@ class Database:
     """
 
     def __init__(self, given: str | Path) -> None:
-        try:
-            import sqlalchemy  # noqa: F401 - so that what is missing is told by its own name
-        except ImportError:
-            text = "A store needs SQLAlchemy, which is not installed. Run: pip install 'epypes[scale]'"
-            raise StoreError("", text) from None
         self._url = url_of(given)
         self.place = shown(self._url)
-        self.engine = self._engine()
+        self.engine = engine_of(self._url)
         try:
             self.write(self._make_tables)
         except BaseException:
             self.engine.dispose()
             raise
-
-    def _engine(self) -> Engine:
-        from sqlalchemy import create_engine, event
-        from sqlalchemy.exc import ArgumentError, NoSuchModuleError
-
-        try:
-            engine = create_engine(
-                self._url,
-                connect_args=connect_options(self._url),
-                hide_parameters=True,
-                # So that a server that was restarted is found again.
-                pool_pre_ping=True,
-            )
-        except (NoSuchModuleError, ImportError, ArgumentError) as error:
-            raise StoreError(self.place, self._no_driver(error)) from None
-        if engine.dialect.name == "sqlite":
-            event.listen(engine, "connect", _set_up_sqlite)
-        return engine
-
-    def _no_driver(self, error: Exception) -> str:
-        kind, driver = self._url.get_backend_name(), self._url.drivername.partition("+")[2]
-        way_out = "pip install 'epypes[postgres]'" if driver == "psycopg" else f"Install a driver of {kind}"
-        missing = getattr(error, "name", None)
-        what = f"module {missing!r} is not installed" if missing else f"SQLAlchemy knows no {self._url.drivername!r}"
-        return f"{self.place} can't be opened: {what}. {way_out}, or store in a file: 'results.sqlite'."
 
     def _make_tables(self, connection: Connection) -> None:
         from sqlalchemy import insert, select
@@ -140,6 +110,41 @@ class Database:
         return StoreError(self.place, f"{self.place} {_plainly(said)}")
 
 
+def engine_of(url: URL) -> Engine:
+    """Return what connects to a database, which is not looked for yet.
+
+    Raises
+    ------
+    StoreError
+        There is no driver for it.
+    """
+    from sqlalchemy import create_engine, event
+    from sqlalchemy.exc import ArgumentError, NoSuchModuleError
+
+    try:
+        # Pinged, so that a server that was restarted is found again.
+        options = connect_options(url)
+        engine = create_engine(url, connect_args=options, hide_parameters=True, pool_pre_ping=True)
+    except (NoSuchModuleError, ImportError, ArgumentError) as error:
+        raise StoreError(shown(url), _no_driver(url, error)) from None
+    if engine.dialect.name == "sqlite":
+        event.listen(engine, "connect", _set_up_sqlite)
+    return engine
+
+
+def check_place(given: str | Path) -> None:
+    """Raise StoreError if there can be no such database; whether it answers is not tried."""
+    engine_of(url_of(given)).dispose()
+
+
+def _no_driver(url: URL, error: Exception) -> str:
+    kind, driver = url.get_backend_name(), url.drivername.partition("+")[2]
+    way_out = "pip install 'epypes[postgres]'" if driver == "psycopg" else f"Install a driver of {kind}"
+    missing = getattr(error, "name", None)
+    what = f"module {missing!r} is not installed" if missing else f"SQLAlchemy knows no {url.drivername!r}"
+    return f"{shown(url)} can't be opened: {what}. {way_out}, or store in a file: 'results.sqlite'."
+
+
 def _set_up_sqlite(connection: Any, _record: object) -> None:
     """Have readers not wait for writers; what a power failure may take is the last rows, never the file."""
     connection.execute("PRAGMA synchronous=NORMAL")
@@ -158,7 +163,7 @@ def _set_up_sqlite(connection: Any, _record: object) -> None:
 def _said(error: SQLAlchemyError) -> str:
     """Return what the driver says, in one line, without the statement."""
     text = str(getattr(error, "orig", None) or error)
-    return re.sub(r"\s+", " ", text).strip()[:500].rstrip(".")
+    return re.sub(r"\s+", " ", text).strip()[:500].rstrip(".?")
 
 
 def _may_be_another(error: SQLAlchemyError) -> bool:

@@ -85,7 +85,15 @@ def _unworded(value: Any) -> Any:
 
 
 def to_word(name: str) -> str:
-    """Return a name as text that every database takes, and that is the name itself wherever it can be."""
+    """Return a name as text that every database takes, and that is the name itself wherever it can be.
+
+    Raises
+    ------
+    TypeError
+        It is no text.
+    """
+    if not isinstance(name, str):
+        raise TypeError(f"Kinds, names and keys of series are texts, not {type(name).__name__!r}: {name!r:.80}")
     return to_text(name)[1:-1]
 
 

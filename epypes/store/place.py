@@ -24,6 +24,11 @@ def url_of(given: str | Path) -> URL:
     StoreError
         There can be no such database.
     """
+    try:
+        import sqlalchemy  # noqa: F401 - so that it is told by its own name
+    except ImportError:
+        text = "A store needs SQLAlchemy, which is not installed. Run: pip install 'epypes[scale]'"
+        raise StoreError("", text) from None
     if isinstance(given, str) and "://" in given:
         return _parsed(given)
     if not str(given).strip() or str(given) == ":memory:":
@@ -38,7 +43,7 @@ def _parsed(given: str) -> URL:
     try:
         url = make_url(given)
     except (ArgumentError, ValueError):
-        scheme = given.partition("://")[0]
+        scheme = given.partition("://")[0] or "postgresql"
         text = (
             f"The URL {scheme}://... can't be read. It is {scheme}://user:password@host:port/database; "
             "special characters of a password are written as %40 for @, %3A for : and %2F for /."

@@ -61,7 +61,9 @@ class Series:
         Raises
         ------
         StoreError
-            It can't be written: the database is away, the disk full, or data is nothing that JSON can say.
+            It can't be written: the database is away, the disk full.
+        TypeError
+            There is something in data that JSON has no word for.
         """
         self.append_all([(key, data)])
 
@@ -70,7 +72,7 @@ class Series:
 
         Raises
         ------
-        StoreError
+        StoreError, TypeError
             As `append`.
         """
         # The last one of a key is the one that stays.
@@ -90,8 +92,7 @@ class Series:
         try:
             return to_text(dict(data))
         except (TypeError, ValueError, RecursionError) as error:
-            text = f"Row {key!r:.200} of {self.kind} {self.name!r} can't be stored: {error}."
-            raise StoreError(self._database.place, text) from error
+            raise TypeError(f"Row {key!r:.200} of {self.kind} {self.name!r} can't be stored: {error}.") from error
 
     # -- reading ------------------------------------------------------------------------------------------------
 

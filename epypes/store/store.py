@@ -6,11 +6,14 @@ import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self, overload
 
 from epypes.store.database import Database
 from epypes.store.jsontext import from_word
 from epypes.store.series import Series
+
+if TYPE_CHECKING:
+    from sqlalchemy import URL
 
 
 class Store:
@@ -42,6 +45,11 @@ class Store:
     def place(self) -> str:
         """The path, or the URL without its password."""
         return self._database.place
+
+    @property
+    def url(self) -> URL:
+        """What SQLAlchemy opens it by, with its password: for another library that is to use the same database."""
+        return self._database.engine.url
 
     def series(self, kind: str, name: str, *, about: Mapping[str, Any] | None = None) -> Series:
         """Return the series of a kind and a name, which is made if it is not there.
@@ -89,6 +97,18 @@ class Store:
 
     def __repr__(self) -> str:
         return f"<Store {self.place[-70:]!r}>"
+
+
+@overload
+def as_store(given: str | Path | Store) -> Store: ...
+
+
+@overload
+def as_store(given: None) -> None: ...
+
+
+@overload
+def as_store(given: str | Path | Store | None) -> Store | None: ...
 
 
 def as_store(given: str | Path | Store | None) -> Store | None:

@@ -23,8 +23,10 @@
 What is remembered:
 
 - ``history``, ``historyframe``: at which values did the hand stop
+- ``stored``: how that is kept in a database
 - ``settings``: how values get into a file, and back
 - ``verdicts``: which test images pass
+- ``searching``: what becomes of a search of hyperparameters
 - ``code``: which line of code does the same
 - ``promotion``, ``writeback``: what becomes of a promotion, and of values that are written back
 - ``still``, ``static``, ``pictures``: what stays in a saved notebook
@@ -41,6 +43,7 @@ What is looked at, and moved:
 
 from __future__ import annotations
 
-from epypes_widgets.panel import Panel, tune
+from epypes_widgets.making import tune
+from epypes_widgets.panel import Panel
 
 __all__ = ["Panel", "tune"]

@@ -17,6 +17,7 @@ from epypes_widgets.looking.overlay import scene
 from epypes_widgets.looking.probe import probe
 from epypes_widgets.picture import Message
 from epypes_widgets.promotion import Outcome, Promotion
+from epypes_widgets.searching import Searching, told
 from epypes_widgets.shown import Comparison
 from epypes_widgets.tuning import Tuning
 from epypes_widgets.writeback import WritingBack, Written
@@ -31,10 +32,16 @@ class Messages:
         Does what they ask for.
     save, load
         Write the present values to a file, and set those of one.
+    search
+        Of hyperparameters; None if there is no metric.
     """
 
-    def __init__(self, tuning: Tuning, save: Callable[[str], Path], load: Callable[[str], None]) -> None:
-        self._tuning, self._save_to, self._load_from = tuning, save, load
+    def __init__(
+        self, tuning: Tuning, save: Callable[[str], Path], load: Callable[[str], None], search: Searching | None
+    ) -> None:
+        self._tuning, self._save_to, self._load_from, self.search = tuning, save, load, search
+        if search is not None:
+            search.report = lambda _: self._tuning.screen.view.tell("optimised", told(search) or {})
         self.promotion = Promotion(self._promoted)
         self.writing_back = WritingBack(self._written)
 
@@ -64,6 +71,9 @@ class Messages:
             "load": lambda message: self._file(self._loaded, message),
             "promote": self._promote,
             "write_back": self._write_back,
+            "optimise": self._optimise,
+            "optimise_stop": self._stop,
+            "optimise_use": lambda _: self._use_best(),
             "seen": lambda _: tuning.seen(),
             "left": lambda _: tuning.leave(),
         }
@@ -144,6 +154,27 @@ class Messages:
     def _loaded(self, name: str) -> str:
         self._load_from(name)
         return f"Loaded {name}."
+
+    # -- optimising ---------------------------------------------------------------------------------------------
+
+    def _optimise(self, message: Message) -> None:
+        if self.search is not None:
+            self.search.start(int(message["n"]))
+
+    def _stop(self, _message: Message) -> None:
+        if self.search is not None:
+            self.search.stop()
+
+    def _use_best(self) -> None:
+        setting = None if self.search is None else self.search.found.setting
+        if setting is None:
+            return
+        try:
+            self._tuning.want(setting)
+        except (EpypesError, ValueError) as error:
+            self._tuning.screen.fail(str(error), names=tuple(setting))
+
+    # -- promoting ----------------------------------------------------------------------------------------------
 
     def _promote(self, message: Message) -> None:
         runner, to = self._tuning.runner, str(message["to"])

@@ -2,127 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import ipywidgets
 
-from epypes.errors import NotComputed, PayloadError, run_call
+from epypes.errors import NotComputed
 from epypes.hints import Roi
-from epypes.run import CompGraphRunner, Run
+from epypes.run import Run
 from epypes.scale.checking import CheckResult, Checks
 from epypes_widgets import code, settings
-from epypes_widgets.controls import column, controls
+from epypes_widgets.controls import column
 from epypes_widgets.cuts import cuts_of, made_from
 from epypes_widgets.hand import Hand
 from epypes_widgets.history import history_of
 from epypes_widgets.latency import Latency, latency_of
-from epypes_widgets.looking.films import Payload, payloads
 from epypes_widgets.messages import Messages
 from epypes_widgets.picture import PictureView
-from epypes_widgets.places import Tunable, tunable
 from epypes_widgets.plain import plain_values
 from epypes_widgets.promotion import proposal
 from epypes_widgets.route import listen_beside_cells
 from epypes_widgets.screen import Screen
+from epypes_widgets.searching import Searching, told
 from epypes_widgets.session import Session
 from epypes_widgets.static import static_html
 from epypes_widgets.still import Still
+from epypes_widgets.stored import StoredHistory
 from epypes_widgets.tuning import Tuning
-from epypes_widgets.verdicts import Verdicts, case_payloads, cases_to_show
+from epypes_widgets.verdicts import Verdicts
 
 if TYPE_CHECKING:
-    from epypes.service.remote.connection import Connection
+    import pandas as pd
+
     from epypes_widgets.historyframe import HistoryFrame
-
-
-def tune(
-    tuned: CompGraphRunner | Connection,
-    /,
-    *,
-    images: Iterable[Any] | None = None,
-    cases: Any = None,
-    token: str | None = None,
-    **hints: Any,
-) -> Panel:
-    """Show controls for the hyperparameters of a runner or a running service, and the picture that they make.
-
-    Parameters
-    ----------
-    tuned
-        A runner that has been run, so that there is a payload, unless ``images`` are given. Or what ``ep.connect``
-        has returned: then the picture follows the service's own events, values are set there, with their revision, and
-        what somebody else sets at the same time is never overwritten unseen.
-    images
-        Test images to switch between: values of the one free source token, or dicts by token. A service has none.
-    cases
-        A labelled set as ``ep.check`` takes it, in the place of ``images``: the inputs are the test images, and each
-        says whether it passes with the values that were committed last. A service has none.
-    token
-        The token whose picture is shown at first; without, the last sink token that is an image, else the last
-        image.
-    hints
-        By hyperparameter: an ``ep.Param``, an ``ep.Roi``, a tuple as a range (low, high[, step]), a list of choices.
-        Without, the annotation of the function that takes it says it, then the table of OpenCV's and scikit-image's
-        parameters, then its value; what can't be moved is shown. A hyperparameter called ``images``, ``cases`` or
-        ``token`` gets its hint from its annotation.
-
-    Returns
-    -------
-    Panel
-        As the last expression of a cell it shows itself. Running the cell again makes a new panel, which goes on from
-        the runner's values and its history.
-
-    Raises
-    ------
-    PayloadError
-        The runner has not been run and there are no images, or they don't fit its free source tokens; or there are
-        images for a service.
-    Exception
-        Whatever a function raises on the first image, if the runner has not been run.
-    UnknownName
-        A hint is for no hyperparameter of the runner, or ``token`` is not in its graph.
-    ScaleError, ImageFileError
-        The cases can't be understood, or the file of an input can't be read.
-    TypeError, ValueError
-        There are images and cases; a hint can't be read, or the hyperparameter's value lies outside of it.
-    ServiceError
-        The service is gone.
-
-    Examples
-    --------
-    >>> from epypes import CompGraph, CompGraphRunner
-    >>> runner = CompGraphRunner(CompGraph({"add": lambda x, y: x + y}, {"add": (("x", "y"), "total")}), {"y": 1})
-    >>> run = runner.run(x=2)
-    >>> panel = tune(runner, y=(0, 10))
-    >>> panel["y"] = 5
-    >>> panel.wait(10)
-    >>> panel.result["total"]
-    7
-    >>> panel.code()
-    'runner.rerun(y=5)'
-    """
-    runner = tunable(tuned)
-    if token is not None:
-        runner.cg.require_token(token)
-    found = cases_to_show(runner, images, cases)
-    given = case_payloads(runner, found) if found else () if images is None else payloads(runner, images)
-    session = Session(runner, given)
-    if not session.place.is_shared:
-        _require_payload(runner, given)
-    elif given:
-        runner.trial({}, payload=given[0].values)  # refuses it
-    hand = Hand(controls(runner, hints))
-    session.begin()
-    return Panel(hand, session, token, found)
-
-
-def _require_payload(runner: Tunable, given: Sequence[Payload]) -> None:
-    if runner.last is None and not given:
-        free = runner.free_source_tokens
-        text = f"Nothing has been run yet, so there is nothing to tune on. Call {run_call(free)} first."
-        raise PayloadError(free, text)
 
 
 class Panel:
@@ -142,9 +55,27 @@ class Panel:
         The token to show first; None for the best one.
     cases
         With their checks; their inputs are the payloads of the session.
+    stored
+        Where the history is kept, if it is.
+    search
+        Of hyperparameters; None if there is no metric.
+
+    Attributes
+    ----------
+    search
+        What the "Optimise" button starts: ``start(n)``, ``stop()``, ``wait(timeout_s)``, ``result``; None without a
+        metric.
     """
 
-    def __init__(self, hand: Hand, session: Session, token: str | None, cases: Checks = ()) -> None:
+    def __init__(
+        self,
+        hand: Hand,
+        session: Session,
+        token: str | None,
+        cases: Checks,
+        stored: StoredHistory,
+        search: Searching | None,
+    ) -> None:
         self._hand, self._session, self._runner = hand, session, session.runner
         self._history = history_of(self._runner)
         if session.payloads:
@@ -152,7 +83,8 @@ class Panel:
         self._column = column(self._runner.cg, hand.controls)
         self._still = Still(self._static)
         self._tuning = tuning = Tuning(hand, session, self._history, self._still.update)
-        self._messages = Messages(tuning, self.save, self.load)
+        self.search = search
+        self._messages = Messages(tuning, self.save, self.load, search)
         self._verdicts = Verdicts(self._runner, cases, self._history, tuning)
         handlers = self._verdicts.beside(self._messages.handlers)
         view = PictureView(tuning.worker.later, handlers, tuning.report)
@@ -163,6 +95,8 @@ class Panel:
         self._widget = ipywidgets.VBox([columns], _dom_classes=("epypes-panel",))
         listen_beside_cells(self._widget)
         tuning.begin()
+        self._stored = stored
+        stored.follow(self._history, self._screen.log)
         self._verdicts.begin()
 
     # -- values -------------------------------------------------------------------------------------------------
@@ -278,6 +212,11 @@ class Panel:
         """The values that were committed, a row each, with the pictures that they made; the pandas table is a copy."""
         return self._history.to_frame()
 
+    @property
+    def stored(self) -> pd.DataFrame:
+        """What was committed under this panel's name, in earlier sessions too, as a pandas table; needs a store."""
+        return self._stored.to_frame()
+
     def undo(self) -> bool:
         """Go back to the values before; False if there are none."""
         self._require_open()
@@ -324,10 +263,13 @@ class Panel:
         for control in self._hand.controls:
             if control.widget.has_trait("disabled"):
                 control.widget.disabled = True
-        try:
-            self._verdicts.close(timeout_s)
-        finally:
-            self._tuning.close(timeout_s)
+        with ExitStack() as last:  # all are closed, whichever does not stop in time; the last one first
+            last.callback(self._stored.close, timeout_s)
+            if self.search is not None:
+                self.search.stop()
+                last.callback(self.search.close, timeout_s)
+            last.callback(self._tuning.close, timeout_s)
+            last.callback(self._verdicts.close, timeout_s)
 
     def _require_open(self) -> None:
         if self._tuning.worker.closed:
@@ -376,5 +318,6 @@ class Panel:
             "promote_to": proposal(self.token),
             "writes_back": self._session.place.is_written_back,
             "settings": list(settings.names(".")),
+            "optimise": told(self.search),
         }
         return content, [film.thumbnail for film in films]

@@ -13,13 +13,13 @@ import threading
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from time import monotonic
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import EpypesError, FailureNotKept, UnknownName
 from epypes.service.failures.files import Entry, entries, read_event, read_record, remove, sweep, to_remove, write
 from epypes.service.failures.pace import BURST, Waiting
 from epypes.service.failures.record import FailureRecord, record_of, with_id
+from epypes.store.writer import Writer
 
 if TYPE_CHECKING:
     from epypes.wire import Envelope
@@ -66,10 +66,11 @@ class FailureStore:
     ) -> None:
         self.folder = Path(folder)
         self._most, self._most_bytes = most, most_bytes
-        self._turn = threading.Condition()
         self._waiting = Waiting(burst)
-        self._is_writing, self._is_flushing = False, 0
-        self._thread: threading.Thread | None = None
+        self._writer = Writer(
+            "epypes failures", self._waiting, lambda found: self._write(*found), lambda: sweep(self.folder)
+        )
+        self._lock = threading.Lock()
         self._counts = Counter(dict.fromkeys(_COUNTED, 0))
         self._causes: dict[str, object] = {}
 
@@ -81,31 +82,13 @@ class FailureStore:
         Returns at once and raises nothing. The event's arrays must not change any more.
         """
         record = with_id(record)
-        with self._turn:
-            self._counts["skipped"] += self._waiting.add(record.cause, (record, event), monotonic())
-            self._start()
-            self._turn.notify_all()
+        what = record.cause, (record, event)
+        self._count("skipped", self._writer.put(lambda now_s: self._waiting.add(*what, now_s)))
         return record
-
-    def _start(self) -> None:
-        if self._thread is None:
-            thread = threading.Thread(target=self._write_all, name="epypes failures", daemon=True)
-            try:
-                thread.start()
-            except RuntimeError:
-                # No more threads, or the interpreter ends: it waits for the next that is kept.
-                return
-            self._thread = thread
 
     def flush(self, timeout_s: float = 5.0) -> bool:
         """Have all that waits written now; return whether that was done in time."""
-        with self._turn:
-            self._is_flushing += 1
-            self._turn.notify_all()
-            try:
-                return self._turn.wait_for(lambda: not self._waiting and not self._is_writing, timeout_s)
-            finally:
-                self._is_flushing -= 1
+        return self._writer.flush(timeout_s)
 
     def counts(self) -> dict[str, int]:
         """Return how many failures were kept, skipped (in a storm), removed (for newer ones) and so on since the start.
@@ -113,46 +96,23 @@ class FailureStore:
         ``without_event`` of those that were kept are without their event; ``unwritten`` could not be written,
         ``unreadable`` is how often a damaged file was met.
         """
-        with self._turn:
+        with self._lock:
             return dict(self._counts)
 
     def _count(self, what: str, count: int = 1) -> None:
-        with self._turn:
+        with self._lock:
             self._counts[what] += count
 
-    def _write_all(self) -> None:
-        """Write what waits, when it is due; end when nothing waits any more."""
-        sweep(self.folder)
-        while (found := self._next()) is not None:
-            try:
-                self._write(*found)
-            except Exception:  # the next failure must be kept, whatever was wrong with this one
-                self._count("unwritten")
-                _log.exception("a failure could not be kept")
-            finally:
-                # So that the event's memory is given back while the next is waited for.
-                found = None
-                with self._turn:
-                    self._is_writing = False
-                    self._turn.notify_all()
-
-    def _next(self) -> tuple[FailureRecord, Any] | None:
-        with self._turn:
-            while (due_in_s := self._waiting.due_in_s(monotonic())) is not None:
-                item = self._waiting.take(monotonic(), at_once=self._is_flushing > 0)
-                if item is not None:
-                    self._is_writing = True
-                    found: tuple[FailureRecord, Any] = item
-                    return found
-                self._turn.wait(due_in_s)
-            self._thread = None
-            return None
-
     def _write(self, record: FailureRecord, event: Any) -> None:
-        packed, no_event = self._packed(event)
-        if packed is not None and self._put(replace(record, has_event=True), packed):
-            return
-        self._put(replace(record, has_event=False, no_event=no_event or "it could not be written"), None)
+        try:
+            packed, no_event = self._packed(event)
+            if packed is not None and self._put(replace(record, has_event=True), packed):
+                return
+            self._put(replace(record, has_event=False, no_event=no_event or "it could not be written"), None)
+        except Exception:
+            # The writer tells what it was.
+            self._count("unwritten")
+            raise
 
     def _put(self, record: FailureRecord, packed: bytes | None) -> bool:
         try:

@@ -18,6 +18,8 @@ _STATES: Final = ("LOADING", "READY", "PAUSED", "DEGRADED", "DRAINING", "FAULTED
 _NS_PER_S: Final = 1e9
 # How an event may end, as it is counted.
 _OUTCOMES: Final = ("answered", "failed", "dropped", "dead_letters")
+# Skipped: there was no room for more to wait.
+_ROWS: Final = ("written", "skipped", "unwritten")
 _COUNTED: Final = {
     "received": ("epypes_events_received", "Events that were accepted."),
     "retried": ("epypes_events_retried", "Further tries of events whose worker was killed."),
@@ -42,6 +44,7 @@ class Collector:
         yield from _events(self.service.counts())
         yield _state(self.service.state)
         yield from _times(self.service.latency())
+        yield from _stored(self.service.event_log.counts())
 
 
 def registry_of(service: Service) -> CollectorRegistry:
@@ -83,6 +86,18 @@ def _events(counts: Mapping[str, int]) -> Iterator[Metric]:
     yield resolved
     for count, (name, about) in _HELD.items():
         yield GaugeMetricFamily(name, about, counts.get(count, 0))
+
+
+def _stored(counts: Mapping[str, int]) -> Iterator[Metric]:
+    """Give what became of the rows of events; nothing if none are stored."""
+    from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+    if counts:
+        rows = CounterMetricFamily("epypes_event_rows", "Rows of events by what became of them.", labels=["outcome"])
+        for outcome in _ROWS:
+            rows.add_metric([outcome], counts[outcome])
+        yield rows
+        yield GaugeMetricFamily("epypes_event_rows_waiting", "Rows that wait for the database.", counts["waiting"])
 
 
 def _state(state: str) -> Metric:

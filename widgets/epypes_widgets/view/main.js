@@ -8,6 +8,7 @@ import { footPart } from "./foot.js";
 import { headerPart } from "./header.js";
 import { histogramPart } from "./histogram.js";
 import { handleKeys } from "./keys.js";
+import { optimisePart } from "./optimise.js";
 import { outbox } from "./outbox.js";
 import { probePart } from "./probe.js";
 import { arrivals } from "./protocol.js";
@@ -21,7 +22,7 @@ import { filmsPart, historyPart, pinnedPart } from "./strips.js";
 // said again, and the thread that is there by then hears it.
 const FIRST_ANSWER_MS = 500;
 const LAST_ANSWER_MS = 8000;
-const GIVES_VALUES = ["reset", "undo", "redo", "goto", "load"];
+const GIVES_VALUES = ["reset", "undo", "redo", "goto", "load", "optimise_use"];
 
 /** @param {{model: any, el: HTMLElement}} context given by anywidget */
 function render({ model, el }) {
@@ -66,14 +67,15 @@ function render({ model, el }) {
   const pinned = pinnedPart(panel);
   const films = filmsPart(panel);
   const history = historyPart(panel);
+  const optimise = optimisePart(panel);
   const foot = footPart(panel);
   const shown = screen(panel, stage, order);
-  const parts = [header, bar, chips, rows, roi, histogram, probe, pinned, films, history, foot];
+  const parts = [header, bar, chips, rows, roi, histogram, probe, pinned, films, history, optimise, foot];
   const all = (method, ...given) => parts.forEach((part) => part[method]?.(...given));
 
   figure.append(
     bar.element, chips.element, header.element, stage.element, header.status,
-    histogram.element, pinned.element, films.tally, films.element, history.element, foot.element,
+    histogram.element, pinned.element, films.tally, films.element, history.element, optimise.element, foot.element,
   );
   el.append(figure);
 
@@ -127,7 +129,7 @@ function render({ model, el }) {
   function close(isClosed) {
     figure.classList.toggle("epypes-closed", isClosed);
     const column = figure.closest(".epypes-panel")?.querySelector(".epypes-controls");
-    for (const node of [column, chips.element, pinned.element, films.element, history.element, ...foot.asking]) if (node) node.inert = isClosed;
+    for (const node of [column, chips.element, pinned.element, films.element, history.element, optimise.element, ...foot.asking]) if (node) node.inert = isClosed;
   }
 
   /** What is waited for stands where the picture will be. */
@@ -149,6 +151,7 @@ function render({ model, el }) {
     settings: foot.settings,
     promoted: foot.promoted,
     written: foot.written,
+    optimised: optimise.optimised,
     note: tellNote,
     log: foot.log,
   };

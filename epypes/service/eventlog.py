@@ -1,0 +1,87 @@
+"""What is kept in a database of each event that a service has resolved?"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from time import perf_counter_ns, time_ns
+from typing import TYPE_CHECKING, Any, Final
+
+from epypes.service.outcome import Result, Setting, event_id
+from epypes.store.later import SeriesWriter
+
+if TYPE_CHECKING:
+    from epypes.service.failures.record import FailureRecord
+    from epypes.service.ledger import Entry
+
+_log = logging.getLogger("epypes.service")
+
+KIND: Final = "events"
+
+
+class EventLog:
+    """A row of each event, in the series ``events`` of the bundle's name; nobody waits for the database.
+
+    Parameters
+    ----------
+    store
+        A path, a URL or a Store; None to keep nothing.
+    name
+        Of the bundle.
+    setting
+        Returns what events are worked on with.
+
+    Raises
+    ------
+    StoreError
+        There can be no such database. One that is away is told in the log.
+    """
+
+    def __init__(self, store: str | Path | None, name: str, setting: Callable[[], Setting]) -> None:
+        self._setting, self._began_ns = setting, time_ns()
+        self._writer = None if store is None else SeriesWriter(store, KIND, name)
+
+    def keep(self, entry: Entry, result: Result, failure: FailureRecord | None) -> None:
+        """Have a row of an event written; returns at once and raises nothing."""
+        if self._writer is not None:
+            self._writer.append(f"{self._began_ns}-{entry.seq}", _row(entry, result, failure, self._setting().digest))
+
+    def counts(self) -> Mapping[str, int]:
+        """Return how many rows were written, skipped and so on, as `SeriesWriter.counts`; none without a store."""
+        return {} if self._writer is None else self._writer.counts()
+
+    def close(self, timeout_s: float) -> None:
+        """Have all that waits written; what can't be in time is told in the log. Events may be kept afterwards."""
+        if self._writer is not None and not self._writer.close(timeout_s):
+            _log.warning("%d rows of events could not be stored in time", self._writer.counts()["waiting"])
+
+
+def _row(entry: Entry, result: Result, failure: FailureRecord | None, digest: str) -> dict[str, Any]:
+    now_ns = time_ns()
+    row = {
+        "seq": entry.seq,
+        "event_id": event_id(entry.event),
+        "outcome": "answered",
+        "received_ns": now_ns - (perf_counter_ns() - entry.accepted_ns),
+        "answered_ns": now_ns,
+        "total_ns": result.total_ns,
+        "times_ns": dict(result.durations_ns),
+        "attempts": entry.attempts,
+        "revision": result.revision,
+        "digest": digest,
+    }
+    return row if failure is None else {**row, **_of_failure(failure, result)}
+
+
+def _of_failure(failure: FailureRecord, result: Result) -> dict[str, Any]:
+    """Return what a row has besides if the event failed; ``failure`` is the id to open it by."""
+    dropped = failure.kind == "dropped"
+    return {
+        "outcome": "dropped" if dropped else result.outcome.removesuffix("s"),
+        "failure": failure.id,
+        "function": failure.function,
+        "exception": failure.exception,
+        "message": failure.message,
+        "digest": failure.digest,
+    }

@@ -1,0 +1,118 @@
+"""Is there a row of each event that a service has resolved, and does the service go on without its database?"""
+
+from __future__ import annotations
+
+import sqlite3
+from time import monotonic, time_ns
+
+import pytest
+
+from epypes.errors import StoreError
+from epypes.service import Service
+from epypes.service.http.metrics import exposed, registry_of
+from epypes.store import Store
+from tests.service.processes import running
+from tests.service.served import TIMEOUT_S, peer_at, peer_of, serving, until
+
+
+def rows_of(path):
+    with Store(path) as store:
+        assert store.kinds() == ("events",)
+        (name,) = store.names("events")
+        return list(store.series("events", name).rows())
+
+
+def metrics_of(service):
+    return exposed(registry_of(service), "text/plain")[1].decode()
+
+
+def test_each_event_has_a_row(acting, tmp_path):
+    path, began_ns = tmp_path / "events.sqlite", time_ns()
+    with serving(acting, store=path, retries=0) as (service, peer):
+        peer.ask(number=7)
+        peer.ask("fail:no rows")
+        service.set_parameters({"k": 5})
+        peer.ask(number=8)
+        peer.ask("kill")
+        digest, sent = service.service_state.digest, list(peer.sent)
+        known = {record.event_id: record.id for record in service.failure_records()}
+    rows = rows_of(path)
+    assert [row["event_id"] for row in rows] == sent
+    assert [row["outcome"] for row in rows] == ["answered", "failed", "answered", "dead_letter"]
+    assert [row["revision"] for row in rows] == [0, 0, 1, 1]
+    assert {row["digest"] for row in rows} == {digest}
+    answered, failed = rows[:2]
+    assert set(answered["times_ns"]) == {"act"}
+    assert 0 < answered["times_ns"]["act"] <= answered["total_ns"] <= answered["answered_ns"] - answered["received_ns"]
+    assert began_ns < answered["received_ns"] < answered["answered_ns"] < time_ns()
+    assert (failed["function"], failed["exception"], failed["message"]) == ("act", "ValueError", "no rows")
+    assert failed["failure"] == known[sent[1]], "by this id it is opened in a notebook"
+    assert "failure" not in answered
+
+
+def test_what_was_dropped_has_a_row_too(acting, tmp_path):
+    path = tmp_path / "events.sqlite"
+    hold = tmp_path / "hold"
+    hold.mkdir()
+    with serving(acting, store=path, mailbox_size=1) as (service, peer):
+        peer.send(f"hold:{hold}")
+        until((hold / "started").exists)
+        peer.send(number=2)
+        peer.send(number=3)
+        until(lambda: service.counts()["dropped"] == 1)
+        (hold / "release").touch()
+        peer.take(3)
+    found = {row["seq"]: row["outcome"] for row in rows_of(path)}
+    assert found == {1: "answered", 2: "dropped", 3: "answered"}
+
+
+def test_a_database_that_is_held_up_holds_no_answer_up_and_is_told_in_the_metrics(acting, tmp_path, caplog):
+    path = tmp_path / "events.sqlite"
+    Store(path).close()
+    other = sqlite3.connect(path, isolation_level=None)
+    other.execute("BEGIN IMMEDIATE")
+    service = Service(acting, store=path, drain_timeout_s=1.0)
+    service.start()
+    try:
+        with peer_of(service) as peer:
+            for number in range(50):
+                assert peer.ask(number=number).parts["out"] == 2 * number
+        assert 'epypes_event_rows_total{outcome="written"} 0.0' in metrics_of(service)
+        assert "epypes_event_rows_waiting 50.0" in metrics_of(service)
+    finally:
+        began_s = monotonic()
+        service.stop()
+    assert monotonic() - began_s < 20
+    assert "50 rows of events could not be stored in time" in caplog.text
+    other.execute("ROLLBACK")
+    other.close()
+    service.event_log.close(60)
+    assert 'epypes_event_rows_total{outcome="written"} 50.0' in metrics_of(service)
+    assert len(rows_of(path)) == 50
+
+
+def test_a_service_without_a_store_has_no_such_metrics(acting):
+    with serving(acting) as (service, peer):
+        peer.ask()
+        assert "epypes_event_rows" not in metrics_of(service)
+
+
+def test_a_service_with_a_store_that_can_never_be_is_not_started(acting):
+    with pytest.raises(StoreError, match="SQLAlchemy knows no 'nosuch'"):
+        Service(acting, store="nosuch://host/db")
+
+
+@pytest.mark.slow
+def test_a_service_of_the_command_line_stores_its_events(acting, tmp_path):
+    from epypes.service.state import read_state
+
+    path = tmp_path / "events.sqlite"
+    with running(acting, "--store", str(path)) as process:
+        state = read_state(acting)
+        with peer_at(state.sub, state.pub, state.failures) as peer:
+            peer.ask()
+        process.terminate()
+        process.communicate(timeout=TIMEOUT_S)
+        assert process.returncode == 0
+    (row,) = rows_of(path)
+    assert row["outcome"] == "answered"

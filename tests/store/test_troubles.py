@@ -1,0 +1,220 @@
+"""What does a store say when its database is away, full, damaged or not to be had, and does it say a password?"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import subprocess
+import sys
+import traceback
+from time import monotonic
+
+import pytest
+import sqlalchemy as sa
+
+from epypes.errors import StoreError
+from epypes.store import Store
+from epypes.store.tables import SCHEMA
+from tests.store.postgres import PASSWORD, server
+
+
+def refused(place):
+    """Return what is said of a place where no store can be."""
+    with pytest.raises(StoreError) as caught:
+        Store(place)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_there_must_be_a_folder_for_the_file(tmp_path):
+    said = refused(tmp_path / "none" / "results.sqlite")
+    assert said == f"There is no folder {tmp_path}/none to store 'results.sqlite' in. Make it first."
+    assert "is a folder. Name a file in it" in refused(tmp_path)
+    assert "There is no folder" in refused(f"sqlite:///{tmp_path}/none/results.sqlite")
+
+
+@pytest.mark.parametrize(
+    "place", ["", ":memory:", "sqlite://", "sqlite:///:memory:", "sqlite:///file:x?mode=memory&uri=true"]
+)
+def test_what_is_only_in_memory_is_refused(place):
+    assert "what is in memory only is lost. Name one: 'results.sqlite'" in refused(place)
+
+
+def test_a_file_that_is_no_database_is_left_alone(tmp_path):
+    path = tmp_path / "picture.png"
+    path.write_bytes(b"\x89PNG" * 2_000)
+    said = refused(path)
+    assert said.startswith(f"{path} is no SQLite file, or a damaged one:")
+    assert path.read_bytes() == b"\x89PNG" * 2_000
+
+
+def test_a_file_that_was_damaged_is_told(tmp_path):
+    path = tmp_path / "results.sqlite"
+    with Store(path) as store:
+        store.series("map", "edges").append_all((f"{number}", {"text": "x" * 500}) for number in range(200))
+    data = bytearray(path.read_bytes())
+    data[8192:-4096] = b"\xff" * (len(data) - 8192 - 4096)
+    path.write_bytes(data)
+    with pytest.raises(StoreError, match="a damaged one"), Store(path) as store:
+        list(store.series("map", "edges").rows())
+
+
+def test_a_row_that_was_written_by_another_program_is_told_with_its_key(store):
+    series = store.series("map", "edges")
+    series.append("mine", {"x": 1})
+    with store._database.engine.begin() as connection:
+        connection.execute(sa.text("UPDATE epypes_rows SET data = '{half'"))
+    with pytest.raises(StoreError, match="Row 'mine' of map 'edges' in .* is damaged"):
+        series.get("mine")
+
+
+def test_a_database_of_another_version_is_refused(place):
+    with Store(place) as store, store._database.engine.begin() as connection:
+        connection.execute(sa.text(f"UPDATE epypes_schema SET version = {SCHEMA + 1}"))
+    said = refused(place)
+    assert f"made by a newer EPypes: its tables have version {SCHEMA + 1}, here it is {SCHEMA}" in said
+    assert said.endswith("Update: pip install --upgrade epypes")
+
+
+_WITHOUT_ROOM = """
+import sys, signal, resource
+from epypes.errors import StoreError
+from epypes.store import Store
+
+with Store(sys.argv[1]) as store:
+    series = store.series("map", "edges")
+    series.append("small", {"x": 1})
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, -1))
+    try:
+        series.append_all([("first", {"x": 2}), ("large", {"text": "x" * 3_000_000})])
+    except StoreError as error:
+        print(error)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (-1, -1))
+    print(sorted(series.keys()))
+    series.append("later", {"x": 3})
+    print(sorted(series.keys()))
+"""
+
+
+def test_a_full_disk_is_told_and_nothing_is_half_written(tmp_path):
+    path = tmp_path / "results.sqlite"
+    done = subprocess.run([sys.executable, "-c", _WITHOUT_ROOM, path], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    said, *keys = done.stdout.splitlines()
+    assert said.startswith(f"{path} can't be written:")
+    assert said.endswith("Make room on the disk.")
+    assert keys == ["['small']", "['later', 'small']"]
+
+
+_AS_NOBODY = """
+import os, sys
+if os.geteuid() == 0:
+    os.setgroups([]); os.setgid(65534); os.setuid(65534)
+from epypes.errors import StoreError
+from epypes.store import Store
+try:
+    with Store(sys.argv[1]) as store:
+        store.series("map", "edges").append("a", {})
+except StoreError as error:
+    print(error)
+"""
+
+
+def test_a_file_that_may_not_be_written_is_told(tmp_path_factory):
+    import tempfile
+    from pathlib import Path
+
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        path = folder / "results.sqlite"
+        Store(path).close()
+        path.chmod(0o444)
+        folder.chmod(0o555)
+        # Packages may be where nobody else can read them: they are loaded before it is not root any more.
+        code = "import sqlalchemy.dialects.sqlite, epypes.store.tables\n" + _AS_NOBODY
+        done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, timeout=60)
+        folder.chmod(0o755)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"{path} can't be opened or written:")
+    assert "Check who may" in done.stdout
+
+
+def test_a_file_that_another_process_holds_is_waited_for_and_then_told(tmp_path, monkeypatch):
+    monkeypatch.setattr("epypes.store.place._BUSY_S", 0.2)
+    path = tmp_path / "results.sqlite"
+    with Store(path) as store:
+        series = store.series("map", "edges")
+        other = sqlite3.connect(path, isolation_level=None)
+        other.execute("BEGIN IMMEDIATE")
+        with pytest.raises(StoreError, match="is locked by another process"):
+            series.append("a", {})
+        assert series.keys() == frozenset(), "who reads does not wait"
+        other.execute("ROLLBACK")
+        other.close()
+        series.append("a", {})
+        assert series.keys() == {"a"}
+
+
+@pytest.mark.parametrize(
+    ("place", "told"),
+    [
+        ("nosuch://u:s3cr3t@host/db", "SQLAlchemy knows no 'nosuch'"),
+        ("postgresql+nosuch://u:s3cr3t@host/db", "SQLAlchemy knows no 'postgresql+nosuch'"),
+        ("mysql://u:s3cr3t@host/db", "module 'MySQLdb' is not installed. Install a driver of mysql"),
+        ("postgresql://u:s3cr3t@host:s3cr3t@/db", "special characters of a password are written as %40"),
+        ("postgresql://u:s3cr3t@:99999999/db", ""),
+        ("postgresql://u:s3cr3t@127.0.0.1:1/db?password=s3cr3t", "can't be reached"),
+        ("postgresql://u:s3cr3t@nosuch.invalid/db", "can't be reached"),
+        ("://u:s3cr3t@host/db", ""),
+    ],
+)
+def test_a_url_that_leads_nowhere_is_told_without_its_password(place, told):
+    with pytest.raises(StoreError) as caught:
+        Store(place)
+    whole = "".join(traceback.format_exception(caught.value))
+    assert told in str(caught.value)
+    assert "s3cr3t" not in str(caught.value) + caught.value.place
+    # The traceback shows this file's own lines, which name no password either.
+    assert "s3cr3t" not in whole
+
+
+def test_who_is_not_let_in_is_told_and_the_password_is_nowhere(postgres):
+    with Store(postgres.url()) as store:
+        shown = repr(store) + store.place + repr(store._database.engine)
+    assert PASSWORD not in shown
+    assert "%40" not in shown
+    for wrong in (
+        postgres.url().replace("W%C3", "X").replace("epypes:", "somebody:"),
+        postgres.url().replace("%2F1", "2"),
+    ):
+        said = refused(wrong)
+        assert "does not let you in" in said
+        assert "pa%40" not in said
+        assert "pa@ss" not in said
+    assert "is not there" in refused(postgres.url().replace("/postgres?", "/nosuch?"))
+
+
+def test_a_server_that_dies_is_told_and_after_a_restart_the_same_store_works_again():
+    with server() as own, Store(own.url()) as store:
+        series = store.series("map", "edges")
+        series.append("before", {"x": 1})
+        own.stop(at_once=True)
+        for doing in (lambda: series.append("lost", {"x": 2}), lambda: list(series.rows()), store.kinds):
+            began_s = monotonic()
+            with pytest.raises(StoreError, match=r"127.0.0.1.* can't be reached: .* Check that it runs"):
+                doing()
+            assert monotonic() - began_s < 20
+        own.start()
+        series.append("after", {"x": 3})
+        assert sorted(series.keys()) == ["after", "before"]
+
+
+def test_a_store_without_sqlalchemy_says_what_to_install():
+    code = (
+        "import sys; sys.modules['sqlalchemy'] = None\n"
+        "import epypes as ep\n"
+        "try:\n    ep.Store('x.sqlite')\nexcept ep.errors.StoreError as error:\n    print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=os.sep)
+    assert done.stdout == "A store needs SQLAlchemy, which is not installed. Run: pip install 'epypes[scale]'\n"
