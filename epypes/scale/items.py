@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from epypes.acquisition.files import read_image
 from epypes.acquisition.pictures import IMAGE_ENDINGS, image_files, natural_order
 from epypes.errors import ScaleError
-from epypes.graph import CompGraph, colour_order
+from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
+from epypes.scale.files import read_value
 
 _KINDS: Final = "a folder, a glob such as 'images/*.png', a list or a generator of images, paths or dicts by token"
 _SHOWN: Final = "*?["
@@ -70,9 +70,11 @@ def opened(item: Item, cg: CompGraph) -> dict[str, Any]:
     ------
     ImageFileError
         A file is missing, or no image.
+    ScaleError
+        A ``.npy`` or ``.npz`` can't be read.
     """
     return {
-        token: read_image(value, colour_order(cg, token)) if isinstance(value, Path) else value
+        token: read_value(value, cg, token) if isinstance(value, Path) else value
         for token, value in item.payload.items()
     }
 
