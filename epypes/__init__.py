@@ -11,7 +11,7 @@ The rooms, from the bottom up; imports point downwards only (checked by ``lint-i
 - ``pipeline``: the paper's ladder of nodes and pipelines; ``acquisition``: where images come from;
   ``display``: how a graph, a run and a value look; ``wire``: how a value travels
 - ``bundle``: from notebook to a folder of text; ``transport``: sockets; ``store``: results and history in a database
-- ``service``: a bundle as a running process; ``experiment``: the paper's own
+- ``scale``: many images and settings; ``service``: a bundle as a running process; ``experiment``: the paper's own
 - ``cli``: the commands; ``epypes_widgets``: the notebook front end
 
 Names are loaded when they are first used, so ``import epypes`` costs little and imports no other package.
@@ -55,6 +55,7 @@ if TYPE_CHECKING:
         summarize,
     )
     from epypes.run.guard import unguarded
+    from epypes.scale import MapResult, map  # noqa: A004 - as in ep.map(runner, images)
     from epypes.service.failures.reopen import load_failure
     from epypes.service.remote.connection import connect
     from epypes.store import Store
@@ -109,6 +110,8 @@ _HOMES = {
     "load": "epypes.bundle",
     "load_failure": "epypes.service.failures.reopen",
     "load_pipeline": "epypes.bundle",
+    "MapResult": "epypes.scale",
+    "map": "epypes.scale",
     "promote": "epypes.bundle",
     "to_source": "epypes.bundle",
     "verify": "epypes.bundle",
@@ -127,6 +130,7 @@ __all__ = [
     "ImageAcquisition",
     "LogNormal",
     "Mailbox",
+    "MapResult",
     "Node",
     "NodeBasedCompGraph",
     "Param",
@@ -154,6 +158,7 @@ __all__ = [
     "load",
     "load_failure",
     "load_pipeline",
+    "map",
     "outputs",
     "promote",
     "register_preview",

@@ -33,6 +33,8 @@ Everything an error's text mentions is an attribute of it::
     |   +-- RevisionConflict    parameters were changed by somebody else meanwhile; .current
     |   +-- ParametersRefused   a running service does not take new values; .problems
     |   +-- DeployRefused       a running service does not take a bundle; .reasons
+    +-- ScaleError              a set of images or settings can't be run
+    |   +-- ExecutorBroken      whoever ran the jobs is gone; .done
     +-- StoreError              a database can't be opened, read or written; .place
     +-- FailureNotKept          a failure of a service, or its event, can't be had; .id, .path
 
@@ -364,6 +366,18 @@ class DeployRefused(ServiceError):
     def __init__(self, path: object, reasons: Sequence[str]) -> None:
         self.reasons = tuple(reasons)
         super().__init__(path, f"{path} is not deployed: {' '.join(self.reasons)}")
+
+
+class ScaleError(EpypesError):
+    """A set of images, settings or cases that can't be run as it was given."""
+
+
+class ExecutorBroken(ScaleError):
+    """An executor that can't do its jobs any more; ``done`` is how many outcomes had come."""
+
+    def __init__(self, done: int, text: str) -> None:
+        self.done = done
+        super().__init__(text)
 
 
 class StoreError(EpypesError):

@@ -14,7 +14,7 @@ from epypes.acquisition.quiet import quiet
 from epypes.errors import ImageFileError
 
 # Endings of what OpenCV reads. A folder may hold notes and tables too; but a file that says it is an image must be one.
-_ENDINGS: Final = frozenset(
+IMAGE_ENDINGS: Final = frozenset(
     {".avif", ".bmp", ".dib", ".exr", ".gif", ".hdr", ".jp2", ".jpe", ".jpeg", ".jpg", ".pbm"}
     | {".pgm", ".png", ".pnm", ".ppm", ".ras", ".sr", ".tif", ".tiff", ".webp"}
 )
@@ -105,10 +105,7 @@ def folder(path: Path, loop: bool = True) -> Sequence:
     """
     import cv2
 
-    try:
-        files = sorted((file for file in path.iterdir() if _is_named_as_image(file)), key=_natural_order)
-    except OSError as error:
-        raise ImageFileError(str(path), f"Folder {str(path)!r} can't be read: {error.strerror}.") from error
+    files = image_files(path)
     if not files:
         raise ImageFileError(str(path), f"There are no images in folder {str(path)!r}. Put PNG, JPEG or TIFF into it.")
     with quiet():
@@ -119,11 +116,26 @@ def folder(path: Path, loop: bool = True) -> Sequence:
     return Sequence(lambda: map(read_image, files), loop)
 
 
+def image_files(path: Path) -> list[Path]:
+    """Return the files of a folder that have the ending of an image, by name: ``img2`` before ``img10``.
+
+    Raises
+    ------
+    ImageFileError
+        The folder can't be read.
+    """
+    try:
+        return sorted((file for file in path.iterdir() if _is_named_as_image(file)), key=natural_order)
+    except OSError as error:
+        raise ImageFileError(str(path), f"Folder {str(path)!r} can't be read: {error.strerror}.") from error
+
+
 def _is_named_as_image(file: Path) -> bool:
-    return file.suffix.lower() in _ENDINGS and not file.name.startswith(".") and file.is_file()
+    return file.suffix.lower() in IMAGE_ENDINGS and not file.name.startswith(".") and file.is_file()
 
 
-def _natural_order(file: Path) -> tuple[list[str | int], str]:
+def natural_order(file: Path) -> tuple[list[str | int], str]:
+    """Return what files are sorted by, so that ``img2`` comes before ``img10``."""
     # Texts and numbers alternate, so only like is compared with like.
     parts = re.split(r"(\d+)", file.name.casefold())
     return [int(part) if place % 2 else part for place, part in enumerate(parts)], file.name

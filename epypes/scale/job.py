@@ -1,0 +1,133 @@
+"""What is done with an item, wherever that is?"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from time import perf_counter_ns
+from typing import Any
+
+from epypes.display.previews.preview import sketch
+from epypes.display.previews.shown import Look
+from epypes.errors import EpypesError
+from epypes.run import CompGraphRunner, Failure, Run
+from epypes.scale.items import Item, opened
+from epypes.scale.outcome import Outcome, Trouble, plain_number
+from epypes.scale.thumbnails import thumbnails_of
+
+Setting = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Items that one worker runs, one after another.
+
+    Attributes
+    ----------
+    items
+        The inputs.
+    settings
+        Hyperparameters by token; each item is run with all of them, in this order.
+    keep
+        Tokens whose values are kept.
+    show
+        Tokens of which thumbnails are made; None: of every token that has a picture.
+    """
+
+    items: tuple[Item, ...]
+    settings: tuple[Setting, ...] = ({},)
+    keep: tuple[str, ...] = ()
+    show: tuple[str, ...] | None = ()
+
+
+def do(runner: CompGraphRunner, job: Job, stop: threading.Event | None = None) -> list[Outcome]:
+    """Return the outcomes of a job: item by item, setting by setting.
+
+    Parameters
+    ----------
+    runner
+        One that nobody else uses; it has its hyperparameters again afterwards.
+    job
+        The items and settings. Of the second setting on only what depends on what changed is run.
+    stop
+        Once it is set, the item that is being run is the last one.
+    """
+    before = dict(runner.hyperparameters)
+    # A setting may leave out what another one has: that is then as it was.
+    varied = {token: before[token] for setting in job.settings for token in setting if token in before}
+    outcomes: list[Outcome] = []
+    try:
+        for item in job.items:
+            for outcome in _of_item(runner, item, job, varied):
+                outcomes.append(outcome)
+                if stop is not None and stop.is_set():
+                    return outcomes
+    finally:
+        runner.set(**varied)
+    return outcomes
+
+
+def _of_item(runner: CompGraphRunner, item: Item, job: Job, varied: Setting) -> Iterator[Outcome]:
+    try:
+        payload = opened(item, runner.cg)
+    except (EpypesError, OSError) as error:
+        trouble = Trouble("", type(error).__name__, str(error))
+        for setting in job.settings:
+            yield Outcome(item.number, item.name, setting, trouble=trouble)
+        return
+    is_begun = False
+    for setting in job.settings:
+        begun_ns = perf_counter_ns()
+        run, trouble_before = _run(runner, None if is_begun else payload, {**varied, **setting})
+        is_begun = is_begun or run is not None
+        if run is None:
+            spent_ns = perf_counter_ns() - begun_ns
+            yield Outcome(item.number, item.name, setting, total_ns=spent_ns, trouble=trouble_before)
+        else:
+            yield _outcome(item, setting, job, run)
+
+
+def _run(
+    runner: CompGraphRunner, payload: Mapping[str, Any] | None, values: Setting
+) -> tuple[Run | None, Trouble | None]:
+    """Run on a payload, or on the last one; return the run, completed or failed, or why there is none."""
+    before = runner.last
+    try:
+        if payload is None:
+            return runner.rerun(**values), None
+        runner.set(**values)
+        return runner.run_on(payload), None
+    except (Exception, SystemExit) as error:  # whatever a function raises
+        if runner.last is not before:
+            return runner.last, None
+        return None, Trouble("", type(error).__name__, str(error))
+
+
+def _outcome(item: Item, setting: Setting, job: Job, run: Run) -> Outcome:
+    report, tokens = run.report, run.tokens
+    return Outcome(
+        item.number,
+        item.name,
+        setting,
+        {token: _value(run[token]) for token in run.cg.sink_tokens if tokens.is_readable(token)},
+        report.durations_ns,
+        report.total_ns,
+        None if run.failure is None else _trouble(run.failure),
+        thumbnails_of(run, job.show) if job.show != () else {},
+        {token: run[token] for token in job.keep if tokens.is_readable(token)},
+    )
+
+
+def _trouble(failure: Failure) -> Trouble:
+    return Trouble(failure.function, failure.kind, failure.message)
+
+
+def _value(value: Any) -> Any:
+    """Return what a table shows of a value."""
+    if value is None or type(value) in (bool, int, float, str):
+        return value
+    number = plain_number(value)
+    if number is not None:
+        return number
+    return str(value) if isinstance(value, str) else sketch(value, Look()).shown.text

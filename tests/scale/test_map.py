@@ -1,0 +1,242 @@
+"""What does a map give, in which order, and what does it keep?"""
+
+from __future__ import annotations
+
+import gc
+import threading
+import weakref
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+import epypes as ep
+from epypes.errors import ScaleError, UnknownName
+
+
+def brightness(image):
+    if image.ndim != 2:
+        raise ValueError("grey only")
+    return float(image.mean())
+
+
+@pytest.fixture
+def bright():
+    return ep.CompGraphRunner(ep.CompGraph({"mean": brightness}, {"mean": ("image", "brightness")}))
+
+
+def values(result, token="brightness"):
+    return [outcome.values.get(token) for outcome in result]
+
+
+def without_times(result):
+    return [replace(outcome, times_ns={}, total_ns=0) for outcome in result]
+
+
+def test_a_folder_becomes_a_table_with_times_and_failures_as_rows(folder, runner):
+    (folder / "crop3.png").write_bytes(b"no image")
+    result = ep.map(runner, folder)
+    frame = result.to_frame()
+    assert frame["name"].tolist() == [f"crop{number}.png" for number in range(12)]
+    assert list(frame.columns[:4]) == ["name", "failure", "edge_pixels", "keypoints"]
+    assert list(frame.columns[4:]) == ["total_ms", "gray ms", "canny ms", "count ms", "corners ms"]
+    assert "is not an image" in frame["failure"][3]
+    assert [outcome.name for outcome in result.failures] == ["crop3.png"]
+    assert (frame["gray ms"].drop(3) > 0).all()
+    assert len(result) == 12
+    assert result[4].name == "crop4.png"
+
+
+def test_values_are_those_of_straight_line_code(runner, crops):
+    expected = [int((cv2.Canny(cv2.cvtColor(crop, cv2.COLOR_BGR2GRAY), 70, 200) > 0).sum()) for crop in crops]
+    assert values(ep.map(runner, crops), "edge_pixels") == expected
+
+
+def test_the_runner_is_left_as_it_was(runner, crops):
+    before = runner.run(image=crops[0])
+    ep.map(runner, crops[1:])
+    assert runner.last is before
+    assert len(runner.reports) == 1
+
+
+def test_images_of_other_shapes_are_rows_that_say_so(bright):
+    result = ep.map(bright, [np.ones((2, 2)), np.ones((2, 2, 3)), np.ones((7, 3))])
+    assert values(result) == [1.0, None, 1.0]
+    assert result[1].trouble.function == "mean"
+    assert result[1].trouble.message == "grey only"
+
+
+@pytest.mark.parametrize("threads", [0, 2])
+def test_a_long_set_is_never_in_memory_as_a_whole(bright, threads):
+    alive, most = set(), 0
+
+    def frames():
+        nonlocal most
+        for number in range(2000):
+            frame = np.full((600, 500), number % 7, np.uint8)
+            alive.add(number)
+            weakref.finalize(frame, alive.discard, number)
+            most = max(most, len(alive))
+            yield frame
+            del frame
+
+    gc.disable()
+    try:
+        if threads:
+            with ThreadPoolExecutor(threads) as pool:
+                result = ep.map(bright, frames(), pool)
+        else:
+            result = ep.map(bright, frames())
+    finally:
+        gc.enable()
+    assert values(result) == [float(number % 7) for number in range(2000)]
+    assert most <= (3 if not threads else 40)
+
+
+def test_an_unknown_token_is_refused_before_anything_is_run(bright):
+    with pytest.raises(UnknownName, match="brightness"):
+        ep.map(bright, [np.ones((2, 2))], keep=["brightnes"])
+
+
+def test_an_empty_set_is_refused(bright, tmp_path):
+    with pytest.raises(ScaleError, match="There are no images"):
+        ep.map(bright, tmp_path)
+    with pytest.raises(ScaleError, match="gave nothing"):
+        ep.map(bright, iter(()))
+
+
+def test_the_bar_counts_images_and_failures(bright, capsys):
+    ep.map(bright, [np.ones((2, 2)), np.ones(3)], progress=True)
+    told = capsys.readouterr().err
+    assert "2/2" in told
+    assert "failed=1" in told
+    ep.map(bright, [np.ones((2, 2))])
+    assert capsys.readouterr().err == ""
+
+
+def test_it_shows_itself_as_a_table_with_failures_marked(runner, crops):
+    result = ep.map(runner, [crops[0], crops[1][..., 0]], show=["edges"])
+    html = result._repr_mimebundle_()["text/html"]
+    assert "2 images, 1 failed" in html
+    assert html.count("data:image/png;base64,") == 1
+    assert "\u2717 gray: error" in html
+    assert repr(result) == "<MapResult: 2 images, 1 failed>"
+
+
+def test_many_rows_with_thumbnails_stay_small(runner, crops):
+    result = ep.map(runner, crops * 10, show=None)
+    html = result._repr_mimebundle_()["text/html"]
+    assert len(html) < 120_000
+    assert "and 90 more: to_frame() has all of them" in html
+
+
+# -- going on ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def calls():
+    return []
+
+
+@pytest.fixture
+def noted(calls):
+    """A runner whose function takes note of what it was called with, and stops at 66 while it is told to."""
+    stopping = threading.Event()
+
+    def note(image, factor):
+        calls.append(int(image.flat[0]))
+        if image.flat[0] == 66 and not stopping.is_set():
+            stopping.set()
+            raise KeyboardInterrupt
+        return float(image.mean() * factor)
+
+    return ep.CompGraphRunner(ep.CompGraph({"note": note}, {"note": (("image", "factor"), "out")}), {"factor": 2})
+
+
+def levels(*numbers):
+    return [np.full((2, 2), number) for number in numbers]
+
+
+def test_an_interrupted_map_goes_on_where_it_was(noted, calls, tmp_path):
+    store, images = tmp_path / "results.sqlite", levels(1, 2, 66, 3)
+    with pytest.raises(KeyboardInterrupt):
+        ep.map(noted, images, store=store, name="levels")
+    assert calls == [1, 2, 66]
+    calls.clear()
+    result = ep.map(noted, images, store=store, name="levels")
+    assert calls == [66, 3]
+    assert values(result, "out") == [2.0, 4.0, 132.0, 6.0]
+    calls.clear()
+    again = ep.map(noted, images, store=store, name="levels")
+    assert calls == []
+    assert list(again) == list(result)
+
+
+def test_images_that_came_later_are_run_and_others_are_not(runner, folder, crops, tmp_path):
+    before = ep.map(runner, folder, store=tmp_path / "r.sqlite")
+    cv2.imwrite(str(folder / "crop2b.png"), crops[0])
+    cv2.imwrite(str(folder / "crop5.png"), crops[0])
+    after = ep.map(runner, folder, store=tmp_path / "r.sqlite")
+    assert [outcome.name for outcome in after][2:5] == ["crop2.png", "crop2b.png", "crop3.png"]
+    assert [outcome.number for outcome in after] == list(range(13))
+    known = {outcome.name: outcome for outcome in before}
+    same = {
+        outcome.name
+        for outcome in after
+        if replace(outcome, number=0) == replace(known.get(outcome.name, outcome), number=0)
+    }
+    assert after[6].name == "crop5.png"
+    assert after[6].total_ns != before[5].total_ns
+    assert "crop4.png" in same
+
+
+def test_other_hyperparameters_are_another_series(noted, calls, tmp_path):
+    ep.map(noted, levels(1), store=tmp_path / "r.sqlite", name="a")
+    noted["factor"] = 3
+    with pytest.raises(ScaleError, match="Series 'a' in the store is of another computation: factor was 2 and is 3"):
+        ep.map(noted, levels(1), store=tmp_path / "r.sqlite", name="a")
+    assert values(ep.map(noted, levels(1), store=tmp_path / "r.sqlite", name="b"), "out") == [3.0]
+
+
+def test_without_a_name_the_graph_and_its_hyperparameters_name_the_series(runner, crops, tmp_path):
+    with ep.Store(tmp_path / "r.sqlite") as store:
+        ep.map(runner, crops[:1], store=store)
+        ep.map(runner, crops[:2], store=store)
+        runner["canny_lo"] = 10
+        ep.map(runner, crops[:1], store=store)
+        first, second = (store.series("map", name) for name in store.names("map"))
+        assert sorted((len(first), len(second))) == [1, 2]
+
+
+def test_a_graph_that_no_text_tells_from_others_wants_a_name(tmp_path):
+    lock = threading.Lock()
+
+    def held(image):
+        with lock:
+            return 1
+
+    runner = ep.CompGraphRunner(ep.CompGraph({"held": held}, {"held": ("image", "out")}))
+    with pytest.raises(ScaleError, match="Give name="):
+        ep.map(runner, levels(1), store=tmp_path / "r.sqlite")
+
+
+def test_arrays_are_told_apart_by_what_is_in_them(noted, calls, tmp_path):
+    ep.map(noted, levels(1, 2), store=tmp_path / "r.sqlite", name="a")
+    result = ep.map(noted, levels(2, 5), store=tmp_path / "r.sqlite", name="a")
+    assert values(result, "out") == [4.0, 10.0]
+
+
+def test_whole_values_are_not_in_the_store_so_they_are_computed_again(noted, calls, tmp_path):
+    ep.map(noted, levels(1), store=tmp_path / "r.sqlite", name="a")
+    result = ep.map(noted, levels(1), store=tmp_path / "r.sqlite", name="a", keep=["out"])
+    assert calls == [1, 1]
+    assert result[0].kept == {"out": 2.0}
+
+
+def test_a_file_that_was_missing_is_tried_again(runner, folder, crops, tmp_path):
+    files = [folder / "later.png"]
+    assert ep.map(runner, files, store=tmp_path / "r.sqlite").failures
+    cv2.imwrite(str(files[0]), crops[0])
+    assert not ep.map(runner, files, store=tmp_path / "r.sqlite").failures
