@@ -61,7 +61,7 @@ class Series:
         Raises
         ------
         StoreError
-            It can't be written: the database is away, the disk full.
+            It can't be written: the database is away, or the disk full.
         TypeError
             There is something in data that JSON has no word for.
         """
