@@ -35,7 +35,6 @@ Everything an error's text mentions is an attribute of it::
     |   +-- DeployRefused       a running service does not take a bundle; .reasons
     +-- ScaleError              a set of images or settings can't be run
     |   +-- ExecutorBroken      whoever ran the jobs is gone; .done
-    |   +-- CasesError          a file of cases can't be read, or says something else; .path, .reasons
     +-- StoreError              a database can't be opened, read or written; .place
     +-- FailureNotKept          a failure of a service, or its event, can't be had; .id, .path
 
@@ -379,14 +378,6 @@ class ExecutorBroken(ScaleError):
     def __init__(self, done: int, text: str) -> None:
         self.done = done
         super().__init__(text)
-
-
-class CasesError(ScaleError):
-    """A file of cases that can't be read, or that says something else; ``reasons`` lists all of them."""
-
-    def __init__(self, path: object, reasons: Sequence[str]) -> None:
-        self.path, self.reasons = str(path), tuple(reasons)
-        super().__init__(self.reasons[0] if len(self.reasons) == 1 else f"{path}: {' '.join(self.reasons)}")
 
 
 class StoreError(EpypesError):

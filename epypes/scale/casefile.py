@@ -36,9 +36,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from epypes.bundle.entries import read
-from epypes.errors import CasesError, EpypesError, UnknownName
+from epypes.errors import EpypesError, ScaleError, UnknownName
 from epypes.scale.cases import Case
-from epypes.scale.labels import is_file
+from epypes.scale.files import is_file
 
 _CASE_KEYS: Final = ("name", "inputs", "hyperparameters", "check")
 _HEADER: Final = re.compile(r"^[ \t]*\[\[[ \t]*case[ \t]*\]\]", re.MULTILINE)
@@ -50,14 +50,15 @@ def read_cases(path: Path) -> list[Case]:
 
     Raises
     ------
-    CasesError
+    ScaleError
         The file can't be read, or says something else than cases; with every reason.
     """
     text, document = _document(path)
-    reasons = [f"{error}" for error in _unknown(document, ("case",), f"in {path.name}")]
+    reasons = [str(error) for error in _unknown(document, ("case",), f"in {path.name}")]
     tables = document.get("case")
     if not (isinstance(tables, list) and tables and all(isinstance(table, dict) for table in tables)):
-        raise CasesError(path, reasons or [f"{path} has no cases. Write one: [[case]] with inputs and [[case.check]]."])
+        reasons.append(f"{path} has no cases. Write one: [[case]] with inputs and [[case.check]].")
+        raise ScaleError(" ".join(reasons))
     cases = []
     for table, line in zip(tables, _lines(text, len(tables)), strict=True):
         try:
@@ -65,7 +66,7 @@ def read_cases(path: Path) -> list[Case]:
         except (EpypesError, ValueError) as error:
             reasons.append(f"{path.name}, line {line}: {error}")
     if reasons:
-        raise CasesError(path, reasons)
+        raise ScaleError(" ".join(reasons))
     return cases
 
 
@@ -74,12 +75,12 @@ def _document(path: Path) -> tuple[str, dict[str, Any]]:
         text = path.read_text(encoding="utf-8-sig")
         return text, tomllib.loads(text)
     except FileNotFoundError as error:
-        raise CasesError(path, [f"There is no file {str(path)!r}. Check the path."]) from error
+        raise ScaleError(f"There is no file {str(path)!r}. Check the path.") from error
     except tomllib.TOMLDecodeError as error:
-        raise CasesError(path, [f"{path} is not TOML: {error}."]) from error
+        raise ScaleError(f"{path} is not TOML: {error}.") from error
     except (OSError, ValueError, RecursionError) as error:  # also bytes that are no text
         said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise CasesError(path, [f"{str(path)!r} can't be read: {said}."]) from error
+        raise ScaleError(f"{str(path)!r} can't be read: {said}.") from error
 
 
 def _lines(text: str, count: int) -> list[int]:

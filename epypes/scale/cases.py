@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from epypes.errors import ScaleError, UnknownName
 from epypes.graph import CompGraph
-from epypes.scale.labels import is_file, labelled
+from epypes.scale.files import is_file, read_value
 from epypes.scale.metrics import METRICS, Metric
 
 # What a threshold spec may say besides the options of its metric.
@@ -202,7 +202,7 @@ def with_labels_read(case: Case, cg: CompGraph) -> Case:
     ScaleError, ImageFileError
         A file can't be read.
     """
-    read = {token: labelled(value, cg, token) for token, value in (case.expected or {}).items()}
+    read = {token: read_value(value, cg, token) for token, value in (case.expected or {}).items()}
     return replace(case, expected=read or case.expected)
 
 

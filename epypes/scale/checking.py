@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import threading
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import UnknownName
 from epypes.run import CompGraphRunner
 from epypes.scale.cases import Case, Check, cases_of, checks_of
+from epypes.scale.files import is_file
 from epypes.scale.items import items_of
 from epypes.scale.job import Job
-from epypes.scale.labels import is_file
 from epypes.scale.measuring import CheckOutcome, measured
 from epypes.scale.needed import needed
 from epypes.scale.progress import progress_bar
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
     import os
 
     import pandas as pd
+
+# More than a page shows; of thousands of cases the pictures would be most of the memory.
+_MOST_PICTURED: Final = 200
 
 Checks = Sequence[tuple[Case, tuple[Check, ...]]]
 
@@ -74,12 +78,19 @@ def check(
     """
     found = prepared(runner, cases)
     outcomes: list[CheckOutcome] = []
+    pictured: Counter[bool] = Counter()
     with progress_bar(progress, len(found), "check", unit="case") as advance:
         for of_case in checked(runner, found, executor):
-            outcomes += of_case
+            outcomes += (_bounded(outcome, pictured) for outcome in of_case)
             advance(1, int(not all(outcome.passed for outcome in of_case)))
     outcomes.sort(key=lambda outcome: outcome.number)
     return CheckResult(tuple(outcomes))
+
+
+def _bounded(outcome: CheckOutcome, pictured: Counter[bool]) -> CheckOutcome:
+    """Return an outcome, without its pictures if there are many of those that have passed, or that have not."""
+    pictured[outcome.passed] += bool(outcome.pictures)
+    return outcome if pictured[outcome.passed] <= _MOST_PICTURED else replace(outcome, pictures={})
 
 
 def prepared(runner: CompGraphRunner, cases: Any) -> Checks:

@@ -16,7 +16,7 @@ from epypes.errors import EpypesError, ScaleError
 from epypes.graph import CompGraph
 from epypes.scale.cases import ABSENT, Case, Check, with_labels_read
 from epypes.scale.differing import pictures_of
-from epypes.scale.labels import labelled
+from epypes.scale.files import read_value
 from epypes.scale.metrics import METRICS
 from epypes.scale.outcome import Outcome, Thumbnail, Trouble
 
@@ -138,7 +138,7 @@ def _compared(outcome: Outcome, check: Check, cg: CompGraph) -> tuple[Any, Any]:
         return None, None
     if check.token not in outcome.kept:
         raise ScaleError(f"Token {check.token!r} has not been computed in this case: no branch that ran makes it.")
-    expected = None if check.expected is ABSENT else labelled(check.expected, cg, check.token)
+    expected = None if check.expected is ABSENT else read_value(check.expected, cg, check.token)
     return outcome.kept[check.token], expected
 
 

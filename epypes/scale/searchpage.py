@@ -23,8 +23,10 @@ _LEFT: Final = 64
 _RIGHT: Final = 14
 _TOP: Final = 14
 _BOTTOM: Final = 34
-# More dots than this can't be told apart, and would make the page large; the line of the best has all trials.
-_MOST_DOTS: Final = 600
+# More dots than this can't be told apart; the line of the best has all trials.
+_MOST_DOTS: Final = 1_000
+# What each of them was would make the page large.
+_MOST_TOLD: Final = 150
 _MOST_ROWS: Final = 30
 _MOST_REASONS: Final = 3
 _TITLE_CHARACTERS: Final = 160
@@ -35,6 +37,7 @@ _RULES: Final = {
     " .end": "text-anchor:end",
     " .axis": "stroke:@line;stroke-width:1;fill:none",
     " .trial": "fill:@accent;fill-opacity:.55",
+    " .trials": "stroke:@accent;stroke-opacity:.55;stroke-width:6;stroke-linecap:round;fill:none",
     " .best": "stroke:@warn;stroke-width:2;fill:none",
     " .top": "fill:@warn;stroke:@ground;stroke-width:1.5",
     " .fault": "stroke:@error;stroke-width:1.4;fill:none",
@@ -92,15 +95,24 @@ def _labels(result: OptimizeResult, low: float, high: float, y: Any, x: Any, las
 
 
 def _dots(trials: Sequence[Trial], x: Any, y: Any) -> Iterator[str]:
-    step = -(-len(trials) // _MOST_DOTS) or 1
-    foot = _HEIGHT - _BOTTOM - 6
-    for trial in trials[::step]:
+    """Give a mark for each trial, with what was tried if there are not too many of them."""
+    if len(trials) > _MOST_TOLD:
+        some = trials[:: -(-len(trials) // _MOST_DOTS)]
+        path = "".join(f"M{x(trial.number)} {y(trial.value)}h0" for trial in some if trial.value is not None)
+        yield f'<path class="trials" d="{path}"/>'
+        failed = (trial for trial in some if trial.value is None)
+        yield f'<path class="fault" d="{"".join(_cross(x(trial.number)) for trial in failed)}"/>'
+        return
+    for trial in trials:
         said = f"<title>{content(_told(trial))}</title>"
         if trial.value is None:
-            left = float(x(trial.number)) - 3
-            yield f'<path class="fault" d="M{left:.1f},{foot - 3}l6,6m0,-6l-6,6">{said}</path>'
+            yield f'<path class="fault" d="{_cross(x(trial.number))}">{said}</path>'
         else:
             yield f'<circle class="trial" cx="{x(trial.number)}" cy="{y(trial.value)}" r="3">{said}</circle>'
+
+
+def _cross(x: str) -> str:
+    return f"M{float(x) - 3:.1f},{_HEIGHT - _BOTTOM - 9}l6,6m0,-6l-6,6"
 
 
 def _line(result: OptimizeResult, x: Any, y: Any) -> str:

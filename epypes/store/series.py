@@ -61,7 +61,7 @@ class Series:
         Raises
         ------
         StoreError
-            It can't be written: the database is away, the disk full.
+            It can't be written: the database is away, or the disk full.
         TypeError
             There is something in data that JSON has no word for.
         """
@@ -98,12 +98,10 @@ class Series:
 
     def get(self, key: str) -> Mapping[str, Any] | None:
         """Return the row under a key; None if there is none."""
-        from sqlalchemy import select
+        from epypes.store.tables import digest_of, row_data
 
-        from epypes.store.tables import digest_of, rows
-
-        wanted = select(rows.c.data).where(rows.c.series_id == self._id, rows.c.digest == digest_of(to_word(key)))
-        text = self._database.read(lambda connection: connection.execute(wanted).scalar())
+        wanted = {"series": self._id, "digest": digest_of(to_word(key))}
+        text = self._database.read(lambda connection: connection.execute(row_data, wanted).scalar())
         return None if text is None else self._data(key, text)
 
     def keys(self) -> frozenset[str]:
@@ -188,14 +186,14 @@ def _flat(data: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]
 
 def _put(connection: Connection, series_id: int, found: Mapping[str, Mapping[str, Any]]) -> None:
     """Write rows by digest; whoever writes one of them at the same moment makes this fail, to be tried again."""
-    from sqlalchemy import insert, update
+    from sqlalchemy import update
 
-    from epypes.store.tables import rows
+    from epypes.store.tables import new_row, rows
 
     there = _there(connection, series_id, list(found))
     new = [dict(row) for digest, row in found.items() if digest not in there]
     if new:
-        connection.execute(insert(rows), new)
+        connection.execute(new_row, new)
     for digest in there:
         mine = (rows.c.series_id == series_id, rows.c.digest == digest)
         changed = {name: found[digest][name] for name in ("data", "written_ns")}
@@ -204,12 +202,10 @@ def _put(connection: Connection, series_id: int, found: Mapping[str, Mapping[str
 
 def _there(connection: Connection, series_id: int, digests: list[str]) -> list[str]:
     """Return which of these are there already."""
-    from sqlalchemy import select
-
-    from epypes.store.tables import rows
+    from epypes.store.tables import rows_there
 
     there: list[str] = []
     for first in range(0, len(digests), _PAGE):
-        asked = rows.c.digest.in_(digests[first : first + _PAGE])
-        there += connection.execute(select(rows.c.digest).where(rows.c.series_id == series_id, asked)).scalars()
+        asked = {"series": series_id, "digests": digests[first : first + _PAGE]}
+        there += connection.execute(rows_there, asked).scalars()
     return there

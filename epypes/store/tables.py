@@ -5,7 +5,20 @@ from __future__ import annotations
 import hashlib
 from typing import Final
 
-from sqlalchemy import BigInteger, Column, ForeignKey, Integer, MetaData, String, Table, Text, UniqueConstraint
+from sqlalchemy import (
+    BigInteger,
+    Column,
+    ForeignKey,
+    Integer,
+    MetaData,
+    String,
+    Table,
+    Text,
+    UniqueConstraint,
+    bindparam,
+    insert,
+    select,
+)
 from sqlalchemy.dialects.mysql import LONGTEXT
 
 # Raised when the tables change; a database of another version is refused.
@@ -47,6 +60,15 @@ rows: Final = Table(
     Column("written_ns", BigInteger, nullable=False),
     UniqueConstraint("series_id", "digest", name="epypes_rows_once"),
 )
+
+# Made once, since to make a statement takes three times as long as to execute it.
+rows_there: Final = select(rows.c.digest).where(
+    rows.c.series_id == bindparam("series"), rows.c.digest.in_(bindparam("digests", expanding=True))
+)
+row_data: Final = select(rows.c.data).where(
+    rows.c.series_id == bindparam("series"), rows.c.digest == bindparam("digest")
+)
+new_row: Final = insert(rows)
 
 
 def digest_of(*words: str) -> str:

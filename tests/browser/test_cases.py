@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from tests.browser.conftest import SCREENSHOTS
+from tests.browser.contrast import unreadable
 from tests.browser.jupyter import JupyterLab, Notebook
 from tests.browser.panel import PanelOnScreen
 from tests.browser.test_panel import written
@@ -44,7 +45,7 @@ STATES = """() => [...document.querySelectorAll('.epypes-filmstrip .epypes-verdi
 @pytest.fixture(scope="module")
 def notebook(browser: Any, lab: JupyterLab) -> Iterator[Notebook]:
     written(lab.root, "cases.ipynb", SET_UP.strip(), SHOW.strip())
-    notebook = Notebook(browser, lab, "cases.ipynb")
+    notebook = Notebook(browser, lab, "cases.ipynb", height=1100)
     notebook.run_all()
     yield notebook
     notebook.close()
@@ -71,6 +72,7 @@ def test_every_test_image_says_whether_it_passes_and_why_not(panel: PanelOnScree
     assert "camera: failed, iou of above: 0." in films.nth(1).get_attribute("title")
     assert panel.page.locator(".epypes-tally").inner_text() == "1 of 3 cases pass"
     panel.page.locator(".epypes-panel").screenshot(path=SCREENSHOTS / f"panel-cases-{theme}.png")
+    assert unreadable(panel.page, ".epypes-panel") == []
 
 
 def test_verdicts_stay_while_the_hand_drags_and_follow_when_it_lets_go(panel: PanelOnScreen) -> None:

@@ -21,7 +21,8 @@ from epypes.cli.app import app
 from epypes.wire import load_sample, save_sample
 
 # By command: what it is given, and what its line says. {bundle} is a good bundle, {broken} one whose pipeline.toml is no
-# TOML, {other} one that computes something else, {folder} an empty folder, {text} a file of text.
+# TOML, {other} one that computes something else, {folder} an empty folder, {text} a file of text, {cases} cases that
+# fail, {wrong} a file of cases with a mistake.
 ROWS = {
     "promote": [
         (["{folder}/none.ipynb", "--to", "{folder}/b"], "Notebook {folder}/none.ipynb can't be read: No such file"),
@@ -34,6 +35,19 @@ ROWS = {
         (["{broken}"], "pipeline.toml can't be read: "),
         (["{other}"], "{other} does not compute what was recorded: in 1 place, token 'edges'. Likely: "),
         (["{other}", "--json"], "does not compute what was recorded"),
+    ],
+    "check": [
+        (["{folder}/none", "{cases}"], "{folder}/none does not exist"),
+        (["{broken}", "{cases}"], "pipeline.toml can't be read: "),
+        (["{bundle}", "{folder}/none.toml"], "There is no file '{folder}/none.toml'. Check the path."),
+        (["{bundle}", "{text}"], "{text} is not TOML: "),
+        (["{bundle}", "{wrong}"], "line 1: No key 'metrc' for metric 'value' of case 'left'. Did you mean 'metric'?"),
+        (
+            ["{bundle}", "{cases}"],
+            "{bundle} does not pass {cases}: 1 of 1 case failed: none.png. First: none.png, runs: ",
+        ),
+        (["{bundle}", "{cases}", "--json"], "1 of 1 case failed"),
+        (["{bundle}", "{cases}", "--junit", "{folder}/none/a.xml"], "'{folder}/none/a.xml' can't be written: No such"),
     ],
     "serve": [
         (["{folder}/none"], "{folder}/none does not exist"),
@@ -100,7 +114,7 @@ def places(tmp_path_factory):
         ep.CompGraph({"canny": cv2.Canny}, {"canny": (("image", "lo", "hi"), "edges")}), {"lo": 70, "hi": 200}
     )
     runner.run(image=np.random.default_rng(3).integers(0, 255, (60, 80), np.uint8))
-    found = {name: base / name for name in ("bundle", "broken", "other", "folder", "text")}
+    found = {name: base / name for name in ("bundle", "broken", "other", "folder", "text", "cases", "wrong")}
     ep.promote(runner, found["bundle"])
     for name in ("broken", "other"):
         shutil.copytree(found["bundle"], found[name])
@@ -112,6 +126,8 @@ def places(tmp_path_factory):
     seal(found["other"])
     found["folder"].mkdir()
     found["text"].write_text("some text")
+    found["cases"].write_text('[[case]]\ninputs = {image = "none.png"}\n')
+    found["wrong"].write_text('[[case]]\nname = "left"\ninputs = 1\n[[case.check]]\nmetrc = "iou"\n')
     return {name: str(path) for name, path in found.items()}
 
 

@@ -137,6 +137,14 @@ def test_what_goes_wrong_in_a_case_fails_that_case_alone(runner, coins, tmp_path
     assert str(result) == "5 of 6 cases failed: shapes, no file, no input, fails, metrics"
 
 
+def test_inputs_may_be_files_of_arrays(runner, coins, tmp_path):
+    np.save(tmp_path / "coins.npy", coins)
+    mask = coins > 100
+    assert ep.check(runner, [ep.Case(str(tmp_path / "coins.npy"), {"mask": mask}, name="a")])
+    result = ep.check(runner, [ep.Case({"image": tmp_path / "none.npy"}, {"mask": mask}, name="b")])
+    assert "none.npy' can't be read as an array" in reasons(result)["b", "equal of mask"]
+
+
 def test_a_function_that_fails_is_named(runner, coins):
     [outcome] = ep.check(runner, [ep.Case(np.zeros((2, 2, 2, 2)), {"n": 3})]).outcomes
     assert outcome.reason.startswith("corners: error: ")
@@ -293,3 +301,12 @@ def test_junit_that_can_t_be_written_is_told(result, tmp_path):
 
 def test_a_result_of_nothing_that_failed_is_true():
     assert CheckResult(())
+
+
+def test_of_many_cases_not_all_pictures_are_kept(runner):
+    image = np.full((8, 8), 200, np.uint8)
+    mask = np.ones((8, 8), bool)
+    cases = [ep.Case(image, {"mask": wanted}) for wanted in (mask, ~mask) for _ in range(210)]
+    result = ep.check(runner, cases)
+    assert sum(bool(one.pictures) for one in result.outcomes if one.passed) == 200
+    assert sum(bool(one.pictures) for one in result.failures) == 200

@@ -13,12 +13,15 @@ from typing import Annotated, Any
 
 import cv2
 import numpy as np
+import optuna
 import pytest
 
 import epypes as ep
 from epypes.errors import ScaleError, UnknownName
 from epypes.scale import trying
 from epypes.scale.optimized import OptimizeResult
+from epypes.scale.ranging import Span
+from epypes.scale.studying import Trial
 from tests.store.postgres import PASSWORD, server
 
 
@@ -93,10 +96,24 @@ def test_tokens_that_are_named_are_kept_for_the_metric(runner: ep.CompGraphRunne
     assert result.best_value > 15
 
 
-def test_a_case_may_have_hyperparameters_of_its_own(runner: ep.CompGraphRunner) -> None:
-    cases = [ep.Case(0, hyperparameters={"b": 1.5}), ep.Case(0)]
-    result = ep.optimize(runner, "score", cases, 1, ranges={"a": (7, 7)})
-    assert result.best_value == (0 - 2.25) / 2
+@pytest.mark.parametrize("has_executor", [False, True])
+def test_a_case_may_have_hyperparameters_of_its_own_which_vary_for_the_others_alone(
+    runner: ep.CompGraphRunner, has_executor: bool
+) -> None:
+    cases = [ep.Case(0, hyperparameters={"a": 7, "b": 1.5}), ep.Case(0)]
+    with ThreadPoolExecutor(1) as threads:
+        result = ep.optimize(
+            runner, "score", cases, 3, executor=threads if has_executor else None, ranges={"a": (-9, 9)}
+        )
+    assert [trial.value for trial in result] == [(0 - (trial.setting["a"] - 7) ** 2 - 2.25) / 2 for trial in result]
+
+
+def test_who_sets_values_meanwhile_does_not_change_what_is_searched(runner: ep.CompGraphRunner) -> None:
+    def metric(tokens: Mapping[str, Any], _case: ep.Case) -> float:
+        runner["b"] = 100.0
+        return float(tokens["score"])
+
+    assert ep.optimize(runner, metric, [0, 0], 1, ranges={"a": (7, 7)}).best_value == -2.25
 
 
 # -- which values are tried -------------------------------------------------------------------------------------
@@ -373,7 +390,7 @@ def test_a_search_goes_on_where_it_was_stopped(runner: ep.CompGraphRunner, tmp_p
     more = ep.optimize(runner, "score", [0], 5, store=store, name="s", on_trial=told.append)
     assert list(more)[:3] == list(first)
     assert [trial.number for trial in told] == [3, 4]
-    assert settings_of(more)[3:] != settings_of(first)[:2], "chance does not begin anew"
+    assert settings_of(more)[3:] != settings_of(first)[1:], "chance does not begin anew"
     again = ep.optimize(runner, "score", [0], 5, store=store, name="s", on_trial=told.append)
     assert (list(again), len(told)) == (list(more), 2)
     assert again.to_frame().equals(more.to_frame())
@@ -464,6 +481,15 @@ def test_it_shows_itself_as_a_curve_and_the_values_found() -> None:
     assert len(page) < 20_000
 
 
+def test_the_page_of_a_long_search_stays_small() -> None:
+    trials = tuple(Trial(number, {"k": number}, None if number % 7 == 0 else number % 50) for number in range(5_000))
+    axes = (Span("k", 0, 5_000, 1, False, True),)
+    result = OptimizeResult(trials, "maximize", "metric", axes, optuna.create_study(direction="maximize"))
+    page = result._repr_mimebundle_()["text/html"]
+    assert len(page) < 40_000
+    ET.fromstring(page[page.index("<svg") : page.index("</svg>") + 6])
+
+
 def test_figures_are_matplotlibs_without_pyplot(runner: ep.CompGraphRunner) -> None:
     result = ep.optimize(runner, "score", [0], 30)
     history, importance = result.history_plot(), result.importance_plot()
@@ -479,8 +505,6 @@ def test_figures_are_matplotlibs_without_pyplot(runner: ep.CompGraphRunner) -> N
 def test_nothing_is_printed_and_optunas_logging_is_as_it_was(
     runner: ep.CompGraphRunner, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    import optuna
-
     before = optuna.logging.get_verbosity()
     _ = ep.optimize(runner, "score", [0], 12, store=tmp_path / "s.sqlite", name="s").importances
     assert optuna.logging.get_verbosity() == before

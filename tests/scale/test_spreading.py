@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import io
 import multiprocessing
 import os
 import pickle
@@ -134,8 +135,6 @@ def test_no_function_of_the_notebook_is_ever_pickled(runner, crops, processes):
             return super().find_class(module, name)
 
     for sent in careful.sent:
-        import io
-
         Looking(io.BytesIO(sent)).load()
 
 
@@ -168,10 +167,6 @@ def test_a_graph_that_can_not_be_promoted_is_refused_with_the_reasons(crops, pro
     with pytest.raises(PromotionRefused, match="'held'") as refused:
         ep.map(runner, crops, processes)
     assert "A ThreadPoolExecutor runs it as it is." in refused.value.__notes__[0]
-
-
-class Plain:
-    pass
 
 
 def test_a_kept_value_without_a_codec_is_refused_with_the_way_out(processes):
@@ -257,7 +252,7 @@ def test_a_pool_whose_worker_dies_says_how_many_were_done_and_a_store_lets_it_go
 
 
 class Gate:
-    """A function that waits until it is let through."""
+    """A function that waits, with all but the first item, until it is let through."""
 
     def __init__(self):
         self.reached, self.opened, self.calls = threading.Event(), threading.Event(), 0
@@ -265,8 +260,9 @@ class Gate:
     def runner(self):
         def wait(image):
             self.calls += 1
-            self.reached.set()
-            self.opened.wait(_WAIT_S)
+            if image:
+                self.reached.set()
+                self.opened.wait(_WAIT_S)
             return int(image)
 
         return ep.CompGraphRunner(ep.CompGraph({"wait": wait}, {"wait": ("image", "out")}))
@@ -281,17 +277,17 @@ def test_a_stop_ends_it_and_leaves_nothing_queued():
     gate, stop = Gate(), threading.Event()
     runner = gate.runner()
     with ThreadPoolExecutor(2) as pool:
-        outcomes = spread(runner, many_jobs(runner), pool, stop=stop)
+        outcomes = spread(runner, many_jobs(runner), pool, stop=stop, ahead=100)
         found: Future[list] = Future()
         reader = threading.Thread(target=lambda: found.set_result([one for some in outcomes for one in some]))
         reader.start()
         assert gate.reached.wait(_WAIT_S)
         stop.set()
         gate.opened.set()
-        assert len(found.result(_WAIT_S)) <= 4
+        assert len(found.result(_WAIT_S)) == 3
         reader.join(_WAIT_S)
         assert pool.submit(lambda: "free").result(_WAIT_S) == "free"
-    assert gate.calls <= 4
+    assert gate.calls == 3
 
 
 def test_a_stop_in_this_thread_ends_after_the_item():
@@ -309,34 +305,40 @@ def test_a_stop_in_this_thread_ends_after_the_item():
 
 def test_whoever_does_not_want_more_leaves_nothing_queued():
     gate = Gate()
-    gate.opened.set()
     runner = gate.runner()
     with ThreadPoolExecutor(2) as pool:
-        outcomes = spread(runner, many_jobs(runner), pool)
+        outcomes = spread(runner, many_jobs(runner), pool, ahead=100)
         next(outcomes)
         outcomes.close()
+        gate.opened.set()
         pool.submit(lambda: None).result(_WAIT_S)
-    assert gate.calls < 20
+    assert gate.calls <= 3
 
 
 def test_an_interruption_leaves_nothing_queued():
     gate = Gate()
     runner = gate.runner()
-    main = threading.main_thread().ident
+    main, filled = threading.main_thread().ident, threading.Event()
+
+    def images():
+        for number in range(100_000):
+            yield number
+            if number == 90:
+                filled.set()
 
     def interrupt():
-        gate.reached.wait(_WAIT_S)
+        filled.wait(_WAIT_S)
         signal.pthread_kill(main, signal.SIGINT)
-        gate.opened.set()
 
     killer = threading.Thread(target=interrupt)
     with ThreadPoolExecutor(2) as pool:
         killer.start()
         with pytest.raises(KeyboardInterrupt):
-            ep.map(runner, range(100_000), pool)
+            ep.map(runner, images(), pool, ahead=100)
         killer.join(_WAIT_S)
+        gate.opened.set()
         pool.submit(lambda: None).result(_WAIT_S)
-    assert gate.calls < 100_000
+    assert gate.calls <= 40
 
 
 def test_no_more_jobs_are_at_work_than_may_be():
@@ -361,6 +363,11 @@ def test_no_more_jobs_are_at_work_than_may_be():
 def test_what_is_no_executor_is_refused_at_once(runner):
     with pytest.raises(TypeError, match="executor must be a concurrent.futures.Executor, not 'int'"):
         spread(runner, [], 2)
+
+
+def test_so_many_jobs_ahead_as_there_can_not_be_are_refused_at_once(runner):
+    with pytest.raises(ValueError, match="1 or more, not 0"):
+        spread(runner, [], ahead=0)
 
 
 def test_workers_are_counted(processes):

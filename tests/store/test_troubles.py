@@ -207,7 +207,30 @@ def test_a_server_that_dies_is_told_and_after_a_restart_the_same_store_works_aga
             assert monotonic() - began_s < 20
         own.start()
         series.append("after", {"x": 3})
-        assert sorted(series.keys()) == ["after", "before"]
+        own.stop(at_once=True)
+        own.start()
+        series.append("unnoticed", {"x": 4})
+        assert sorted(series.keys()) == ["after", "before", "unnoticed"]
+
+
+def test_a_password_that_a_driver_repeats_is_left_out(postgres):
+    said = sa.exc.OperationalError("CONNECT", {}, Exception(f"no connection with {PASSWORD} to the host"))
+    with Store(postgres.url()) as store:
+        assert "no connection with *** to the host" in str(store._database._told(said))
+
+
+def test_who_reads_for_long_holds_no_writer_up(tmp_path, monkeypatch):
+    monkeypatch.setattr("epypes.store.place._BUSY_S", 0.2)
+    path = tmp_path / "results.sqlite"
+    with Store(path) as store:
+        series = store.series("map", "edges")
+        series.append("a", {})
+        other = sqlite3.connect(path, isolation_level=None)
+        other.execute("BEGIN")
+        assert len(other.execute("SELECT * FROM epypes_rows").fetchall()) == 1
+        series.append("b", {})
+        assert len(other.execute("SELECT * FROM epypes_rows").fetchall()) == 1
+        other.close()
 
 
 def test_a_store_without_sqlalchemy_says_what_to_install():

@@ -429,6 +429,8 @@ def test_the_picture_is_compared_with_what_was_shown(panel: Panel, screen: Front
 def test_what_a_service_can_not_do_is_said(connection: Connection, panel: Panel, screen: FrontEnd, image: Any) -> None:
     with pytest.raises(PayloadError, match="takes its events from its own line"):
         tune(connection, images=[image])
+    with pytest.raises(PayloadError, match="makes its own events, so it takes no cases"):
+        tune(connection, cases=[ep.Case(image)])
     screen.tell("promote", to="somewhere")
     assert "a running service is a bundle already" in screen.last("promoted")["text"]
     with pytest.raises(ServiceError, match="Function 'above' runs in the service at"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -262,13 +263,13 @@ class Panel:
         for control in self._hand.controls:
             if control.widget.has_trait("disabled"):
                 control.widget.disabled = True
-        if self.search is not None:
-            self.search.stop()
-        self._verdicts.close(timeout_s)
-        self._tuning.close(timeout_s)
-        if self.search is not None:
-            self.search.close(timeout_s)
-        self._stored.close(timeout_s)
+        with ExitStack() as last:  # all are closed, whichever does not stop in time; the last one first
+            last.callback(self._stored.close, timeout_s)
+            if self.search is not None:
+                self.search.stop()
+                last.callback(self.search.close, timeout_s)
+            last.callback(self._tuning.close, timeout_s)
+            last.callback(self._verdicts.close, timeout_s)
 
     def _require_open(self) -> None:
         if self._tuning.worker.closed:

@@ -16,8 +16,8 @@ from epypes.errors import EpypesError, PayloadError
 from epypes.run import CompGraphRunner
 from epypes.scale.cases import Case, Check
 from epypes.scale.checking import CheckResult, Checks, checked, inputs_of, prepared
+from epypes.scale.files import read_value
 from epypes.scale.items import items_of, opened
-from epypes.scale.labels import labelled
 from epypes.scale.measuring import CheckOutcome
 from epypes.wording import counted
 from epypes_widgets.history import Entry, History
@@ -147,8 +147,6 @@ class Verdicts:
         told_s = 0.0
         self._tuning.screen.tell_verdicts(self._content(came))
         for outcomes in checked(own, self._cases, has_pictures=False, stop=over):
-            if over.is_set():
-                return
             came[outcomes[0].number] = outcomes
             if monotonic() - told_s >= _TELL_S:
                 self._tuning.screen.tell_verdicts(self._content(came))
@@ -220,7 +218,7 @@ def _with_label(checks: Sequence[Check], runner: CompGraphRunner) -> tuple[Check
 
 def _label(value: Any, runner: CompGraphRunner, token: str) -> Any:
     try:
-        return labelled(value, runner.cg, token)
+        return read_value(value, runner.cg, token)
     except (EpypesError, OSError):
         return value
 

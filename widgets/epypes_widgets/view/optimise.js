@@ -127,14 +127,14 @@ export function optimisePart(panel) {
 }
 
 /** How many trials the curve has room for: as many as there are to be, if that is not far more than there are. */
-function reach(done, n) {
+export function reach(done, n) {
   let room = LEAST_REACH;
   while (room < done) room *= 2;
   return Math.max(done, Math.min(room, n));
 }
 
 /** The best so far: a step wherever it gets better. */
-function bestSoFar(values, direction, x, y) {
+export function bestSoFar(values, direction, x, y) {
   const isBetter = direction === "minimize" ? (one, other) => one < other : (one, other) => one > other;
   let best = null;
   let path = "";

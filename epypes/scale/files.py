@@ -1,4 +1,4 @@
-"""Which value was expected, if it stands in a file?"""
+"""What is in a file that stands for a value?"""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ ARRAYS: Final = frozenset({".npy", ".npz"})
 
 
 def is_file(value: Any) -> bool:
-    """Whether a value stands for what is in its file: a path, or a text that ends like the name of one."""
+    """Whether something stands for what is in a file: a path, or a text that ends like the name of one."""
     if isinstance(value, os.PathLike):
         return True
     return isinstance(value, str) and PurePath(value).suffix.lower() in IMAGE_ENDINGS | ARRAYS
 
 
-def labelled(value: Any, cg: CompGraph, token: str) -> Any:
+def read_value(value: Any, cg: CompGraph, token: str) -> Any:
     """Return a value, of a path what is in its file.
 
     Parameters

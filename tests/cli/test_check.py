@@ -1,0 +1,113 @@
+"""Does ``epypes check`` tell continuous integration what it must know?"""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import cv2
+import junitparser
+import numpy as np
+import pytest
+from skimage import data
+
+import epypes as ep
+from epypes.acquisition import write_image
+
+pytestmark = pytest.mark.slow  # each runs commands on a bundle
+
+
+@pytest.fixture(scope="module")
+def labelled(tmp_path_factory):
+    """A bundle, two images and what is expected of one of them."""
+    folder = tmp_path_factory.mktemp("labelled")
+    runner = ep.CompGraphRunner(
+        ep.CompGraph({"canny": cv2.Canny}, {"canny": (("image", "lo", "hi"), "edges")}), {"lo": 70, "hi": 200}
+    )
+    coins, camera = data.coins(), data.camera()
+    run = runner.run(image=coins)
+    ep.promote(runner, folder / "edges")
+    write_image(folder / "coins.png", coins)
+    write_image(folder / "camera.png", camera)
+    write_image(folder / "coins_edges.png", run["edges"])
+    np.save(folder / "camera_edges.npy", cv2.Canny(camera, 30, 200))
+    return folder
+
+
+CASES = """
+[[case]]
+inputs = {image = "coins.png"}
+[[case.check]]
+expected = "coins_edges.png"
+[[case.check]]
+metric = "count"
+of = "nonzero"
+min = 1000
+
+[[case]]
+name = "camera"
+inputs = {image = "camera.png"}
+hyperparameters = {lo = LO}
+[[case.check]]
+expected = "camera_edges.npy"
+metric = "iou"
+min = 0.99
+"""
+
+
+@pytest.fixture
+def cases(labelled, tmp_path):
+    """Return a file of cases with this threshold, beside its images, but not in the working folder."""
+
+    def written(lo):
+        path = shutil.copytree(labelled, tmp_path / f"labelled {lo}") / "cases.toml"
+        path.write_text(CASES.replace("LO", str(lo)))
+        return path
+
+    return written
+
+
+def test_a_set_that_passes_exits_with_0(labelled, cases, epypes, tmp_path):
+    junit = tmp_path / "checks.xml"
+    done = epypes("check", labelled / "edges", cases(30), "--junit", junit)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.strip() == f"{labelled / 'edges'}: 2 cases passed, 3 checks in all."
+    [suite] = junitparser.JUnitXml.fromfile(str(junit))
+    assert (suite.name, suite.tests, suite.failures + suite.errors) == ("epypes check edges", 3, 0)
+
+
+def test_a_set_that_fails_exits_with_1_and_says_which_case_and_why(labelled, cases, epypes, tmp_path):
+    junit, path = tmp_path / "checks.xml", cases(90)
+    done = epypes("check", labelled / "edges", path, "--junit", junit)
+    assert done.returncode == 1
+    assert "camera" in done.stdout
+    assert "iou of edges" in done.stdout
+    assert "coins" not in done.stdout
+    [line] = done.stderr.strip().splitlines()
+    assert line.startswith(f"epypes: {labelled / 'edges'} does not pass {path}: 1 of 2 cases failed: camera. First: ")
+    assert line.endswith("is not at least 0.99.")
+    [suite] = junitparser.JUnitXml.fromfile(str(junit))
+    assert [test.is_passed for test in suite] == [True, True, False]
+
+
+def test_json_has_every_check(labelled, cases, epypes):
+    done = epypes("check", labelled / "edges", cases(90), "--json")
+    found = json.loads(done.stdout)
+    assert (found["passed"], found["cases"]) == (False, {"coins.png": True, "camera": False})
+    assert [check["check"] for check in found["checks"]] == ["equal of edges", "count of edges", "iou of edges"]
+    assert found["checks"][2]["value"] < 0.99
+    assert found["checks"][2]["reason"].endswith("is not at least 0.99")
+
+
+def test_the_help_documents_the_keys_of_a_case(epypes):
+    said = epypes("check", "--help").stdout
+    for word in (
+        "[[case]]",
+        "[[case.check]]",
+        "inputs = ",
+        "hyperparameters = ",
+        "token = ",
+        "expected = ",
+        "metric = ",
+    ):
+        assert word in said
