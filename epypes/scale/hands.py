@@ -56,10 +56,14 @@ class Threads:
         The threads.
     over
         Once it is set, jobs that were begun end with the item that is being run.
+    stop
+        Once it is set, no job is begun any more.
     """
 
-    def __init__(self, runner: CompGraphRunner, executor: Executor, over: threading.Event) -> None:
-        self._runner, self._executor, self._over = own_runner(runner), executor, over
+    def __init__(
+        self, runner: CompGraphRunner, executor: Executor, over: threading.Event, stop: threading.Event | None
+    ) -> None:
+        self._runner, self._executor, self._over, self._stop = own_runner(runner), executor, over, stop
         self._idle: queue.SimpleQueue[CompGraphRunner] = queue.SimpleQueue()
 
     def submit(self, job: Job) -> Future[Any]:
@@ -67,6 +71,8 @@ class Threads:
         return self._executor.submit(self._do, job)
 
     def _do(self, job: Job) -> list[Outcome]:
+        if self._stop is not None and self._stop.is_set():
+            return []
         try:
             own = self._idle.get_nowait()
         except queue.Empty:

@@ -68,7 +68,8 @@ def spread(
     if not isinstance(executor, Executor):
         raise TypeError(f"executor must be a concurrent.futures.Executor, not {type(executor).__name__!r}.")
     over = threading.Event()
-    hands = Threads(runner, executor, over) if isinstance(executor, ThreadPoolExecutor) else Bundles(runner, executor)
+    on_threads = isinstance(executor, ThreadPoolExecutor)
+    hands = Threads(runner, executor, over, stop) if on_threads else Bundles(runner, executor)
     return _handed_out(hands, jobs, ahead or _JOBS_PER_WORKER * worker_count(executor), over, stop)
 
 
