@@ -213,7 +213,7 @@ def _blocks(outcomes: Sequence[Outcome], plan: _Plan) -> tuple[Block, ...]:
 
 def _block(outcomes: Sequence[Outcome], places: Sequence[int], plan: _Plan, has_images: bool) -> Block:
     first = outcomes[places[0]]
-    title = ", ".join([first.name] * has_images + [_named(first, name) for name in plan.by_block])
+    title = ", ".join([first.name] * has_images + [_named(first, name, plan) for name in plan.by_block])
     if plan.laid == (None, None):
         return Block(title, (tuple((_tile(place, outcomes[place], plan),) for place in places),))
     lines = [list(plan.axes[name]) if name else [None] for name in plan.laid]
@@ -225,18 +225,22 @@ def _block(outcomes: Sequence[Outcome], places: Sequence[int], plan: _Plan, has_
     return Block(title, tuple(tuple(tuple(cells.get((row, column), ())) for column in columns) for row in rows))
 
 
-def _named(outcome: Outcome, name: str) -> str:
-    return f"{name} {said(outcome.setting[name])}"
+def _named(outcome: Outcome, name: str, plan: _Plan) -> str:
+    return f"{name} {plan.axes[name][identity(outcome.setting[name])]}"
 
 
 def _tile(place: int, outcome: Outcome, plan: _Plan) -> Tile:
-    label = ", ".join(_named(outcome, name) for name in plan.by_tile)
+    label = ", ".join(_named(outcome, name, plan) for name in plan.by_tile)
     thumbnail = None if plan.token is None else outcome.thumbnails.get(plan.token)
     if outcome.trouble is not None:
         return Tile(place, label, str(outcome.trouble), True, thumbnail)
-    values = {token: value for token, value in outcome.values.items() if plan.token in (None, token)} or outcome.values
-    told = ", ".join(f"{token} {said(value)}" for token, value in values.items())
-    return Tile(place, label, thumbnail.caption if thumbnail else told, False, thumbnail)
+    return Tile(place, label, thumbnail.caption if thumbnail else _told(outcome, plan.token), False, thumbnail)
+
+
+def _told(outcome: Outcome, shown: str | None) -> str:
+    """Return the value of the token that is shown, or those of all sink tokens."""
+    values = {token: value for token, value in outcome.values.items() if shown in (None, token)} or outcome.values
+    return ", ".join(f"{token} {said(value)}" for token, value in values.items())
 
 
 # -- which token ----------------------------------------------------------------------------------------------------

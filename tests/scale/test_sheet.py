@@ -80,7 +80,9 @@ def test_any_token_that_has_pictures_can_be_shown(runner: ep.CompGraphRunner) ->
         result.sheet("bright")
     with pytest.raises(UnknownName, match="Did you mean 'bright'"):
         result.sheet("brigt")
-    with pytest.raises(UnknownName, match="No hyperparameter 'ofset' that this sweep has varied. Did you mean 'offset'"):
+    with pytest.raises(
+        UnknownName, match="No hyperparameter 'ofset' that this sweep has varied. Did you mean 'offset'"
+    ):
         result.sheet(rows="ofset")
     with pytest.raises(ScaleError, match="both 'offset'"):
         result.sheet(rows="offset", columns="offset")
@@ -88,7 +90,7 @@ def test_any_token_that_has_pictures_can_be_shown(runner: ep.CompGraphRunner) ->
 
 def test_without_pictures_values_are_shown(runner: ep.CompGraphRunner) -> None:
     result = ep.sweep(runner, {"power": [0, 1]}, show=())
-    assert [tile.text for tile in result.sheet().tiles][0] == "level 1.0"
+    assert result.sheet().tiles[0].text == "level 1.0"
     assert "level 1.0" in html_of(result)
 
 

@@ -15,6 +15,7 @@ import pytest
 
 import epypes as ep
 from epypes.errors import PayloadError, ScaleError, UnknownName
+from tests.scale.conftest import counting_runner
 
 
 class Calls:
@@ -113,7 +114,12 @@ def test_what_depends_on_the_slowest_runs_once_for_each_of_its_values_whatever_t
     result = ep.sweep(runner, {"threshold": list(range(20, 60)), "kernel": [1, 2, 3]})
     assert calls.counts["load"] == 1
     assert calls.counts["blur"] == 3
-    assert [(one.setting["threshold"], one.setting["kernel"]) for one in result][:4] == [(20, 1), (20, 2), (20, 3), (21, 1)]
+    assert [(one.setting["threshold"], one.setting["kernel"]) for one in result][:4] == [
+        (20, 1),
+        (20, 2),
+        (20, 3),
+        (21, 1),
+    ]
     assert all(one.values["size"] == by_hand(image, one.setting["kernel"], one.setting["threshold"]) for one in result)
 
 
@@ -216,6 +222,24 @@ def test_what_is_in_a_store_is_not_run_again(runner: ep.CompGraphRunner, calls: 
     ep.sweep(runner, {"threshold": [10, 13]}, store=place, name="more")
     ep.sweep(runner, {"threshold": [10, 13], "kernel": [1, 2]}, store=place, name="tried")
     assert calls.counts["load"] == 1
+
+
+@pytest.mark.parametrize("count", [None, 1, 5])
+def test_processes_give_the_same(processes: Any, crops: list[Any], count: int | None) -> None:
+    runner = counting_runner()
+    runner.run(image=crops[0])
+    images = None if count is None else crops[:count]
+    grid = {"canny_lo": [10, 50, 90], "canny_hi": [60, 120, "no number"]}
+    here, there = (ep.sweep(runner, grid, images, executor, keep=["edges"]) for executor in (None, processes))
+    assert [(one.number, one.name, dict(one.setting), dict(one.values), one.has_failed) for one in there] == [
+        (one.number, one.name, dict(one.setting), dict(one.values), one.has_failed) for one in here
+    ]
+    assert len(there) == 9 * (count or 1)
+    assert len(there.failures) == 3 * (count or 1)
+    assert [one.thumbnails for one in there] == [one.thumbnails for one in here]
+    assert all(
+        np.array_equal(one.kept.get("edges"), other.kept.get("edges")) for one, other in zip(here, there, strict=True)
+    )
 
 
 def test_an_interrupted_sweep_goes_on_where_it_was(runner: ep.CompGraphRunner, calls: Calls, tmp_path: Path) -> None:
