@@ -176,6 +176,14 @@ def test_a_picture_of_what_stays_is_made_once(runner: ep.CompGraphRunner) -> Non
     assert len({id(one.thumbnails["mask"]) for one in result}) == 3
 
 
+def test_a_hyperparameter_that_is_called_like_a_column_has_one_of_its_own() -> None:
+    cg = ep.CompGraph({"f": lambda x, name: x + name}, {"f": (("x", "name"), "failure")})
+    frame = ep.sweep(ep.CompGraphRunner(cg, {"name": 1}), {"name": [1, 2]}, [10]).to_frame()
+    assert list(frame["name (hyperparameter)"]) == [1, 2]
+    assert list(frame["failure (token)"]) == [11, 12]
+    assert list(frame["name"]) == ["#0", "#0"]
+
+
 def test_without_images_nothing_can_be_swept_before_a_run(runner: ep.CompGraphRunner) -> None:
     new = ep.CompGraphRunner(runner.cg, runner.hyperparameters)
     with pytest.raises(PayloadError, match=r"images=\.\.\., or call run\(image=\.\.\.\)"):
