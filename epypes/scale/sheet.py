@@ -106,8 +106,7 @@ def _first_of(blocks: Iterable[Block], most: int) -> Iterator[Block]:
         for row in block.rows:
             kept = tuple(cell if count <= most else () for count, cell in zip(_counts(row), row, strict=True))
             most -= sum(map(len, kept))
-            # A row without tiles stays where it stands, for its label.
-            rows += [kept] * (any(kept) or not any(row))
+            rows += [kept] * any(kept)
         if rows:
             yield Block(block.title, tuple(rows))
 

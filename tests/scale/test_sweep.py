@@ -123,6 +123,14 @@ def test_what_depends_on_the_slowest_runs_once_for_each_of_its_values_whatever_t
     assert all(one.values["size"] == by_hand(image, one.setting["kernel"], one.setting["threshold"]) for one in result)
 
 
+def test_threads_compute_what_the_slowest_makes_once_where_it_has_values_for_all_of_them(
+    runner: ep.CompGraphRunner, calls: Calls
+) -> None:
+    sweep_on(2, runner, {"threshold": list(range(20, 60)), "kernel": [1, 2, 3, 4, 5]})
+    assert calls.counts["load"] == 1
+    assert calls.counts["blur"] == 5
+
+
 def test_the_given_runner_is_left_as_it_was(runner: ep.CompGraphRunner, image: Any) -> None:
     before = (dict(runner.hyperparameters), runner.last, runner.revision, len(runner.reports), runner.stale)
     told: list[None] = []
