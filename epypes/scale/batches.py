@@ -12,6 +12,8 @@ from epypes.scale.outcome import Outcome
 # job's, for which all others wait.
 _JOB_NS: Final = 50_000_000
 _MOST_ITEMS: Final = 64
+# What is left is divided into so many groups per worker.
+_LAST_JOBS: Final = 3
 # Of arrays that wait in memory, in one job.
 _MOST_BYTES: Final = 4_000_000
 # One more outcome changes what is expected by so much.
@@ -25,19 +27,20 @@ class Batches:
     ----------
     items
         Taken one by one, when a group is asked for.
-    are_single
-        Whether each group has one item only.
+    workers
+        How many work at once; 0: each group has one item only.
+    total
+        How many items there are, if that is known: the last groups are smaller, so that all workers end together.
     """
 
-    def __init__(self, items: Iterable[Item], are_single: bool = False) -> None:
-        self._items, self._are_single = iter(items), are_single
-        self._item_ns = 0.0
+    def __init__(self, items: Iterable[Item], workers: int = 0, total: int | None = None) -> None:
+        self._items, self._workers, self._total = iter(items), workers, total
+        self._item_ns, self._taken = 0.0, 0
 
     def learn(self, outcomes: Iterable[Outcome]) -> None:
-        """Take note of how long items took."""
-        for outcome in outcomes:
-            last_ns = max(outcome.total_ns, 1)
-            self._item_ns = self._item_ns + _SHARE * (last_ns - self._item_ns) if self._item_ns else last_ns
+        """Take note of how long items took; those that could not be read tell nothing."""
+        for took_ns in (outcome.total_ns for outcome in outcomes if outcome.total_ns):
+            self._item_ns = self._item_ns + _SHARE * (took_ns - self._item_ns) if self._item_ns else took_ns
 
     def __iter__(self) -> Iterator[tuple[Item, ...]]:
         while batch := self._next():
@@ -53,13 +56,17 @@ class Batches:
             if item is None:
                 break
             batch.append(item)
+            self._taken += 1
             size += _bytes_of(item.payload.values())
         return batch
 
     def _most(self) -> int:
-        if self._are_single or not self._item_ns:
+        if not self._workers or not self._item_ns:
             return 1
-        return max(1, min(_MOST_ITEMS, int(_JOB_NS / self._item_ns)))
+        most = min(_MOST_ITEMS, int(_JOB_NS / self._item_ns))
+        if self._total is not None:
+            most = min(most, (self._total - self._taken) // (_LAST_JOBS * self._workers))
+        return max(1, most)
 
 
 def _bytes_of(values: Iterable[Any]) -> int:

@@ -128,7 +128,7 @@ def _endings() -> str:
 
 def _of_files(files: list[Path], root: Path, token: str) -> Iterator[Item]:
     for number, file in enumerate(files):
-        yield Item(number, _name(file, root), {token: file}, stamp_of(file))
+        yield Item(number, _name(file, root), {token: file.absolute()}, stamp_of(file))
 
 
 def _name(file: Path, root: Path) -> str:
@@ -174,14 +174,16 @@ def _item(number: int, value: Any, free: tuple[str, ...]) -> Item:
         return value
     if isinstance(value, Mapping):
         if set(value) != set(free):
-            given, wanted = (", ".join(map(str, names)) or "nothing" for names in (value, free))
-            raise ScaleError(f"Item #{number} gives {given}; the graph's free source tokens are: {wanted}.")
-        payload = dict(value)
+            named, wanted = (", ".join(map(str, names)) or "nothing" for names in (value, free))
+            raise ScaleError(f"Item #{number} gives {named}; the graph's free source tokens are: {wanted}.")
+        given = dict(value)
     else:
         if value is None:
             raise ScaleError(f"Item #{number} is None, which is no image. Leave it out.")
-        payload = {_only(free, f"item #{number} is one value"): Path(value) if isinstance(value, str) else value}
-    files = [file for file in payload.values() if isinstance(file, Path)]
+        given = {_only(free, f"item #{number} is one value"): Path(value) if isinstance(value, str) else value}
+    files = [file for file in given.values() if isinstance(file, Path)]
+    # Whoever reads it may stand in another folder.
+    payload = {token: file.absolute() if isinstance(file, Path) else file for token, file in given.items()}
     return Item(number, ", ".join(map(str, files)) or f"#{number}", payload, ", ".join(map(stamp_of, files)))
 
 

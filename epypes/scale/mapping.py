@@ -17,7 +17,7 @@ from epypes.scale.outcome import Outcome
 from epypes.scale.progress import Advance, progress_bar
 from epypes.scale.remembered import Remembered, series_of
 from epypes.scale.shown import rows_shown
-from epypes.scale.spreading import spread
+from epypes.scale.spreading import spread, worker_count
 from epypes.scale.table import frame_of
 from epypes.store import Store, opened_store
 from epypes.wording import counted
@@ -65,10 +65,14 @@ class MapResult(Sequence[Outcome]):
         return len(self.outcomes)
 
     def __repr__(self) -> str:
-        return f"<MapResult: {counted(len(self), 'image')}, {len(self.failures)} failed>"
+        return f"<MapResult: {self._caption}>"
+
+    @property
+    def _caption(self) -> str:
+        return f"{counted(len(self), 'image')}, {len(self.failures)} failed"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        return {"text/plain": repr(self), "text/html": rows_shown(self.outcomes, self.cg, repr(self)[1:-1])}
+        return {"text/plain": repr(self), "text/html": rows_shown(self.outcomes, self.cg, self._caption)}
 
 
 def map_images(
@@ -159,7 +163,8 @@ class _Map:
 
     def run(self, runner: CompGraphRunner, images: Any, executor: Executor | None, ahead: int | None) -> None:
         """Run what has to be run."""
-        batches = Batches(self._unknown(items_of(images, runner)), are_single=executor is None)
+        workers = 0 if executor is None else worker_count(executor)
+        batches = Batches(self._unknown(items_of(images, runner)), workers, count_of(images))
         jobs = (Job(batch, keep=self._keep, show=self._show) for batch in batches)
         for outcomes in spread(runner, jobs, executor, ahead=ahead):
             batches.learn(outcomes)

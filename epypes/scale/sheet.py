@@ -13,6 +13,7 @@ from itertools import accumulate
 from typing import Any
 
 from epypes.display.previews.preview import sketch
+from epypes.display.previews.short import reason
 from epypes.display.previews.shown import Look
 from epypes.errors import ScaleError, UnknownName
 from epypes.graph import CompGraph
@@ -97,7 +98,10 @@ class Sheet:
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         from epypes.scale.sheetpage import page_of
 
-        return {"text/plain": repr(self), "text/html": page_of(self)}
+        try:
+            return {"text/plain": repr(self), "text/html": page_of(self)}
+        except Exception as error:  # a notebook shows the result whatever is wrong with its pictures
+            return {"text/plain": f"{self!r}\n(no picture: {reason(error)})"}
 
 
 def _first_of(blocks: Iterable[Block], most: int) -> Iterator[Block]:

@@ -23,12 +23,14 @@ def rows_shown(outcomes: Sequence[Outcome], cg: CompGraph, caption: str) -> str:
     """Return a table as HTML: the failed and the first others, in order, with the thumbnails there is room for."""
     chosen = _chosen(outcomes)
     shown = [token for token in cg.tokens if any(token in outcome.thumbnails for outcome in chosen)]
-    head = _row("th", ["name", *shown, *cg.sink_tokens, "time"])
+    # A sink token with a picture says the rest in the picture's title.
+    sinks = [token for token in cg.sink_tokens if token not in shown]
+    head = _row("th", ["name", *shown, *sinks, "time"])
     room, rows = _THUMBNAIL_CHARACTERS, []
     for outcome in chosen:
         pictures = [_picture(outcome.thumbnails.get(token)) for token in shown]
         room -= sum(map(len, pictures))
-        rows.append(_outcome_row(outcome, pictures if room >= 0 else [""] * len(shown), cg.sink_tokens))
+        rows.append(_outcome_row(outcome, pictures if room >= 0 else [""] * len(shown), sinks))
     left_out = len(outcomes) - len(chosen)
     more = f"<p>and {left_out} more: to_frame() has all of them</p>" if left_out else ""
     return f"<table><caption>{content(caption)}</caption>{head}{''.join(rows)}</table>{more}"
@@ -43,14 +45,15 @@ def _chosen(outcomes: Sequence[Outcome]) -> list[Outcome]:
     return [outcomes[place] for place in sorted(places)]
 
 
-def _outcome_row(outcome: Outcome, pictures: list[str], sinks: tuple[str, ...]) -> str:
+def _outcome_row(outcome: Outcome, pictures: list[str], sinks: Sequence[str]) -> str:
     name = content(outcome.name)
     if outcome.trouble is None:
         values = [content(value_text(outcome.values[token])) if token in outcome.values else "" for token in sinks]
         return _row("td", [name, *pictures, *values, duration_text(outcome.total_ns)])
     said = " ".join(str(outcome.trouble).split())
     cut = said if len(said) <= _MESSAGE_CHARACTERS else f"{said[:_MESSAGE_CHARACTERS]}..."
-    failure = f'<td colspan="{len(sinks) + 1}" style="text-align:left;color:{_ERROR}">\u2717 {content(cut)}</td>'
+    style = f'style="text-align:left;color:{_ERROR}" title="{escape(said)}"'
+    failure = f'<td colspan="{len(sinks) + 1}" {style}>\u2717 {content(cut)}</td>'
     cells = "".join(f"<td{_LEFT}>{cell}</td>" for cell in (name, *pictures))
     return f"<tr>{cells}{failure}</tr>"
 

@@ -60,6 +60,8 @@ def spread(
     ScaleError, PromotionRefused
         The graph can't travel to another process.
     """
+    if ahead is not None and (type(ahead) is not int or ahead < 1):
+        raise ValueError(f"ahead is how many jobs are at work or waiting, 1 or more, not {ahead!r}.")
     if executor is None:
         return _done_here(runner, jobs, stop)
     if not isinstance(executor, Executor):

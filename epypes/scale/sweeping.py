@@ -107,7 +107,9 @@ class SweepResult:
         return f"<SweepResult: {counted(len(self), 'outcome')} of {varied:.40}; {failed}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        return {**self.sheet()._repr_mimebundle_(), "text/plain": repr(self)}
+        shown = self.sheet()
+        bundle = shown._repr_mimebundle_()
+        return {**bundle, "text/plain": bundle["text/plain"].replace(repr(shown), repr(self))}
 
 
 def sweep(

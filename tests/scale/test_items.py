@@ -114,6 +114,14 @@ def test_files_are_read_in_the_order_of_the_tokens_colours(folder, crops):
     assert np.array_equal(opened(item, cg)["image"], crops[0][..., ::-1])
 
 
+def test_files_are_found_from_another_folder_too(folder, runner, monkeypatch):
+    monkeypatch.chdir(folder)
+    items = [*items_of(["crop0.png"], runner), *items_of(".", runner)]
+    monkeypatch.chdir("/")
+    assert [item.name for item in items[:2]] == ["crop0.png", "crop0.png"]
+    assert all(opened(item, runner.cg)["image"].shape == (100, 150, 3) for item in items)
+
+
 def test_another_file_under_the_same_name_has_another_stamp(folder, runner, crops):
     (before,) = items_of(folder / "crop0.png", runner)
     cv2.imwrite(str(folder / "crop0.png"), crops[5][:50])

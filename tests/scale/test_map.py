@@ -75,7 +75,7 @@ def test_a_long_set_is_never_in_memory_as_a_whole(bright, threads):
     def frames():
         nonlocal most
         for number in range(2000):
-            frame = np.full((1000, 1000), number % 7, np.uint8)
+            frame = np.full((600, 500), number % 7, np.uint8)
             alive.add(number)
             weakref.finalize(frame, alive.discard, number)
             most = max(most, len(alive))

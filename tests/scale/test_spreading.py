@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import io
 import multiprocessing
 import os
 import pickle
@@ -134,8 +135,6 @@ def test_no_function_of_the_notebook_is_ever_pickled(runner, crops, processes):
             return super().find_class(module, name)
 
     for sent in careful.sent:
-        import io
-
         Looking(io.BytesIO(sent)).load()
 
 
@@ -168,10 +167,6 @@ def test_a_graph_that_can_not_be_promoted_is_refused_with_the_reasons(crops, pro
     with pytest.raises(PromotionRefused, match="'held'") as refused:
         ep.map(runner, crops, processes)
     assert "A ThreadPoolExecutor runs it as it is." in refused.value.__notes__[0]
-
-
-class Plain:
-    pass
 
 
 def test_a_kept_value_without_a_codec_is_refused_with_the_way_out(processes):
@@ -361,6 +356,11 @@ def test_no_more_jobs_are_at_work_than_may_be():
 def test_what_is_no_executor_is_refused_at_once(runner):
     with pytest.raises(TypeError, match="executor must be a concurrent.futures.Executor, not 'int'"):
         spread(runner, [], 2)
+
+
+def test_so_many_jobs_ahead_as_there_can_not_be_are_refused_at_once(runner):
+    with pytest.raises(ValueError, match="1 or more, not 0"):
+        spread(runner, [], ahead=0)
 
 
 def test_workers_are_counted(processes):
