@@ -55,7 +55,7 @@ class Threads:
     executor
         The threads.
     over
-        Once it is set, no item is begun any more.
+        Once it is set, jobs that were begun end with the item that is being run.
     """
 
     def __init__(self, runner: CompGraphRunner, executor: Executor, over: threading.Event) -> None:
@@ -67,8 +67,6 @@ class Threads:
         return self._executor.submit(self._do, job)
 
     def _do(self, job: Job) -> list[Outcome]:
-        if self._over.is_set():
-            return []
         try:
             own = self._idle.get_nowait()
         except queue.Empty:

@@ -23,7 +23,8 @@ from epypes.scale.job import Job, do
 from epypes.scale.outcome import Outcome
 from epypes.wording import counted
 
-# How soon a stop that somebody asks for is seen while nothing is done.
+# How soon a stop that somebody asks for is seen while nothing comes, and a Ctrl+C that another thread was given, which
+# does not wake a main thread that waits on a lock.
 _LOOK_S: Final = 0.05
 _JOBS_PER_WORKER: Final = 2
 # How long it is waited, once it was stopped, for what is at work.
@@ -98,7 +99,7 @@ def _handed_out(
                 if (job := hands.suspect()) is None:
                     return
                 at_work[hands.submit(job)] = job
-            ready, _ = wait(at_work, None if stop is None else _LOOK_S, FIRST_COMPLETED)
+            ready, _ = wait(at_work, _LOOK_S, FIRST_COMPLETED)
             for future in ready:
                 outcomes, again = hands.read(future, at_work.pop(future))
                 at_work |= again

@@ -92,7 +92,8 @@ def test_a_long_set_is_never_in_memory_as_a_whole(bright, threads):
     finally:
         gc.enable()
     assert values(result) == [float(number % 7) for number in range(2000)]
-    assert most <= (3 if not threads else 40)
+    # Four jobs of 4 MB, and one that is being made.
+    assert most <= (3 if not threads else 80)
 
 
 def test_an_unknown_token_is_refused_before_anything_is_run(bright):
@@ -238,5 +239,8 @@ def test_whole_values_are_not_in_the_store_so_they_are_computed_again(noted, cal
 def test_a_file_that_was_missing_is_tried_again(runner, folder, crops, tmp_path):
     files = [folder / "later.png"]
     assert ep.map(runner, files, store=tmp_path / "r.sqlite").failures
+    with ep.Store(tmp_path / "r.sqlite") as store:
+        (name,) = store.names("map")
+        assert not store.series("map", name).keys()
     cv2.imwrite(str(files[0]), crops[0])
     assert not ep.map(runner, files, store=tmp_path / "r.sqlite").failures
