@@ -13,6 +13,7 @@ from itertools import accumulate
 from typing import Any
 
 from epypes.display.previews.preview import sketch
+from epypes.display.previews.short import reason
 from epypes.display.previews.shown import Look
 from epypes.errors import ScaleError, UnknownName
 from epypes.graph import CompGraph
@@ -97,7 +98,10 @@ class Sheet:
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         from epypes.scale.sheetpage import page_of
 
-        return {"text/plain": repr(self), "text/html": page_of(self)}
+        try:
+            return {"text/plain": repr(self), "text/html": page_of(self)}
+        except Exception as error:  # a notebook shows the result whatever is wrong with its pictures
+            return {"text/plain": f"{self!r}\n(no picture: {reason(error)})"}
 
 
 def _first_of(blocks: Iterable[Block], most: int) -> Iterator[Block]:
@@ -106,8 +110,7 @@ def _first_of(blocks: Iterable[Block], most: int) -> Iterator[Block]:
         for row in block.rows:
             kept = tuple(cell if count <= most else () for count, cell in zip(_counts(row), row, strict=True))
             most -= sum(map(len, kept))
-            # A row without tiles stays where it stands, for its label.
-            rows += [kept] * (any(kept) or not any(row))
+            rows += [kept] * any(kept)
         if rows:
             yield Block(block.title, tuple(rows))
 
@@ -213,7 +216,7 @@ def _blocks(outcomes: Sequence[Outcome], plan: _Plan) -> tuple[Block, ...]:
 
 def _block(outcomes: Sequence[Outcome], places: Sequence[int], plan: _Plan, has_images: bool) -> Block:
     first = outcomes[places[0]]
-    title = ", ".join([first.name] * has_images + [_named(first, name) for name in plan.by_block])
+    title = ", ".join([first.name] * has_images + [_named(first, name, plan) for name in plan.by_block])
     if plan.laid == (None, None):
         return Block(title, (tuple((_tile(place, outcomes[place], plan),) for place in places),))
     lines = [list(plan.axes[name]) if name else [None] for name in plan.laid]
@@ -225,18 +228,22 @@ def _block(outcomes: Sequence[Outcome], places: Sequence[int], plan: _Plan, has_
     return Block(title, tuple(tuple(tuple(cells.get((row, column), ())) for column in columns) for row in rows))
 
 
-def _named(outcome: Outcome, name: str) -> str:
-    return f"{name} {said(outcome.setting[name])}"
+def _named(outcome: Outcome, name: str, plan: _Plan) -> str:
+    return f"{name} {plan.axes[name][identity(outcome.setting[name])]}"
 
 
 def _tile(place: int, outcome: Outcome, plan: _Plan) -> Tile:
-    label = ", ".join(_named(outcome, name) for name in plan.by_tile)
+    label = ", ".join(_named(outcome, name, plan) for name in plan.by_tile)
     thumbnail = None if plan.token is None else outcome.thumbnails.get(plan.token)
     if outcome.trouble is not None:
         return Tile(place, label, str(outcome.trouble), True, thumbnail)
-    values = {token: value for token, value in outcome.values.items() if plan.token in (None, token)} or outcome.values
-    told = ", ".join(f"{token} {said(value)}" for token, value in values.items())
-    return Tile(place, label, thumbnail.caption if thumbnail else told, False, thumbnail)
+    return Tile(place, label, thumbnail.caption if thumbnail else _told(outcome, plan.token), False, thumbnail)
+
+
+def _told(outcome: Outcome, shown: str | None) -> str:
+    """Return the value of the token that is shown, or those of all sink tokens."""
+    values = {token: value for token, value in outcome.values.items() if shown in (None, token)} or outcome.values
+    return ", ".join(f"{token} {said(value)}" for token, value in values.items())
 
 
 # -- which token ----------------------------------------------------------------------------------------------------

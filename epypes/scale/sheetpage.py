@@ -49,7 +49,7 @@ _STYLE: Final = (
     "object-fit:contain}"
     ".epypes-contact span{display:-webkit-box;-webkit-box-orient:vertical;-webkit-line-clamp:7;overflow:hidden;"
     "overflow-wrap:anywhere;line-height:1.3;margin-top:2px}"
-    ".epypes-contact b{color:var(--epypes-failed)}"
+    ".epypes-contact b{color:var(--epypes-failed);color:color-mix(in srgb,var(--epypes-failed) 62%,currentColor)}"
     ".epypes-contact .failed{outline:2px solid var(--epypes-failed);outline-offset:-2px;background:#e5484d22;"
     "text-align:left!important}"
     ".epypes-contact .chosen{outline:3px solid var(--jp-brand-color1,#1976d2);outline-offset:-2px}</style>"

@@ -107,7 +107,9 @@ class SweepResult:
         return f"<SweepResult: {counted(len(self), 'outcome')} of {varied:.40}; {failed}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        return {**self.sheet()._repr_mimebundle_(), "text/plain": repr(self)}
+        shown = self.sheet()
+        bundle = shown._repr_mimebundle_()
+        return {**bundle, "text/plain": bundle["text/plain"].replace(repr(shown), repr(self))}
 
 
 def sweep(
@@ -294,15 +296,17 @@ def _cuts(
     runner: CompGraphRunner, settings: Sequence[Setting], executor: Executor | None, images: int | None
 ) -> list[int]:
     """Return where the settings of an item are cut into parts: from 0 to their number."""
-    workers = 1 if executor is None else worker_count(executor)
-    # Of the parts of one image each that begins elsewhere than in this process computes what all have in common: there
-    # are only as many as keep all workers at work.
-    parts = -(-workers // max(images or workers, 1))
-    if _is_here(executor) and (parts > 1 or executor is None):
-        parts *= _PARTS
-    parts = max(parts, -(-len(settings) // _MOST_SETTINGS))
-    # What the slowest hyperparameter has made is computed once if no part begins in the midst of one of its values.
-    places = steps(runner.cg, settings)
-    places = places if len(places) >= workers else list(range(len(settings)))
-    parts = min(parts, len(places))
+    if executor is None:
+        # Each begins where the one before has ended, so they are for progress only.
+        parts, places = _PARTS, list(range(len(settings)))
+    else:
+        workers = worker_count(executor)
+        # Outside of this process each part computes what all have in common: there are only as many as keep all
+        # workers at work.
+        parts = -(-workers // max(images or workers, 1))
+        parts *= _PARTS if parts > 1 and _is_here(executor) else 1
+        # What the slowest hyperparameter has made is computed once if no part begins amid one of its values.
+        places = steps(runner.cg, settings)
+        places = places if len(places) >= workers else list(range(len(settings)))
+    parts = min(max(parts, -(-len(settings) // _MOST_SETTINGS)), len(places))
     return [*(places[len(places) * part // parts] for part in range(parts)), len(settings)]

@@ -7,7 +7,19 @@ from pathlib import Path
 
 from rich.console import Console
 
-from tests.benchmarks import case, engine, imports, peers, picture, pipeline, scale_map, service, sockets, tuning
+from tests.benchmarks import (
+    case,
+    engine,
+    imports,
+    peers,
+    picture,
+    pipeline,
+    scale_map,
+    scale_sweep,
+    service,
+    sockets,
+    tuning,
+)
 from tests.benchmarks.table import as_table, write_json
 from tests.benchmarks.timing import Effort
 
@@ -21,7 +33,7 @@ def main() -> None:
     console = Console()
     console = console if console.is_terminal else Console(width=_WIDTH)
     rows = []
-    for module in (imports, engine, pipeline, picture, sockets, service, scale_map, case, tuning):
+    for module in (imports, engine, pipeline, picture, sockets, service, scale_map, scale_sweep, case, tuning):
         console.print(module.__doc__, style="dim")
         rows += module.rows(effort)
     console.print(as_table(rows))

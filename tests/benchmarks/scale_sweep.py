@@ -31,7 +31,9 @@ def canny(image_blurred: np.ndarray, canny_lo: int) -> np.ndarray:
 def rows(effort: Effort) -> list[Row]:
     photograph = cv2.cvtColor(data.coffee(), cv2.COLOR_RGB2BGR)
     image = cv2.resize(photograph, (_WIDTH, _HEIGHT), interpolation=cv2.INTER_CUBIC)
-    cg = ep.CompGraph.from_functions(ep.outputs("image_gray")(grayscale), ep.outputs("image_blurred")(blur), ep.outputs("edges")(canny))
+    cg = ep.CompGraph.from_functions(
+        ep.outputs("image_gray")(grayscale), ep.outputs("image_blurred")(blur), ep.outputs("edges")(canny)
+    )
     runner = ep.CompGraphRunner(cg, {"blur_kernel": 11, "canny_lo": 70})
     runner.run(image=image)
     values = list(range(20, 20 + 3 * (_QUICK_SETTINGS if effort.quick else _SETTINGS), 3))
@@ -45,7 +47,9 @@ def rows(effort: Effort) -> list[Row]:
         result = ep.sweep(runner, {"canny_lo": values}, keep=(), show=show, progress=False)
         return len(result.failures)
 
-    note = f"{len(values)} values of the last function's parameter, 12 MP; limit: one upstream run and the last functions"
+    note = (
+        f"{len(values)} values of the last function's parameter, 12 MP; limit: one upstream run and the last functions"
+    )
     contenders = {
         "by hand": by_hand,
         "EPypes": lambda: swept(None),

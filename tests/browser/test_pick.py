@@ -126,7 +126,7 @@ def test_a_setting_that_fails_is_said_and_not_set(notebook: Notebook) -> None:
 
 
 def test_the_mark_follows_the_hand_on_the_panel(notebook: Notebook) -> None:
-    notebook.execute("panel.set(canny_lo=70) if hasattr(panel, 'set') else panel.__setitem__('canny_lo', 70)")
+    notebook.execute("panel['canny_lo'] = 70; panel.wait(10)")
     wait_for_chosen(notebook, 2)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import epypes as ep
 from epypes.display.limits import CHARACTERS, THUMBNAIL_CHARACTERS
 from epypes.errors import ScaleError, UnknownName
+from epypes.scale.outcome import Thumbnail
 from epypes.scale.sheet import Tile
 
 
@@ -80,7 +82,9 @@ def test_any_token_that_has_pictures_can_be_shown(runner: ep.CompGraphRunner) ->
         result.sheet("bright")
     with pytest.raises(UnknownName, match="Did you mean 'bright'"):
         result.sheet("brigt")
-    with pytest.raises(UnknownName, match="No hyperparameter 'ofset' that this sweep has varied. Did you mean 'offset'"):
+    with pytest.raises(
+        UnknownName, match="No hyperparameter 'ofset' that this sweep has varied. Did you mean 'offset'"
+    ):
         result.sheet(rows="ofset")
     with pytest.raises(ScaleError, match="both 'offset'"):
         result.sheet(rows="offset", columns="offset")
@@ -88,7 +92,7 @@ def test_any_token_that_has_pictures_can_be_shown(runner: ep.CompGraphRunner) ->
 
 def test_without_pictures_values_are_shown(runner: ep.CompGraphRunner) -> None:
     result = ep.sweep(runner, {"power": [0, 1]}, show=())
-    assert [tile.text for tile in result.sheet().tiles][0] == "level 1.0"
+    assert result.sheet().tiles[0].text == "level 1.0"
     assert "level 1.0" in html_of(result)
 
 
@@ -122,6 +126,16 @@ def test_the_page_is_no_larger_than_other_pictures_and_says_what_is_left_out(
     assert (left_out is None) == (pictures == count)
     if left_out is not None:
         assert int(left_out[1].replace(",", "")) == count - pictures
+
+
+def test_what_can_not_be_painted_is_told_as_text(runner: ep.CompGraphRunner) -> None:
+    result = ep.sweep(runner, {"offset": [1, 2]})
+    outcomes = tuple(
+        replace(one, thumbnails={"bright": Thumbnail("image/png", b"no picture" * 9_000, "")}) for one in result
+    )
+    bundle = replace(result, outcomes=outcomes)._repr_mimebundle_()
+    assert list(bundle) == ["text/plain"]
+    assert bundle["text/plain"].startswith(f"{result!r}\n(no picture: ")
 
 
 def test_a_cut_sheet_keeps_its_labels_beside_their_rows(runner: ep.CompGraphRunner) -> None:

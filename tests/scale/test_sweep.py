@@ -15,6 +15,7 @@ import pytest
 
 import epypes as ep
 from epypes.errors import PayloadError, ScaleError, UnknownName
+from tests.scale.conftest import counting_runner
 
 
 class Calls:
@@ -113,8 +114,21 @@ def test_what_depends_on_the_slowest_runs_once_for_each_of_its_values_whatever_t
     result = ep.sweep(runner, {"threshold": list(range(20, 60)), "kernel": [1, 2, 3]})
     assert calls.counts["load"] == 1
     assert calls.counts["blur"] == 3
-    assert [(one.setting["threshold"], one.setting["kernel"]) for one in result][:4] == [(20, 1), (20, 2), (20, 3), (21, 1)]
+    assert [(one.setting["threshold"], one.setting["kernel"]) for one in result][:4] == [
+        (20, 1),
+        (20, 2),
+        (20, 3),
+        (21, 1),
+    ]
     assert all(one.values["size"] == by_hand(image, one.setting["kernel"], one.setting["threshold"]) for one in result)
+
+
+def test_threads_compute_what_the_slowest_makes_once_where_it_has_values_for_all_of_them(
+    runner: ep.CompGraphRunner, calls: Calls
+) -> None:
+    sweep_on(2, runner, {"threshold": list(range(20, 60)), "kernel": [1, 2, 3, 4, 5]})
+    assert calls.counts["load"] == 1
+    assert calls.counts["blur"] == 5
 
 
 def test_the_given_runner_is_left_as_it_was(runner: ep.CompGraphRunner, image: Any) -> None:
@@ -170,6 +184,14 @@ def test_a_picture_of_what_stays_is_made_once(runner: ep.CompGraphRunner) -> Non
     assert len({id(one.thumbnails["mask"]) for one in result}) == 3
 
 
+def test_a_hyperparameter_that_is_called_like_a_column_has_one_of_its_own() -> None:
+    cg = ep.CompGraph({"f": lambda x, name: x + name}, {"f": (("x", "name"), "failure")})
+    frame = ep.sweep(ep.CompGraphRunner(cg, {"name": 1}), {"name": [1, 2]}, [10]).to_frame()
+    assert list(frame["name (hyperparameter)"]) == [1, 2]
+    assert list(frame["failure (token)"]) == [11, 12]
+    assert list(frame["name"]) == ["#0", "#0"]
+
+
 def test_without_images_nothing_can_be_swept_before_a_run(runner: ep.CompGraphRunner) -> None:
     new = ep.CompGraphRunner(runner.cg, runner.hyperparameters)
     with pytest.raises(PayloadError, match=r"images=\.\.\., or call run\(image=\.\.\.\)"):
@@ -216,6 +238,24 @@ def test_what_is_in_a_store_is_not_run_again(runner: ep.CompGraphRunner, calls: 
     ep.sweep(runner, {"threshold": [10, 13]}, store=place, name="more")
     ep.sweep(runner, {"threshold": [10, 13], "kernel": [1, 2]}, store=place, name="tried")
     assert calls.counts["load"] == 1
+
+
+@pytest.mark.parametrize("count", [None, 1, 5])
+def test_processes_give_the_same(processes: Any, crops: list[Any], count: int | None) -> None:
+    runner = counting_runner()
+    runner.run(image=crops[0])
+    images = None if count is None else crops[:count]
+    grid = {"canny_lo": [10, 50, 90], "canny_hi": [60, 120, "no number"]}
+    here, there = (ep.sweep(runner, grid, images, executor, keep=["edges"]) for executor in (None, processes))
+    assert [(one.number, one.name, dict(one.setting), dict(one.values), one.has_failed) for one in there] == [
+        (one.number, one.name, dict(one.setting), dict(one.values), one.has_failed) for one in here
+    ]
+    assert len(there) == 9 * (count or 1)
+    assert len(there.failures) == 3 * (count or 1)
+    assert [one.thumbnails for one in there] == [one.thumbnails for one in here]
+    assert all(
+        np.array_equal(one.kept.get("edges"), other.kept.get("edges")) for one, other in zip(here, there, strict=True)
+    )
 
 
 def test_an_interrupted_sweep_goes_on_where_it_was(runner: ep.CompGraphRunner, calls: Calls, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import anywidget
 
 from epypes.display.markup import cut
 from epypes.errors import EpypesError
+from epypes.scale.order import identity
 from epypes.scale.sheet import Block, Sheet, Tile
 from epypes.scale.sheetpage import page_of
 from epypes.scale.sweeping import SweepResult
@@ -74,6 +75,8 @@ class Picker:
 
     def __init__(self, result: SweepResult, sheet: Sheet) -> None:
         self.result, self._sheet = result, sheet
+        # The first place of each setting.
+        self._places = {self._key(result[place].setting): place for place in reversed(range(len(result)))}
         self._lock = threading.Lock()
         self._wanted: int | None = None
         self._clicked: int | None = None
@@ -91,13 +94,15 @@ class Picker:
     @property
     def chosen(self) -> int | None:
         """The place in the result of the setting that the runner has; None if it has none of them."""
-        now, names = self.result.runner.hyperparameters, self.result.names
-        is_now = [
-            place
-            for place in dict.fromkeys((self._clicked or 0, *range(len(self.result))))
-            if all(name in now and is_same(self.result[place].setting.get(name), now[name]) for name in names)
-        ]
-        return is_now[0] if is_now else None
+        now = self.result.runner.hyperparameters
+        if self._clicked is not None:
+            setting = self.result[self._clicked].setting
+            if all(name in now and is_same(value, now[name]) for name, value in setting.items()):
+                return self._clicked
+        return self._places.get(self._key(now))
+
+    def _key(self, values: Mapping[str, Any]) -> tuple[Any, ...]:
+        return tuple(identity(values.get(name)) for name in self.result.names)
 
     @property
     def text(self) -> str:
