@@ -109,7 +109,7 @@ def _case(table: Mapping[str, Any], folder: Path) -> Case:
         raise ValueError(f'There are no inputs {where}. Write: inputs = {{image = "a.png"}}.')
     metrics, expected = _checks(table.get("check", []), folder, where)
     hyperparameters = _table(table.get("hyperparameters", {}), "hyperparameters", where)
-    values = {token: _hyperparameter(value) for token, value in hyperparameters.items()}
+    values = {token: _hyperparameter(token, entry) for token, entry in hyperparameters.items()}
     return Case(_inputs(table["inputs"], folder), expected, metrics, name, values)
 
 
@@ -119,9 +119,17 @@ def _inputs(given: Any, folder: Path) -> Any:
     return _value(given, folder)
 
 
-def _hyperparameter(value: Any) -> Any:
+def _hyperparameter(token: str, entry: Any) -> Any:
     """Return a value as pipeline.toml has it: what TOML has none like is a table with its kind."""
-    return read(value) if isinstance(value, Mapping) and "value" in value else value
+    if not isinstance(entry, Mapping):
+        return entry
+    try:
+        return read(entry)
+    except (LookupError, TypeError, ValueError, ArithmeticError) as error:
+        raise ValueError(
+            f"Hyperparameter {token!r} can't be read: {error}. Write it as in pipeline.toml, such as "
+            '{value = [3, 5], kind = "tuple"}.'
+        ) from error
 
 
 def _value(value: Any, folder: Path) -> Any:

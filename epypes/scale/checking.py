@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import threading
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -10,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from epypes.bundle.entries import Member
 from epypes.errors import UnknownName
 from epypes.run import CompGraphRunner
 from epypes.scale.cases import Case, Check, cases_of, checks_of
@@ -101,12 +103,26 @@ def prepared(runner: CompGraphRunner, cases: Any) -> Checks:
     ScaleError, UnknownName
         As ``check`` does.
     """
-    found = [(case, checks_of(case, runner.cg)) for case in cases_of(cases)]
-    for case, _ in found:
-        for token in case.hyperparameters or {}:
-            if token not in runner.hyperparameters:
-                raise UnknownName("hyperparameter", token, runner.hyperparameters, f"for {case}")
-    return found
+    return [(_placed(case, runner), checks_of(case, runner.cg)) for case in cases_of(cases)]
+
+
+def _placed(case: Case, runner: CompGraphRunner) -> Case:
+    """Return a case whose hyperparameters the runner has, with members of enumerations in place of their names."""
+    now, given = runner.hyperparameters, case.hyperparameters or {}
+    for token in given:
+        if token not in now:
+            raise UnknownName("hyperparameter", token, now, f"for {case}")
+    return replace(case, hyperparameters={token: _member(value, now[token], case) for token, value in given.items()})
+
+
+def _member(value: Any, present: Any, case: Case) -> Any:
+    """Return the member of an enumeration that a file names; any other value as it is."""
+    if not isinstance(value, Member):
+        return value
+    members = type(present).__members__ if isinstance(present, enum.Enum) else {}
+    if value.name not in members:
+        raise UnknownName(f"member of {value.enum}", value.name, members, f"for {case}")
+    return members[value.name]
 
 
 def checked(

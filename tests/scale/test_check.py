@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import threading
 import xml.etree.ElementTree as ET
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -143,6 +144,24 @@ def test_inputs_may_be_files_of_arrays(runner, coins, tmp_path):
     assert ep.check(runner, [ep.Case(str(tmp_path / "coins.npy"), {"mask": mask}, name="a")])
     result = ep.check(runner, [ep.Case({"image": tmp_path / "none.npy"}, {"mask": mask}, name="b")])
     assert "none.npy' can't be read as an array" in reasons(result)["b", "equal of mask"]
+
+
+class Side(enum.Enum):
+    ABOVE = 1
+    BELOW = 2
+
+
+def test_a_file_names_a_member_of_the_enumeration_that_the_runner_has(tmp_path):
+    cg = ep.CompGraph({"which": lambda x, side: side.value * x}, {"which": (("x", "side"), "y")})
+    runner = ep.CompGraphRunner(cg, {"side": Side.ABOVE})
+    path = tmp_path / "cases.toml"
+    for member, passed in (("ABOVE", False), ("BELOW", True)):
+        side = f'{{value = "{member}", kind = "enum", enum = "Side"}}'
+        path.write_text(f"[[case]]\ninputs = 3\nhyperparameters = {{side = {side}}}\n[[case.check]]\nexpected = 6\n")
+        assert bool(ep.check(runner, path)) is passed
+    path.write_text(path.read_text().replace("BELOW", "BELLOW"))
+    with pytest.raises(UnknownName, match="No member of Side 'BELLOW' for case '#0'. Did you mean 'BELOW'?"):
+        ep.check(runner, path)
 
 
 def test_a_function_that_fails_is_named(runner, coins):
