@@ -29,7 +29,7 @@ fix: $(VENV)/.test
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) demo-output test-output notebooks/edge_service notebooks/orb.* notebooks/*.toml notebooks/services services
+	rm -rf $(VENV) demo-output test-output notebooks/edge_service notebooks/orb.* notebooks/*.toml notebooks/services notebooks/many_images services
 
 # uv comes from the same registry as everything else and installs eight times faster than pip.
 $(BIN)/python:
