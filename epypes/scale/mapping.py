@@ -147,8 +147,8 @@ def map_images(
         memory = None
         if opened is not None:
             series = series_of(opened, "map", runner, name)
-            memory = Remembered(series, "" if show == () else f"show={show and list(show)}", not keep)
-            stack.callback(memory.write)
+            how = "" if show == () else f"show={show and list(show)}"
+            memory = stack.enter_context(Remembered(series, how, not keep))
         advance = stack.enter_context(progress_bar(progress, count_of(images), "map"))
         work = _Map(memory, advance, tuple(keep), None if show is None else tuple(show))
         is_copied = executor is not None or opened is not None or bool(keep)

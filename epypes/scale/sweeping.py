@@ -195,8 +195,7 @@ def sweep(
         memory = None
         if (opened := stack.enter_context(opened_store(store))) is not None:
             series = series_of(opened, "sweep", runner, name, plan.names)
-            memory = Remembered(series, f"show={shown and list(shown)}", not kept)
-            stack.callback(memory.write)
+            memory = stack.enter_context(Remembered(series, f"show={shown and list(shown)}", not kept))
         work = _Sweep(runner, Job((), in_order, kept, shown), memory, advance)
         is_copied = executor is not None or opened is not None or bool(kept)
         work.run(_items(given, images, plan, is_copied=is_copied), executor, count)
