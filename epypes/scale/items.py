@@ -13,6 +13,7 @@ from epypes.errors import ScaleError
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
 from epypes.scale.files import read_value
+from epypes.scale.lasting import lasting_each
 
 _KINDS: Final = "a folder, a glob such as 'images/*.png', a list or a generator of images, paths or dicts by token"
 _SHOWN: Final = "*?["
@@ -30,17 +31,14 @@ class Item:
         Of a file its name, relative to the folder that was given; otherwise its place, as ``"#3"``.
     payload
         Values by free source token; a Path stands for an image file, which is read where the item is run.
-    stamp
-        Size and time of its files, which tells that a file is another one now; "" for what is no file.
     """
 
     number: int
     name: str
     payload: Mapping[str, Any]
-    stamp: str = ""
 
 
-def items_of(images: Any, runner: CompGraphRunner) -> Iterator[Item]:
+def items_of(images: Any, runner: CompGraphRunner, *, is_copied: bool = True) -> Iterator[Item]:
     """Give the inputs of an image set, each when it is asked for.
 
     Parameters
@@ -50,6 +48,9 @@ def items_of(images: Any, runner: CompGraphRunner) -> Iterator[Item]:
         token, in which a Path stands for an image file.
     runner
         Its free source tokens are what an item has to give.
+    is_copied
+        Whether what a generator gives is copied, since it may be one array that is filled again each time. False if
+        each item is done with before the next one is asked for.
 
     Raises
     ------
@@ -60,7 +61,7 @@ def items_of(images: Any, runner: CompGraphRunner) -> Iterator[Item]:
     if isinstance(images, str | Path):
         return _of_files(*_files(images), _only(free, f"{str(images)!r} gives one image"))
     _check_set(images)
-    return _of_values(images, free)
+    return _of_values(lasting_each(images) if is_copied else images, type(images).__name__, free)
 
 
 def opened(item: Item, cg: CompGraph) -> dict[str, Any]:
@@ -130,20 +131,11 @@ def _endings() -> str:
 
 def _of_files(files: list[Path], root: Path, token: str) -> Iterator[Item]:
     for number, file in enumerate(files):
-        yield Item(number, _name(file, root), {token: file.absolute()}, stamp_of(file))
+        yield Item(number, _name(file, root), {token: file.absolute()})
 
 
 def _name(file: Path, root: Path) -> str:
     return str(file.relative_to(root)) if file.is_relative_to(root) else str(file)
-
-
-def stamp_of(file: Path) -> str:
-    """Return what tells that a file is another one now; "" if it can't be had, as of one that is not there."""
-    try:
-        found = file.stat()
-    except OSError:
-        return ""
-    return f"{found.st_size}-{found.st_mtime_ns}"
 
 
 # -- values -----------------------------------------------------------------------------------------------------
@@ -159,7 +151,7 @@ def _check_set(images: Any) -> None:
         raise ScaleError(f"images can't be {type(images).__name__!r}. Give {_KINDS}.")
 
 
-def _of_values(images: Iterable[Any], free: tuple[str, ...]) -> Iterator[Item]:
+def _of_values(images: Iterable[Any], kind: str, free: tuple[str, ...]) -> Iterator[Item]:
     number = -1
     for number, value in enumerate(images):
         item = _item(number, value, free)
@@ -168,7 +160,7 @@ def _of_values(images: Iterable[Any], free: tuple[str, ...]) -> Iterator[Item]:
         yield item
         del item
     if number < 0:
-        raise ScaleError(f"The image set is empty: the {type(images).__name__} gave nothing. Give {_KINDS}.")
+        raise ScaleError(f"The image set is empty: the {kind} gave nothing. Give {_KINDS}.")
 
 
 def _item(number: int, value: Any, free: tuple[str, ...]) -> Item:
@@ -178,7 +170,7 @@ def _item(number: int, value: Any, free: tuple[str, ...]) -> Item:
         if set(value) != set(free):
             named, wanted = (", ".join(map(str, names)) or "nothing" for names in (value, free))
             raise ScaleError(f"Item #{number} gives {named}; the graph's free source tokens are: {wanted}.")
-        given = dict(value)
+        given = {token: value[token] for token in free}
     else:
         if value is None:
             raise ScaleError(f"Item #{number} is None, which is no image. Leave it out.")
@@ -186,7 +178,7 @@ def _item(number: int, value: Any, free: tuple[str, ...]) -> Item:
     files = [file for file in given.values() if isinstance(file, Path)]
     # Whoever reads it may stand in another folder.
     payload = {token: file.absolute() if isinstance(file, Path) else file for token, file in given.items()}
-    return Item(number, ", ".join(map(str, files)) or f"#{number}", payload, ", ".join(map(stamp_of, files)))
+    return Item(number, ", ".join(map(str, files)) or f"#{number}", payload)
 
 
 def _only(free: tuple[str, ...], given: str) -> str:
