@@ -108,10 +108,8 @@ def _handed_out(
                 yield outcomes
         over.set()
         yield from _last(hands, at_work)
-    except (BrokenExecutor, CancelledError) as error:
-        raise ExecutorBroken(done, _broken(done, error)) from error
-    except NotTaken as error:
-        raise ExecutorBroken(done, _closed(done, str(error))) from error.__cause__
+    except (BrokenExecutor, CancelledError, NotTaken) as error:
+        raise ExecutorBroken(done, _why(done, error)) from error
     finally:
         over.set()
         for future in at_work:
@@ -128,7 +126,9 @@ def _last(hands: Hands, at_work: dict[Future[Any], Job]) -> Iterator[list[Outcom
         yield outcomes
 
 
-def _broken(done: int, error: BaseException) -> str:
+def _why(done: int, error: BaseException) -> str:
+    if isinstance(error, NotTaken):
+        return _closed(done, str(error))
     return (
         f"The executor broke after {counted(done, 'outcome')}, most likely since one of its processes died "
         f"({said(error)}). Make a new one and run again: with store= what was done is taken from there. "
@@ -159,6 +159,6 @@ def worker_count(executor: Executor) -> int:
     if not callable(cores):
         return os.cpu_count() or 1
     try:
-        return max(sum(cores().values()), 1)
+        return max(int(sum(cores().values())), 1)
     except Exception as error:  # a client without a scheduler raises whatever comes first
         raise ExecutorBroken(0, _closed(0, said(error))) from error
