@@ -4,19 +4,32 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import StoreError
 from epypes.store.jsontext import from_text, from_word, to_text, to_word
+from epypes.store.onefile import file_of
 
 if TYPE_CHECKING:
     import pandas as pd
-    from sqlalchemy import Connection
+    from sqlalchemy import Connection, Select
 
     from epypes.store.database import Database
 
 # Read at a time, so that a long series is never in memory as a whole.
 _PAGE: Final = 500
+# The number of no series.
+_NONE: Final = 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    """What a database knows of a series; one in which it was made anew may know it by another number."""
+
+    file: int | None
+    number: int
+    about: str
 
 
 class Series:
@@ -29,23 +42,40 @@ class Series:
 
     def __init__(self, database: Database, kind: str, name: str, about: Mapping[str, Any] | None = None) -> None:
         self._database, self.kind, self.name = database, kind, name
-        self._id, self._about = database.write(lambda connection: self._found(connection, about or {}))
+        self._about = self._text("about", about or {})
+        self._entry = database.write(self._made)
+        self._about = self._entry.about
 
-    def _found(self, connection: Connection, about: Mapping[str, Any]) -> tuple[int, str]:
-        """Return number and description of this series; it is made if it is not there."""
-        from sqlalchemy import insert, select
+    def _made(self, connection: Connection) -> _Entry:
+        """Return the entry of this series; it is made if it is not there."""
+        from sqlalchemy import insert
 
         from epypes.store.tables import digest_of, series
 
-        kind, name = to_word(self.kind), to_word(self.name)
-        wanted = select(series.c.id, series.c.about).where(series.c.digest == digest_of(kind, name))
-        found = connection.execute(wanted).one_or_none()
+        found = self._found(connection)
         if found is None:
+            kind, name = to_word(self.kind), to_word(self.name)
             values = {"kind": kind, "name": name, "digest": digest_of(kind, name)}
-            text = self._text("about", about)
-            connection.execute(insert(series).values(**values, about=text, made_ns=time.time_ns()))
-            found = connection.execute(wanted).one()
-        return found[0], found[1]
+            made = insert(series).values(**values, about=self._about, made_ns=time.time_ns())
+            number: Any = connection.execute(made).inserted_primary_key
+            found = _Entry(file_of(connection), number[0], self._about)
+        return found
+
+    def _found(self, connection: Connection) -> _Entry | None:
+        """Return the entry of this series in the file that is there now; None if it is not there."""
+        from sqlalchemy import select
+
+        from epypes.store.tables import digest_of, series
+
+        digest = digest_of(to_word(self.kind), to_word(self.name))
+        found = connection.execute(select(series.c.id, series.c.about).where(series.c.digest == digest)).one_or_none()
+        return None if found is None else _Entry(file_of(connection), found[0], found[1])
+
+    def _number(self, connection: Connection) -> int:
+        """Return the number of this series in the file that is there now, to read it."""
+        entry = self._entry
+        found = entry if entry.file == file_of(connection) else self._found(connection)
+        return _NONE if found is None else found.number
 
     @property
     def about(self) -> Mapping[str, Any]:
@@ -79,14 +109,20 @@ class Series:
         found = {row["digest"]: row for row in (self._row(key, data) for key, data in rows)}
         if not found:
             return
-        self._database.write(lambda connection: _put(connection, self._id, found))
+
+        def put(connection: Connection) -> _Entry:
+            entry = self._entry if self._entry.file == file_of(connection) else self._made(connection)
+            _put(connection, entry.number, found)
+            return entry
+
+        # Not before that is written: what is undone has made no series either.
+        self._entry = self._database.write(put)
 
     def _row(self, key: str, data: Mapping[str, Any]) -> dict[str, Any]:
         from epypes.store.tables import digest_of
 
         word, text = to_word(key), self._text(key, data)
-        stamp = {"series_id": self._id, "written_ns": time.time_ns()}
-        return {**stamp, "digest": digest_of(word), "key": word, "data": text}
+        return {"digest": digest_of(word), "key": word, "data": text, "written_ns": time.time_ns()}
 
     def _text(self, key: str, data: Mapping[str, Any]) -> str:
         try:
@@ -100,8 +136,13 @@ class Series:
         """Return the row under a key; None if there is none."""
         from epypes.store.tables import digest_of, row_data
 
-        wanted = {"series": self._id, "digest": digest_of(to_word(key))}
-        text = self._database.read(lambda connection: connection.execute(row_data, wanted).scalar())
+        digest = digest_of(to_word(key))
+
+        def read(connection: Connection) -> Any:
+            wanted = {"series": self._number(connection), "digest": digest}
+            return connection.execute(row_data, wanted).scalar()
+
+        text = self._database.read(read)
         return None if text is None else self._data(key, text)
 
     def keys(self) -> frozenset[str]:
@@ -110,9 +151,8 @@ class Series:
 
         from epypes.store.tables import rows
 
-        wanted = select(rows.c.key).where(rows.c.series_id == self._id)
-        found = self._database.read(lambda connection: connection.execute(wanted).scalars().all())
-        return frozenset(from_word(word) for word in found)
+        found = self._selected(select(rows.c.key))
+        return frozenset(from_word(word) for (word,) in found)
 
     def items(self) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """Yield keys with their rows in the order of writing, a page at a time; what comes meanwhile may come too."""
@@ -122,20 +162,22 @@ class Series:
 
         last = 0
         while True:
-            wanted = (
-                select(rows.c.id, rows.c.key, rows.c.data)
-                .where(rows.c.series_id == self._id, rows.c.id > last)
-                .order_by(rows.c.id)
-                .limit(_PAGE)
-            )
-            page = self._page(wanted)
+            wanted = select(rows.c.id, rows.c.key, rows.c.data).where(rows.c.id > last).order_by(rows.c.id).limit(_PAGE)
+            page = self._selected(wanted)
             if not page:
                 return
             for last, word, text in page:  # noqa: B007 - where the next page begins
                 yield from_word(word), self._data(word, text)
 
-    def _page(self, wanted: Any) -> list[Any]:
-        return self._database.read(lambda connection: list(connection.execute(wanted)))
+    def _selected(self, wanted: Select[Any]) -> list[Any]:
+        """Return what is wanted of the rows of this series."""
+        from epypes.store.tables import rows
+
+        def read(connection: Connection) -> list[Any]:
+            mine = rows.c.series_id == self._number(connection)
+            return list(connection.execute(wanted.where(mine)))
+
+        return self._database.read(read)
 
     def rows(self) -> Iterator[Mapping[str, Any]]:
         """Yield the rows in the order of writing."""
@@ -162,8 +204,8 @@ class Series:
 
         from epypes.store.tables import rows
 
-        wanted = select(func.count()).select_from(rows).where(rows.c.series_id == self._id)
-        return int(self._database.read(lambda connection: connection.execute(wanted).scalar()) or 0)
+        ((count,),) = self._selected(select(func.count()).select_from(rows))
+        return int(count)
 
     def __bool__(self) -> bool:
         # An empty series is one all the same; and to ask costs no look into the database.
@@ -191,7 +233,7 @@ def _put(connection: Connection, series_id: int, found: Mapping[str, Mapping[str
     from epypes.store.tables import new_row, rows
 
     there = _there(connection, series_id, list(found))
-    new = [dict(row) for digest, row in found.items() if digest not in there]
+    new = [{"series_id": series_id, **row} for digest, row in found.items() if digest not in there]
     if new:
         connection.execute(new_row, new)
     for digest in there:
