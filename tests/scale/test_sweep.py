@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import Counter
 from collections.abc import Callable
@@ -190,6 +191,15 @@ def test_a_hyperparameter_that_is_called_like_a_column_has_one_of_its_own() -> N
     assert list(frame["name (hyperparameter)"]) == [1, 2]
     assert list(frame["failure (token)"]) == [11, 12]
     assert list(frame["name"]) == ["#0", "#0"]
+
+
+def test_none_in_a_grid_is_none_in_the_table() -> None:
+    cg = ep.CompGraph({"f": lambda x, gain, size: x}, {"f": (("x", "gain", "size"), "y")})
+    grid = [{"gain": None, "size": 1}, {"gain": 0.5, "size": 2}, {"gain": math.nan, "size": 3}]
+    frame = ep.sweep(ep.CompGraphRunner(cg, {"gain": 1, "size": 1}), grid, [10]).to_frame()
+    assert frame["gain"].to_list()[:2] == [None, 0.5]
+    assert math.isnan(frame["gain"][2])
+    assert frame["size"].dtype == np.int64
 
 
 def test_without_images_nothing_can_be_swept_before_a_run(runner: ep.CompGraphRunner) -> None:
