@@ -7,6 +7,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -141,6 +142,37 @@ def test_the_given_runner_is_left_as_it_was(runner: ep.CompGraphRunner, image: A
     after = (dict(runner.hyperparameters), runner.last, runner.revision, len(runner.reports), runner.stale)
     assert after == before
     assert told == []
+
+
+@pytest.mark.parametrize("threads", EXECUTORS)
+def test_nodes_and_pipelines_of_the_graph_are_left_as_they_were(threads: int | None) -> None:
+    def times(x: float, gain: float = 2.0) -> float:
+        return x * gain
+
+    deepest = ep.Pipeline("deepest", ep.CompGraph.from_functions(times), {"gain": 3.0})
+    nested = ep.CompGraph(
+        {"deepest": deepest, "less": lambda b, k: b - k}, {"deepest": ("a", "b"), "less": (("b", "k"), "c")}
+    )
+    scaled = ep.Pipeline("scaled", nested, {"k": 1})
+    plus = ep.Node("plus", lambda c, y: c + y)
+    functions = {"scaled": ep.Node("outer", scaled), "plus": plus}
+    cg = ep.CompGraph(functions, {"scaled": ("x", "c"), "plus": (("c", "y"), "z")})
+    runner = ep.CompGraphRunner(cg, {"y": 1})
+    runner.run(x=3)
+
+    def state() -> tuple[Any, ...]:
+        nodes = (scaled, deepest, plus, cg.functions["scaled"], *scaled.network.nodes.values())
+        return (*((node.run_count, node.traverse_time()) for node in nodes), scaled.runner.last, deepest.runner.last)
+
+    before = state()
+    with nullcontext() if threads is None else ThreadPoolExecutor(threads) as executor:
+        swept = ep.sweep(runner, {"y": [1, 2]}, [5, 6], executor)
+        mapped = ep.map(runner, [7], executor)
+        ep.check(runner, [8], executor)
+        ep.optimize(runner, "z", [{"x": 9}], 3, ranges={"y": (0, 3)}, executor=executor)
+    assert state() == before
+    assert (scaled["b"], deepest["times"]) == (9, 9)
+    assert [one.values["z"] for one in (*swept, *mapped)] == [15, 16, 18, 19, 21]
 
 
 @pytest.mark.parametrize("threads", EXECUTORS)
