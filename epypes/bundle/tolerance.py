@@ -13,13 +13,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from epypes.bundle.apart import apart
 from epypes.bundle.compare import Tolerance, Unlike, differences
 from epypes.bundle.kept import kept_by, what_changed
-from epypes.bundle.nodes import called_by, is_plain_pipeline
 from epypes.bundle.suspects import suspicion, way_out
 from epypes.errors import BundleError
 from epypes.graph import CompGraph, with_defaults
-from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
 
@@ -89,20 +88,6 @@ def learn(
         reason = seen.reason(outputs)
         reasons += [reason] if reason and reason not in reasons else []
     return Learnt(tolerances, tuple(reasons or what_changed(before, kept_by(cg.functions))))
-
-
-def apart(cg: CompGraph) -> CompGraph:
-    """Return the same graph, in which nodes and pipelines are not those of the user, who may look at their times."""
-    functions = {name: _own(function) for name, function in cg.functions.items()}
-    changed = {name: function for name, function in functions.items() if function is not cg.functions[name]}
-    return CompGraph({**cg.functions, **changed}, cg.func_io, types=cg.types) if changed else cg
-
-
-def _own(function: Any) -> Any:
-    inner = called_by(function)
-    if is_plain_pipeline(inner):
-        return Pipeline(inner.name, apart(inner.source_cg), inner.runner.hyperparameters)
-    return inner
 
 
 class _Seen:

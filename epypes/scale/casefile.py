@@ -9,7 +9,8 @@
 
     [[case.check]]
     token = "edges"                      # whose value is measured; without: the one sink token
-    expected = "left_edges.png"          # what it is compared with: a value, or an image, .npy or .npz
+    expected = "left_edges.png"          # what it is compared with: a value, or an image, .npy or .npz; not of count
+                                         # and value, which compare nothing
     metric = "iou"                       # without: equal if there is something expected, else value
     min = 0.9                            # the least that passes; of equal and close 1 without min and max
     max = 1.0                            # the most that passes
@@ -37,7 +38,7 @@ from typing import Any, Final
 
 from epypes.bundle.entries import read
 from epypes.errors import EpypesError, ScaleError, UnknownName
-from epypes.scale.cases import Case
+from epypes.scale.cases import SINK, Case
 from epypes.scale.files import is_file
 
 _CASE_KEYS: Final = ("name", "inputs", "hyperparameters", "check")
@@ -154,7 +155,8 @@ def _checks(given: Any, folder: Path, where: str) -> tuple[dict[str, Any], dict[
     for table in given:
         spec = {key: _value(value, folder) if key == "expected" else value for key, value in table.items()}
         spec.setdefault("metric", "equal" if "expected" in spec else "value")
-        metrics[_label(spec, metrics)] = spec
+        label = _label(spec, metrics)
+        metrics[label] = {"token": SINK, **spec}
         if "expected" in spec and "token" in spec:
             expected.setdefault(spec["token"], spec["expected"])
     return metrics, expected

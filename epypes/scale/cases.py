@@ -33,6 +33,16 @@ class _Absent:
 ABSENT: Final = _Absent()
 
 
+class _SinkToken:
+    """Stands for the one sink token, which only the graph knows."""
+
+    def __repr__(self) -> str:
+        return "the sink token"
+
+
+SINK: Final = _SinkToken()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Check:
     """One thing that must be so in a case.
@@ -53,6 +63,8 @@ class Check:
         Of the metric.
     keep
         The tokens that the metric needs the values of.
+    is_of_case
+        Without a token: whether it may be the one that the case expects something of, not the one sink token.
     """
 
     name: str
@@ -63,6 +75,7 @@ class Check:
     at_most: float | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
     keep: tuple[str, ...] = ()
+    is_of_case: bool = False
 
     @property
     def threshold(self) -> str:
@@ -82,7 +95,8 @@ class Case:
         source token.
     expected
         By token: the value that it must have, or the path of a file that holds it (an image, ``.npy`` or ``.npz``);
-        a text with such an ending is a path. A token that no metric looks at must be equal to it.
+        a text with such an ending is a path. Where no function and no metric that compares looks at a token, it must
+        be equal to it.
     metrics
         By name, what must be so; see below.
     name
@@ -100,12 +114,14 @@ class Case:
     - a pair ``(least, most)``;
     - a function, which must return True;
     - a dict with ``min``, ``max`` or both, and if need be ``token``, ``metric``, ``expected``, ``keep`` and options of
-      the metric: ``{"token": "points", "min": 100}``.
+      the metric: ``{"token": "points", "min": 100}``. ``count`` and ``value`` compare nothing and take no
+      ``expected``.
 
-    Without ``token`` a metric that compares looks at the one token of ``expected``, any other one at the one sink
-    token. A function is called as ``metric(value, expected)`` if there is a ``token`` (``expected`` is None if nothing
-    is), else as ``metric(run, case)``: a dict of the sink tokens' values, and of those that ``keep`` names, and this
-    case with the files of ``expected`` read. It returns a number, or True or False if there is no threshold.
+    Without ``token`` a metric that compares looks at the one token of the case's ``expected``, any other one, and one
+    with an ``expected`` of its own, at the one sink token. A function is called as ``metric(value, expected)`` if there
+    is a ``token`` (``expected`` is None if nothing is), else as ``metric(run, case)``: a dict of the sink tokens'
+    values, and of those that ``keep`` names, and this case with the files of ``expected`` read. It returns a number, or
+    True or False if there is no threshold.
 
     Raises
     ------
@@ -139,7 +155,7 @@ class Case:
         return f"case {self.name!r:.{_CASE_CHARACTERS}}" if self.name else "a case"
 
     def __repr__(self) -> str:
-        looked_at = {spec.get("token") for spec in (self.metrics or {}).values() if isinstance(spec, Mapping)}
+        looked_at = _looked_at(_check(self, name, spec) for name, spec in (self.metrics or {}).items())
         number = len(self.metrics or ()) + sum(token not in looked_at for token in self.expected or ())
         name = "" if self.name is None else f" {self.name!r:.{_CASE_CHARACTERS}}"
         return f"<Case{name}: {number} check{'s' * (number != 1)}>"
@@ -187,7 +203,7 @@ def checks_of(case: Case, cg: CompGraph) -> tuple[Check, ...]:
     for token in expected:
         cg.require_token(token)
     checks = [_placed(_check(case, name, spec), case, cg) for name, spec in (case.metrics or {}).items()]
-    looked_at = {check.token for check in checks}
+    looked_at = _looked_at(checks)
     alone = [
         Check(f"equal of {token}", token, "equal", wanted, METRICS["equal"].least, keep=(token,))
         for token, wanted in expected.items()
@@ -244,6 +260,15 @@ def _file_name(inputs: Any) -> str:
 # -- checks -----------------------------------------------------------------------------------------------------
 
 
+def _looked_at(checks: Iterable[Check]) -> frozenset[Any]:
+    """Return the tokens whose values are compared with what is expected of them, or given to a function with it."""
+    return frozenset(check.token for check in checks if _takes_expected(check.metric))
+
+
+def _takes_expected(metric: str | Callable[..., Any]) -> bool:
+    return callable(metric) or METRICS[metric].compares
+
+
 def _check(case: Case, name: str, spec: Any) -> Check:
     """Return what an entry of ``metrics`` asks for; its token may still be missing."""
     given = _spelled_out(case, name, spec)
@@ -253,6 +278,11 @@ def _check(case: Case, name: str, spec: Any) -> Check:
     for key in given:
         if key not in allowed:
             raise UnknownName("key", key, allowed, f"for metric {name!r} of {case}")
+    if "expected" in given and not _takes_expected(metric):
+        raise ScaleError(
+            f"Metric {name!r} of {case} compares nothing: {metric!r} takes no expected. Leave it out, or take a metric "
+            f"that compares: {', '.join(known for known in METRICS if METRICS[known].compares)}."
+        )
     at_least, at_most = (_bound(case, name, given, key) for key in ("min", "max"))
     if at_least is None and at_most is None and built_in is not None:
         at_least = built_in.least
@@ -263,7 +293,10 @@ def _check(case: Case, name: str, spec: Any) -> Check:
     options = {key: value for key, value in given.items() if key not in SPEC_KEYS}
     expected, keep = given.get("expected", ABSENT), given.get("keep", ())
     keep = (keep,) if isinstance(keep, str) else tuple(keep)
-    return Check(name, given.get("token"), metric, expected, at_least, at_most, options, keep)
+    token = given.get("token")
+    is_of_case = token is None and built_in is not None and built_in.compares and expected is ABSENT
+    token = None if token is SINK else token
+    return Check(name, token, metric, expected, at_least, at_most, options, keep, is_of_case)
 
 
 def _spelled_out(case: Case, name: str, spec: Any) -> Mapping[str, Any]:
@@ -312,15 +345,14 @@ def _placed(check: Check, case: Case, cg: CompGraph) -> Check:
     token = check.token if check.token is not None else _meant(check, case, cg)
     cg.require_token(token)
     expected = check.expected if check.expected is not ABSENT else (case.expected or {}).get(token, ABSENT)
-    if expected is ABSENT and not callable(check.metric) and METRICS[check.metric].compares:
+    if expected is ABSENT and not callable(check.metric) and _takes_expected(check.metric):
         raise ScaleError(f"Metric {check.name!r} of {case} has nothing to compare {token!r} with. Give it expected.")
     name = f"{check.name} of {token}" if check.name in METRICS else check.name
     return replace(check, token=token, expected=expected, name=name, keep=(token,))
 
 
 def _meant(check: Check, case: Case, cg: CompGraph) -> str:
-    compares = not callable(check.metric) and METRICS[check.metric].compares
-    tokens = tuple(case.expected) if compares and case.expected else cg.sink_tokens
+    tokens = tuple(case.expected) if check.is_of_case and case.expected else cg.sink_tokens
     if len(tokens) == 1:
         return tokens[0]
     among = ", ".join(map(repr, tokens))

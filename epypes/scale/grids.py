@@ -139,6 +139,8 @@ def _values(runner: CompGraphRunner, name: str, given: Any) -> Sequence[Any]:
             f"{name}={given!r:.60} is a range, as everywhere in EPypes. For these values write {name}={listed}; "
             f"for values between two ends how='random' with n=..."
         )
+    if hasattr(given, "tolist"):
+        given = given.tolist()  # of numpy, as numbers of Python; of an array without axes the one that it holds
     if isinstance(given, str | bytes | Mapping) or not isinstance(given, Iterable):
         raise ScaleError(f"{name}={given!r:.60} is no list of values. Write {name}=[{given!r:.60}, ...].")
     values = _counted(given)
@@ -148,8 +150,6 @@ def _values(runner: CompGraphRunner, name: str, given: Any) -> Sequence[Any]:
 
 
 def _counted(given: Iterable[Any]) -> Sequence[Any]:
-    if hasattr(given, "tolist"):
-        given = given.tolist()  # of numpy, as numbers of Python
     if isinstance(given, Sequence):
         return given
     if isinstance(given, Sized) and len(given) > MOST_OUTCOMES:

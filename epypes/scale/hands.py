@@ -11,6 +11,7 @@ from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from dataclasses import replace
 from typing import Any, Final, Protocol
 
+from epypes.bundle.apart import apart
 from epypes.errors import EpypesError, ScaleError
 from epypes.run import CompGraphRunner
 from epypes.scale.atwork import Refusal, Sent, lighter, work
@@ -59,8 +60,8 @@ def said(error: BaseException) -> str:
 
 
 def own_runner(runner: CompGraphRunner) -> CompGraphRunner:
-    """Return another runner of the same graph, with the same hyperparameters."""
-    return CompGraphRunner(runner.cg, runner.hyperparameters, workers=runner.workers, guard=runner.guard)
+    """Return another runner of the same graph, with the same hyperparameters; the user's nodes see nothing of it."""
+    return CompGraphRunner(apart(runner.cg), runner.hyperparameters, workers=runner.workers, guard=runner.guard)
 
 
 class Threads:

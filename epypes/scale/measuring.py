@@ -87,12 +87,17 @@ def measured(outcome: Outcome, case: Case, checks: tuple[Check, ...], cg: CompGr
 
 @dataclass(frozen=True, slots=True)
 class _Verdict:
-    """What was measured, why it does not do, what failed, and how it looks; passed where there is no reason."""
+    """What was measured, why it does not do, what failed, and how it looks."""
 
     value: float | None
     reason: str = ""
     trouble: Trouble | None = None
     pictures: Mapping[str, Thumbnail] = field(default_factory=dict)
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing failed, and there is no reason why it does not do."""
+        return self.trouble is None and not self.reason
 
 
 def _outcome(outcome: Outcome, case: Case, check: Check, cg: CompGraph) -> CheckOutcome:
@@ -105,7 +110,7 @@ def _outcome(outcome: Outcome, case: Case, check: Check, cg: CompGraph) -> Check
         check.token,
         verdict.value,
         check.threshold,
-        not verdict.reason,
+        verdict.passed,
         " ".join(verdict.reason.split())[:_REASON_CHARACTERS],
         verdict.trouble,
         outcome.total_ns,
@@ -127,7 +132,7 @@ def _judged(outcome: Outcome, case: Case, check: Check, cg: CompGraph) -> _Verdi
         verdict = _Verdict(number, _shortfall(number, check, value, expected))
     except (Exception, SystemExit) as error:  # whatever a user's metric raises
         verdict = _failed(error, check)
-    if check.token is None or expected is None or not verdict.reason or not outcome.thumbnails:
+    if check.token is None or expected is None or verdict.passed or not outcome.thumbnails:
         return verdict
     return replace(verdict, pictures=pictures_of(value, expected, cg, check.token))
 
@@ -196,10 +201,10 @@ def _differing(value: Any, expected: Any) -> str:
 
 def _failed(error: BaseException, check: Check) -> _Verdict:
     """Return the verdict where nothing could be measured."""
-    message = str(error)
+    message = str(error).strip()
     if isinstance(error, KeyError) and check.token is None:
         message = f"no token {message} is kept. If the graph has it, give the metric keep=[{message}]."
     trouble = Trouble("", type(error).__name__, message)
-    # Our own sentences say all; of a user's metric the kind of error does.
-    is_ours = isinstance(error, EpypesError) or not callable(check.metric)
+    # Our own sentences say all; of a user's metric, and where there is no text, the kind of error does.
+    is_ours = bool(message) and (isinstance(error, EpypesError) or not callable(check.metric))
     return _Verdict(None, message if is_ours else str(trouble), trouble)

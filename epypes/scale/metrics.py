@@ -204,8 +204,9 @@ def psnr(value: Any, expected: Any, *, data_range: float | None = None) -> float
     value, expected
         Images of one shape and one dtype.
     data_range
-        The distance of the least and the largest possible value. Without, that of an integer dtype; of bool and
-        floating-point images it must be given.
+        The distance of the least and the largest possible value. Without, that of an integer dtype: if it is signed
+        and nothing that was expected is negative, of 0 and the largest, as there. Of bool and floating-point images it
+        must be given.
 
     Raises
     ------
@@ -217,10 +218,8 @@ def psnr(value: Any, expected: Any, *, data_range: float | None = None) -> float
     got, wanted = _pair(value, expected)
     if got.dtype != wanted.dtype:
         raise ValueError(f"The value is {got.dtype}, what was expected {wanted.dtype}. Give one dtype.")
-    if data_range is None:
-        if got.dtype.kind not in "iu":
-            raise ValueError(f"Of {got.dtype} images, psnr needs data_range.")
-        data_range = float(np.iinfo(got.dtype).max) - float(np.iinfo(got.dtype).min)
+    if data_range is None and got.dtype.kind not in "iu":
+        raise ValueError(f"Of {got.dtype} images, psnr needs data_range.")
     if np.array_equal(got, wanted):
         return math.inf
     try:

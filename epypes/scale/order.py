@@ -49,9 +49,14 @@ def functions_after(cg: CompGraph, token: str) -> frozenset[str]:
 
 
 def identity(value: Any) -> Hashable:
-    """Return what is equal for values that are one and the same: 1 is not True, and arrays are not compared."""
+    """Return what is equal for values that are one and the same: 1 is not True, and arrays are not compared.
+
+    0.0 is not -0.0, since a runner computes both.
+    """
     try:
         hash(value)
     except TypeError:
         return (type(value), id(value))
-    return (type(value), value)
+    if type(value) is tuple:
+        return (tuple, *map(identity, value))
+    return (type(value), repr(value) if isinstance(value, float | complex) else value)

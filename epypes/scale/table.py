@@ -36,7 +36,7 @@ def frame_of(
         ``"<function> ms"`` of what ran. A token that is called like another column has `` (token)`` after its name.
     """
     columns: dict[str, Sequence[Any]] = {"name": [outcome.name for outcome in outcomes]}
-    columns |= extra or {}
+    columns |= {column: _as_given(values) for column, values in (extra or {}).items()}
     columns["failure"] = [
         None if outcome.trouble is None else " ".join(str(outcome.trouble).split()) for outcome in outcomes
     ]
@@ -63,6 +63,12 @@ def _column(values: list[Any]) -> Any:
         except OverflowError:  # above 64 bits
             return values
     return values
+
+
+def _as_given(values: Sequence[Any]) -> Any:
+    """Return values as a column; where None is one of them it stays None, since NaN is another value."""
+    has_none = any(value is None for value in values)
+    return needed("pandas").Series(list(values), dtype=object) if has_none else values
 
 
 def _in_ms(duration_ns: int | None) -> float:

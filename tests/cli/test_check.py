@@ -90,6 +90,27 @@ def test_a_set_that_fails_exits_with_1_and_says_which_case_and_why(labelled, cas
     assert [test.is_passed for test in suite] == [True, True, False]
 
 
+def things(n):
+    class Uncountable:
+        def __len__(self):
+            raise AssertionError
+
+    return [0] * n if n > 0 else Uncountable()
+
+
+def test_a_metric_that_raises_without_a_text_exits_with_1_and_is_an_error(epypes, tmp_path):
+    runner = ep.CompGraphRunner(ep.CompGraph({"things": things}, {"things": ("n", "found")}))
+    runner.run(n=3)
+    ep.promote(runner, tmp_path / "things")
+    path, junit = tmp_path / "cases.toml", tmp_path / "checks.xml"
+    path.write_text('[[case]]\ninputs = {n = 0}\n[[case.check]]\nmetric = "count"\nmin = 1\n')
+    done = epypes("check", tmp_path / "things", path, "--junit", junit)
+    assert done.returncode == 1
+    assert done.stderr.strip().endswith("First: #0, count of found: AssertionError.")
+    [suite] = junitparser.JUnitXml.fromfile(str(junit))
+    assert (suite.tests, suite.failures, suite.errors) == (1, 0, 1)
+
+
 def test_json_has_every_check(labelled, cases, epypes):
     done = epypes("check", labelled / "edges", cases(90), "--json")
     found = json.loads(done.stdout)

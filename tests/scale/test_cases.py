@@ -54,6 +54,30 @@ def test_a_metric_without_a_token_looks_at_what_is_expected_or_at_the_one_sink_t
         checks(0, {"mask": 1, "n": 2}, {"iou": 0.9})
 
 
+def test_an_expected_of_its_own_is_that_of_the_one_sink_token():
+    [equal_of_mask, check] = checks(0, {"mask": 1}, {"mine": {"metric": "equal", "expected": 5}})
+    assert (equal_of_mask.token, equal_of_mask.expected) == ("mask", 1)
+    assert (check.token, check.expected) == ("n", 5)
+
+
+def test_what_is_expected_must_be_equal_unless_a_metric_compares_it():
+    for metric, names in (("value", ["equal of n", "value of n"]), ("close", ["close of n"])):
+        case = ep.Case(0, {"n": 999}, {metric: {"token": "n", "min": 1}})
+        assert [check.name for check in checks_of(case, CG)] == names
+        assert f": {len(names)} check" in repr(case)
+    found = checks(0, {"n": 999}, {"mine": {"metric": lambda value, expected: True, "token": "n"}})
+    assert [check.name for check in found] == ["mine"]
+
+
+@pytest.mark.parametrize("metric", ["value", "count"])
+def test_a_metric_that_compares_nothing_takes_no_expected(tmp_path, metric):
+    said = f"compares nothing: '{metric}' takes no expected. Leave it out, or take a metric that compares: equal, close"
+    with pytest.raises(ScaleError, match=said):
+        ep.Case(0, metrics={"mine": {"metric": metric, "token": "n", "expected": 999, "min": 1}})
+    with pytest.raises(ScaleError, match=f"cases.toml, line 1: .*{said}"):
+        read(tmp_path, f'[[case]]\ninputs = 1\n[[case.check]]\nexpected = 999\nmetric = "{metric}"\nmin = 1\n')
+
+
 @pytest.mark.parametrize(
     ("metrics", "error", "said"),
     [
@@ -181,6 +205,15 @@ def test_a_file_of_cases_says_what_goes_in_and_what_must_come_out(tmp_path):
     assert found[2] == ("equal of n", "n", "at least 1", 4)
     assert (right.name, right.inputs) == ("right.png", tmp_path / "sub" / "right.png")
     assert checks_of(right, CG) == ()
+
+
+def test_a_check_without_a_token_is_of_the_one_sink_token_whatever_others_of_its_case_expect(tmp_path):
+    other = '[[case]]\ninputs = 1\n[[case.check]]\ntoken = "mask"\nexpected = 2\n'
+    [case] = read(tmp_path, f"{other}[[case.check]]\nexpected = 3\n")
+    assert [(check.token, check.expected) for check in checks_of(case, CG)] == [("mask", 2), ("n", 3)]
+    [case] = read(tmp_path, f'{other}[[case.check]]\nmetric = "iou"\nmin = 0.5\n')
+    with pytest.raises(ScaleError, match="has nothing to compare 'n' with. Give it expected"):
+        checks_of(case, CG)
 
 
 def test_two_checks_of_one_metric_and_token_are_both_made(tmp_path):

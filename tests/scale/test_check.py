@@ -138,6 +138,34 @@ def test_what_goes_wrong_in_a_case_fails_that_case_alone(runner, coins, tmp_path
     assert str(result) == "5 of 6 cases failed: shapes, no file, no input, fails, metrics"
 
 
+class Uncountable:
+    """What can't be counted, for a reason without a word."""
+
+    def __len__(self):
+        raise AssertionError
+
+
+@pytest.mark.parametrize("text", ["", " \n"])
+def test_a_metric_that_raises_without_a_text_fails_and_is_an_error(text, tmp_path):
+    def raises(run, case):
+        raise MemoryError(text)
+
+    runner = ep.CompGraphRunner(ep.CompGraph({"make": lambda n: Uncountable()}, {"make": ("n", "things")}))
+    result = ep.check(runner, [ep.Case(1, metrics={"count": (1, 3), "mine": raises})])
+    assert not result
+    assert [(one.passed, one.reason, one.value) for one in result.outcomes] == [
+        (False, "AssertionError", None),
+        (False, "MemoryError", None),
+    ]
+    assert [one.trouble.kind for one in result.outcomes] == ["AssertionError", "MemoryError"]
+    [suite] = junitparser.JUnitXml.fromfile(str(result.to_junit(tmp_path / "checks.xml")))
+    assert (suite.tests, suite.failures, suite.errors) == (2, 0, 2)
+    assert [(test.result[0].type, test.result[0].message) for test in suite] == [
+        ("AssertionError", "AssertionError"),
+        ("MemoryError", "MemoryError"),
+    ]
+
+
 def test_inputs_may_be_files_of_arrays(runner, coins, tmp_path):
     np.save(tmp_path / "coins.npy", coins)
     mask = coins > 100

@@ -141,6 +141,16 @@ def test_psnr_is_that_of_scikit_image():
         psnr(one, other / 255)
 
 
+@pytest.mark.parametrize("least", ["least", "zero"])
+@pytest.mark.parametrize("dtype", ["int8", "int16", "int32", "int64", ">i2", "uint8", "uint16", "uint32", "uint64"])
+def test_psnr_of_integers_is_that_of_scikit_image_whatever_their_sign(dtype, least):
+    rng, most = np.random.default_rng(1), np.iinfo(dtype)
+    low = most.min if least == "least" else 0
+    one, other = (rng.integers(low, most.max, (20, 30), np.dtype(dtype).newbyteorder("=")) for _ in range(2))
+    one, other = one.astype(dtype), other.astype(dtype)
+    assert psnr(one, other) == peak_signal_noise_ratio(other, one)
+
+
 @pytest.mark.parametrize("name", [name for name, metric in METRICS.items() if metric.compares])
 def test_another_shape_is_a_reason_and_no_number(name):
     with pytest.raises(ValueError, match="The shapes differ: the value is uint8 2 x 3, what was expected uint8 3 x 2"):

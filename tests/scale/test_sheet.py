@@ -75,6 +75,12 @@ def test_settings_that_fill_no_table_stand_one_after_another_each_with_its_label
     assert all(tile.label.startswith("offset ") for tile in laid.tiles)
 
 
+def test_zeros_of_either_sign_are_two_values_since_both_are_run(runner: ep.CompGraphRunner) -> None:
+    sheet = ep.sweep(runner, {"offset": [0.0, -0.0], "gain": [(0.0,), (-0.0,), (0.0,)]}).sheet()
+    assert (sheet.row_labels, sheet.column_labels) == (("0.0", "-0.0"), ("(0.0,)", "(-0.0,)"))
+    assert places(sheet.blocks[0].rows) == [[[0, 2], [1]], [[3, 5], [4]]]
+
+
 def test_any_token_that_has_pictures_can_be_shown(runner: ep.CompGraphRunner) -> None:
     result = ep.sweep(runner, {"offset": [1, 2]}, show=["image"])
     assert result.sheet().token == "image"

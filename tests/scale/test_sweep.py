@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -143,6 +145,37 @@ def test_the_given_runner_is_left_as_it_was(runner: ep.CompGraphRunner, image: A
 
 
 @pytest.mark.parametrize("threads", EXECUTORS)
+def test_nodes_and_pipelines_of_the_graph_are_left_as_they_were(threads: int | None) -> None:
+    def times(x: float, gain: float = 2.0) -> float:
+        return x * gain
+
+    deepest = ep.Pipeline("deepest", ep.CompGraph.from_functions(times), {"gain": 3.0})
+    nested = ep.CompGraph(
+        {"deepest": deepest, "less": lambda b, k: b - k}, {"deepest": ("a", "b"), "less": (("b", "k"), "c")}
+    )
+    scaled = ep.Pipeline("scaled", nested, {"k": 1})
+    plus = ep.Node("plus", lambda c, y: c + y)
+    functions = {"scaled": ep.Node("outer", scaled), "plus": plus}
+    cg = ep.CompGraph(functions, {"scaled": ("x", "c"), "plus": (("c", "y"), "z")})
+    runner = ep.CompGraphRunner(cg, {"y": 1})
+    runner.run(x=3)
+
+    def state() -> tuple[Any, ...]:
+        nodes = (scaled, deepest, plus, cg.functions["scaled"], *scaled.network.nodes.values())
+        return (*((node.run_count, node.traverse_time()) for node in nodes), scaled.runner.last, deepest.runner.last)
+
+    before = state()
+    with nullcontext() if threads is None else ThreadPoolExecutor(threads) as executor:
+        swept = ep.sweep(runner, {"y": [1, 2]}, [5, 6], executor)
+        mapped = ep.map(runner, [7], executor)
+        ep.check(runner, [8], executor)
+        ep.optimize(runner, "z", [{"x": 9}], 3, ranges={"y": (0, 3)}, executor=executor)
+    assert state() == before
+    assert (scaled["b"], deepest["times"]) == (9, 9)
+    assert [one.values["z"] for one in (*swept, *mapped)] == [15, 16, 18, 19, 21]
+
+
+@pytest.mark.parametrize("threads", EXECUTORS)
 def test_a_failing_setting_is_a_row_with_its_failure_and_the_others_go_on(
     runner: ep.CompGraphRunner, image: Any, threads: int | None
 ) -> None:
@@ -190,6 +223,15 @@ def test_a_hyperparameter_that_is_called_like_a_column_has_one_of_its_own() -> N
     assert list(frame["name (hyperparameter)"]) == [1, 2]
     assert list(frame["failure (token)"]) == [11, 12]
     assert list(frame["name"]) == ["#0", "#0"]
+
+
+def test_none_in_a_grid_is_none_in_the_table() -> None:
+    cg = ep.CompGraph({"f": lambda x, gain, size: x}, {"f": (("x", "gain", "size"), "y")})
+    grid = [{"gain": None, "size": 1}, {"gain": 0.5, "size": 2}, {"gain": math.nan, "size": 3}]
+    frame = ep.sweep(ep.CompGraphRunner(cg, {"gain": 1, "size": 1}), grid, [10]).to_frame()
+    assert frame["gain"].to_list()[:2] == [None, 0.5]
+    assert math.isnan(frame["gain"][2])
+    assert frame["size"].dtype == np.int64
 
 
 def test_without_images_nothing_can_be_swept_before_a_run(runner: ep.CompGraphRunner) -> None:
