@@ -30,14 +30,11 @@ class Item:
         Of a file its name, relative to the folder that was given; otherwise its place, as ``"#3"``.
     payload
         Values by free source token; a Path stands for an image file, which is read where the item is run.
-    stamp
-        Size and time of its files, which tells that a file is another one now; "" for what is no file.
     """
 
     number: int
     name: str
     payload: Mapping[str, Any]
-    stamp: str = ""
 
 
 def items_of(images: Any, runner: CompGraphRunner) -> Iterator[Item]:
@@ -130,20 +127,11 @@ def _endings() -> str:
 
 def _of_files(files: list[Path], root: Path, token: str) -> Iterator[Item]:
     for number, file in enumerate(files):
-        yield Item(number, _name(file, root), {token: file.absolute()}, stamp_of(file))
+        yield Item(number, _name(file, root), {token: file.absolute()})
 
 
 def _name(file: Path, root: Path) -> str:
     return str(file.relative_to(root)) if file.is_relative_to(root) else str(file)
-
-
-def stamp_of(file: Path) -> str:
-    """Return what tells that a file is another one now; "" if it can't be had, as of one that is not there."""
-    try:
-        found = file.stat()
-    except OSError:
-        return ""
-    return f"{found.st_size}-{found.st_mtime_ns}"
 
 
 # -- values -----------------------------------------------------------------------------------------------------
@@ -178,7 +166,7 @@ def _item(number: int, value: Any, free: tuple[str, ...]) -> Item:
         if set(value) != set(free):
             named, wanted = (", ".join(map(str, names)) or "nothing" for names in (value, free))
             raise ScaleError(f"Item #{number} gives {named}; the graph's free source tokens are: {wanted}.")
-        given = dict(value)
+        given = {token: value[token] for token in free}
     else:
         if value is None:
             raise ScaleError(f"Item #{number} is None, which is no image. Leave it out.")
@@ -186,7 +174,7 @@ def _item(number: int, value: Any, free: tuple[str, ...]) -> Item:
     files = [file for file in given.values() if isinstance(file, Path)]
     # Whoever reads it may stand in another folder.
     payload = {token: file.absolute() if isinstance(file, Path) else file for token, file in given.items()}
-    return Item(number, ", ".join(map(str, files)) or f"#{number}", payload, ", ".join(map(stamp_of, files)))
+    return Item(number, ", ".join(map(str, files)) or f"#{number}", payload)
 
 
 def _only(free: tuple[str, ...], given: str) -> str:

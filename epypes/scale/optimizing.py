@@ -15,6 +15,7 @@ from epypes.bundle import to_source
 from epypes.errors import EpypesError, ScaleError
 from epypes.run import CompGraphRunner
 from epypes.scale.cases import Case, cases_of, with_labels_read
+from epypes.scale.digests import Untold
 from epypes.scale.hands import own_runner
 from epypes.scale.items import Item, items_of
 from epypes.scale.job import Job
@@ -22,6 +23,7 @@ from epypes.scale.optimized import OptimizeResult
 from epypes.scale.outcome import Outcome
 from epypes.scale.progress import progress_bar
 from epypes.scale.ranging import Axis, axes_of
+from epypes.scale.remembered import contents_of
 from epypes.scale.scoring import Metric, Score, Scoring
 from epypes.scale.spreading import spread, worker_count
 from epypes.scale.studying import Asked, Direction, Search, Trial
@@ -84,7 +86,7 @@ def optimize(
         Path, URL or ``ep.Store`` of a database that keeps the trials, in Optuna's own tables. A second call goes on.
     name
         Of the study in the store; without, it follows from the graph and its other hyperparameters, from what is
-        searched, from the metric's source, and from the names of the cases and the state of their files.
+        searched, from the metric's source, and from the names of the cases and what goes into them.
     stop
         Ends the search once it is set: when the function that runs has returned. So does Ctrl+C, at once. What has
         been found until then is returned.
@@ -150,7 +152,7 @@ def _cases(given: Any, runner: CompGraphRunner) -> tuple[Case, ...]:
 
 def _items(cases: Sequence[Case], runner: CompGraphRunner) -> Iterator[Item]:
     for number, item in enumerate(items_of([case.inputs for case in cases], runner)):
-        yield Item(number, cases[number].name or item.name, item.payload, item.stamp)
+        yield Item(number, cases[number].name or item.name, item.payload)
 
 
 def _name(
@@ -161,10 +163,11 @@ def _name(
     fixed = {token: value for token, value in runner.hyperparameters.items() if token not in varied}
     try:
         source = to_source(runner.cg, fixed)
-    except EpypesError as error:
+        inputs = [(item.name, contents_of(item.payload)) for item in items]
+    except (EpypesError, Untold) as error:
         text = f"What is searched has no name for the store: {error}"
         raise ScaleError(f"{text}\nGive one: name='...'.") from error
-    said = repr((source, axes, scoring.source, direction, [(item.name, item.stamp) for item in items]))
+    said = repr((source, axes, scoring.source, direction, inputs))
     return f"optimize {scoring.name} {hashlib.sha256(said.encode()).hexdigest()[:12]}"
 
 
@@ -230,7 +233,7 @@ class _Work:
             pending[one.number] = _Pending(one)
             for item, own in zip(self.items, self.own, strict=True):
                 number = one.number * len(self.items) + item.number
-                marked = Item(number, item.name, item.payload, item.stamp)
+                marked = Item(number, item.name, item.payload)
                 keep = self.scoring.keep
                 yield Job((marked,), ({**one.setting, **own},), keep=keep, targets=keep)
 

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from time import monotonic
+from types import MappingProxyType
 from typing import Any, Final
 
 from epypes.bundle import to_source
 from epypes.errors import PlaceholderNeeded, ScaleError, SourceRefused
 from epypes.run import CompGraphRunner
-from epypes.run.guard import is_plain_array
+from epypes.scale.digests import Untold, digest_of, file_digest, joined, told
 from epypes.scale.items import Item
 from epypes.scale.outcome import Outcome
 from epypes.store import Series, Store
 
 # What is lost at most if the process is killed; to write each outcome by itself would take longer than to make it.
 _WRITE_EVERY_S: Final = 0.5
+_NONE: Final[Mapping[str, Any]] = MappingProxyType({})
 
 
 def series_of(
@@ -45,7 +47,7 @@ def series_of(
         hyperparameters.
     """
     fixed = {token: value for token, value in runner.hyperparameters.items() if token not in varied}
-    source, hyperparameters = _source_of(runner), _texts_of(fixed)
+    source, hyperparameters = _source_of(runner), _hyperparameters(fixed)
     if name is None:
         if source is None:
             text = "What this graph computes can't be written as text, which would tell it from others. Give name=."
@@ -65,17 +67,22 @@ def _source_of(runner: CompGraphRunner) -> str | None:
 
 
 def _texts_of(values: Mapping[str, Any]) -> dict[str, str]:
-    return {token: _text_of(value) for token, value in values.items()}
+    return {token: told(value) for token, value in values.items()}
 
 
-def _text_of(value: Any) -> str:
-    if is_plain_array(value):
-        return f"{value.dtype} {value.shape} {content_of(value)}"
-    return repr(value)
+def _hyperparameters(values: Mapping[str, Any]) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for token in values:
+        try:
+            found |= _texts_of({token: values[token]})
+        except Untold as error:
+            text = f"Hyperparameter {token!r} is or holds {error}: nothing tells it from others, as a store has to."
+            raise ScaleError(f"{text} Make it of numbers, texts, arrays, lists or dicts.") from error
+    return found
 
 
 def _digest(*texts: str) -> str:
-    return hashlib.sha256("\0".join(texts).encode("utf-8", "surrogatepass")).hexdigest()
+    return joined("", *texts).hex()
 
 
 def _check_same(series: Series, about: Mapping[str, Any]) -> None:
@@ -102,37 +109,52 @@ class Remembered:
         What else decides about an outcome, such as the tokens of which thumbnails are made.
     are_whole
         Whether all that is wanted of an outcome is in the store; whole values of tokens are not.
+
+    Notes
+    -----
+    An item is known again by its name and by what is in its files and values. One that holds something of which nobody
+    can say what is in it is run each time, and not written.
     """
 
     def __init__(self, series: Series, how: str = "", are_whole: bool = True) -> None:
         self._series, self._how = series, how
         self._known = series.keys() if are_whole else frozenset()
-        self._keys: dict[tuple[int, str], str] = {}
-        self._of_item = -1, ""
+        self._keys: dict[tuple[int, int], str] = {}
+        self._of_item: tuple[int, str | None] = -1, None
+        # With the settings themselves, so that no other has the identity of one.
+        self._of_settings: dict[int, tuple[Mapping[str, Any], str | None]] = {id(_NONE): (_NONE, "")}
         self._waiting: list[tuple[str, dict[str, Any]]] = []
         self._written_s = monotonic()
 
-    def recall(self, item: Item, setting: Mapping[str, Any] | None = None) -> Outcome | None:
+    def recall(self, item: Item, setting: Mapping[str, Any] = _NONE) -> Outcome | None:
         """Return the outcome of an item, under a setting, that was run before; None if it has to be run."""
-        told = _setting_text(setting or {})
-        key = f"{self._item_text(item)} {self._how}{told}"
+        of_item, of_setting = self._item_text(item), self._setting_text(setting)
+        if of_item is None or of_setting is None:
+            return None
+        key = f"{of_item} {self._how}{of_setting}"
         found = self._series.get(key) if key in self._known else None
         if found is None:
-            self._keys[item.number, told] = key
+            self._keys[item.number, id(setting or _NONE)] = key
             return None
-        return replace(Outcome.from_json(found), number=item.number, name=item.name, setting=setting or {})
+        return replace(Outcome.from_json(found), number=item.number, name=item.name, setting=setting)
 
-    def _item_text(self, item: Item) -> str:
+    def _item_text(self, item: Item) -> str | None:
         if self._of_item[0] != item.number:
-            self._of_item = item.number, f"{item.name} {item.stamp or _contents_of(item.payload)}"
+            self._of_item = item.number, _told(lambda: f"{item.name} {contents_of(item.payload)}")
         return self._of_item[1]
+
+    def _setting_text(self, setting: Mapping[str, Any]) -> str | None:
+        setting = setting or _NONE
+        if id(setting) not in self._of_settings:
+            self._of_settings[id(setting)] = setting, _told(lambda: f" {_texts_of(setting)}")
+        return self._of_settings[id(setting)][1]
 
     def add(self, outcomes: Iterable[Outcome]) -> None:
         """Take outcomes of items that had to be run."""
         for outcome in outcomes:
-            key = self._keys.pop((outcome.number, _setting_text(outcome.setting)))
+            key = self._keys.pop((outcome.number, id(outcome.setting or _NONE)), None)
             # A file that could not be read may be there the next time.
-            if outcome.trouble is None or outcome.trouble.function:
+            if key is not None and (outcome.trouble is None or outcome.trouble.function):
                 self._waiting.append((key, outcome.to_json()))
         if monotonic() - self._written_s >= _WRITE_EVERY_S:
             self.write()
@@ -145,16 +167,23 @@ class Remembered:
         self._written_s = monotonic()
 
 
-def _setting_text(setting: Mapping[str, Any]) -> str:
-    return f" {_texts_of(setting)}" if setting else ""
+def _told(what: Callable[[], str]) -> str | None:
+    try:
+        return what()
+    except Untold:
+        return None
 
 
-def _contents_of(payload: Mapping[str, Any]) -> str:
-    return _digest(*(f"{token}={_text_of(value)}" for token, value in payload.items()))[:32]
+def contents_of(payload: Mapping[str, Any]) -> str:
+    """Return what tells a payload from others: of every token the file's contents, or the value.
 
-
-def content_of(array: Any) -> str:
-    """Return a digest of what is in an array."""
-    import numpy as np
-
-    return hashlib.blake2b(np.ascontiguousarray(array).view(np.uint8).data, digest_size=16).hexdigest()
+    Raises
+    ------
+    Untold
+        A file can't be read, or nobody can say what is in a value.
+    """
+    parts = (
+        (token, file_digest(value) if isinstance(value, Path) else digest_of(value))
+        for token, value in sorted(payload.items())
+    )
+    return joined("payload", *(text for part in parts for text in part)).hex()

@@ -122,14 +122,6 @@ def test_files_are_found_from_another_folder_too(folder, runner, monkeypatch):
     assert all(opened(item, runner.cg)["image"].shape == (100, 150, 3) for item in items)
 
 
-def test_another_file_under_the_same_name_has_another_stamp(folder, runner, crops):
-    (before,) = items_of(folder / "crop0.png", runner)
-    cv2.imwrite(str(folder / "crop0.png"), crops[5][:50])
-    (after,) = items_of(folder / "crop0.png", runner)
-    assert before.name == after.name
-    assert before.stamp != after.stamp
-
-
 def test_a_text_by_token_stays_a_text_and_a_missing_file_is_told_when_it_is_opened(runner):
     text = Item(0, "#0", {"image": "no path"})
     assert opened(text, runner.cg) == {"image": "no path"}
