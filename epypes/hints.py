@@ -175,6 +175,18 @@ def _is_end(value: numbers.Real, *, is_step: bool) -> bool:
     return math.isfinite(number) if is_step else not math.isnan(number)
 
 
+def odd_step(step: float | None) -> int:
+    """Return the distance between the values of a range of odd numbers: the least even one that is not below a step.
+
+    Examples
+    --------
+    >>> odd_step(3)
+    4
+    """
+    whole = max(1, math.ceil(step or 1))
+    return whole + whole % 2
+
+
 def as_param(hint: Any) -> Param | Roi | None:
     """Read a hint: a Param or Roi, a tuple as a range (low, high[, step]), a list as choices; None if it is neither.
 

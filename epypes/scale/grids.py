@@ -16,7 +16,9 @@ from epypes.errors import ScaleError, UnknownName
 from epypes.graph import as_switch
 from epypes.hints import Param, as_param
 from epypes.run import CompGraphRunner
-from epypes.scale.sampling import drawn_by, shares, values_of
+from epypes.scale.ranging import token_below
+from epypes.scale.sampling import drawn_by, shares, span_of, values_of
+from epypes.scale.steps import kept_below
 
 How = Literal["product", "zip", "random", "latin"]
 Setting = Mapping[str, Any]
@@ -209,19 +211,28 @@ def _require_branches(runner: CompGraphRunner, name: str, values: Iterable[Any])
 
 
 def _drawn(runner: CompGraphRunner, axes: Mapping[str, Any], how: str, n: int, seed: int) -> Grid:
-    draws = {name: _draw(runner, name, given) for name, given in axes.items()}
+    params = {name: _hint(runner, name) if given is None else _as_range(name, given) for name, given in axes.items()}
+    draws = {name: _draw(runner, name, param) for name, param in params.items()}
+    bounds, present = _bounds(runner, params), runner.hyperparameters
 
     def settings() -> tuple[Setting, ...]:
         rows = shares(how, n, len(draws), seed)
-        return tuple({name: draws[name](share) for name, share in zip(draws, row, strict=True)} for row in rows)
+        drawn = ({name: draws[name](share) for name, share in zip(draws, row, strict=True)} for row in rows)
+        return tuple(kept_below(setting, bounds, present) for setting in drawn)
 
     return Grid(tuple(draws), n, settings)
 
 
-def _draw(runner: CompGraphRunner, name: str, given: Any) -> Callable[[float], Any]:
-    param = _hint(runner, name) if given is None else _as_range(name, given)
+def _draw(runner: CompGraphRunner, name: str, param: Param) -> Callable[[float], Any]:
     _require_branches(runner, name, param.choices or ())
     return drawn_by(name, param, runner.hyperparameters[name])
+
+
+def _bounds(runner: CompGraphRunner, params: Mapping[str, Param]) -> dict[str, tuple[str, Callable[[float], Any]]]:
+    """Return what each hyperparameter never exceeds that has something, and its largest value up to a number."""
+    found = {name: token_below(runner, name, param.below) for name, param in params.items()}
+    present = runner.hyperparameters
+    return {name: (above, span_of(name, params[name], present[name]).at_most) for name, above in found.items() if above}
 
 
 def _as_range(name: str, given: Any) -> Param:

@@ -37,6 +37,8 @@ class Job:
         Tokens of which thumbnails are made; None: of every token that has a picture.
     start
         What jobs with the same one item have in common; None for what travels to another process.
+    targets
+        Tokens; only what they need is run, branches that are not chosen too. Everything without.
     """
 
     items: tuple[Item, ...]
@@ -44,6 +46,7 @@ class Job:
     keep: tuple[str, ...] = ()
     show: tuple[str, ...] | None = ()
     start: Start | None = None
+    targets: tuple[str, ...] = ()
 
 
 def do(runner: CompGraphRunner, job: Job, stop: threading.Event | None = None) -> list[Outcome]:
@@ -79,7 +82,7 @@ def _of_item(runner: CompGraphRunner, item: Item, job: Job, varied: Setting) -> 
 
     def outcome_of(own: CompGraphRunner, payload: Mapping[str, Any] | None) -> Outcome:
         setting, start_ns = waiting.popleft(), perf_counter_ns()
-        run, trouble = _run(own, payload, {**varied, **setting})
+        run, trouble = _run(own, payload, {**varied, **setting}, job.targets)
         if run is None:
             return Outcome(item.number, item.name, setting, total_ns=perf_counter_ns() - start_ns, trouble=trouble)
         return _outcome(item, setting, job, run, album)
@@ -106,15 +109,15 @@ def _of_item(runner: CompGraphRunner, item: Item, job: Job, varied: Setting) -> 
 
 
 def _run(
-    runner: CompGraphRunner, payload: Mapping[str, Any] | None, values: Setting
+    runner: CompGraphRunner, payload: Mapping[str, Any] | None, values: Setting, targets: tuple[str, ...]
 ) -> tuple[Run | None, Trouble | None]:
     """Run on a payload, or on the last one; return the run, completed or failed, or why there is none."""
     before = runner.last
     try:
         if payload is None:
-            return runner.rerun(**values), None
+            return runner.rerun(*targets, **values), None
         runner.set(**values)
-        return runner.run_on(payload), None
+        return runner.run_on(payload, targets), None
     except (Exception, SystemExit) as error:  # whatever a function raises
         if runner.last is not before:
             return runner.last, None

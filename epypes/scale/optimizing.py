@@ -79,7 +79,7 @@ def optimize(
         no others vary. Without, all vary that have a range by an annotation, or by the tables of OpenCV and
         scikit-image.
     keep
-        Tokens that a metric is given; the sink tokens without.
+        Tokens that a metric is given; the sink tokens without. Only what they need is run.
     seed
         The same one tries the same, if there is no executor.
     store
@@ -235,7 +235,8 @@ class _Work:
             for item, own in zip(self.items, self.own, strict=True):
                 number = one.number * len(self.items) + item.number
                 marked = Item(number, item.name, item.payload)
-                yield Job((marked,), ({**one.setting, **own},), keep=self.scoring.keep)
+                keep = self.scoring.keep
+                yield Job((marked,), ({**one.setting, **own},), keep=keep, targets=keep)
 
 
 def _searched(

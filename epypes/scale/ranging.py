@@ -16,12 +16,10 @@ from epypes.bundle.entries import plain
 from epypes.bundle.ranges import range_of
 from epypes.errors import ScaleError, UnknownName
 from epypes.graph import CompGraph
-from epypes.hints import Param, Roi, as_param, param_from_value
+from epypes.hints import Param, Roi, as_param, odd_step, param_from_value
 from epypes.parameters import parameter_names
 from epypes.run import CompGraphRunner
-
-# What is left of a step by rounding.
-_ROUNDING = 1e-9
+from epypes.scale.steps import at_place, kept_below, last_place, odd_from
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +60,8 @@ class Span:
 
     def _on_grid(self, value: float, rounded: Any) -> Any:
         if self.step is not None:
-            steps = (value - self.low) / self.step
-            value = self.low + rounded(round(steps, 9)) * self.step
+            place = rounded(round((value - self.low) / self.step, 9))
+            value = at_place(self.low, self.high, self.step, place)
         return int(value) if self.is_integer else float(value)
 
 
@@ -142,11 +140,8 @@ def setting_of(axes: Sequence[Axis], suggested: Mapping[str, Any], present: Mapp
         The values of the other hyperparameters.
     """
     values = {axis.token: _value(axis, suggested[axis.token]) for axis in axes}
-    for axis in axes:
-        if isinstance(axis, Span) and axis.below:
-            bound = values.get(axis.below, present.get(axis.below))
-            values[axis.token] = axis.at_most(min(values[axis.token], bound))
-    return values
+    bounds = {axis.token: (axis.below, axis.at_most) for axis in axes if isinstance(axis, Span) and axis.below}
+    return kept_below(values, bounds, present)
 
 
 def suggestion_of(axes: Sequence[Axis], setting: Mapping[str, Any]) -> dict[str, Any]:
@@ -208,10 +203,10 @@ def _axis(runner: CompGraphRunner, token: str, param: Param, *, is_given: bool) 
     low, high = _ends(param)
     if param.soft is not None and not is_given:
         low, high = min(low, value), max(high, value)
-    # 1.0 is a float on purpose, and so is what it ranges over.
-    is_whole = isinstance(value, numbers.Integral)
+    # 1.0 is a float on purpose, and so is what it ranges over, unless that is odd.
+    is_whole = param.odd or isinstance(value, numbers.Integral)
     span = _stepped(Span(token, low, high, param.step, param.log, is_whole), is_odd=param.odd)
-    return replace(span, below=_token_below(runner, token, param.below))
+    return replace(span, below=token_below(runner, token, param.below))
 
 
 def _ends(param: Param) -> tuple[Any, Any]:
@@ -223,18 +218,16 @@ def _stepped(span: Span, *, is_odd: bool) -> Span:
     """Return a span whose ends are on its grid."""
     low, high, step = span.low, span.high, span.step
     if span.is_integer:
-        low, high, whole = math.ceil(low), math.floor(high), max(1, round(step or 1))
-        step = whole
-        if is_odd:
-            low, step = low + (low % 2 == 0), whole if whole % 2 == 0 else 2 * whole
+        low, high = odd_from(low) if is_odd else math.ceil(low), math.floor(high)
+        step = odd_step(step) if is_odd else max(1, round(step or 1))
     if low > high:
         raise ScaleError(f"There is no {'odd' if is_odd else 'whole'} number in the range of {span.token!r}.")
     if step is not None:
-        high = low + math.floor((high - low) / step + _ROUNDING) * step
+        high = at_place(low, high, step, last_place(low, high, step))
     return replace(span, low=low, high=high, step=step)
 
 
-def _token_below(runner: CompGraphRunner, token: str, name: str) -> str:
+def token_below(runner: CompGraphRunner, token: str, name: str) -> str:
     """Return the hyperparameter that a hint calls by its own name or by that of a function's parameter."""
     if not name or name in runner.hyperparameters:
         return name

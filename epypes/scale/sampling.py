@@ -6,14 +6,12 @@ import math
 import numbers
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 from epypes.errors import ScaleError
-from epypes.hints import Param
+from epypes.hints import Param, odd_step
 from epypes.scale.needed import needed
-
-# A range of 0 to 0.3 in steps of 0.1 has four values, though 0.3 / 0.1 is a little less than 3.
-_SLACK: Final = 1e-9
+from epypes.scale.steps import at_place, last_place, odd_from
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,41 +26,41 @@ class Span:
         The distance between two values; None if all between the ends are.
     log
         Whether as many values are drawn below the geometric mean of the ends as above it.
-    whole
-        Whether the values are integers.
     """
 
     low: float
     high: float
     step: float | None
     log: bool
-    whole: bool
 
     @property
     def size(self) -> int:
         """How many values there are; 0 if they can't be counted."""
-        return 0 if self.step is None else math.floor((self.high - self.low) / self.step + _SLACK) + 1
+        return 0 if self.step is None else last_place(self.low, self.high, self.step) + 1
 
     def value(self, place: int) -> float:
         """Return the value of this place, for a span that has steps."""
-        return self._told(self.low + place * (self.step or 0))
+        return self.low if self.step is None else at_place(self.low, self.high, self.step, place)
 
     def at(self, share: float) -> float:
         """Return the value that lies so far, from 0 to below 1, on the way from low to high."""
         if self.step is not None and not self.log:
             return self.value(min(int(share * self.size), self.size - 1))
         value = self._between(share)
-        if self.step is None:
-            return self._told(value)
-        return self.value(min(max(round((value - self.low) / self.step), 0), self.size - 1))
+        return min(max(float(f"{value:.12g}"), self.low), self.high) if self.step is None else self._near(value, round)
+
+    def at_most(self, value: float) -> float:
+        """Return the largest value that does not exceed a number; the smallest of all if none does."""
+        return min(max(value, self.low), self.high) if self.step is None else self._near(value, math.floor)
+
+    def _near(self, value: float, rounded: Callable[[float], int]) -> float:
+        steps = round((value - self.low) / (self.step or 1), 9)
+        return self.value(min(max(rounded(steps), 0), self.size - 1))
 
     def _between(self, share: float) -> float:
         if self.log:
             return min(self.low * math.exp(share * math.log(self.high / self.low)), self.high)
         return self.low + share * (self.high - self.low)
-
-    def _told(self, value: float) -> float:
-        return round(value) if self.whole else float(f"{value:.12g}")
 
 
 def values_of(name: str, param: Param, present: Any, most: int) -> Sequence[Any]:
@@ -112,10 +110,10 @@ def span_of(name: str, param: Param, present: Any) -> Span:
     whole = param.odd or _is_whole(low, high, param.step, present)
     step = param.step or (1 if whole else None)
     if param.odd:
-        step, low = max(2, round(step or 2)), math.ceil(low) + (math.ceil(low) % 2 == 0)
+        step, low = odd_step(param.step), odd_from(low)
     if low > high:
         raise ScaleError(f"There is no odd value between {low} and {high} for {name!r}. Widen its range.")
-    return Span(low, high, step, param.log, whole)
+    return Span(low, high, step, param.log)
 
 
 def _is_whole(low: float, high: float, step: float | None, present: Any) -> bool:

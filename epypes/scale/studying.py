@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from epypes.errors import ScaleError
 from epypes.scale.needed import needed
-from epypes.scale.ranging import Axis, Choices, setting_of, suggestion_of
+from epypes.scale.ranging import Axis, Choices, Span, setting_of, suggestion_of
+from epypes.scale.steps import ends_on_step
 from epypes.store.place import connect_options
 
 if TYPE_CHECKING:
@@ -197,11 +198,16 @@ def _distribution(axis: Axis) -> optuna.distributions.BaseDistribution:
 
     if isinstance(axis, Choices):
         return CategoricalDistribution(axis.labels)
-    # On a logarithmic scale Optuna has no steps: what it suggests is brought onto the grid.
-    step = None if axis.log else axis.step
+    # On a logarithmic scale Optuna has no steps, nor such as end beside the range: what it suggests is brought onto
+    # the grid.
+    step = None if axis.log or not _ends_on_step(axis) else axis.step
     if axis.is_integer:
         return IntDistribution(int(axis.low), int(axis.high), log=axis.log, step=int(step or 1))
     return FloatDistribution(axis.low, axis.high, log=axis.log, step=step)
+
+
+def _ends_on_step(axis: Span) -> bool:
+    return axis.step is not None and ends_on_step(axis.low, axis.high, axis.step)
 
 
 def _said_of(distributions: Mapping[str, Any]) -> str:

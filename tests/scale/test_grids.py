@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -23,6 +24,10 @@ def shift(
     method: str,
 ) -> float:
     return (x + offset) * scale * kernel
+
+
+def add(x: float, k: float) -> float:
+    return x + k
 
 
 @pytest.fixture
@@ -80,6 +85,45 @@ def test_drawn_settings_are_within_their_ranges_and_the_same_for_a_seed(runner: 
     assert {one["method"] for one in made} == {"near", "far"}
     assert made == settings(runner, grid, how=how, n=40, seed=7)
     assert made != settings(runner, grid, how=how, n=40, seed=8)
+
+
+STEPPED = [
+    (ep.Param(1, 31, odd=True, step=3), 5, [1, 5, 9, 13, 17, 21, 25, 29]),
+    (ep.Param(4, 12, odd=True, step=1), 5, [5, 7, 9, 11]),
+    (ep.Param(1.0, 9.0, odd=True), 3.0, [1, 3, 5, 7, 9]),
+    (ep.Param(0.1, 0.3, step=0.1), 0.3, [0.1, 0.2, 0.3]),
+    (ep.Param(-0.3, 0.6, step=0.3), 0.0, [-0.3, 0.0, 0.3, 0.6]),
+    (ep.Param(0.0, 2.0, step=2 / 3), 0.0, [0.0, 0.6666666666666666, 1.3333333333333333, 2.0]),
+    (ep.Param(1 / 3, 0.7, step=0.1), 1 / 3, [1 / 3, 0.4333333333333333, 0.5333333333333333, 0.6333333333333333]),
+]
+
+
+@pytest.mark.parametrize(("hint", "present", "allowed"), STEPPED)
+def test_a_sweep_and_a_search_take_the_same_values_of_a_range_and_its_hint_allows_them(
+    hint: ep.Param, present: float, allowed: list[float], tmp_path: Path
+) -> None:
+    runner = ep.CompGraphRunner(ep.CompGraph.from_functions(add), {"k": present})
+    assert list(map(repr, (one["k"] for one in settings(runner, {"k": hint})))) == list(map(repr, allowed))
+    assert {one["k"] for one in settings(runner, {"k": hint}, how="random", n=60)} == set(allowed)
+    found = ep.optimize(runner, "add", [1], 60, ranges={"k": hint}, store=tmp_path / "trials.sqlite")
+    assert {trial.setting["k"] for trial in found} == set(allowed)
+    assert len(ep.optimize(runner, "add", [1], 61, ranges={"k": hint}, store=tmp_path / "trials.sqlite")) == 61
+    assert all(hint.allows(value) for value in allowed)
+
+
+@pytest.mark.parametrize("how", ["random", "latin"])
+def test_a_drawn_value_never_exceeds_the_one_that_it_is_to_stay_below(how: str) -> None:
+    def between(x: float, low: Annotated[int, ep.Param(1, 31, odd=True, below="high")], high: int, top: float) -> int:
+        return low
+
+    cg = ep.CompGraph({"between": between}, {"between": (("x", "least", "most", "top"), "y")})
+    runner = ep.CompGraphRunner(cg, {"least": 1, "most": 9, "top": 12.5})
+    assert max(one["least"] for one in settings(runner, ["least"], how=how, n=40)) == 9
+    ranges = {"least": None, "most": ep.Param(1, 31, below="top")}
+    made = settings(runner, ranges, how=how, n=40)
+    assert all(one["least"] <= one["most"] <= 12 and one["least"] % 2 == 1 for one in made)
+    found = ep.optimize(runner, "y", [0.0], 30, ranges={"least": ep.Param(1, 31, below="most"), "most": ranges["most"]})
+    assert all(trial.setting["least"] <= trial.setting["most"] <= 12 for trial in found)
 
 
 def test_latin_hypercubes_take_each_part_of_a_range_once(runner: ep.CompGraphRunner) -> None:

@@ -14,6 +14,7 @@ from epypes.scale.items import Item, items_of
 from epypes.scale.job import Job, do
 from epypes.scale.outcome import Outcome, Thumbnail, Trouble
 from epypes.scale.table import frame_of
+from epypes.scale.travel import packed_job, unpacked_job
 
 
 @pytest.fixture
@@ -40,6 +41,16 @@ def counted(calls):
         {"double": ("image", "doubled"), "add": (("doubled", "offset", "limit"), "total")},
     )
     return ep.CompGraphRunner(cg, {"offset": 0, "limit": 1000})
+
+
+def test_only_what_the_targets_need_is_run(counted, calls):
+    job = Job((item(),), ({"offset": -1}, {"offset": -2}), keep=("doubled", "total"), targets=("doubled",))
+    outcomes = do(counted, job)
+    assert calls == {"double": 1}
+    assert [(list(outcome.kept), outcome.values, outcome.trouble) for outcome in outcomes] == [
+        (["doubled"], {}, None)
+    ] * 2
+    assert unpacked_job(packed_job(job), {}).targets == ("doubled",)
 
 
 def item(number=0):

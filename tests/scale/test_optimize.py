@@ -239,6 +239,38 @@ def test_threads_give_the_values_that_one_thread_gives(runner: ep.CompGraphRunne
         assert trial.value == pytest.approx(sum(expected) / 3)
 
 
+@pytest.mark.parametrize("asked", [["score"], ["score", "y"], ["odds"], ["y"]])
+def test_an_executor_runs_what_this_thread_runs_and_that_is_what_the_metric_needs(asked: list[str]) -> None:
+    called = set()
+
+    def score(x: int, k: int) -> float:
+        called.add("score")
+        return float(x * k)
+
+    def odds(x: int, k: int) -> float:
+        called.add("odds")
+        return float(k % 2)
+
+    def overlay(x: int, k: int) -> None:
+        raise ValueError("nobody has asked for it")
+
+    def total(tokens: Mapping[str, Any], _case: ep.Case) -> float:
+        return float(sum(tokens.values()))
+
+    chosen = ep.switch("choose", {"one": "score", "other": "odds"}, by="which", output="y")
+    cg = ep.CompGraph.from_functions(score, odds, overlay) | chosen
+    runner = ep.CompGraphRunner(cg, {"k": 3, "which": "one"})
+    with ThreadPoolExecutor(1) as threads:
+        found = []
+        for executor in (None, threads):
+            called.clear()
+            result = ep.optimize(runner, total, [2], 1, ranges={"k": (0, 10)}, keep=asked, executor=executor)
+            found.append((result.best_value, set(called)))
+    # What is not chosen is run if it is asked for.
+    values = {"score": 6.0, "odds": 1.0, "y": 6.0}
+    assert found == [(sum(values[token] for token in asked), {"odds"} if asked == ["odds"] else {"score"})] * 2
+
+
 @pytest.mark.slow
 def test_processes_run_trials_and_the_metric_stays_here(tmp_path: Path) -> None:
     cg = ep.CompGraph({"canny": cv2.Canny}, {"canny": (("image", "lo", "hi"), "edges")})

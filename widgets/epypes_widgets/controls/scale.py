@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from epypes.display.previews.short import short_repr
-from epypes.hints import Param
+from epypes.hints import Param, odd_step
 from epypes_widgets.controls.kinds import like, limits, plain
 from epypes_widgets.movable import is_integer, is_number
 from epypes_widgets.ranges import allows, described
@@ -193,8 +193,7 @@ def _step(param: Param, low: float, high: float, integer: bool) -> float:
         span = exponent(high) - exponent(low)
         return min(max(span / 200, 1e-3), span / 20)
     if integer:
-        step = max(int(param.step or 1), 1)
-        return step + step % 2 if param.odd else step
+        return odd_step(param.step) if param.odd else max(int(param.step or 1), 1)
     # Smaller than what the greatest numbers of the range differ by, a step would lead nowhere.
     least = math.ulp(max(abs(low), abs(high)))
     return max(float(param.step or 10.0 ** math.floor(math.log10(max((high - low) / 100, least)))), least)
