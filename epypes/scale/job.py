@@ -34,7 +34,7 @@ class Job:
     keep
         Tokens whose values are kept.
     show
-        Tokens of which thumbnails are made; None: of every token that has a picture.
+        Tokens of which thumbnails are made; None: of every token that has a picture. What has none is told as text.
     start
         What jobs with the same one item have in common; None for what travels to another process.
     targets
@@ -126,6 +126,7 @@ def _run(
 
 def _outcome(item: Item, setting: Setting, job: Job, run: Run, album: Album) -> Outcome:
     report, tokens = run.report, run.tokens
+    thumbnails, texts = album.shown_of(run, job.show) if job.show != () else ({}, {})
     return Outcome(
         item.number,
         item.name,
@@ -134,8 +135,9 @@ def _outcome(item: Item, setting: Setting, job: Job, run: Run, album: Album) -> 
         report.durations_ns,
         report.total_ns,
         None if run.failure is None else _trouble(run.failure),
-        album.thumbnails_of(run, job.show) if job.show != () else {},
+        thumbnails,
         {token: run[token] for token in job.keep if tokens.is_readable(token)},
+        texts,
     )
 
 

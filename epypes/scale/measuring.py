@@ -132,7 +132,7 @@ def _judged(outcome: Outcome, case: Case, check: Check, cg: CompGraph) -> _Verdi
         verdict = _Verdict(number, _shortfall(number, check, value, expected))
     except (Exception, SystemExit) as error:  # whatever a user's metric raises
         verdict = _failed(error, check)
-    if check.token is None or expected is None or verdict.passed or not outcome.thumbnails:
+    if check.token is None or expected is None or verdict.passed or not (outcome.thumbnails or outcome.texts):
         return verdict
     return replace(verdict, pictures=pictures_of(value, expected, cg, check.token))
 

@@ -75,6 +75,8 @@ class Outcome:
         By token, if they were asked for.
     kept
         Whole values by token, if they were asked for.
+    texts
+        Of tokens whose pictures were asked for and that have none: what is said of them instead.
     """
 
     number: int
@@ -86,6 +88,7 @@ class Outcome:
     trouble: Trouble | None = None
     thumbnails: Mapping[str, Thumbnail] = field(default_factory=dict)
     kept: Mapping[str, Any] = field(default_factory=dict)
+    texts: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def has_failed(self) -> bool:
@@ -110,6 +113,7 @@ class Outcome:
                 }
                 for token, shown in self.thumbnails.items()
             },
+            "texts": dict(self.texts),
         }
 
     @staticmethod
@@ -128,6 +132,7 @@ class Outcome:
                 token: Thumbnail(shown["media_type"], base64.b64decode(shown["data"]), shown["caption"])
                 for token, shown in data["thumbnails"].items()
             },
+            texts=dict(data.get("texts", {})),
         )
 
 

@@ -145,9 +145,9 @@ def sheet_of(
     UnknownName
         A name is none of a token, or of a hyperparameter that was varied.
     ScaleError
-        There are no pictures of the token; or rows and columns are the same.
+        Neither pictures nor texts of the token were kept; or rows and columns are the same.
     """
-    shown = _pictured(cg, outcomes) if token is None else _require_pictures(cg, outcomes, token)
+    shown = _pictured(cg, outcomes) if token is None else _require_shown(cg, outcomes, token)
     axes = _axes(outcomes)
     is_full = math.prod(map(len, axes.values())) == len({_key(outcome, axes) for outcome in outcomes})
     laid = _laid_out(axes, is_full, rows, columns)
@@ -241,9 +241,12 @@ def _tile(place: int, outcome: Outcome, plan: _Plan) -> Tile:
 
 
 def _told(outcome: Outcome, shown: str | None) -> str:
-    """Return the value of the token that is shown, or those of all sink tokens."""
-    values = {token: value for token, value in outcome.values.items() if shown in (None, token)} or outcome.values
-    return ", ".join(f"{token} {said(value)}" for token, value in values.items())
+    """Return what is said of the token that is shown; if there is none of it, the values of all sink tokens."""
+    if shown is not None and shown in outcome.texts:
+        return outcome.texts[shown]
+    if shown is not None and shown in outcome.values:
+        return said(outcome.values[shown])
+    return ", ".join(f"{token} {said(value)}" for token, value in outcome.values.items())
 
 
 # -- which token ----------------------------------------------------------------------------------------------------
@@ -256,9 +259,22 @@ def _pictured(cg: CompGraph, outcomes: Sequence[Outcome]) -> str | None:
     return next((token for token in reversed(in_order) if token in pictured), None)
 
 
-def _require_pictures(cg: CompGraph, outcomes: Sequence[Outcome], token: str) -> str:
+def shown_tokens(cg: CompGraph, outcomes: Iterable[Outcome]) -> tuple[str, ...]:
+    """Return the tokens of which a sheet can be made, in the order of the graph: with pictures, texts or numbers."""
+    found = frozenset[str]().union(*(_shown_tokens(outcome) for outcome in outcomes))
+    return tuple(token for token in cg.tokens if token in found)
+
+
+def _shown_tokens(outcome: Outcome) -> frozenset[str]:
+    # A text among the values may stand for an image of which no picture was asked for.
+    numbers = (token for token, value in outcome.values.items() if not isinstance(value, str))
+    return frozenset((*outcome.thumbnails, *outcome.texts, *numbers))
+
+
+def _require_shown(cg: CompGraph, outcomes: Sequence[Outcome], token: str) -> str:
     cg.require_token(token)
-    if any(token in outcome.thumbnails for outcome in outcomes):
+    complete = [outcome for outcome in outcomes if outcome.trouble is None]
+    if token in shown_tokens(cg, outcomes) or not complete:
         return token
     pictured = dict.fromkeys(name for outcome in outcomes for name in outcome.thumbnails)
     there_are = f"There are pictures of {', '.join(pictured)}." if pictured else "There are none of any token."

@@ -42,10 +42,10 @@ _STYLE: Final = (
     ".epypes-contact tr{background:none!important}"
     ".epypes-contact th{font-weight:600;text-align:center!important;padding:2px 6px;white-space:nowrap}"
     ".epypes-contact .cell{box-sizing:border-box;width:calc(var(--side) + 8px);min-width:calc(var(--side) + 8px);"
-    "max-width:calc(var(--side) + 8px);padding:3px;text-align:center!important;"
+    "max-width:calc(var(--side) + 8px);height:var(--tall);padding:3px;text-align:center!important;"
     "vertical-align:top;border:1px solid #8885;white-space:normal}"
-    ".epypes-contact div.cell{display:inline-block;margin:0 4px 4px 0}"
-    ".epypes-contact img{display:block;margin:0 auto;width:var(--side);height:auto;max-height:var(--side);"
+    ".epypes-contact div.cell{display:inline-block;height:auto;min-height:var(--tall);margin:0 4px 4px 0}"
+    ".epypes-contact img{display:block;margin:0 auto;width:var(--side);height:var(--side);max-width:none;"
     "object-fit:contain}"
     ".epypes-contact span{display:-webkit-box;-webkit-box-orient:vertical;-webkit-line-clamp:7;overflow:hidden;"
     "overflow-wrap:anywhere;line-height:1.3;margin-top:2px}"
@@ -82,7 +82,9 @@ def _page(sheet: Sheet, shown: Sheet, chosen: int | None) -> str:
     blocks = "".join(_block(shown, block, look) for block in shown.blocks)
     more = f"<p>{_left_out(total - len(tiles))}</p>" if len(tiles) < total else ""
     side_px = _SIDE_PX if pictures <= _MANY else _SMALL_PX
-    return f'<div class="epypes-contact" style="--side:{side_px}px">{_heading(sheet)}{blocks}{more}{_STYLE}</div>'
+    # Where there are but texts, tiles are no higher than these.
+    sizes = f"--side:{side_px}px;--tall:{side_px + 8 if pictures else 0}px"
+    return f'<div class="epypes-contact" style="{sizes}">{_heading(sheet)}{blocks}{more}{_STYLE}</div>'
 
 
 def _left_out(number: int) -> str:
@@ -144,7 +146,7 @@ def _tile(tile: Tile, look: _Look) -> str:
         return f"{label}<span>{content(fitted(tile.text, _MESSAGE_ROOM))}</span>"
     data = base64.b64encode(picture.data).decode()
     alt = escape(fitted(tile.text, _LABEL_ROOM))
-    return f'<img src="data:{picture.media_type};base64,{data}" alt="{alt}">{label}'
+    return f'<img src="data:{picture.media_type};base64,{data}" alt="{alt}" title="{alt}">{label}'
 
 
 def smaller(thumbnail: Thumbnail, most_bytes: int) -> Thumbnail | None:

@@ -88,7 +88,8 @@ class SweepResult:
         Parameters
         ----------
         token
-            Any that has pictures; None: the last sink token that has some, else the last token.
+            Any that was shown: what has no picture is told as text. None: the last sink token that has pictures, else
+            the last token that has some.
         rows, columns
             Hyperparameters by which the pictures are laid out; None: the first two that vary. What else varies, and
             several images, give further blocks.
@@ -98,7 +99,7 @@ class SweepResult:
         UnknownName
             A name is none of a token, or of a hyperparameter that was varied.
         ScaleError
-            The token has no pictures, or rows and columns are the same.
+            Nothing of the token was kept to be shown, or rows and columns are the same.
         """
         return sheet_of(self.runner.cg, self.outcomes, token, rows, columns)
 
@@ -153,7 +154,7 @@ def sweep(
     keep
         Tokens whose values are kept in ``outcome.kept``; of all others only thumbnails, numbers and texts are.
     show
-        Tokens of which thumbnails are made; None: all that have a picture.
+        Tokens of which thumbnails are made; None: all that have a picture. What has none is told as text.
     store, name
         As for ``map``: settings that are stored already are not run again.
     progress

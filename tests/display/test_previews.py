@@ -171,6 +171,30 @@ def test_regions_are_labels_whichever_way_they_were_found(photograph):
         assert f"{len(np.unique(labels[labels > 0]))} labels" in shown.detail
 
 
+@pytest.mark.parametrize("radii", [(1,), (2,), (2, 4), (2, 8)])
+@pytest.mark.parametrize("seed", range(5))
+def test_many_small_objects_are_labels_whatever_their_size(radii, seed):
+    labels, rng = np.zeros((128, 170), np.int32), np.random.default_rng(seed)
+    for number in range(1, 36):
+        centre = (int(rng.integers(8, 162)), int(rng.integers(8, 120)))
+        cv2.circle(labels, centre, int(rng.integers(radii[0], radii[-1] + 1)), number, -1)
+    assert preview(labels).detail.endswith(f"{len(np.unique(labels)) - 1} labels")
+
+
+def test_one_object_that_fills_an_image_and_none_at_all_are_labels():
+    assert preview(np.ones((64, 64), np.int32)).detail.endswith("1 label")
+    assert preview(np.zeros((64, 64), np.int32)).detail.endswith("0 labels")
+    assert "label" not in preview(np.full((64, 64), 127, np.int32)).detail
+    assert "label" not in preview(np.zeros((64, 64), np.int16)).detail
+
+
+def test_sparse_counts_are_no_labels():
+    rng = np.random.default_rng(0)
+    for mean in (0.05, 0.3, 1):
+        for dtype in (np.int32, np.uint16):
+            assert "label" not in preview(rng.poisson(mean, (128, 170)).astype(dtype)).detail
+
+
 @pytest.mark.parametrize("name", ["dark", "gradient", "distance", "negative", "constant", "noise"])
 def test_photographs_and_measurements_are_no_labels(name, photograph):
     gray = cv2.cvtColor(photograph, cv2.COLOR_BGR2GRAY)

@@ -7,13 +7,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import epypes as ep
 from epypes.display.limits import CHARACTERS, THUMBNAIL_CHARACTERS
 from epypes.errors import ScaleError, UnknownName
 from epypes.scale.outcome import Thumbnail
-from epypes.scale.sheet import Tile
+from epypes.scale.sheet import Tile, said
 
 
 def shifted(image: Any, offset: int, gain: int) -> Any:
@@ -100,6 +101,59 @@ def test_without_pictures_values_are_shown(runner: ep.CompGraphRunner) -> None:
     result = ep.sweep(runner, {"power": [0, 1]}, show=())
     assert result.sheet().tiles[0].text == "level 1.0"
     assert "level 1.0" in html_of(result)
+
+
+def table_of(level: float) -> Any:
+    return pd.DataFrame({"level": [level]})
+
+
+def halved(level: float) -> float:
+    return level / 2
+
+
+def test_a_token_without_pictures_is_shown_as_text() -> None:
+    cg = ep.CompGraph(
+        {"mean": mean, "table": table_of, "halved": halved},
+        {
+            "mean": (("bright", "power"), "level"),
+            "table": ("level", "table"),
+            "halved": ("level", "half"),
+        },
+    )
+    runner = ep.CompGraphRunner(cg, {"power": 1})
+    runner.run(bright=np.full((9, 9), 4, np.uint8))
+    result = ep.sweep(runner, {"power": [1, 2]})
+    assert [tile.text for tile in result.sheet("level").tiles] == ["4.0", "16.0"]
+    assert [tile.text for tile in result.sheet("half").tiles] == ["2.0", "8.0"]
+    assert [tile.text for tile in result.sheet("table").tiles] == [said(table_of(4.0))] * 2
+    assert "16.0" in html_of(result.sheet("level"))
+    assert "power" not in result[0].texts
+    only = ep.sweep(runner, {"power": [1, 2]}, show=())
+    assert [tile.text for tile in only.sheet("half").tiles] == ["2.0", "8.0"]
+    with pytest.raises(ScaleError, match=r"show=\('level',\)"):
+        only.sheet("level")
+    again = ep.sweep(runner, {"power": [1, 2]}, show=("level",))
+    assert [tile.text for tile in again.sheet("level").tiles] == ["4.0", "16.0"]
+
+
+def test_a_sheet_of_failures_needs_no_pictures(runner: ep.CompGraphRunner) -> None:
+    sheet = ep.sweep(runner, {"offset": [13]}).sheet("level")
+    assert [tile.has_failed for tile in sheet.tiles] == [True]
+
+
+def test_an_image_of_one_value_is_told_by_it() -> None:
+    cg = ep.CompGraph({"level": np.full_like}, {"level": (("image", "fill"), "flat")})
+    images = [np.zeros((16, 16), np.int16), np.zeros((16, 16), np.int32), np.zeros((16, 16), np.float32)]
+    result = ep.sweep(ep.CompGraphRunner(cg, {"fill": 0}), {"fill": [0, 1, 127]}, images)
+    assert [tile.text for tile in result.sheet("flat").tiles] == [
+        *(f"int16 16 x 16, all {level}" for level in (0, 1, 127)),
+        "int32 16 x 16",
+        "int32 16 x 16",
+        "int32 16 x 16, all 127",
+        "float32 16 x 16",
+        "float32 16 x 16",
+        "float32 16 x 16, all 127.0",
+    ]
 
 
 def html_of(shown: Any) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import threading
 from collections import Counter
 from collections.abc import Callable
@@ -17,6 +18,7 @@ import pytest
 
 import epypes as ep
 from epypes.errors import PayloadError, ScaleError, UnknownName
+from tests.bundle.cells import cell
 from tests.scale.conftest import counting_runner
 
 
@@ -320,3 +322,45 @@ def test_an_interrupted_sweep_goes_on_where_it_was(runner: ep.CompGraphRunner, c
     # It went to 90, and what was done before in whole parts of the grid is there.
     assert 30 <= calls.counts["interrupted"] < 40
     assert [one.values["size"] for one in result] == [81 * (one < 100) for one in grid["threshold"]]
+
+
+SIGNED = """
+import cv2
+import numpy as np
+
+
+def gradient(image, gain):
+    return np.float32(gain) * cv2.Sobel(image[..., 0], cv2.CV_32F, 1, 0)
+
+
+def corners(gradient, quality):
+    return cv2.goodFeaturesToTrack(gradient, 20, quality, 5)
+"""
+
+
+@pytest.mark.slow
+def test_the_same_value_has_the_same_picture_whoever_makes_it_and_in_whatever_order(
+    processes: Any, crops: list[Any]
+) -> None:
+    made = cell(SIGNED)
+    cg = ep.CompGraph(
+        {"gradient": made["gradient"], "corners": made["corners"]},
+        {"gradient": (("image", "gain"), "gradient"), "corners": (("gradient", "quality"), "points")},
+    )
+    runner = ep.CompGraphRunner(cg, {"gain": 1, "quality": 0.1})
+    gains = [1, 4, 40]
+
+    def seen(executor: Any, settings: list[int], order: list[int]) -> dict[Any, Any]:
+        result = ep.sweep(runner, {"gain": settings}, [crops[number] for number in order], executor)
+        return {(one.setting["gain"], order[one.number]): one.thumbnails for one in result}
+
+    order = list(range(4))
+    expected = seen(None, gains, order)
+    assert {"image", "gradient", "points"} == set(expected[1, 0])
+    assert re.fullmatch(r"float32 100 x 150, shown from -[\d.]+ to [\d.]+", expected[1, 0]["gradient"].caption)
+    assert seen(processes, gains, order) == expected
+    with ThreadPoolExecutor(3) as threads:
+        assert seen(threads, gains, order) == expected
+    assert seen(None, gains[::-1], order[::-1]) == expected
+    mapped = ep.map(runner, crops[3::-1], show=None)
+    assert [one.thumbnails for one in mapped][::-1] == [expected[1, number] for number in order]

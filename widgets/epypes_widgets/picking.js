@@ -97,6 +97,7 @@ function render({ model, el }) {
 
   function tellTokens({ token, tokens }) {
     const choice = element("select", "", { "aria-label": "Token that is shown" });
+    if (token === null) choice.append(element("option", "", { value: "", selected: "" }, "values"));
     for (const name of tokens) choice.append(element("option", "", name === token ? { value: name, selected: "" } : { value: name }, name));
     choice.addEventListener("change", () => send({ kind: "show", token: choice.value }));
     const hint = element("span", "epypes-picker-hint", {}, "Click a tile, or press Enter on it, to set the runner to it.");

@@ -14,7 +14,7 @@ import anywidget
 from epypes.display.markup import cut
 from epypes.errors import EpypesError
 from epypes.scale.order import identity
-from epypes.scale.sheet import Block, Sheet, Tile
+from epypes.scale.sheet import Block, Sheet, Tile, shown_tokens
 from epypes.scale.sheetpage import page_of
 from epypes.scale.sweeping import SweepResult
 from epypes_widgets.route import listen_beside_cells
@@ -198,8 +198,7 @@ class Picker:
 
     @property
     def _tokens(self) -> list[str]:
-        pictured = {token for outcome in self.result for token in outcome.thumbnails}
-        return [token for token in self.result.runner.cg.tokens if token in pictured]
+        return list(shown_tokens(self.result.runner.cg, self.result))
 
     def _tell(self, content: Message, buffers: Sequence[bytes] = ()) -> None:
         if self._is_seen:

@@ -91,18 +91,20 @@ def image_sketch(array: Array, look: Look) -> Sketch:
     kind = image_kind(array, sample)
     ends = look.range_of(array)
     text = array_text(array) + _order_text(array, look)
-    said = [text, statistics_text(sample, array)]
+    said, note = [text, statistics_text(sample, array)], ""
     if kind == "labels":
         said.append(label_text(one_channel(sample)) + (" in a sample" if sample is not array else ""))
     elif kind == "mask":
         said.append("mask" if is_pooled(array) else "mask, of a sample: thin lines may be missing")
     elif not is_of_dtype(array.dtype, ends):
-        said.append(f"shown from {ends[0]:.6g} to {ends[1]:.6g}")
+        note = f"shown from {ends[0]:.6g} to {ends[1]:.6g}"
+        said.append(note)
     return Sketch(
         Preview(text, ", ".join(said)),
         lambda most_bytes: encode_small(pillow_image(array, THUMBNAIL_PX, look.order, ends, kind), most_bytes),
         is_image=True,
         scene=lambda: Scene(Backdrop(array, look.order, ends, "")),
+        note=note,
     )
 
 

@@ -6,6 +6,7 @@ What is decided from the values of a large image is decided from a strided sampl
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.display.previews.kinds import is_of
@@ -29,6 +30,10 @@ _FEW_LABELS: Final = 7
 _MOST_DISTINCT: Final = 4096
 _EQUAL_NEIGHBOURS: Final = 0.8
 _EQUAL_OF_FEW: Final = 0.6
+# Most pixels of objects a few pixels wide lie at their edge; in sparse counts hardly a pixel has an equal neighbour.
+_EQUAL_OF_SMALL: Final = 0.2
+# Integers so wide are hardly a camera's.
+_WIDE_BYTES: Final = 4
 _SMALL_STEPS: Final = 0.8
 
 
@@ -87,8 +92,12 @@ def _is_labels(image: Array, sample: Array) -> bool:
     if image.ndim != 2 or image.dtype.kind not in "iu" or not sample.size:
         return False
     least, largest = int(sample.min()), int(sample.max())
-    if least < -1 or not 1 <= largest <= _MOST_LABELS.get(image.dtype.itemsize, largest):
+    is_wide = image.dtype.itemsize >= _WIDE_BYTES
+    if least < -1 or not (0 if is_wide else 1) <= largest <= _MOST_LABELS.get(image.dtype.itemsize, largest):
         return False
+    if least == largest:
+        # One object that fills the image, or none; larger numbers are rather measured.
+        return is_wide and largest <= 1
     return _has_pieces(image, largest) and _has_few_values(sample, largest)
 
 
@@ -98,23 +107,44 @@ def _has_few_values(sample: Array, largest: int) -> bool:
     return largest <= _MOST_DISTINCT or len(np.unique(sample)) <= _MOST_DISTINCT
 
 
-def _has_pieces(image: Array, largest: int) -> bool:
-    """Whether most neighbours are equal, of those that are not background.
+@dataclass(frozen=True, slots=True)
+class _Neighbours:
+    """How many pairs of pixels there are: touching an object, within objects, equal within them, differing, by one."""
 
-    In a dark and blurred photograph they are, too, but there they differ by one where they differ.
-    """
+    touching: int
+    within: int
+    equal: int
+    by_one: int
+
+    @property
+    def differing(self) -> int:
+        return self.touching - self.equal
+
+
+def _has_pieces(image: Array, largest: int) -> bool:
+    """Whether most neighbours are equal, of those that are not background."""
+    pairs = _neighbours(image)
+    least_equal = _EQUAL_OF_FEW if largest <= _FEW_LABELS else _EQUAL_NEIGHBOURS
+    if image.dtype.itemsize >= _WIDE_BYTES:
+        return pairs.equal > 0 and (
+            pairs.equal >= least_equal * pairs.within and pairs.equal >= _EQUAL_OF_SMALL * pairs.touching
+        )
+    # In a dark and blurred photograph most are equal, too, but there they differ by one where they differ.
+    is_smooth = largest > _FEW_LABELS and pairs.by_one > _SMALL_STEPS * pairs.differing
+    return pairs.differing > 0 and not is_smooth and pairs.equal >= least_equal * pairs.touching
+
+
+def _neighbours(image: Array) -> _Neighbours:
     import numpy as np
 
     stride = math.ceil(math.sqrt(image.size / _PAIRS_PX))
     at, right, below = image[:-1:stride, :-1:stride], image[:-1:stride, 1::stride], image[1::stride, :-1:stride]
-    pairs = [(at, side[: at.shape[0], : at.shape[1]]) for side in (right, below)]
-    counted = equal = by_one = 0
-    for ours, theirs in pairs:
-        is_inside = (ours != 0) | (theirs != 0)
-        counted += int(np.count_nonzero(is_inside))
-        equal += int(np.count_nonzero(is_inside & (ours == theirs)))
+    touching = within = equal = by_one = 0
+    for side in (right, below):
+        ours, theirs = at, side[: at.shape[0], : at.shape[1]]
+        is_touching = (ours != 0) | (theirs != 0)
+        touching += int(np.count_nonzero(is_touching))
+        within += int(np.count_nonzero((ours != 0) & (theirs != 0)))
+        equal += int(np.count_nonzero(is_touching & (ours == theirs)))
         by_one += int(np.count_nonzero(np.maximum(ours, theirs) - np.minimum(ours, theirs) == 1))
-    may_be_smooth = image.dtype.itemsize <= 2 and largest > _FEW_LABELS
-    if equal == counted or (may_be_smooth and by_one > _SMALL_STEPS * (counted - equal)):
-        return False
-    return equal >= (_EQUAL_OF_FEW if largest <= _FEW_LABELS else _EQUAL_NEIGHBOURS) * counted
+    return _Neighbours(touching, within, equal, by_one)

@@ -19,7 +19,7 @@ from epypes.display.previews.short import reason
 from epypes.display.previews.shown import Chart, Look, Preview, Scene, Sketch
 from epypes.images import Order
 
-__all__ = ["THUMBNAIL_PX", "Chart", "Preview", "finished", "preview", "sketch"]
+__all__ = ["THUMBNAIL_PX", "Chart", "Preview", "finished", "looked_closer", "preview", "sketch"]
 
 TEXT_CHARACTERS: Final = 30
 _DETAIL_CHARACTERS: Final = 290
@@ -46,12 +46,20 @@ def sketch(value: Any, look: Look) -> Sketch:
             return Sketch(_failed(Preview("", _kind(value)), "no preview", error))
 
 
-def finished(sketched: Sketch, most_bytes: int = THUMBNAIL_BYTES) -> Preview:
-    """Return a preview with its thumbnail; one that can't be made gives the reason instead. Never raises."""
+def looked_closer(sketched: Sketch) -> Sketch:
+    """Return what is shown once there is room for a thumbnail, which is not made yet. Never raises."""
     with looking():
         try:
-            if sketched.closer is not None:
-                sketched = _limited(sketched.closer())
+            return sketched if sketched.closer is None else _limited(sketched.closer())
+        except Exception as error:
+            return Sketch(_failed(sketched.shown, "no picture", error))
+
+
+def finished(sketched: Sketch, most_bytes: int = THUMBNAIL_BYTES) -> Preview:
+    """Return a preview with its thumbnail; one that can't be made gives the reason instead. Never raises."""
+    sketched = looked_closer(sketched)
+    with looking():
+        try:
             drawn = sketched.draw(most_bytes) if sketched.draw is not None else None
         except Exception as error:
             return _failed(sketched.shown, "no picture", error)

@@ -37,6 +37,20 @@ def display_range(image: Array) -> Range:
     return (low, high) if high > low else (low, low + 1.0)
 
 
+def sole_value(image: Array) -> Any:
+    """Return the value of an image that has but one and whose dtype does not tell how bright that is; None if not so.
+
+    Its own range would make it black, whatever it is.
+    """
+    if image.dtype.kind == "b" or (image.dtype.itemsize <= 2 and image.dtype.kind == "u"):
+        return None
+    first = image.flat[0]
+    # A few pixels of most images tell already that there are more values.
+    if not all(((part == first) | ((part != part) & (first != first))).all() for part in (image[::16, ::16], image)):
+        return None
+    return None if image.dtype.kind == "f" and 0.0 <= first <= 1.0 else first.item()
+
+
 def kept_range(program: Program, token: str, image: Array) -> Range:
     """Return the values that are shown black and white in a token's images: what its first one had.
 

@@ -78,6 +78,8 @@ class Sketch:
         Whether the value itself is an image.
     scene
         Returns the image that the thumbnail is made of, and what is drawn over it; None for charts and texts.
+    note
+        Which values are black and white, where the dtype of an image does not tell.
     """
 
     shown: Preview
@@ -85,6 +87,7 @@ class Sketch:
     is_image: bool = False
     closer: Callable[[], Sketch | Preview] | None = None
     scene: Callable[[], Scene] | None = None
+    note: str = ""
 
     @property
     def may_be_drawn(self) -> bool:

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, Final
 
 from epypes.display.previews.arrays import plain_array
 from epypes.display.previews.features import are_keypoints
 from epypes.display.previews.imagekinds import image_kind, is_image, sampled
-from epypes.display.previews.ranges import kept_range
+from epypes.display.previews.ranges import Range, kept_range
 from epypes.display.previews.shown import Backdrop
 from epypes.graph import colour_order
 from epypes.run import Run
@@ -29,10 +30,13 @@ class RunSurroundings:
         Its values that are out of date are not looked at.
     token
         Which one is to be drawn over them.
+    range_of
+        Returns which values of a token's image are black and white; None: those that are kept of its first one.
     """
 
-    def __init__(self, run: Run, token: str) -> None:
+    def __init__(self, run: Run, token: str, range_of: Callable[[str, Any], Range] | None = None) -> None:
         self._run, self._token = run, token
+        self._range_of = partial(kept_range, run.tokens.program) if range_of is None else range_of
         self._digraph = run.cg.digraph
 
     def nearest_image(self) -> Backdrop | None:
@@ -121,5 +125,4 @@ class RunSurroundings:
 
     def _backdrop(self, token: str) -> Backdrop:
         value = self._value(token)
-        ends = kept_range(self._run.tokens.program, token, value)
-        return Backdrop(value, colour_order(self._run.cg, token), ends, token)
+        return Backdrop(value, colour_order(self._run.cg, token), self._range_of(token, value), token)
