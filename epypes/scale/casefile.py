@@ -23,8 +23,9 @@
 A text that ends like the name of an image, of ``.npy`` or of ``.npz`` is a file, whose path is relative to that of the
 cases; other texts and numbers stand for themselves. The metrics are ``equal``, ``close`` (``atol``, ``rtol``), ``iou``
 (``boxes``), ``count`` (``of``), ``value``, ``mean_abs_difference`` and ``psnr`` (``data_range``): see
-``epypes.scale.metrics``, whose options stand beside ``min`` and ``max``. A check may have a ``name``. A case without a
-check passes if it runs.
+``epypes.scale.metrics``, whose options stand beside ``min`` and ``max``. Of label images, integers with more than one
+value besides 0, ``iou`` is the mean over the objects, paired one with one; one that is left over on either side counts
+0. A check may have a ``name``. A case without a check passes if it runs.
 """
 
 from __future__ import annotations

@@ -101,6 +101,9 @@ class Case:
     - a dict with ``min``, ``max`` or both, and if need be ``token``, ``metric``, ``expected``, ``keep`` and options of
       the metric: ``{"token": "points", "min": 100}``.
 
+    ``iou`` compares masks as a whole, but of label images (integers with more than one value besides 0) object by
+    object: it is the mean over the objects, paired one with one, where one that is left over on either side counts 0.
+
     Without ``token`` a metric that compares looks at the one token of ``expected``, any other one at the one sink
     token. A function is called as ``metric(value, expected)`` if there is a ``token`` (``expected`` is None if nothing
     is), else as ``metric(run, case)``: a dict of the sink tokens' values, and of those that ``keep`` names, and this
