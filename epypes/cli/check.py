@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from epypes.cli.terminal import out
 from epypes.errors import ScaleError
-from epypes.wording import counted
+from epypes.wording import counted, ended
 
 if TYPE_CHECKING:
     from epypes.scale.checking import CheckResult
@@ -64,7 +64,7 @@ def check(
         _print_table(result.failures)
     if not result.passed:
         first = result.failures[0]
-        why = f"First: {first.case}, {first.check}: {first.reason}."
+        why = f"First: {first.case}, {first.check}: {ended(first.reason)}"
         raise ScaleError(f"{bundle} does not pass {cases}: {result}. {why}")
     if not as_json:
         out.print(f"{bundle}: {result}, {counted(len(result), 'check')} in all.")

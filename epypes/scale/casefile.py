@@ -40,6 +40,7 @@ from epypes.bundle.entries import read
 from epypes.errors import EpypesError, ScaleError, UnknownName
 from epypes.scale.cases import Case
 from epypes.scale.files import is_file
+from epypes.wording import ended
 
 _CASE_KEYS: Final = ("name", "inputs", "hyperparameters", "check")
 _HEADER: Final = re.compile(r"^[ \t]*\[\[[ \t]*case[ \t]*\]\]", re.MULTILINE)
@@ -128,7 +129,7 @@ def _hyperparameter(token: str, entry: Any) -> Any:
         return read(entry)
     except (LookupError, TypeError, ValueError, ArithmeticError) as error:
         raise ValueError(
-            f"Hyperparameter {token!r} can't be read: {error}. Write it as in pipeline.toml, such as "
+            f"Hyperparameter {token!r} can't be read: {ended(str(error))} Write it as in pipeline.toml, such as "
             '{value = [3, 5], kind = "tuple"}.'
         ) from error
 
