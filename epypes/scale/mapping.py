@@ -99,6 +99,7 @@ def map_images(
     executor
         Who does it: this thread without. A ThreadPoolExecutor runs the graph as it is; any other executor, of
         processes or a Dask cluster (``client.get_executor()``), a bundle that is made of it. The results are the same.
+        Functions of a module that is not installed, such as a file next to the notebook, can't go to other processes.
     keep
         Tokens whose values are kept, in ``outcome.kept``; nothing else but numbers and texts is.
     show
