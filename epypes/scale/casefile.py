@@ -73,6 +73,9 @@ def read_cases(path: Path) -> list[Case]:
 
 
 def _document(path: Path) -> tuple[str, dict[str, Any]]:
+    if path.is_dir():
+        text = f"{str(path)!r} is a folder. Give the path of a CASES.toml, or a list of cases that say what is expected"
+        raise ScaleError(f"{text}: [ep.Case('{path.name}/a.png', expected={{...}}), ...].")
     try:
         text = path.read_text(encoding="utf-8-sig")
         return text, tomllib.loads(text)

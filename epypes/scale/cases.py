@@ -77,8 +77,8 @@ class Case:
     Attributes
     ----------
     inputs
-        By free source token: a value, or the path of its file. A value that is no mapping is that of the one free
-        source token.
+        By free source token: a value, or the path of its file; a text is a path if it ends like an image, ``.npy`` or
+        ``.npz`` and there is such a file. A value that is no mapping is that of the one free source token.
     expected
         By token: the value that it must have, or the path of a file that holds it (an image, ``.npy`` or ``.npz``);
         a text with such an ending is a path. A token that no metric looks at must be equal to it.

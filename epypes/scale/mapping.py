@@ -95,7 +95,8 @@ def map_images(
         Its graph and hyperparameters are used.
     images
         A folder, a glob, or an iterable of images, paths of image files, or dicts by free source token; read when
-        their turn comes, so that they may be more than fit into memory.
+        their turn comes, so that they may be more than fit into memory. In a dict a text stands for itself, unless it
+        has the ending of an image and there is such a file.
     executor
         Who does it: this thread without. A ThreadPoolExecutor runs the graph as it is; any other executor, of
         processes or a Dask cluster (``client.get_executor()``), a bundle that is made of it. The results are the same.

@@ -37,9 +37,9 @@ def frame_of(
     """
     columns: dict[str, Sequence[Any]] = {"name": [outcome.name for outcome in outcomes]}
     columns |= extra or {}
-    columns["failure"] = [
-        None if outcome.trouble is None else " ".join(str(outcome.trouble).split()) for outcome in outcomes
-    ]
+    columns["failure"] = failure_column(
+        [None if outcome.trouble is None else " ".join(str(outcome.trouble).split()) for outcome in outcomes]
+    )
     tokens = _all((outcome.values for outcome in outcomes), () if cg is None else cg.sink_tokens)
     functions = _all((outcome.times_ns for outcome in outcomes), () if cg is None else cg.functions)
     for token in tokens:
@@ -52,6 +52,11 @@ def frame_of(
         columns[f"{function} ms"] = [_in_ms(outcome.times_ns.get(function)) for outcome in outcomes]
     frame: pd.DataFrame = needed("pandas").DataFrame(columns)
     return frame
+
+
+def failure_column(values: Sequence[str | None]) -> Any:
+    """Return what failed as a column; None stays None where others failed, which pandas would make NaN of."""
+    return needed("pandas").Series(list(values), dtype=object)
 
 
 def _column(values: list[Any]) -> Any:

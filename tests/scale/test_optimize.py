@@ -284,6 +284,7 @@ def test_a_trial_that_fails_says_why_and_the_others_go_on() -> None:
         3: "#0: metric gave a 'str', no number",
     }
     assert (result.best, result.best_value) == ({"k": 5}, 5.0)
+    assert set(frame.failure[frame.state == "complete"]) == {None}
     assert len(result.failures) + sum(frame.state == "complete") == 40
 
 
