@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from epypes.cli.terminal import out
 from epypes.errors import ScaleError
-from epypes.wording import counted
+from epypes.wording import counted, ended
 
 if TYPE_CHECKING:
     from epypes.scale.checking import CheckResult
@@ -53,18 +53,22 @@ def check(
     from epypes.bundle import load
     from epypes.scale.cases import cases_of
     from epypes.scale.checking import check as check_runner
+    from epypes.scale.junit import check_place
 
+    if junit is not None:
+        check_place(junit)
     labelled = cases_of(cases)
     result = check_runner(load(bundle), labelled)
-    if junit is not None:
-        result.to_junit(junit, f"epypes check {bundle.resolve().name}")
     if as_json:
         out.print(json.dumps({"bundle": str(bundle), "passed": result.passed, **_fields(result)}, indent=1))
     elif result.failures:
         _print_table(result.failures)
+    # What has been found is told already if this can't be written.
+    if junit is not None:
+        result.to_junit(junit, f"epypes check {bundle.resolve().name}")
     if not result.passed:
         first = result.failures[0]
-        why = f"First: {first.case}, {first.check}: {first.reason}."
+        why = f"First: {first.case}, {first.check}: {ended(first.reason)}"
         raise ScaleError(f"{bundle} does not pass {cases}: {result}. {why}")
     if not as_json:
         out.print(f"{bundle}: {result}, {counted(len(result), 'check')} in all.")

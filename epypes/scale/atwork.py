@@ -20,6 +20,7 @@ from epypes.scale.job import Job, do
 from epypes.scale.outcome import Outcome
 from epypes.scale.parcel import Parcel
 from epypes.scale.travel import packed_outcomes, unpacked_job, unpacked_values
+from epypes.wording import ended
 
 _MOST_LOADED: Final = 8
 
@@ -122,9 +123,8 @@ def _why_not(parcel: Parcel, error: BaseException) -> str:
     where = f"Worker process {os.getpid()} on {socket.gethostname()}"
     needs = ", ".join(line for line in parcel.requirements.splitlines() if line and not line.startswith("#"))
     way_out = f"Install there what the graph needs: {needs}" if needs else "Look at what its modules do there"
-    return (
-        f"{where} can't load the graph: {type(error).__name__}: {error}. {way_out}; or use an executor of this machine."
-    )
+    said = ended(f"{type(error).__name__}: {error}")
+    return f"{where} can't load the graph: {said} {way_out}; or use an executor of this machine."
 
 
 def lighter(sent: Sent) -> Sent:

@@ -24,8 +24,9 @@
 A text that ends like the name of an image, of ``.npy`` or of ``.npz`` is a file, whose path is relative to that of the
 cases; other texts and numbers stand for themselves. The metrics are ``equal``, ``close`` (``atol``, ``rtol``), ``iou``
 (``boxes``), ``count`` (``of``), ``value``, ``mean_abs_difference`` and ``psnr`` (``data_range``): see
-``epypes.scale.metrics``, whose options stand beside ``min`` and ``max``. A check may have a ``name``. A case without a
-check passes if it runs.
+``epypes.scale.metrics``, whose options stand beside ``min`` and ``max``. Of label images, integers with more than one
+value besides 0, ``iou`` is the mean over the objects, paired one with one; one that is left over on either side counts
+0. A check may have a ``name``. A case without a check passes if it runs.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ from epypes.bundle.entries import read
 from epypes.errors import EpypesError, ScaleError, UnknownName
 from epypes.scale.cases import SINK, Case
 from epypes.scale.files import is_file
+from epypes.wording import ended
 
 _CASE_KEYS: Final = ("name", "inputs", "hyperparameters", "check")
 _HEADER: Final = re.compile(r"^[ \t]*\[\[[ \t]*case[ \t]*\]\]", re.MULTILINE)
@@ -72,6 +74,9 @@ def read_cases(path: Path) -> list[Case]:
 
 
 def _document(path: Path) -> tuple[str, dict[str, Any]]:
+    if path.is_dir():
+        text = f"{str(path)!r} is a folder. Give the path of a CASES.toml, or a list of cases that say what is expected"
+        raise ScaleError(f"{text}: [ep.Case('{path.name}/a.png', expected={{...}}), ...].")
     try:
         text = path.read_text(encoding="utf-8-sig")
         return text, tomllib.loads(text)
@@ -128,7 +133,7 @@ def _hyperparameter(token: str, entry: Any) -> Any:
         return read(entry)
     except (LookupError, TypeError, ValueError, ArithmeticError) as error:
         raise ValueError(
-            f"Hyperparameter {token!r} can't be read: {error}. Write it as in pipeline.toml, such as "
+            f"Hyperparameter {token!r} can't be read: {ended(str(error))} Write it as in pipeline.toml, such as "
             '{value = [3, 5], kind = "tuple"}.'
         ) from error
 

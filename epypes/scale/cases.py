@@ -91,8 +91,8 @@ class Case:
     Attributes
     ----------
     inputs
-        By free source token: a value, or the path of its file. A value that is no mapping is that of the one free
-        source token.
+        By free source token: a value, or the path of its file; a text is a path if it ends like an image, ``.npy`` or
+        ``.npz`` and there is such a file. A value that is no mapping is that of the one free source token.
     expected
         By token: the value that it must have, or the path of a file that holds it (an image, ``.npy`` or ``.npz``);
         a text with such an ending is a path. Where no function and no metric that compares looks at a token, it must
@@ -116,6 +116,9 @@ class Case:
     - a dict with ``min``, ``max`` or both, and if need be ``token``, ``metric``, ``expected``, ``keep`` and options of
       the metric: ``{"token": "points", "min": 100}``. ``count`` and ``value`` compare nothing and take no
       ``expected``.
+
+    ``iou`` compares masks as a whole, but of label images (integers with more than one value besides 0) object by
+    object: it is the mean over the objects, paired one with one, where one that is left over on either side counts 0.
 
     Without ``token`` a metric that compares looks at the one token of the case's ``expected``, any other one, and one
     with an ``expected`` of its own, at the one sink token. A function is called as ``metric(value, expected)`` if there

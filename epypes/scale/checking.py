@@ -23,6 +23,7 @@ from epypes.scale.measuring import CheckOutcome, measured
 from epypes.scale.needed import needed
 from epypes.scale.progress import progress_bar
 from epypes.scale.spreading import spread
+from epypes.scale.table import none_as_it_is
 from epypes.wording import counted
 
 if TYPE_CHECKING:
@@ -214,12 +215,13 @@ class CheckResult:
                 "value": float("nan") if outcome.value is None else outcome.value,
                 "threshold": outcome.threshold,
                 "passed": outcome.passed,
-                "failure": outcome.reason or None,
+                "failure": None,
                 "run_ms": outcome.total_ns / 1e6,
             }
             for outcome in self.outcomes
         ]
         frame: pd.DataFrame = needed("pandas").DataFrame(rows)
+        frame["failure"] = none_as_it_is([outcome.reason or None for outcome in self.outcomes])
         return frame
 
     def to_junit(self, path: str | os.PathLike[str], name: str = "epypes check") -> Path:

@@ -20,6 +20,7 @@ from epypes.scale.job import Job, do
 from epypes.scale.outcome import Outcome, Trouble
 from epypes.scale.parcel import Parcel, known_parcel, parcel_of
 from epypes.scale.travel import packed_job, packed_values, unpacked_outcomes
+from epypes.wording import ended
 
 # A larger bundle is sent to whom asks for it, and not with every job.
 _LIGHT: Final = 64_000
@@ -195,4 +196,4 @@ def _unable(error: Exception) -> EpypesError:
     if isinstance(error, EpypesError):
         return error
     needed = "Workers need epypes, of the same version, and what the graph imports."
-    return ScaleError(f"A worker could not do its job: {said(error)}. {needed}")
+    return ScaleError(f"A worker could not do its job: {ended(said(error))} {needed}")

@@ -12,7 +12,7 @@ from epypes.acquisition.pictures import IMAGE_ENDINGS, image_files, natural_orde
 from epypes.errors import ScaleError
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
-from epypes.scale.files import read_value
+from epypes.scale.files import is_file, read_value
 from epypes.scale.lasting import lasting_each
 
 _KINDS: Final = "a folder, a glob such as 'images/*.png', a list or a generator of images, paths or dicts by token"
@@ -45,7 +45,8 @@ def items_of(images: Any, runner: CompGraphRunner, *, is_copied: bool = True) ->
     ----------
     images
         A folder, a glob, one file, or an iterable of images (arrays), paths of image files, or dicts by free source
-        token, in which a Path stands for an image file.
+        token, in which a Path stands for an image file, and so does a text with the ending of an image, of ``.npy`` or
+        of ``.npz`` if there is such a file; any other text stands for itself.
     runner
         Its free source tokens are what an item has to give.
     is_copied
@@ -175,10 +176,18 @@ def _item(number: int, value: Any, free: tuple[str, ...]) -> Item:
         if value is None:
             raise ScaleError(f"Item #{number} is None, which is no image. Leave it out.")
         given = {_only(free, f"item #{number} is one value"): Path(value) if isinstance(value, str) else value}
+    given = {token: _file_or_value(value) for token, value in given.items()}
     files = [file for file in given.values() if isinstance(file, Path)]
     # Whoever reads it may stand in another folder.
     payload = {token: file.absolute() if isinstance(file, Path) else file for token, file in given.items()}
     return Item(number, ", ".join(map(str, files)) or f"#{number}", payload)
+
+
+def _file_or_value(value: Any) -> Any:
+    """Return the path that a text stands for: one with a file's ending, of a file that is there."""
+    if isinstance(value, str) and is_file(value) and Path(value).expanduser().is_file():
+        return Path(value).expanduser()
+    return value
 
 
 def _only(free: tuple[str, ...], given: str) -> str:

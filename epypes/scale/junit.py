@@ -5,6 +5,7 @@ As JUnit XML: one suite, in which a case is a class and each of its checks a tes
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -52,6 +53,18 @@ def write_junit(path: Path, outcomes: Sequence[CheckOutcome], name: str) -> Path
     except OSError as error:
         raise ScaleError(f"{str(path)!r} can't be written: {error.strerror}. Name another file.") from error
     return path
+
+
+def check_place(path: Path) -> None:
+    """Raise ScaleError if no JUnit XML can be written there, before what it is to tell of is run."""
+    needed("junitparser")
+    if path.is_dir():
+        raise ScaleError(f"{str(path)!r} is a folder. Name a file in it.")
+    if not path.parent.is_dir():
+        folder = str(path.parent)
+        raise ScaleError(f"{str(path)!r} can't be written: there is no folder {folder!r}. Make it, or name another.")
+    if not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise ScaleError(f"{str(path)!r} can't be written: that is not allowed. Name another file.")
 
 
 def _test_case(junit: Any, outcome: CheckOutcome, time_s: float) -> Any:

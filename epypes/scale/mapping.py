@@ -97,9 +97,11 @@ def map_images(
     images
         A folder, a glob, or an iterable of images, paths of image files, or dicts by free source token; read when
         their turn comes, so that they may be more than fit into memory. A generator may fill one array again and again.
+        In a dict a text stands for itself, unless it has the ending of an image and there is such a file.
     executor
         Who does it: this thread without. A ThreadPoolExecutor runs the graph as it is; any other executor, of
         processes or a Dask cluster (``client.get_executor()``), a bundle that is made of it. The results are the same.
+        Functions of a module that is not installed, such as a file next to the notebook, can't go to other processes.
     keep
         Tokens whose values are kept, in ``outcome.kept``; nothing else but numbers and texts is.
     show

@@ -12,6 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+from epypes.scale.overlaps import BoxForm, boxes_iou, is_boxes, is_label_image, labels_iou
+
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
@@ -19,7 +21,6 @@ if TYPE_CHECKING:
     Array = npt.NDArray[np.generic]
 
 Better = Literal["greater", "less"]
-BoxForm = Literal["xywh", "xyxy"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,25 +103,29 @@ def iou(value: Any, expected: Any, *, boxes: BoxForm = "xywh") -> float:
     Parameters
     ----------
     value, expected
-        Two masks: arrays of one shape (y, x), of which all that is not zero is in. Or boxes: arrays (n, 4) and (m, 4)
-        of another dtype than bool and uint8, or sequences of four numbers; they are paired so that the sum of their IoU
-        is largest (the Hungarian method), and what is returned is that sum divided by max(n, m), so that each box too
-        many or too few costs.
+        Two masks: arrays of one shape (y, x), of which all that is not zero is in. Two label images: such arrays of
+        integers, where one of the two has more than one value besides 0; each value is then an object of its own, and
+        a mask is one object. Or boxes: arrays (n, 4) and (m, 4) of another dtype than bool and uint8, or sequences of
+        four numbers. Objects and boxes are paired one with one so that the sum of their IoU is largest (the Hungarian
+        method), whatever their numbers are, and what is returned is that sum divided by max(n, m): each one too many or
+        too few costs, and so do two that were merged. To compare label images as masks, give both as bool.
     boxes
         What the four numbers are: ``"xywh"``, a corner with width and height as in OpenCV, or ``"xyxy"``, two corners.
 
     Raises
     ------
     ValueError
-        The shapes differ, or one is a mask and the other boxes.
+        The shapes differ, one is a mask and the other boxes, or there are too many labels to pair them.
     """
     import numpy as np
 
     if boxes not in ("xywh", "xyxy"):
         raise ValueError(f"boxes is {boxes!r}, not 'xywh' or 'xyxy'.")
-    if _is_boxes(value) and _is_boxes(expected):
-        return _boxes_iou(_corners(value, boxes), _corners(expected, boxes))
-    got, wanted = _pair(value, expected)
+    if is_boxes(value) and is_boxes(expected):
+        return boxes_iou(value, expected, boxes)
+    got, wanted = _same_shape(value, expected)
+    if is_label_image(got) or is_label_image(wanted):
+        return labels_iou(got, wanted)
     inside, outside = np.count_nonzero((got != 0) & (wanted != 0)), np.count_nonzero((got != 0) | (wanted != 0))
     return float(inside / outside) if outside else 1.0
 
@@ -261,11 +266,16 @@ def _is_same(value: Any, expected: Any) -> bool:
 
 def _pair(value: Any, expected: Any) -> tuple[Any, Any]:
     """Return two values as arrays of one shape; a mask is compared with what is not zero."""
+    got, wanted = _same_shape(value, expected)
+    if (got.dtype.kind == "b") != (wanted.dtype.kind == "b"):
+        got, wanted = got != 0, wanted != 0
+    return got, wanted
+
+
+def _same_shape(value: Any, expected: Any) -> tuple[Any, Any]:
     got, wanted = _array(value), _array(expected)
     if got.shape != wanted.shape:
         raise ValueError(f"The shapes differ: the value is {_kind(got)}, what was expected {_kind(wanted)}.")
-    if (got.dtype.kind == "b") != (wanted.dtype.kind == "b"):
-        got, wanted = got != 0, wanted != 0
     return got, wanted
 
 
@@ -297,53 +307,3 @@ def _kind(value: Any) -> str:
         return f"{type(value).__name__} of {len(value)}" if isinstance(value, Sequence) else type(value).__name__
     sides = " x ".join(map(str, value.shape))
     return f"{value.dtype} {sides}" if sides else str(value.dtype)
-
-
-# -- boxes ------------------------------------------------------------------------------------------------------
-
-
-def _is_boxes(value: Any) -> bool:
-    """Whether these are four numbers each, and no mask that is four pixels wide."""
-    if _is_array(value):
-        return value.dtype not in ("bool", "uint8") and (
-            (value.ndim == 2 and value.shape[1] == 4) or value.shape in ((4,), (0,))
-        )
-    return isinstance(value, list | tuple) and (
-        all(hasattr(box, "__len__") and len(box) == 4 for box in value) or _is_one_box(value)
-    )
-
-
-def _is_one_box(value: Sequence[Any]) -> bool:
-    return len(value) == 4 and all(isinstance(number, int | float) for number in value)
-
-
-def _corners(value: Any, form: BoxForm) -> Any:
-    """Return boxes as float64 (n, 4): x and y of the first corner, x and y of the second."""
-    import numpy as np
-
-    boxes = np.asarray(value, np.float64).reshape(-1, 4)
-    if form == "xywh":
-        boxes = np.concatenate([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], axis=1)
-    return boxes
-
-
-def _boxes_iou(got: Any, wanted: Any) -> float:
-    import numpy as np
-
-    most = max(len(got), len(wanted))
-    if not most:
-        return 1.0
-    if not (len(got) and len(wanted)):
-        return 0.0
-    try:
-        from scipy.optimize import linear_sum_assignment
-    except ImportError as error:
-        raise ValueError("iou of boxes needs scipy. Run: pip install 'epypes[scale]'.") from error
-    first = np.maximum(got[:, None, :2], wanted[None, :, :2])
-    last = np.minimum(got[:, None, 2:], wanted[None, :, 2:])
-    inside = np.prod(np.clip(last - first, 0, None), axis=2)
-    areas = [np.prod(np.clip(boxes[:, 2:] - boxes[:, :2], 0, None), axis=1) for boxes in (got, wanted)]
-    union = areas[0][:, None] + areas[1][None, :] - inside
-    pairs = np.divide(inside, union, out=np.zeros_like(inside), where=union > 0)
-    rows, columns = linear_sum_assignment(pairs, maximize=True)
-    return float(pairs[rows, columns].sum() / most)

@@ -10,6 +10,7 @@ from epypes.errors import ScaleError
 from epypes.scale.needed import needed
 from epypes.scale.ranging import Axis
 from epypes.scale.studying import Direction, Trial, importances
+from epypes.scale.table import none_as_it_is
 from epypes.wording import counted
 
 if TYPE_CHECKING:
@@ -108,13 +109,13 @@ class OptimizeResult:
             called like one of these has `` (hyperparameter)`` after its name.
         """
         taken = {"trial", self.metric, "state", "failure", "ms"}
-        columns: dict[str, list[Any]] = {"trial": [trial.number for trial in self.trials]}
+        columns: dict[str, Any] = {"trial": [trial.number for trial in self.trials]}
         for axis in self.axes:
             title = f"{axis.token} (hyperparameter)" if axis.token in taken else axis.token
             columns[title] = [trial.setting[axis.token] for trial in self.trials]
         columns[self.metric] = [float("nan") if trial.value is None else trial.value for trial in self.trials]
         columns["state"] = ["failed" if trial.value is None else "complete" for trial in self.trials]
-        columns["failure"] = [trial.failure or None for trial in self.trials]
+        columns["failure"] = none_as_it_is([trial.failure or None for trial in self.trials])
         columns["ms"] = [trial.total_ns / 1e6 for trial in self.trials]
         frame: pd.DataFrame = needed("pandas").DataFrame(columns)
         return frame

@@ -29,6 +29,7 @@ from epypes.scale.spreading import spread, worker_count
 from epypes.scale.studying import Asked, Direction, Search, Trial
 from epypes.scale.trying import Bench, Stopped
 from epypes.store import opened_store
+from epypes.wording import ended
 
 if TYPE_CHECKING:
     from epypes.store import Store
@@ -103,7 +104,8 @@ def optimize(
     Raises
     ------
     ScaleError
-        There are no cases, nothing that may vary, or no trial has completed.
+        There are no cases, nothing that may vary, or no trial has completed; or in the first one an input can't be
+        read, which is known before another is run.
     UnknownName
         The graph has no such token, or the runner no such hyperparameter.
     StoreError
@@ -254,6 +256,7 @@ def _searched(
         try:
             with contextlib.closing(work.scores(search, n - len(done))) as coming:
                 for asked, score in coming:
+                    _require_readable(asked, score, len(done))
                     trial = search.tell(asked, score.value, score.failure, score.total_ns)
                     advance(1, trial.value is None)
                     if on_trial is not None:
@@ -263,8 +266,14 @@ def _searched(
     return work.is_stopped
 
 
+def _require_readable(asked: Asked, score: Score, first: int) -> None:
+    """Raise ScaleError if an input can't be read in the first trial that is run: it could not in any other."""
+    if asked.number == first and score.unreadable:
+        raise ScaleError(f"No trial can complete: {ended(score.unreadable)} Mend the file, or leave it out.")
+
+
 def _require_one(result: OptimizeResult) -> None:
     if result.trials and not result.was_stopped and all(trial.value is None for trial in result.trials):
         first = result.trials[0]
-        text = f"None of {len(result.trials)} trials completed. The first one failed: {first.failure}."
+        text = f"None of {len(result.trials)} trials completed. The first one failed: {ended(first.failure)}"
         raise ScaleError(f"{text} Its values: {first.setting}.")

@@ -7,6 +7,10 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
+from epypes.errors import ImageFileError, ScaleError
+
+# What reading a file raises.
+_UNREADABLE: Final = frozenset({ImageFileError.__name__, ScaleError.__name__})
 # Python can be told to refuse numbers of more than 640 digits.
 _MOST_BITS: Final = 2_126
 
@@ -28,6 +32,11 @@ class Trouble:
     function: str
     kind: str
     message: str
+
+    @property
+    def is_unreadable(self) -> bool:
+        """Whether it is a file of the input that could not be read: with other hyperparameters it can't be either."""
+        return not self.function and self.kind in _UNREADABLE
 
     def __str__(self) -> str:
         where = f"{self.function}: " if self.function else ""

@@ -5,22 +5,27 @@ As a bundle: it is promoted once, which proves that it computes there what it co
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
+import re
 import tempfile
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from epypes.bundle import promote, to_source
 from epypes.bundle.load import SAMPLES
-from epypes.errors import BundleError, PlaceholderNeeded, SourceRefused
+from epypes.errors import BundleError, PlaceholderNeeded, PromotionRefused, SourceRefused
 from epypes.run import CompGraphRunner
 
 _NAME: Final = "graph"
+# What stands in the reasons in place of the temporary folder.
+_BUNDLE: Final = "the graph's bundle"
+_MISSING: Final = re.compile(r"ModuleNotFoundError: No module named '([^']+)'")
 _MOST_PROVEN: Final = 16
 _NOTE: Final = (
     "To be run by other processes or a cluster, a graph is promoted to a bundle first. "
@@ -95,6 +100,10 @@ def parcel_of(runner: CompGraphRunner) -> Parcel:
     with tempfile.TemporaryDirectory(prefix="epypes-parcel-") as folder:
         try:
             bundle = promote(runner, Path(folder) / _NAME)
+        except PromotionRefused as error:
+            refused = PromotionRefused(_BUNDLE, _told(error.reasons, Path(folder) / _NAME))
+            refused.add_note(_NOTE)
+            raise refused from error
         except BundleError as error:
             error.add_note(_NOTE)
             raise
@@ -107,6 +116,19 @@ def parcel_of(runner: CompGraphRunner) -> Parcel:
     if source is not None:
         _PROVEN.add(source, parcel)
     return parcel
+
+
+def _told(reasons: Sequence[str], folder: Path) -> list[str]:
+    """Return the reasons without a folder that nobody has named and that is gone; first which modules are missing."""
+    places = sorted({str(folder), str(folder.resolve())}, key=len, reverse=True)
+    said = [functools.reduce(lambda text, place: text.replace(place, _BUNDLE), places, reason) for reason in reasons]
+    missing = dict.fromkeys(name for reason in said for name in _MISSING.findall(reason))
+    first = [
+        f"Module {name!r} is not installed, so no other process can import it: install it as a package, or take a "
+        "ThreadPoolExecutor, or no executor, which run the graph as it is."
+        for name in missing
+    ]
+    return [*first, *said]
 
 
 def _files(folder: Path) -> list[Path]:

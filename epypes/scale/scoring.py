@@ -31,11 +31,14 @@ class Score:
         Which case failed, and why; empty if none did.
     total_ns
         Nanoseconds of the functions that ran.
+    unreadable
+        Which file of a case can't be read, in which case no other setting gives anything either; empty if none.
     """
 
     value: float | None
     failure: str
     total_ns: int
+    unreadable: str = ""
 
 
 class Scoring:
@@ -92,7 +95,9 @@ class Scoring:
             spent_ns += outcome.total_ns
             value, failure = self.of_one(case, outcome)
             if value is None:
-                return Score(None, failure, spent_ns)
+                trouble = outcome.trouble
+                unreadable = trouble.message if trouble is not None and trouble.is_unreadable else ""
+                return Score(None, failure, spent_ns, unreadable)
             values.append(value)
         return Score(math.fsum(values) / len(values), "", spent_ns)
 

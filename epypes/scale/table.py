@@ -36,10 +36,10 @@ def frame_of(
         ``"<function> ms"`` of what ran. A token that is called like another column has `` (token)`` after its name.
     """
     columns: dict[str, Sequence[Any]] = {"name": [outcome.name for outcome in outcomes]}
-    columns |= {column: _as_given(values) for column, values in (extra or {}).items()}
-    columns["failure"] = [
-        None if outcome.trouble is None else " ".join(str(outcome.trouble).split()) for outcome in outcomes
-    ]
+    columns |= {column: none_as_it_is(values) for column, values in (extra or {}).items()}
+    columns["failure"] = none_as_it_is(
+        [None if outcome.trouble is None else " ".join(str(outcome.trouble).split()) for outcome in outcomes]
+    )
     tokens = _all((outcome.values for outcome in outcomes), () if cg is None else cg.sink_tokens)
     functions = _all((outcome.times_ns for outcome in outcomes), () if cg is None else cg.functions)
     for token in tokens:
@@ -65,7 +65,7 @@ def _column(values: list[Any]) -> Any:
     return values
 
 
-def _as_given(values: Sequence[Any]) -> Any:
+def none_as_it_is(values: Sequence[Any]) -> Any:
     """Return values as a column; where None is one of them it stays None, since NaN is another value."""
     has_none = any(value is None for value in values)
     return needed("pandas").Series(list(values), dtype=object) if has_none else values

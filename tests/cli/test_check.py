@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 
 import cv2
@@ -109,6 +110,29 @@ def test_a_metric_that_raises_without_a_text_exits_with_1_and_is_an_error(epypes
     assert done.stderr.strip().endswith("First: #0, count of found: AssertionError.")
     [suite] = junitparser.JUnitXml.fromfile(str(junit))
     assert (suite.tests, suite.failures, suite.errors) == (1, 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("place", "said"),
+    [
+        ("new/dir/j.xml", "there is no folder .*new/dir'. Make it, or name another"),
+        (".", "is a folder. Name a file in"),
+    ],
+)
+def test_where_no_xml_can_be_written_is_told_before_anything_is_run(labelled, cases, epypes, tmp_path, place, said):
+    path = cases(90)
+    (path.parent / "coins.png").unlink()
+    done = epypes("check", labelled / "edges", path, "--junit", tmp_path / place)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert re.search(said, done.stderr)
+
+
+def test_the_reason_of_a_failure_has_one_full_stop(labelled, epypes, tmp_path):
+    text = '[[case]]\ninputs = {image = "../coins.png"}\n[[case.check]]\nmetric = "count"\nmin = 1\n'
+    (tmp_path / "cases.toml").write_text(text.replace("../coins.png", str(labelled / "coins.png")))
+    done = epypes("check", labelled / "edges", tmp_path / "cases.toml")
+    assert done.returncode == 1
+    assert done.stderr.strip().endswith("give of='items', 'nonzero' or 'labels'.")
 
 
 def test_json_has_every_check(labelled, cases, epypes):

@@ -283,5 +283,9 @@ def test_a_file_that_can_t_be_read_is_refused(tmp_path):
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe")
     with pytest.raises(match="can't be read"):
         cases_of(tmp_path / "bytes.toml")
-    with pytest.raises(match="can't be read: Is a directory"):
-        cases_of(tmp_path)
+
+
+def test_a_folder_of_images_is_no_set_of_cases_and_what_is_one_is_said(tmp_path):
+    for given in (tmp_path, str(tmp_path)):
+        with pytest.raises(ScaleError, match=r"is a folder. Give the path of a CASES.toml, or a list .*ep.Case\("):
+            cases_of(given)

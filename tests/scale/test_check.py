@@ -281,6 +281,7 @@ def test_the_table_has_a_row_per_check(result):
     assert frame["passed"].tolist() == [False, True, False]
     assert frame["value"].isna().tolist() == [False, False, True]
     assert "can't be read" in frame["failure"][2]
+    assert frame["failure"][1] is None
 
 
 def test_a_notebook_shows_what_was_expected_what_came_and_where_they_differ(result):

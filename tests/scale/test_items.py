@@ -130,6 +130,20 @@ def test_a_text_by_token_stays_a_text_and_a_missing_file_is_told_when_it_is_open
         opened(missing, runner.cg)
 
 
+def test_a_text_by_token_is_a_file_if_it_has_the_ending_of_one_and_is_there(folder, stereo, tmp_path, monkeypatch):
+    np.save(tmp_path / "right.npy", np.ones((100, 150, 3), np.uint8))
+    (tmp_path / "note").write_text("no image")
+    monkeypatch.chdir(folder)
+    (item,) = items_of([{"left": "crop0.png", "right": str(tmp_path / "right.npy")}], stereo)
+    assert item.name == f"crop0.png, {tmp_path / 'right.npy'}"
+    assert {token: value.shape for token, value in opened(item, stereo.cg).items()} == dict.fromkeys(
+        ("left", "right"), (100, 150, 3)
+    )
+    texts = {"left": "nowhere.png", "right": str(tmp_path / "note")}
+    (item,) = items_of([texts], stereo)
+    assert opened(item, stereo.cg) == texts
+
+
 def test_how_many_there_are_is_known_without_going_through_them(folder, crops):
     assert count_of(folder) == 12
     assert count_of(crops) == 12

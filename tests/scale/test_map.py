@@ -43,6 +43,8 @@ def test_a_folder_becomes_a_table_with_times_and_failures_as_rows(folder, runner
     assert list(frame.columns[:4]) == ["name", "failure", "edge_pixels", "keypoints"]
     assert list(frame.columns[4:]) == ["total_ms", "gray ms", "canny ms", "count ms", "corners ms"]
     assert "is not an image" in frame["failure"][3]
+    assert frame["failure"].drop(3).tolist() == [None] * 11
+    assert ep.map(runner, folder / "crop0.png").to_frame()["failure"].tolist() == [None]
     assert [outcome.name for outcome in result.failures] == ["crop3.png"]
     assert (frame["gray ms"].drop(3) > 0).all()
     assert len(result) == 12

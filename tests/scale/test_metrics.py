@@ -48,6 +48,46 @@ def test_each_box_too_many_or_too_few_costs():
     assert iou([(0, 0, 0, 0)], [(0, 0, 0, 0)]) == 0.0  # without an area there is nothing in common
 
 
+def labelled(*objects, dtype=np.int32):
+    """A label image of 10 x 20 pixels with an object in each range of columns, numbered from 1."""
+    found = np.zeros((10, 20), dtype)
+    for number, (first, last) in enumerate(objects, 1):
+        found[:, first:last] = number
+    return found
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.uint8, np.uint16])
+def test_two_objects_that_were_merged_are_not_two(dtype):
+    two, merged = labelled((2, 8), (8, 12), dtype=dtype), labelled((2, 12), dtype=dtype)
+    assert iou(merged, two) == iou(two, merged) == pytest.approx(0.6 / 2)
+    assert iou(merged != 0, two) == iou((merged != 0).astype(np.uint8) * 255, two) == pytest.approx(0.6 / 2)
+    assert iou(merged != 0, two != 0) == 1.0
+
+
+def test_the_numbers_of_labels_do_not_matter():
+    two = labelled((2, 8), (8, 12))
+    assert iou(np.array([0, 700, -3])[two], two) == 1.0
+    assert iou(labelled((2, 8), (8, 16)), two) == pytest.approx((1 + 4 / 8) / 2)
+
+
+def test_each_object_too_many_or_too_few_costs():
+    two, nothing = labelled((0, 5), (10, 15)), labelled()
+    assert iou(labelled((0, 5), (10, 15), (16, 20)), two) == iou(two, labelled((0, 5), (10, 15), (16, 20))) == 2 / 3
+    assert iou(nothing, two) == iou(two, nothing) == 0.0
+
+
+def test_a_mask_is_compared_as_a_whole_whatever_its_one_value_is():
+    one = labelled((2, 8), dtype=np.uint8)
+    for other in (one * 255, one != 0, one.astype(np.int32) * 7):
+        assert iou(other, labelled((5, 8), dtype=np.uint8)) == 0.5
+
+
+def test_what_has_a_label_at_every_pixel_is_refused_before_it_fills_the_memory():
+    many = np.arange(10_000).reshape(100, 100)
+    with pytest.raises(ValueError, match="The value has 10000 labels, what was expected 10000: too many"):
+        iou(many, many)
+
+
 def test_boxes_may_be_two_corners():
     assert iou([(0, 0, 10, 10)], [(5, 0, 15, 10)], boxes="xyxy") == pytest.approx(50 / 150)
     with pytest.raises(ValueError, match="boxes is 'corners', not 'xywh' or 'xyxy'"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import enum
 import threading
 import xml.etree.ElementTree as ET
@@ -315,14 +316,39 @@ def test_a_trial_that_fails_says_why_and_the_others_go_on() -> None:
         3: "#0: metric gave a 'str', no number",
     }
     assert (result.best, result.best_value) == ({"k": 5}, 5.0)
+    assert set(frame.failure[frame.state == "complete"]) == {None}
     assert len(result.failures) + sum(frame.state == "complete") == 40
 
 
-def test_if_all_trials_fail_the_reason_of_the_first_is_raised(tmp_path: Path) -> None:
+def test_if_all_trials_fail_the_reason_of_the_first_is_raised() -> None:
+    def f(x: int, k: int) -> int:
+        raise ValueError("There is no kernel." if k == 3 else "another")
+
+    with pytest.raises(ScaleError) as told:
+        ep.optimize(runner_of(f, k=3), "y", [1], 4, ranges={"k": (0, 5)})
+    said = "None of 4 trials completed. The first one failed: f: ValueError: There is no kernel. Its values: {'k': 3}."
+    assert str(told.value) == said
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_file_that_can_not_be_read_ends_the_search_before_the_second_trial(tmp_path: Path, workers: int) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((5, 5, 3), np.uint8))
     (tmp_path / "broken.png").write_bytes(b"no image")
-    runner = runner_of(lambda x, k: k, k=3)
-    with pytest.raises(ScaleError, match=r"None of 4 trials completed\. The first one failed: ImageFileError.*'k': 3"):
-        ep.optimize(runner, "y", tmp_path, 4, ranges={"k": (0, 5)})
+    tried: set[int] = set()
+    kept: dict[str, Any] = {"ranges": {"k": (0, 500)}, "store": tmp_path / "s.db", "name": "n"}
+
+    def f(x: Any, k: int) -> int:
+        tried.add(k)
+        return k
+
+    with contextlib.ExitStack() as stack:
+        executor = stack.enter_context(ThreadPoolExecutor(workers)) if workers else None
+        with pytest.raises(ScaleError, match=r"No trial can complete: .*broken\.png.*[^.]\. Mend the file"):
+            ep.optimize(runner_of(f, k=3), "y", tmp_path, 50, executor=executor, **kept)
+    assert len(tried) <= 1 + workers
+    # Once the file is mended, the search begins: that it could not be read is not kept.
+    cv2.imwrite(str(tmp_path / "broken.png"), np.zeros((5, 5, 3), np.uint8))
+    assert not ep.optimize(runner_of(f, k=3), "y", tmp_path, 3, **kept).failures
 
 
 @pytest.mark.parametrize(

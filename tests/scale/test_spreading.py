@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import importlib
 import io
 import multiprocessing
 import os
@@ -182,6 +183,20 @@ def test_a_graph_that_can_not_be_promoted_is_refused_with_the_reasons(crops, pro
     with pytest.raises(PromotionRefused, match="'held'") as refused:
         ep.map(runner, crops, processes)
     assert "A ThreadPoolExecutor runs it as it is." in refused.value.__notes__[0]
+
+
+def test_a_module_next_to_the_notebook_is_named_first_with_who_can_run_it(processes, tmp_path, monkeypatch):
+    (tmp_path / "beside_the_notebook.py").write_text("def half(image):\n    return image // 2\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    half = importlib.import_module("beside_the_notebook").half
+    runner = ep.CompGraphRunner(ep.CompGraph({"half": half}, {"half": ("image", "out")}))
+    with pytest.raises(PromotionRefused) as refused:
+        ep.map(runner, [np.ones((5, 5), np.uint8)], processes)
+    first, second = refused.value.reasons
+    assert first.startswith("Module 'beside_the_notebook' is not installed")
+    assert "a ThreadPoolExecutor, or no executor" in first
+    assert second.startswith("The replay of the graph's bundle failed at pipeline.py")
+    assert "epypes-parcel" not in str(refused.value)
 
 
 def test_a_kept_value_without_a_codec_is_refused_with_the_way_out(processes):
