@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from epypes.bundle.nodes import called_by, is_plain_pipeline
@@ -25,7 +26,12 @@ def _own(function: Any) -> Any:
 
 
 def _another(pipeline: Pipeline) -> Pipeline:
-    hyperparameters, cg = pipeline.runner.hyperparameters, apart(pipeline.source_cg)
-    # A default that was unfrozen is an input of the pipeline.
+    hyperparameters = pipeline.runner.hyperparameters
+    cg = without_unfrozen(apart(pipeline.source_cg), hyperparameters)
+    return Pipeline(pipeline.name, cg, hyperparameters, workers=pipeline.runner.workers)
+
+
+def without_unfrozen(cg: CompGraph, hyperparameters: Mapping[str, Any]) -> CompGraph:
+    """Return the graph without the defaults that a runner with these hyperparameters has unfrozen: they are inputs."""
     frozen = {token: value for token, value in cg.defaults.items() if token in hyperparameters}
-    return Pipeline(pipeline.name, with_defaults(cg, frozen), hyperparameters, workers=pipeline.runner.workers)
+    return cg if len(frozen) == len(cg.defaults) else with_defaults(cg, frozen)

@@ -11,7 +11,7 @@ from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from dataclasses import replace
 from typing import Any, Final, Protocol
 
-from epypes.bundle.apart import apart
+from epypes.bundle.apart import apart, without_unfrozen
 from epypes.errors import EpypesError, ScaleError
 from epypes.run import CompGraphRunner
 from epypes.scale.atwork import Refusal, Sent, lighter, work
@@ -62,7 +62,9 @@ def said(error: BaseException) -> str:
 
 def own_runner(runner: CompGraphRunner) -> CompGraphRunner:
     """Return another runner of the same graph, with the same hyperparameters; the user's nodes see nothing of it."""
-    return CompGraphRunner(apart(runner.cg), runner.hyperparameters, workers=runner.workers, guard=runner.guard)
+    hyperparameters = runner.hyperparameters
+    cg = without_unfrozen(apart(runner.cg), hyperparameters)
+    return CompGraphRunner(cg, hyperparameters, workers=runner.workers, guard=runner.guard)
 
 
 class Threads:

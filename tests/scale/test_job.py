@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
+from epypes.scale.hands import own_runner
 from epypes.scale.items import Item, items_of
 from epypes.scale.job import Job, do
 from epypes.scale.outcome import Outcome, Thumbnail, Trouble
@@ -168,3 +169,15 @@ def test_a_token_that_is_called_like_a_column_has_another_name():
     frame = frame_of(do(ep.CompGraphRunner(cg), Job((item(),))), cg)
     assert frame["name (token)"].tolist() == [1]
     assert frame["name"].tolist() == ["#0"]
+
+
+def test_a_default_that_was_unfrozen_is_an_input_of_each_item() -> None:
+    def times(x: float, gain: float = 2.0) -> float:
+        return x * gain
+
+    runner = ep.CompGraphRunner(ep.CompGraph.from_functions(times))
+    runner.unfreeze("gain")
+    own = own_runner(runner)
+    assert own.free_source_tokens == ("x", "gain")
+    assert own_runner(own).free_source_tokens == ("x", "gain")
+    assert [one.values["times"] for one in ep.map(runner, [{"x": 3, "gain": 5}])] == [15]
