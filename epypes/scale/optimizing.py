@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
@@ -11,20 +10,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.bundle import to_source
-from epypes.errors import EpypesError, ScaleError
+from epypes.errors import ScaleError
 from epypes.run import CompGraphRunner
 from epypes.scale.cases import Case, cases_of, with_labels_read
-from epypes.scale.digests import Untold
 from epypes.scale.items import Item, items_of
 from epypes.scale.job import Job
 from epypes.scale.lasting import settled_runner
 from epypes.scale.optimized import OptimizeResult
 from epypes.scale.outcome import Outcome
 from epypes.scale.progress import progress_bar
-from epypes.scale.ranging import Axis, axes_of
-from epypes.scale.remembered import contents_of
+from epypes.scale.ranging import axes_of
 from epypes.scale.scoring import Metric, Score, Scoring
+from epypes.scale.searched import METRIC, about_search, has_changed, name_of
 from epypes.scale.spreading import spread, worker_count
 from epypes.scale.studying import Asked, Direction, Search, Trial
 from epypes.scale.trying import Bench, Stopped
@@ -87,7 +84,8 @@ def optimize(
         Path, URL or ``ep.Store`` of a database that keeps the trials, in Optuna's own tables. A second call goes on.
     name
         Of the study in the store; without, it follows from the graph and its other hyperparameters, from what is
-        searched, from the metric's source, and from the names of the cases and what goes into them.
+        searched, from what the metric computes, and from the cases: what goes into them, their labels and their
+        hyperparameters. A study that has been searched for another one of these is refused.
     stop
         Ends the search once it is set: when the function that runs has returned. So does Ctrl+C, at once. What has
         been found until then is returned.
@@ -129,11 +127,15 @@ def optimize(
     work = _Work(runner, scoring, items, executor, stop)
     with opened_store(store) as opened:
         url = None if opened is None else opened.url
-        known = name or ("" if url is None else _name(runner, axes, scoring, items, direction))
+        about = {} if url is None else about_search(runner, axes, scoring, items, is_named=bool(name))
+        known = name or ("" if url is None else name_of(scoring.name, direction, axes, about))
         at_once = 1 if executor is None else worker_count(executor)
-        search = Search(axes, runner.hyperparameters, direction, seed=seed, at_once=at_once, url=url, name=known)
+        present = runner.hyperparameters
+        search = Search(axes, present, direction, seed=seed, at_once=at_once, url=url, name=known, about=about)
         with contextlib.closing(search):
             was_stopped = _searched(search, work, n, on_trial, progress)
+            if has_changed(scoring, about):
+                search.forget(METRIC)
     result = OptimizeResult(search.trials, direction, scoring.name, axes, search.study, was_stopped)
     _require_one(result)
     return result
@@ -156,22 +158,6 @@ def _cases(given: Any, runner: CompGraphRunner) -> tuple[Case, ...]:
 def _items(cases: Sequence[Case], runner: CompGraphRunner) -> Iterator[Item]:
     for number, item in enumerate(items_of([case.inputs for case in cases], runner)):
         yield Item(number, cases[number].name or item.name, item.payload)
-
-
-def _name(
-    runner: CompGraphRunner, axes: Sequence[Axis], scoring: Scoring, items: Sequence[Item], direction: Direction
-) -> str:
-    """Return what a search is called in a store if the user does not say: a digest of what it computes."""
-    varied = {axis.token for axis in axes}
-    fixed = {token: value for token, value in runner.hyperparameters.items() if token not in varied}
-    try:
-        source = to_source(runner.cg, fixed)
-        inputs = [(item.name, contents_of(item.payload)) for item in items]
-    except (EpypesError, Untold) as error:
-        text = f"What is searched has no name for the store: {error}"
-        raise ScaleError(f"{text}\nGive one: name='...'.") from error
-    said = repr((source, axes, scoring.source, direction, inputs))
-    return f"optimize {scoring.name} {hashlib.sha256(said.encode()).hexdigest()[:12]}"
 
 
 # -- running ----------------------------------------------------------------------------------------------------

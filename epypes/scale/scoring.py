@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +11,8 @@ from typing import Any
 from epypes.errors import ScaleError
 from epypes.graph import CompGraph
 from epypes.scale.cases import Case
+from epypes.scale.digests import joined
+from epypes.scale.metricdigest import function_digest
 from epypes.scale.outcome import Outcome
 
 Measure = Callable[[Mapping[str, Any], Case], Any]
@@ -72,6 +73,7 @@ class Scoring:
         self.name: str = metric if isinstance(metric, str) else getattr(metric, "__name__", "metric")
         self.keep: tuple[str, ...] = cg.sink_tokens if keep is None else tuple(keep)
         self._measure: Measure
+        self._is_token = isinstance(metric, str)
         if isinstance(metric, str):
             self.keep, self._measure = (metric,), _value_of(metric)
         else:
@@ -79,13 +81,16 @@ class Scoring:
         for token in self.keep:
             cg.require_token(token)
 
-    @property
-    def source(self) -> str:
-        """What the metric computes, as text: its source, or only its name where that can't be had."""
-        try:
-            return self.name if self.keep == (self.name,) else inspect.getsource(self._measure)
-        except (OSError, TypeError):
-            return self.name
+    def digest(self) -> str:
+        """Return what tells the metric from others, with what it is given.
+
+        Raises
+        ------
+        Untold
+            Nobody can say what it computes, as of an object that is called.
+        """
+        measure = "token" if self._is_token else function_digest(self._measure)
+        return joined("metric", measure, *self.keep).hex()
 
     def of_outcomes(self, outcomes: Iterable[Outcome]) -> Score:
         """Return the score of a setting by what it gave, in the order of the cases; after a failure none is taken."""

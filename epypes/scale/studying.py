@@ -11,11 +11,13 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 from epypes.errors import ScaleError
 from epypes.scale.needed import needed
 from epypes.scale.ranging import Axis, Choices, Span, setting_of, suggestion_of
+from epypes.scale.searched import changed_in
 from epypes.scale.steps import ends_on_step
 from epypes.store.place import connect_options
 
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
     from sqlalchemy import URL
 
 Direction = Literal["maximize", "minimize"]
-_FAILURE, _NANOSECONDS = "failure", "total_ns"
+_FAILURE, _NANOSECONDS, _ABOUT = "failure", "total_ns", "about"
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +82,8 @@ class Search:
         Of a database; None for none.
     name
         Of the study in there. If it is there, it goes on.
+    about
+        What is searched: digests by what they are of, "" where there is none. They are kept with the study.
 
     Raises
     ------
@@ -97,10 +101,11 @@ class Search:
         at_once: int = 1,
         url: URL | None = None,
         name: str = "",
+        about: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         found = needed("optuna")
         self.axes, self.direction = tuple(axes), direction
-        self._present = dict(present)
+        self._present, self._about = dict(present), dict(about)
         self._distributions = {axis.token: _distribution(axis) for axis in axes}
         self._written: optuna.Study | None = None
         with _quietly():
@@ -140,6 +145,19 @@ class Search:
             self._written.add_trial(frozen)
         return self._told(frozen)
 
+    def forget(self, what: str) -> None:
+        """Take down that this part of what is searched can't be told from others, since it changes by itself."""
+        self._about[what] = ""
+        if self._written is not None:
+            self._note(self._written)
+
+    def _note(self, written: optuna.Study) -> None:
+        # What could not be told once is not told from then on.
+        before = written.user_attrs.get(_ABOUT, self._about)
+        about = {what: digest and self._about.get(what, digest) for what, digest in {**self._about, **before}.items()}
+        if about != before or _ABOUT not in written.user_attrs:
+            written.set_user_attr(_ABOUT, about)
+
     def close(self) -> None:
         """Let go of the database. May be called twice."""
         written, self._written = self._written, None
@@ -169,11 +187,14 @@ class Search:
         """Return the trials of a study that goes on, numbered as they will be in memory."""
         found = [trial for trial in written.get_trials() if trial.state.is_finished()]
         others = next((trial for trial in found if trial.distributions != self._distributions), None)
-        if written.direction.name.lower() == self.direction and others is None:
+        changed = changed_in(written.user_attrs.get(_ABOUT, {}), self._about)
+        if written.direction.name.lower() == self.direction and others is None and not changed:
+            self._note(written)
             return found
         self.close()
         _close(written._storage)
-        what = f"to {written.direction.name.lower()}" if others is None else _said_of(others.distributions)
+        what = changed if changed and others is None else f"to {written.direction.name.lower()}"
+        what = what if others is None else _said_of(others.distributions)
         text = f"There is a study {name!r} in this store, and it searches something else ({what})."
         raise ScaleError(f"{text} Give another name=, or search the same.")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import enum
+import functools
 import threading
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping
@@ -495,6 +496,74 @@ def test_a_study_of_something_else_is_left_alone(runner: ep.CompGraphRunner, tmp
     with pytest.raises(ScaleError, match=r"something else \(to maximize\)"):
         ep.optimize(runner, "score", [0], 2, direction="minimize", **options)
     assert len(ep.optimize(runner, "score", [0], 1, **options)) == 1
+
+
+def near(tokens: Mapping[str, Any], case: ep.Case) -> float:
+    return -abs(float(tokens["y"]) - case.expected["y"])
+
+
+def away(tokens: Mapping[str, Any], case: ep.Case, *, target: float = 1.0) -> float:
+    return -abs(float(tokens["y"]) - target)
+
+
+class Nearest:
+    def __call__(self, tokens: Mapping[str, Any], case: ep.Case) -> float:
+        return near(tokens, case)
+
+
+CASE = ep.Case({"x": 1}, {"y": 3})
+OTHERS = {
+    "metric": (functools.partial(away, target=2.0), [CASE]),
+    "inputs of the cases": (near, [ep.Case({"x": 2}, {"y": 3})]),
+    "labels of the cases": (near, [ep.Case({"x": 1}, {"y": 9})]),
+    "own hyperparameters": (near, [ep.Case({"x": 1}, {"y": 3}, hyperparameters={"j": 1})]),
+}
+
+
+@pytest.mark.parametrize("what", OTHERS)
+def test_trials_of_other_cases_and_of_another_metric_are_not_taken_for_its_own(what: str, tmp_path: Path) -> None:
+    runner = runner_of(lambda x, k, j: x + k + j, k=1, j=0)
+    options: dict[str, Any] = {"store": tmp_path / "s.sqlite", "ranges": {"k": (0, 9)}}
+    ep.optimize(runner, near, [CASE], 2, **options)
+    ep.optimize(runner, near, [CASE], 2, name="s", **options)
+    assert len(ep.optimize(runner, near, [ep.Case({"x": 1}, {"y": 3})], 3, **options)) == 3
+    metric, cases = OTHERS[what]
+    found = ep.optimize(runner, metric, cases, 1, **options)
+    assert len(found) == 1, "it has trials of another search"
+    said = what if what != "own hyperparameters" else "labels of the cases"
+    with pytest.raises(ScaleError, match=rf"something else \(other {said}\)\. Give another name="):
+        ep.optimize(runner, metric, cases, 3, name="s", **options)
+    assert len(ep.optimize(runner, near, [CASE], 1, name="s", **options)) == 2
+
+
+def test_another_graph_and_other_hyperparameters_are_refused_under_a_name(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"store": tmp_path / "s.sqlite", "ranges": {"k": (0, 9)}, "name": "s"}
+    ep.optimize(runner_of(lambda x, k, j: x + k + j, k=1, j=0), "y", [1], 1, **options)
+    with pytest.raises(ScaleError, match="other hyperparameters"):
+        ep.optimize(runner_of(lambda x, k, j: x + k + j, k=1, j=5), "y", [1], 2, **options)
+    with pytest.raises(ScaleError, match="other graph"):
+        ep.optimize(runner_of(lambda x, k, j: x - k + j, k=1, j=0), "y", [1], 2, **options)
+
+
+def test_a_metric_that_nobody_can_tell_apart_needs_a_name(tmp_path: Path) -> None:
+    runner = runner_of(lambda x, k: x + k, k=1)
+    options: dict[str, Any] = {"store": tmp_path / "s.sqlite", "ranges": {"k": (0, 9)}}
+    with pytest.raises(ScaleError, match=r"Nothing tells its metric from others: a 'Nearest'"):
+        ep.optimize(runner, Nearest(), [CASE], 1, **options)
+    for count in (1, 2):
+        assert len(ep.optimize(runner, Nearest(), [CASE], count, name="s", **options)) == count
+
+
+def test_a_metric_that_changes_what_it_reads_goes_on_under_a_name(tmp_path: Path) -> None:
+    seen: list[float] = []
+
+    def noted(tokens: Mapping[str, Any], case: ep.Case) -> float:
+        seen.append(float(tokens["y"]))
+        return seen[-1]
+
+    runner, options = runner_of(lambda x, k: x + k, k=1), {"store": tmp_path / "s.sqlite", "ranges": {"k": (0, 9)}}
+    for count in (1, 2, 3):
+        assert len(ep.optimize(runner, noted, [1], count, name="s", **options)) == count
 
 
 @pytest.mark.slow
