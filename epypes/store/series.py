@@ -11,16 +11,18 @@ from epypes.store.jsontext import from_text, from_word, to_text, to_word
 
 if TYPE_CHECKING:
     import pandas as pd
-    from sqlalchemy import Connection
+    from sqlalchemy import Connection, Select
 
     from epypes.store.database import Database
 
 # Read at a time, so that a long series is never in memory as a whole.
 _PAGE: Final = 500
+# The number of no series.
+_NONE: Final = 0
 
 
 class Series:
-    """Rows of one kind under one name; `Store.series` makes it.
+    """Rows of one kind under one name; `Store.series` gives it.
 
     A row is a mapping under a key: numbers (NaN and infinities too), texts, truth values, None, lists and dicts.
     Written under a key that is there already, it takes the place of the earlier one. Any thread may use it, and many
@@ -29,27 +31,48 @@ class Series:
 
     def __init__(self, database: Database, kind: str, name: str, about: Mapping[str, Any] | None = None) -> None:
         self._database, self.kind, self.name = database, kind, name
-        self._id, self._about = database.write(lambda connection: self._found(connection, about or {}))
+        # The number is 0 and nothing is said of it as long as nobody has made it.
+        self._id, self._about = _NONE, self._text("about", {})
+        if about is None:
+            database.read(self._look)
+        else:
+            text = self._text("about", about)
+            database.write(lambda connection: self._make(connection, text))
 
-    def _found(self, connection: Connection, about: Mapping[str, Any]) -> tuple[int, str]:
-        """Return number and description of this series; it is made if it is not there."""
-        from sqlalchemy import insert, select
+    def _look(self, connection: Connection) -> int:
+        """Return the number of this series, to read it; 0 if it is not there."""
+        from sqlalchemy import select
 
         from epypes.store.tables import digest_of, series
 
+        if self._id == _NONE:
+            digest = digest_of(to_word(self.kind), to_word(self.name))
+            wanted = select(series.c.id, series.c.about).where(series.c.digest == digest)
+            found = connection.execute(wanted).one_or_none()
+            if found is not None:
+                # Readers on other threads look at the number first.
+                self._about, self._id = found[1], found[0]
+        return self._id
+
+    def _make(self, connection: Connection, about: str) -> int:
+        """Return the number of this series, to write it; it is made if it is not there."""
+        from sqlalchemy import insert
+
+        from epypes.store.tables import digest_of, series
+
+        number = self._look(connection)
+        if number != _NONE:
+            return number
         kind, name = to_word(self.kind), to_word(self.name)
-        wanted = select(series.c.id, series.c.about).where(series.c.digest == digest_of(kind, name))
-        found = connection.execute(wanted).one_or_none()
-        if found is None:
-            values = {"kind": kind, "name": name, "digest": digest_of(kind, name)}
-            text = self._text("about", about)
-            connection.execute(insert(series).values(**values, about=text, made_ns=time.time_ns()))
-            found = connection.execute(wanted).one()
-        return found[0], found[1]
+        values = {"kind": kind, "name": name, "digest": digest_of(kind, name)}
+        made = connection.execute(insert(series).values(**values, about=about, made_ns=time.time_ns()))
+        (number,) = made.inserted_primary_key or (_NONE,)
+        return int(number)
 
     @property
     def about(self) -> Mapping[str, Any]:
         """What was said of the series when it was made."""
+        self._database.read(self._look)
         about: dict[str, Any] = from_text(self._about)
         return about
 
@@ -79,14 +102,14 @@ class Series:
         found = {row["digest"]: row for row in (self._row(key, data) for key, data in rows)}
         if not found:
             return
-        self._database.write(lambda connection: _put(connection, self._id, found))
+        about = self._text("about", {})
+        self._database.write(lambda connection: _put(connection, self._make(connection, about), found))
 
     def _row(self, key: str, data: Mapping[str, Any]) -> dict[str, Any]:
         from epypes.store.tables import digest_of
 
         word, text = to_word(key), self._text(key, data)
-        stamp = {"series_id": self._id, "written_ns": time.time_ns()}
-        return {**stamp, "digest": digest_of(word), "key": word, "data": text}
+        return {"digest": digest_of(word), "key": word, "data": text, "written_ns": time.time_ns()}
 
     def _text(self, key: str, data: Mapping[str, Any]) -> str:
         try:
@@ -100,8 +123,12 @@ class Series:
         """Return the row under a key; None if there is none."""
         from epypes.store.tables import digest_of, row_data
 
-        wanted = {"series": self._id, "digest": digest_of(to_word(key))}
-        text = self._database.read(lambda connection: connection.execute(row_data, wanted).scalar())
+        digest = digest_of(to_word(key))
+
+        def read(connection: Connection) -> Any:
+            return connection.execute(row_data, {"series": self._look(connection), "digest": digest}).scalar()
+
+        text = self._database.read(read)
         return None if text is None else self._data(key, text)
 
     def keys(self) -> frozenset[str]:
@@ -110,9 +137,7 @@ class Series:
 
         from epypes.store.tables import rows
 
-        wanted = select(rows.c.key).where(rows.c.series_id == self._id)
-        found = self._database.read(lambda connection: connection.execute(wanted).scalars().all())
-        return frozenset(from_word(word) for word in found)
+        return frozenset(from_word(word) for (word,) in self._selected(select(rows.c.key)))
 
     def items(self) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """Yield keys with their rows in the order of writing, a page at a time; what comes meanwhile may come too."""
@@ -122,20 +147,21 @@ class Series:
 
         last = 0
         while True:
-            wanted = (
-                select(rows.c.id, rows.c.key, rows.c.data)
-                .where(rows.c.series_id == self._id, rows.c.id > last)
-                .order_by(rows.c.id)
-                .limit(_PAGE)
-            )
-            page = self._page(wanted)
+            wanted = select(rows.c.id, rows.c.key, rows.c.data).where(rows.c.id > last).order_by(rows.c.id).limit(_PAGE)
+            page = self._selected(wanted)
             if not page:
                 return
             for last, word, text in page:  # noqa: B007 - where the next page begins
                 yield from_word(word), self._data(word, text)
 
-    def _page(self, wanted: Any) -> list[Any]:
-        return self._database.read(lambda connection: list(connection.execute(wanted)))
+    def _selected(self, wanted: Select[Any]) -> list[Any]:
+        """Return what is wanted of the rows of this series."""
+        from epypes.store.tables import rows
+
+        def read(connection: Connection) -> list[Any]:
+            return list(connection.execute(wanted.where(rows.c.series_id == self._look(connection))))
+
+        return self._database.read(read)
 
     def rows(self) -> Iterator[Mapping[str, Any]]:
         """Yield the rows in the order of writing."""
@@ -162,8 +188,8 @@ class Series:
 
         from epypes.store.tables import rows
 
-        wanted = select(func.count()).select_from(rows).where(rows.c.series_id == self._id)
-        return int(self._database.read(lambda connection: connection.execute(wanted).scalar()) or 0)
+        ((count,),) = self._selected(select(func.count()).select_from(rows))
+        return int(count)
 
     def __bool__(self) -> bool:
         # An empty series is one all the same; and to ask costs no look into the database.
@@ -191,7 +217,7 @@ def _put(connection: Connection, series_id: int, found: Mapping[str, Mapping[str
     from epypes.store.tables import new_row, rows
 
     there = _there(connection, series_id, list(found))
-    new = [dict(row) for digest, row in found.items() if digest not in there]
+    new = [{"series_id": series_id, **row} for digest, row in found.items() if digest not in there]
     if new:
         connection.execute(new_row, new)
     for digest in there:
