@@ -33,7 +33,7 @@ class _Entry:
 
 
 class Series:
-    """Rows of one kind under one name; `Store.series` makes it.
+    """Rows of one kind under one name; `Store.series` gives it.
 
     A row is a mapping under a key: numbers (NaN and infinities too), texts, truth values, None, lists and dicts.
     Written under a key that is there already, it takes the place of the earlier one. Any thread may use it, and many
@@ -43,8 +43,13 @@ class Series:
     def __init__(self, database: Database, kind: str, name: str, about: Mapping[str, Any] | None = None) -> None:
         self._database, self.kind, self.name = database, kind, name
         self._about = self._text("about", about or {})
-        self._entry = database.write(self._made)
-        self._about = self._entry.about
+        # Nobody has made it yet, as far as is known.
+        self._entry = _Entry(None, _NONE, self._about)
+        if about is None:
+            database.read(self._number)
+        else:
+            self._entry = database.write(self._made)
+            self._about = self._entry.about
 
     def _made(self, connection: Connection) -> _Entry:
         """Return the entry of this series; it is made if it is not there."""
@@ -71,15 +76,25 @@ class Series:
         found = connection.execute(select(series.c.id, series.c.about).where(series.c.digest == digest)).one_or_none()
         return None if found is None else _Entry(file_of(connection), found[0], found[1])
 
+    def _is_known(self, connection: Connection) -> bool:
+        """Whether its number is known in the file that is there now."""
+        return self._entry.number != _NONE and self._entry.file == file_of(connection)
+
     def _number(self, connection: Connection) -> int:
-        """Return the number of this series in the file that is there now, to read it."""
-        entry = self._entry
-        found = entry if entry.file == file_of(connection) else self._found(connection)
-        return _NONE if found is None else found.number
+        """Return the number of this series in the file that is there now, to read it; 0 if nobody has made it."""
+        if self._is_known(connection):
+            return self._entry.number
+        found = self._found(connection)
+        if found is None:
+            return _NONE
+        if self._entry.number == _NONE:
+            self._about, self._entry = found.about, found
+        return found.number
 
     @property
     def about(self) -> Mapping[str, Any]:
         """What was said of the series when it was made."""
+        self._database.read(self._number)
         about: dict[str, Any] = from_text(self._about)
         return about
 
@@ -111,7 +126,7 @@ class Series:
             return
 
         def put(connection: Connection) -> _Entry:
-            entry = self._entry if self._entry.file == file_of(connection) else self._made(connection)
+            entry = self._entry if self._is_known(connection) else self._made(connection)
             _put(connection, entry.number, found)
             return entry
 

@@ -55,14 +55,15 @@ class Store:
         return self._database.engine.url
 
     def series(self, kind: str, name: str, *, about: Mapping[str, Any] | None = None) -> Series:
-        """Return the series of a kind and a name, which is made if it is not there.
+        """Return the series of a kind and a name.
 
         Parameters
         ----------
         kind
             ``"map"``, ``"sweep"``, ``"check"``, ``"tuning"``, ``"events"``, or a word of your own.
         about
-            What is said of a series that is made here; one that is there keeps what was said of it.
+            What is said of a series, which is then made if it is not there; one that is keeps what was said of it.
+            Without, its first row makes it, so that to look for a series is not to make it.
 
         Raises
         ------

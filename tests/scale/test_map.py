@@ -203,6 +203,15 @@ def test_other_hyperparameters_are_another_series(noted, calls, tmp_path):
     assert values(ep.map(noted, levels(1), store=tmp_path / "r.sqlite", name="b"), "out") == [3.0]
 
 
+def test_a_series_that_somebody_has_looked_for_is_not_of_another_computation(noted, calls, tmp_path):
+    with ep.Store(tmp_path / "r.sqlite") as store:
+        assert store.series("map", "a").to_frame().empty
+        ep.map(noted, levels(1), store=store, name="a")
+        ep.map(noted, levels(1, 2), store=store, name="a")
+        assert len(store.series("map", "a")) == 2
+    assert calls == [1, 2]
+
+
 def test_without_a_name_the_graph_and_its_hyperparameters_name_the_series(runner, crops, tmp_path):
     with ep.Store(tmp_path / "r.sqlite") as store:
         ep.map(runner, crops[:1], store=store)

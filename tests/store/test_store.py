@@ -155,6 +155,25 @@ def test_what_is_said_of_a_series_is_said_when_it_is_made(store):
     assert store.series("map", "other").about == {}
 
 
+def test_to_look_into_a_series_does_not_make_it(store):
+    looked = store.series("map", "edges")
+    assert (len(looked), looked.keys(), looked.get("a"), looked.about) == (0, frozenset(), None, {})
+    assert looked.to_frame().empty
+    assert store.names("map") == ()
+    # Whoever makes it says what it is, and who has looked before sees it.
+    store.series("map", "edges", about={"k": 1}).append("a", {"n": 1})
+    assert (looked.keys(), looked.about) == ({"a"}, {"k": 1})
+    looked.append("b", {"n": 2})
+    assert store.series("map", "edges", about={"k": 2}).about == {"k": 1}
+    assert len(store.series("map", "edges")) == 2
+
+
+def test_a_series_of_which_nothing_was_said_is_made_by_its_first_row(store):
+    store.series("tuning", "edges").append("a", {"n": 1})
+    assert store.names("tuning") == ("edges",)
+    assert store.series("tuning", "edges", about={"k": 1}).about == {}
+
+
 def test_a_series_is_a_table(store):
     series = store.series("tuning", "edges")
     assert series.to_frame().empty
