@@ -24,6 +24,7 @@ from epypes.scale.outcome import Outcome
 from epypes.scale.progress import progress_bar
 from epypes.scale.ranging import Axis, axes_of
 from epypes.scale.remembered import contents_of
+from epypes.scale.sameness import computation_of
 from epypes.scale.scoring import Metric, Score, Scoring
 from epypes.scale.spreading import spread, worker_count
 from epypes.scale.studying import Asked, Direction, Search, Trial
@@ -168,7 +169,7 @@ def _name(
     except (EpypesError, Untold) as error:
         text = f"What is searched has no name for the store: {error}"
         raise ScaleError(f"{text}\nGive one: name='...'.") from error
-    said = repr((source, axes, scoring.source, direction, inputs))
+    said = repr((source, computation_of(runner.cg, source), axes, scoring.source, direction, inputs))
     return f"optimize {scoring.name} {hashlib.sha256(said.encode()).hexdigest()[:12]}"
 
 
