@@ -110,7 +110,9 @@ def map_images(
         A path, a URL or an ep.Store, where outcomes are written as they come. What is there already is not run again,
         unless ``keep`` is given: so a map that was interrupted goes on.
     name
-        What the series in the store is called; a digest of graph and hyperparameters without.
+        What the series in the store is called; without, a digest of graph, hyperparameters, and the modules that the
+        graph imports. A series of another graph or of other code is refused; but what is inside of objects, lists and
+        dicts that functions use is not looked at: give another name when you change that.
     progress
         Whether there is a bar; without, in a terminal and in a notebook.
     ahead

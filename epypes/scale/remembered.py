@@ -16,6 +16,7 @@ from epypes.run import CompGraphRunner
 from epypes.scale.digests import Untold, digest_of, file_digest, joined, told
 from epypes.scale.items import Item
 from epypes.scale.outcome import Outcome
+from epypes.scale.sameness import computation_of
 from epypes.store import Series, Store
 
 # What is lost at most if the process is killed; to write each outcome by itself would take longer than to make it.
@@ -49,12 +50,13 @@ def series_of(
     """
     fixed = {token: value for token, value in runner.hyperparameters.items() if token not in varied}
     source, hyperparameters = _source_of(runner), _hyperparameters(fixed)
+    computation = computation_of(runner.cg, source)
     if name is None:
         if source is None:
             text = "What this graph computes can't be written as text, which would tell it from others. Give name=."
             raise ScaleError(text)
-        name = _digest(source, repr(hyperparameters))[:16]
-    about = {"graph": "" if source is None else _digest(source), "hyperparameters": hyperparameters}
+        name = _digest(computation, repr(hyperparameters))[:16]
+    about = {"graph": computation, "hyperparameters": hyperparameters}
     series = store.series(kind, name, about=about)
     _check_same(series, about)
     return series
