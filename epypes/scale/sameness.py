@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dis
 import hashlib
 import sys
 from collections.abc import Iterable, Iterator
@@ -17,6 +18,7 @@ from epypes.bundle.requirements import bringing
 from epypes.graph import CompGraph, as_switch
 from epypes.scale.digests import Untold, digest_of, joined
 
+_LOOKS_UP: Final = ("LOAD_GLOBAL", "LOAD_NAME")
 _OURS: Final = "epypes"
 # The folders that pip, and Debian's packages, install into.
 _INSTALLED: Final = frozenset({"site-packages", "dist-packages"})
@@ -121,9 +123,10 @@ def _content(cell: Any) -> Any:
 
 
 def _names(code: CodeType) -> set[str]:
-    """Return the names that code, and the functions inside of it, may look up."""
+    """Return the names that code, and the functions inside of it, look up among globals; attributes are none."""
     inner = (_names(one) for one in code.co_consts if isinstance(one, CodeType))
-    return set(code.co_names).union(*inner)
+    own = {one.argval for one in dis.get_instructions(code) if one.opname in _LOOKS_UP}
+    return own.union(*inner)
 
 
 # -- modules ----------------------------------------------------------------------------------------------------

@@ -72,6 +72,22 @@ def test_what_is_inside_of_objects_is_the_users_word():
     assert computation_of(graph_of(noted), None) == before
 
 
+GAIN = 1
+
+
+def test_a_global_counts_for_who_looks_it_up_and_not_for_an_attribute_of_that_name(monkeypatch):
+    def looks_up(image):
+        return LOCK, GAIN
+
+    def has_one(image):
+        return LOCK, image.GAIN
+
+    before = [computation_of(graph_of(function), None) for function in (looks_up, has_one)]
+    monkeypatch.setitem(globals(), "GAIN", 2)
+    after = [computation_of(graph_of(function), None) for function in (looks_up, has_one)]
+    assert [one == other for one, other in zip(before, after, strict=True)] == [False, True]
+
+
 @pytest.fixture
 def modules(tmp_path, monkeypatch):
     """Write modules of somebody's own, and load them anew."""
