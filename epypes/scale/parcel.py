@@ -29,7 +29,8 @@ _MISSING: Final = re.compile(r"ModuleNotFoundError: No module named '([^']+)'")
 _MOST_PROVEN: Final = 16
 _NOTE: Final = (
     "To be run by other processes or a cluster, a graph is promoted to a bundle first. "
-    "A ThreadPoolExecutor runs it as it is."
+    "A ThreadPoolExecutor runs it as it is. If a function keeps something from one item to the next, "
+    "run it without an executor: on threads its results are others."
 )
 
 

@@ -49,6 +49,8 @@ def spread(
         Taken one by one, when there is room for another.
     executor
         None: this thread does them. A ThreadPoolExecutor runs the graph itself; any other one a bundle of it.
+        Functions that keep something from one item to the next give other results on threads, which share it and take
+        items in any order: a bundle's promotion refuses such functions, threads can't know them.
     ahead
         How many jobs are at work or waiting at most; twice as many as there are workers without.
     stop

@@ -199,6 +199,14 @@ def test_a_module_next_to_the_notebook_is_named_first_with_who_can_run_it(proces
     assert "epypes-parcel" not in str(refused.value)
 
 
+def test_a_function_that_keeps_something_is_refused_and_told_to_be_run_without_an_executor(crops, processes):
+    apply = cv2.createBackgroundSubtractorMOG2().apply
+    runner = ep.CompGraphRunner(ep.CompGraph({"apply": apply}, {"apply": ("image", "mask")}))
+    with pytest.raises(PromotionRefused, match="is a method of an object of class") as refused:
+        ep.map(runner, crops, processes)
+    assert "keeps something from one item to the next, run it without an executor" in refused.value.__notes__[0]
+
+
 def test_a_kept_value_without_a_codec_is_refused_with_the_way_out(processes):
     made = cell("class Plain:\n    pass\n\ndef make(image):\n    return Plain()\n\ndef use(plain):\n    return 1")
     cg = ep.CompGraph({"make": made["make"], "use": made["use"]}, {"make": ("image", "plain"), "use": ("plain", "n")})
