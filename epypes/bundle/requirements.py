@@ -45,6 +45,11 @@ def _distribution(name: str) -> str:
     return owners[0] if len(owners) == 1 else _loaded_from(owners or candidates, top)
 
 
+def bringing(top: str) -> tuple[str, ...]:
+    """Return the normalized names of the distributions that bring a top-level module."""
+    return tuple(_by_module().get(top, ()))
+
+
 @cache
 def _by_module() -> dict[str, list[str]]:
     # A distribution is listed once for each of its files' folders.

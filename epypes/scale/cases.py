@@ -15,6 +15,7 @@ from typing import Any, Final
 from epypes.errors import ScaleError, UnknownName
 from epypes.graph import CompGraph
 from epypes.scale.files import is_file, read_value
+from epypes.scale.lasting import holds_its_arrays, lasting
 from epypes.scale.metrics import METRICS, Metric
 
 # What a threshold spec may say besides the options of its metric.
@@ -165,7 +166,8 @@ def cases_of(given: Any) -> tuple[Case, ...]:
         raise ScaleError(
             f"cases is a list of cases or the path of a file of them, not a single {type(given).__name__!r}."
         )
-    found = _named([_case(item) for item in given])
+    cases = map(_case, given)
+    found = _named(list(cases if holds_its_arrays(given) else map(_lasting, cases)))
     if not found:
         raise ScaleError("There are no cases. Give at least one: ep.Case(inputs, expected={...}).")
     return found
@@ -207,6 +209,11 @@ def with_labels_read(case: Case, cg: CompGraph) -> Case:
 
 
 # -- cases ------------------------------------------------------------------------------------------------------
+
+
+def _lasting(case: Case) -> Case:
+    """Return a case that stays as it is when whoever gave it fills its arrays for the next one."""
+    return replace(case, inputs=lasting(case.inputs), expected=lasting(case.expected))
 
 
 def _case(item: Any) -> Case:

@@ -18,6 +18,7 @@ from epypes.scale.cases import Case, Check, cases_of, checks_of
 from epypes.scale.files import is_file
 from epypes.scale.items import items_of
 from epypes.scale.job import Job
+from epypes.scale.lasting import settled_runner
 from epypes.scale.measuring import CheckOutcome, measured
 from epypes.scale.needed import needed
 from epypes.scale.progress import progress_bar
@@ -78,6 +79,7 @@ def check(
     >>> result.failures[0].reason
     'expected 7, got 6'
     """
+    runner = settled_runner(runner)
     found = prepared(runner, cases)
     outcomes: list[CheckOutcome] = []
     pictured: Counter[bool] = Counter()
@@ -153,7 +155,7 @@ def checked(
 
 def _jobs(runner: CompGraphRunner, cases: Checks, *, has_pictures: bool) -> Iterator[Job]:
     """Give a job per case, when it is asked for."""
-    items = items_of((inputs_of(case) for case, _ in cases), runner)
+    items = items_of([inputs_of(case) for case, _ in cases], runner)
     for item, (case, checks) in zip(items, cases, strict=True):
         looked_at = tuple(dict.fromkeys(check.token for check in checks if check.token is not None))
         keep = tuple(dict.fromkeys(token for check in checks for token in check.keep))

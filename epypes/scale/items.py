@@ -13,6 +13,7 @@ from epypes.errors import ScaleError
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
 from epypes.scale.files import read_value
+from epypes.scale.lasting import lasting_each
 
 _KINDS: Final = "a folder, a glob such as 'images/*.png', a list or a generator of images, paths or dicts by token"
 _SHOWN: Final = "*?["
@@ -37,7 +38,7 @@ class Item:
     payload: Mapping[str, Any]
 
 
-def items_of(images: Any, runner: CompGraphRunner) -> Iterator[Item]:
+def items_of(images: Any, runner: CompGraphRunner, *, is_copied: bool = True) -> Iterator[Item]:
     """Give the inputs of an image set, each when it is asked for.
 
     Parameters
@@ -47,6 +48,9 @@ def items_of(images: Any, runner: CompGraphRunner) -> Iterator[Item]:
         token, in which a Path stands for an image file.
     runner
         Its free source tokens are what an item has to give.
+    is_copied
+        Whether what a generator gives is copied, since it may be one array that is filled again each time. False if
+        each item is done with before the next one is asked for.
 
     Raises
     ------
@@ -57,7 +61,7 @@ def items_of(images: Any, runner: CompGraphRunner) -> Iterator[Item]:
     if isinstance(images, str | Path):
         return _of_files(*_files(images), _only(free, f"{str(images)!r} gives one image"))
     _check_set(images)
-    return _of_values(images, free)
+    return _of_values(lasting_each(images) if is_copied else images, type(images).__name__, free)
 
 
 def opened(item: Item, cg: CompGraph) -> dict[str, Any]:
@@ -147,7 +151,7 @@ def _check_set(images: Any) -> None:
         raise ScaleError(f"images can't be {type(images).__name__!r}. Give {_KINDS}.")
 
 
-def _of_values(images: Iterable[Any], free: tuple[str, ...]) -> Iterator[Item]:
+def _of_values(images: Iterable[Any], kind: str, free: tuple[str, ...]) -> Iterator[Item]:
     number = -1
     for number, value in enumerate(images):
         item = _item(number, value, free)
@@ -156,7 +160,7 @@ def _of_values(images: Iterable[Any], free: tuple[str, ...]) -> Iterator[Item]:
         yield item
         del item
     if number < 0:
-        raise ScaleError(f"The image set is empty: the {type(images).__name__} gave nothing. Give {_KINDS}.")
+        raise ScaleError(f"The image set is empty: the {kind} gave nothing. Give {_KINDS}.")
 
 
 def _item(number: int, value: Any, free: tuple[str, ...]) -> Item:

@@ -14,7 +14,7 @@ from epypes.display.previews.shown import Look
 from epypes.errors import EpypesError
 from epypes.run import CompGraphRunner, Failure, Run
 from epypes.scale.items import Item, opened
-from epypes.scale.outcome import Outcome, Trouble, plain_number
+from epypes.scale.outcome import Outcome, Trouble, is_endless, long_number, plain_number
 from epypes.scale.start import Start
 from epypes.scale.thumbnails import Album
 
@@ -145,6 +145,8 @@ def _trouble(failure: Failure) -> Trouble:
 
 def _value(value: Any) -> Any:
     """Return what a table shows of a value."""
+    if type(value) is int and is_endless(value):
+        return long_number(value)
     if value is None or type(value) in (bool, int, float, str):
         return value
     number = plain_number(value)

@@ -13,6 +13,7 @@ from epypes.run import CompGraphRunner
 from epypes.scale.batches import Batches
 from epypes.scale.items import Item, count_of, items_of
 from epypes.scale.job import Job
+from epypes.scale.lasting import settled_runner
 from epypes.scale.outcome import Outcome
 from epypes.scale.progress import Advance, progress_bar
 from epypes.scale.remembered import Remembered, series_of
@@ -95,7 +96,7 @@ def map_images(
         Its graph and hyperparameters are used.
     images
         A folder, a glob, or an iterable of images, paths of image files, or dicts by free source token; read when
-        their turn comes, so that they may be more than fit into memory.
+        their turn comes, so that they may be more than fit into memory. A generator may fill one array again and again.
     executor
         Who does it: this thread without. A ThreadPoolExecutor runs the graph as it is; any other executor, of
         processes or a Dask cluster (``client.get_executor()``), a bundle that is made of it. The results are the same.
@@ -107,7 +108,9 @@ def map_images(
         A path, a URL or an ep.Store, where outcomes are written as they come. What is there already is not run again,
         unless ``keep`` is given: so a map that was interrupted goes on.
     name
-        What the series in the store is called; a digest of graph and hyperparameters without.
+        What the series in the store is called; without, a digest of graph, hyperparameters, and the modules that the
+        graph imports. A series of another graph or of other code is refused; but what is inside of objects, lists and
+        dicts that functions use is not looked at: give another name when you change that.
     progress
         Whether there is a bar; without, in a terminal and in a notebook.
     ahead
@@ -139,16 +142,19 @@ def map_images(
     """
     for token in (*keep, *(show or ())):
         runner.cg.require_token(token)
+    # Whoever sets values on theirs meanwhile, or writes into them, does not change what is computed and stored.
+    runner = settled_runner(runner)
     with ExitStack() as stack:
         opened = stack.enter_context(opened_store(store))
         memory = None
         if opened is not None:
             series = series_of(opened, "map", runner, name)
-            memory = Remembered(series, "" if show == () else f"show={show and list(show)}", not keep)
-            stack.callback(memory.write)
+            how = "" if show == () else f"show={show and list(show)}"
+            memory = stack.enter_context(Remembered(series, how, not keep))
         advance = stack.enter_context(progress_bar(progress, count_of(images), "map"))
         work = _Map(memory, advance, tuple(keep), None if show is None else tuple(show))
-        work.run(runner, images, executor, ahead)
+        is_copied = executor is not None or opened is not None or bool(keep)
+        work.run(runner, items_of(images, runner, is_copied=is_copied), count_of(images), executor, ahead)
     return MapResult(runner.cg, sorted(work.outcomes, key=lambda outcome: outcome.number))
 
 
@@ -161,10 +167,17 @@ class _Map:
         self._memory, self._advance, self._keep, self._show = memory, advance, keep, show
         self.outcomes: list[Outcome] = []
 
-    def run(self, runner: CompGraphRunner, images: Any, executor: Executor | None, ahead: int | None) -> None:
+    def run(
+        self,
+        runner: CompGraphRunner,
+        items: Iterable[Item],
+        count: int | None,
+        executor: Executor | None,
+        ahead: int | None,
+    ) -> None:
         """Run what has to be run."""
         workers = 0 if executor is None else worker_count(executor)
-        batches = Batches(self._unknown(items_of(images, runner)), workers, count_of(images))
+        batches = Batches(self._unknown(items), workers, count)
         jobs = (Job(batch, keep=self._keep, show=self._show) for batch in batches)
         for outcomes in spread(runner, jobs, executor, ahead=ahead):
             batches.learn(outcomes)

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, Final
 from epypes.errors import ScaleError
 from epypes.run import CompGraphRunner
 from epypes.scale.cases import Case, cases_of, with_labels_read
-from epypes.scale.hands import own_runner
 from epypes.scale.items import Item, items_of
 from epypes.scale.job import Job
+from epypes.scale.lasting import settled_runner
 from epypes.scale.optimized import OptimizeResult
 from epypes.scale.outcome import Outcome
 from epypes.scale.progress import progress_bar
@@ -116,7 +116,8 @@ def optimize(
     {'y': 0}
     """
     _check(n, direction)
-    runner = own_runner(runner)  # whoever sets values on theirs meanwhile does not change what is searched
+    # Whoever sets values on theirs meanwhile, or writes into them, does not change what is searched.
+    runner = settled_runner(runner)
     axes = axes_of(runner, ranges)
     labelled = _cases(cases, runner)
     scoring = Scoring(runner.cg, metric, labelled, keep)

@@ -5,7 +5,10 @@ from __future__ import annotations
 import base64
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, Final
+
+# Python can be told to refuse numbers of more than 640 digits.
+_MOST_BITS: Final = 2_126
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +133,8 @@ class Outcome:
 
 def _plain(value: Any) -> Any:
     """Return a hyperparameter's value as JSON can hold it; a tuple is told from a list."""
+    if isinstance(value, int) and is_endless(value):
+        return {"text": long_number(value)}
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, tuple | list):
@@ -145,6 +150,16 @@ def _read(data: Any) -> Any:
     if not isinstance(data, Mapping):
         return data
     return tuple(_read(item) for item in data["tuple"]) if "tuple" in data else data["text"]
+
+
+def is_endless(value: int) -> bool:
+    """Whether a number has more digits than can be read from a text, whatever Python is told to refuse."""
+    return value.bit_length() > _MOST_BITS
+
+
+def long_number(value: int) -> str:
+    """Return what a table says of a number that nobody reads."""
+    return f"int of {value.bit_length():,} bits"
 
 
 def plain_number(value: Any) -> bool | int | float | None:

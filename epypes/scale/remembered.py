@@ -7,14 +7,16 @@ from dataclasses import replace
 from pathlib import Path
 from time import monotonic
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, Self
+from warnings import warn
 
 from epypes.bundle import to_source
-from epypes.errors import PlaceholderNeeded, ScaleError, SourceRefused
+from epypes.errors import PlaceholderNeeded, ScaleError, SourceRefused, StoreError
 from epypes.run import CompGraphRunner
 from epypes.scale.digests import Untold, digest_of, file_digest, joined, told
 from epypes.scale.items import Item
 from epypes.scale.outcome import Outcome
+from epypes.scale.sameness import computation_of
 from epypes.store import Series, Store
 
 # What is lost at most if the process is killed; to write each outcome by itself would take longer than to make it.
@@ -48,12 +50,13 @@ def series_of(
     """
     fixed = {token: value for token, value in runner.hyperparameters.items() if token not in varied}
     source, hyperparameters = _source_of(runner), _hyperparameters(fixed)
+    computation = computation_of(runner.cg, source)
     if name is None:
         if source is None:
             text = "What this graph computes can't be written as text, which would tell it from others. Give name=."
             raise ScaleError(text)
-        name = _digest(source, repr(hyperparameters))[:16]
-    about = {"graph": "" if source is None else _digest(source), "hyperparameters": hyperparameters}
+        name = _digest(computation, repr(hyperparameters))[:16]
+    about = {"graph": computation, "hyperparameters": hyperparameters}
     series = store.series(kind, name, about=about)
     _check_same(series, about)
     return series
@@ -160,11 +163,41 @@ class Remembered:
             self.write()
 
     def write(self) -> None:
-        """Write what waits."""
-        waiting, self._waiting = self._waiting, []
-        if waiting:
-            self._series.append_all(waiting)
+        """Write what waits.
+
+        Raises
+        ------
+        StoreError
+            The store can't be written; then it still waits.
+        """
+        try:
+            self._series.append_all(self._waiting)
+            self._waiting.clear()
+        except TypeError:
+            # All or none are written, and one of them can't be.
+            self._write_each()
         self._written_s = monotonic()
+
+    def _write_each(self) -> None:
+        while self._waiting:
+            try:
+                self._series.append(*self._waiting[0])
+            except TypeError as error:
+                warn(f"{error} It is run again the next time.", stacklevel=2)
+            del self._waiting[0]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        """Write what waits; if something else has gone wrong before, that is what is raised."""
+        try:
+            self.write()
+        except StoreError as failed:
+            if error is None:
+                raise
+            if error is not failed:
+                error.add_note(f"What waited to be stored could not be: {failed}")
 
 
 def _told(what: Callable[[], str]) -> str | None:

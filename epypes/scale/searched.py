@@ -13,6 +13,7 @@ from epypes.scale.digests import Untold, digest_of, joined
 from epypes.scale.items import Item
 from epypes.scale.ranging import Axis, Choices
 from epypes.scale.remembered import contents_of
+from epypes.scale.sameness import computation_of
 from epypes.scale.scoring import Scoring
 
 METRIC: Final = "metric"
@@ -47,7 +48,7 @@ def about_search(
     choices = {axis.token: axis.values for axis in axes if isinstance(axis, Choices)}
     labels = [(case.name, case.expected, case.hyperparameters) for case in scoring.cases]
     ways: dict[str, Callable[[], str]] = {
-        "graph": lambda: digest_of(to_source(runner.cg)),
+        "graph": lambda: computation_of(runner.cg, to_source(runner.cg)),
         "hyperparameters": lambda: digest_of(fixed),
         "choices": lambda: digest_of(choices),
         METRIC: scoring.digest,

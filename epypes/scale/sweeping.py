@@ -15,6 +15,7 @@ from epypes.run import CompGraphRunner
 from epypes.scale.grids import Grid, Setting, grid_of
 from epypes.scale.items import Item, count_of, items_of
 from epypes.scale.job import Job
+from epypes.scale.lasting import settled_runner
 from epypes.scale.order import functions_after, running_order, steps
 from epypes.scale.outcome import Outcome
 from epypes.scale.progress import Advance, progress_bar
@@ -180,6 +181,7 @@ def sweep(
     >>> [outcome.values["total"] for outcome in result]
     [11, 21, 12, 22]
     """
+    given, runner = runner, settled_runner(runner)
     kept, shown = _tokens(runner, keep), None if show is None else _tokens(runner, show)
     plan = grid_of(runner, grid, how=how, n=n, seed=seed)
     count = 1 if images is None else count_of(images)
@@ -193,12 +195,12 @@ def sweep(
         memory = None
         if (opened := stack.enter_context(opened_store(store))) is not None:
             series = series_of(opened, "sweep", runner, name, plan.names)
-            memory = Remembered(series, f"show={shown and list(shown)}", not kept)
-            stack.callback(memory.write)
+            memory = stack.enter_context(Remembered(series, f"show={shown and list(shown)}", not kept))
         work = _Sweep(runner, Job((), in_order, kept, shown), memory, advance)
-        work.run(_items(runner, images, plan), executor, count)
+        is_copied = executor is not None or opened is not None or bool(kept)
+        work.run(_items(given, images, plan, is_copied=is_copied), executor, count)
     found = sorted(work.outcomes, key=lambda outcome: (outcome.number, places[id(outcome.setting)]))
-    return SweepResult(tuple(found), plan.names, runner)
+    return SweepResult(tuple(found), plan.names, given)
 
 
 class _Sweep:
@@ -266,11 +268,11 @@ def _made_after(runner: CompGraphRunner, name: str) -> Iterator[str]:
         yield from runner.cg.func_outputs(function)
 
 
-def _items(runner: CompGraphRunner, images: Any, plan: Grid) -> Iterator[Item]:
+def _items(runner: CompGraphRunner, images: Any, plan: Grid, *, is_copied: bool) -> Iterator[Item]:
     if images is None:
         yield Item(0, "last payload", _last_payload(runner))
         return
-    for item in items_of(images, runner):
+    for item in items_of(images, runner, is_copied=is_copied):
         # How many a generator gives is known when it gives them.
         plan.require_room(item.number + 1)
         yield item

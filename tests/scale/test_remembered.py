@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
+import sqlite3
 
 import cv2
 import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.errors import ScaleError
+from epypes.errors import ScaleError, StoreError
+from epypes.scale.items import Item
+from epypes.scale.outcome import Outcome
+from epypes.scale.remembered import Remembered
 
 
 def above(image, level):
@@ -173,3 +178,67 @@ def test_settings_with_arrays_are_told_by_what_is_in_them(store):
         table[2500] = level
         (found,) = ep.sweep(runner, [{"table": (table,)}], [np.zeros((2, 2))], store=store, name="s")
         assert found.values["out"] == level
+
+
+# -- what can't be written --------------------------------------------------------------------------------------
+
+
+def number_of(image):
+    return 10**5000 if image.flat[0] == 3 else int(image.flat[0])
+
+
+def levels(count):
+    return [np.full((3, 3), level) for level in range(count)]
+
+
+def test_a_number_too_long_to_be_read_is_a_short_text_and_the_others_are_stored(store):
+    runner = runner_of(number_of, "image")
+    for _ in range(2):
+        found = [one.values["out"] for one in ep.map(runner, levels(6), store=store)]
+        assert found == [0, 1, 2, "int of 16,610 bits", 4, 5]
+    assert rows(store) == 6
+    by_length = runner_of(lambda image, size: size % 10, "image", "size", size=1)
+    swept = ep.sweep(by_length, {"size": [10**5000, 3]}, levels(1), store=store, name="s")
+    assert [one.values["out"] for one in swept] == [0, 3]
+    assert rows(store, "sweep") == 2
+
+
+def test_a_row_that_can_not_be_written_takes_no_other_with_it(store):
+    memory = Remembered(store.series("map", "n"))
+    for number in range(4):
+        item = Item(number, f"#{number}", {"image": number})
+        memory.recall(item)
+        memory.add([Outcome(number, item.name, values={"out": object() if number == 1 else number})])
+    with pytest.warns(UserWarning, match="can't be stored: .* It is run again the next time"):
+        memory.write()
+    assert rows(store) == 3
+    memory.write()
+
+
+def without_rows(path):
+    with contextlib.closing(sqlite3.connect(path)) as database, database:
+        database.execute("drop table epypes_rows")
+
+
+def test_what_could_not_be_written_waits_until_it_can(tmp_path):
+    with ep.Store(tmp_path / "r.sqlite") as store:
+        memory = Remembered(store.series("map", "n"))
+        memory.recall(Item(0, "#0", {"image": 0}))
+        memory.add([Outcome(0, "#0", values={"out": 1})])
+        without_rows(tmp_path / "r.sqlite")
+        with pytest.raises(StoreError):
+            memory.write()
+        with ep.Store(tmp_path / "r.sqlite"):  # which makes the tables that are not there
+            memory.write()
+        assert rows(store) == 1
+
+
+def test_a_generators_own_error_is_the_one_that_is_raised(tmp_path):
+    def frames():
+        yield from levels(3)
+        without_rows(tmp_path / "r.sqlite")
+        raise RuntimeError("camera gone")
+
+    with pytest.raises(RuntimeError, match="camera gone") as caught:
+        ep.map(runner_of(number_of, "image"), frames(), store=tmp_path / "r.sqlite")
+    assert "What waited to be stored could not be" in caught.value.__notes__[0]
