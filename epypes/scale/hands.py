@@ -6,7 +6,7 @@ import queue
 import threading
 import uuid
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from dataclasses import replace
 from typing import Any, Final, Protocol
@@ -41,6 +41,24 @@ class Hands(Protocol):
         """Return a job that is to be done again while no other one is; None if there is none."""
 
 
+class NotTaken(Exception):
+    """An executor that takes no jobs any more: it was shut down, or its client closed."""
+
+
+def _given(executor: Executor, call: Callable[..., Any], argument: object) -> Future[Any]:
+    try:
+        return executor.submit(call, argument)
+    except BrokenExecutor:
+        raise
+    except Exception as error:  # Python's pools raise RuntimeError, others what they like
+        raise NotTaken(said(error)) from error
+
+
+def said(error: BaseException) -> str:
+    """Return what an error says, behind its kind."""
+    return f"{type(error).__name__}: {error!s:.500}" if str(error) else type(error).__name__
+
+
 def own_runner(runner: CompGraphRunner) -> CompGraphRunner:
     """Return another runner of the same graph, with the same hyperparameters."""
     return CompGraphRunner(runner.cg, runner.hyperparameters, workers=runner.workers, guard=runner.guard)
@@ -69,7 +87,7 @@ class Threads:
 
     def submit(self, job: Job) -> Future[Any]:
         """Give a job to a thread."""
-        return self._executor.submit(self._do, job)
+        return _given(self._executor, self._do, job)
 
     def _do(self, job: Job) -> list[Outcome]:
         if self._stop is not None and self._stop.is_set():
@@ -135,7 +153,7 @@ class Bundles:
 
     def _send(self, sent: Sent) -> Future[Any]:
         sent = replace(sent, id=uuid.uuid4().hex)
-        future = self._executor.submit(work, sent)
+        future = _given(self._executor, work, sent)
         self._sent[future] = sent
         return future
 
@@ -176,6 +194,5 @@ class Bundles:
 def _unable(error: Exception) -> EpypesError:
     if isinstance(error, EpypesError):
         return error
-    said = f"{type(error).__name__}: {error}"
     needed = "Workers need epypes, of the same version, and what the graph imports."
-    return ScaleError(f"A worker could not do its job: {ended(said[:500])} {needed}")
+    return ScaleError(f"A worker could not do its job: {ended(said(error))} {needed}")

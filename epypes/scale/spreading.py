@@ -18,7 +18,7 @@ from typing import Any, Final
 
 from epypes.errors import ExecutorBroken
 from epypes.run import CompGraphRunner
-from epypes.scale.hands import Bundles, Hands, Threads, own_runner
+from epypes.scale.hands import Bundles, Hands, NotTaken, Threads, own_runner, said
 from epypes.scale.job import Job, do
 from epypes.scale.outcome import Outcome
 from epypes.wording import counted
@@ -108,8 +108,8 @@ def _handed_out(
                 yield outcomes
         over.set()
         yield from _last(hands, at_work)
-    except (BrokenExecutor, CancelledError) as error:
-        raise ExecutorBroken(done, _broken(done, error)) from error
+    except (BrokenExecutor, CancelledError, NotTaken) as error:
+        raise ExecutorBroken(done, _why(done, error)) from error
     finally:
         over.set()
         for future in at_work:
@@ -126,19 +126,39 @@ def _last(hands: Hands, at_work: dict[Future[Any], Job]) -> Iterator[list[Outcom
         yield outcomes
 
 
-def _broken(done: int, error: BaseException) -> str:
-    said = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+def _why(done: int, error: BaseException) -> str:
+    if isinstance(error, NotTaken):
+        return _closed(done, str(error))
     return (
-        f"The executor broke after {counted(done, 'outcome')}, most likely since one of its processes died ({said}). "
-        "Make a new one and run again: with store= what was done is taken from there. A Dask cluster goes on by itself."
+        f"The executor broke after {counted(done, 'outcome')}, most likely since one of its processes died "
+        f"({said(error)}). Make a new one and run again: with store= what was done is taken from there. "
+        "A Dask cluster goes on by itself."
+    )
+
+
+def _closed(done: int, why: str) -> str:
+    return (
+        f"The executor takes no jobs after {counted(done, 'outcome')}: it was shut down, or its client closed ({why}). "
+        "Make a new one and run again: with store= what was done is taken from there."
     )
 
 
 def worker_count(executor: Executor) -> int:
-    """Return how many jobs an executor does at once, as far as that can be known."""
+    """Return how many jobs an executor does at once, as far as that can be known.
+
+    Raises
+    ------
+    ExecutorBroken
+        It can't be asked any more, as that of a Dask client that was closed.
+    """
     # Neither Python's pools nor Dask's executor say it in public.
     most = getattr(executor, "_max_workers", None)
     if isinstance(most, int):
         return most
     cores = getattr(getattr(executor, "_client", None), "ncores", None)
-    return max(sum(cores().values()), 1) if callable(cores) else os.cpu_count() or 1
+    if not callable(cores):
+        return os.cpu_count() or 1
+    try:
+        return max(int(sum(cores().values())), 1)
+    except Exception as error:  # a client without a scheduler raises whatever comes first
+        raise ExecutorBroken(0, _closed(0, said(error))) from error

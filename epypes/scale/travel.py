@@ -73,10 +73,10 @@ def unpacked_values(values: Mapping[str, Any], enums: Mapping[str, Any] | None =
 
 
 def packed_job(job: Job) -> Job:
-    """Return a job as it travels."""
+    """Return a job as it travels: where it starts, with a lock and a runner, is of this process alone."""
     items = tuple(replace(item, payload=packed_values(item.payload, "Input")) for item in job.items)
     settings = tuple(packed_values(setting, "Hyperparameter") for setting in job.settings)
-    return replace(job, items=items, settings=settings)
+    return replace(job, items=items, settings=settings, start=None)
 
 
 def unpacked_job(job: Job, enums: Mapping[str, Any]) -> Job:

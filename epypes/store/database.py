@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from epypes.errors import StoreError
-from epypes.store.place import connect_options, shown, url_of
+from epypes.store.onefile import OneFile, file_of
+from epypes.store.place import connect_options, file_path, shown, url_of
 
 if TYPE_CHECKING:
     from sqlalchemy import URL, Connection, Engine
@@ -22,6 +23,7 @@ _T = TypeVar("_T")
 # Two that make the tables, or write one key, at the same moment: one of them begins again.
 _TRIES: Final = 8
 _AGAIN_S: Final = 0.02
+_NOWHERE: Final = object()
 
 
 class Database:
@@ -42,8 +44,10 @@ class Database:
         self._url = url_of(given)
         self.place = shown(self._url)
         self.engine = engine_of(self._url)
+        self._made_in: object = _NOWHERE
+        self._is_closed = False
         try:
-            self.write(self._make_tables)
+            self.write(lambda _connection: None)
         except BaseException:
             self.engine.dispose()
             raise
@@ -66,22 +70,33 @@ class Database:
             who, way_out = "a newer", "Update: pip install --upgrade epypes"
         return f"{self.place} was made by {who} EPypes: its tables have version {found}, here it is {known}. {way_out}"
 
+    def _done(self, work: Callable[[Connection], _T]) -> _T:
+        """Do something in one transaction, in a database that has the tables."""
+        with self.engine.begin() as connection:
+            file = file_of(connection)
+            if file != self._made_in:
+                self._make_tables(connection)
+            found = work(connection)
+        self._made_in = file
+        return found
+
     def write(self, work: Callable[[Connection], _T]) -> _T:
         """Do something in one transaction: all of it is written, or nothing; again if another came in between.
 
         Raises
         ------
         StoreError
-            It can't be written.
+            It can't be written, or was closed.
         """
         from sqlalchemy.exc import SQLAlchemyError
 
+        if self._is_closed:
+            raise StoreError(self.place, f"The store {self.place} was closed. Open it again: ep.Store(...)")
         tries = 0
         while True:
             tries += 1
             try:
-                with self.engine.begin() as connection:
-                    return work(connection)
+                return self._done(work)
             except SQLAlchemyError as error:
                 if tries == _TRIES or not _may_be_another(error):
                     raise self._told(error) from None
@@ -93,15 +108,15 @@ class Database:
         Raises
         ------
         StoreError
-            It can't be read.
+            It can't be read, or was closed.
         """
-        from sqlalchemy.exc import SQLAlchemyError
+        # In a file that was made anew meanwhile there are the tables to be made first.
+        return self.write(work)
 
-        try:
-            with self.engine.connect() as connection:
-                return work(connection)
-        except SQLAlchemyError as error:
-            raise self._told(error) from None
+    def close(self) -> None:
+        """Have nothing written or read any more."""
+        self._is_closed = True
+        self.engine.dispose()
 
     def _told(self, error: SQLAlchemyError) -> StoreError:
         said = _said(error)
@@ -129,6 +144,8 @@ def engine_of(url: URL) -> Engine:
         raise StoreError(shown(url), _no_driver(url, error)) from None
     if engine.dialect.name == "sqlite":
         event.listen(engine, "connect", _set_up_sqlite)
+        if (path := file_path(url)) is not None:
+            OneFile(path).watch(engine)
     return engine
 
 

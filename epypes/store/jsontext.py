@@ -23,7 +23,7 @@ def to_text(value: Any) -> str:
     Raises
     ------
     TypeError
-        It has something in it that JSON has no word for.
+        It has something in it that JSON has no word for, or a key that is no text.
     ValueError
         It contains itself.
     """
@@ -33,7 +33,20 @@ def to_text(value: Any) -> str:
         text = ""
     if not text or '{"$' in text:
         text = _dumped(_worded(value))
+    _check_keys(value)
     return _SURROGATE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+def _check_keys(value: Any) -> None:
+    """Refuse keys that JSON would write as texts, where they may be those of others: 1 and "1"."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            if not isinstance(key, str):
+                raise TypeError(f"key {key!r:.80} is no text; as one it is {str(key)!r:.80}")
+            _check_keys(item)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            _check_keys(item)
 
 
 def _dumped(value: Any) -> str:

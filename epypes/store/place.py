@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import unquote, urlsplit
 
 from epypes.errors import StoreError
 
@@ -23,7 +24,11 @@ def url_of(given: str | Path) -> URL:
     ------
     StoreError
         There can be no such database.
+    TypeError
+        It is neither a path nor a URL.
     """
+    if not isinstance(given, str | Path):
+        raise TypeError(f"A store is a path or a URL, not {given!r:.80}. Name a file: 'results.sqlite'.")
     try:
         import sqlalchemy  # noqa: F401 - so that it is told by its own name
     except ImportError:
@@ -66,11 +71,23 @@ def _file_url(path: Path, url: URL | None = None) -> URL:
 
     if path.is_dir():
         raise StoreError(str(path), f"{path} is a folder. Name a file in it: {path / 'results.sqlite'}")
+    if path.exists() and not path.is_file():
+        raise StoreError(str(path), f"{path} is no file but a device or a pipe. Name a file: 'results.sqlite'.")
     if not path.absolute().parent.is_dir():
         raise StoreError(
             str(path), f"There is no folder {path.absolute().parent} to store {path.name!r} in. Make it first."
         )
     return url.set(database=str(path)) if url is not None else URL.create("sqlite", database=str(path))
+
+
+def file_path(url: URL) -> str | None:
+    """Return the absolute path of the file of a SQLite database; None if it is another database, or not to be told."""
+    if url.get_backend_name() != "sqlite" or not url.database:
+        return None
+    if not url.database.startswith("file:"):
+        return str(Path(url.database).absolute())
+    path = unquote(urlsplit(url.database).path)
+    return str(Path(path).absolute()) if path else None
 
 
 def shown(url: URL) -> str:

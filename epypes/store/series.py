@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import StoreError
 from epypes.store.jsontext import from_text, from_word, to_text, to_word
+from epypes.store.onefile import file_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -21,6 +23,15 @@ _PAGE: Final = 500
 _NONE: Final = 0
 
 
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    """What a database knows of a series; one in which it was made anew may know it by another number."""
+
+    file: int | None
+    number: int
+    about: str
+
+
 class Series:
     """Rows of one kind under one name; `Store.series` gives it.
 
@@ -31,48 +42,56 @@ class Series:
 
     def __init__(self, database: Database, kind: str, name: str, about: Mapping[str, Any] | None = None) -> None:
         self._database, self.kind, self.name = database, kind, name
-        # The number is 0 and nothing is said of it as long as nobody has made it.
-        self._id, self._about = _NONE, self._text("about", {})
-        if about is None:
-            database.read(self._look)
-        else:
-            text = self._text("about", about)
-            database.write(lambda connection: self._make(connection, text))
+        self._about = self._text("about", about or {})
+        # None as long as nobody has made it: to look for a series is not to make it.
+        self._entry: _Entry | None = None
+        self._take(database.read(self._found) if about is None else database.write(self._made))
 
-    def _look(self, connection: Connection) -> int:
-        """Return the number of this series, to read it; 0 if it is not there."""
-        from sqlalchemy import select
+    def _take(self, entry: _Entry | None) -> None:
+        """Know from now on what the database knows of this series, and go on with what is said of it there."""
+        if entry is not None:
+            self._entry, self._about = entry, entry.about
 
-        from epypes.store.tables import digest_of, series
-
-        if self._id == _NONE:
-            digest = digest_of(to_word(self.kind), to_word(self.name))
-            wanted = select(series.c.id, series.c.about).where(series.c.digest == digest)
-            found = connection.execute(wanted).one_or_none()
-            if found is not None:
-                # Readers on other threads look at the number first.
-                self._about, self._id = found[1], found[0]
-        return self._id
-
-    def _make(self, connection: Connection, about: str) -> int:
-        """Return the number of this series, to write it; it is made if it is not there."""
+    def _made(self, connection: Connection) -> _Entry:
+        """Return the entry of this series; it is made if it is not there."""
         from sqlalchemy import insert
 
         from epypes.store.tables import digest_of, series
 
-        number = self._look(connection)
-        if number != _NONE:
-            return number
-        kind, name = to_word(self.kind), to_word(self.name)
-        values = {"kind": kind, "name": name, "digest": digest_of(kind, name)}
-        made = connection.execute(insert(series).values(**values, about=about, made_ns=time.time_ns()))
-        (number,) = made.inserted_primary_key or (_NONE,)
-        return int(number)
+        found = self._found(connection)
+        if found is None:
+            kind, name = to_word(self.kind), to_word(self.name)
+            values = {"kind": kind, "name": name, "digest": digest_of(kind, name)}
+            made = insert(series).values(**values, about=self._about, made_ns=time.time_ns())
+            number: Any = connection.execute(made).inserted_primary_key
+            found = _Entry(file_of(connection), number[0], self._about)
+        return found
+
+    def _found(self, connection: Connection) -> _Entry | None:
+        """Return the entry of this series in the file that is there now; None if it is not there."""
+        from sqlalchemy import select
+
+        from epypes.store.tables import digest_of, series
+
+        digest = digest_of(to_word(self.kind), to_word(self.name))
+        found = connection.execute(select(series.c.id, series.c.about).where(series.c.digest == digest)).one_or_none()
+        return None if found is None else _Entry(file_of(connection), found[0], found[1])
+
+    def _number(self, connection: Connection) -> int:
+        """Return the number of this series in the file that is there now, to read it."""
+        found = self._known(connection) or self._found(connection)
+        return _NONE if found is None else found.number
+
+    def _known(self, connection: Connection) -> _Entry | None:
+        """Return the entry that is known; None if there is none, or it is of another file than the one there now."""
+        entry = self._entry
+        return entry if entry is not None and entry.file == file_of(connection) else None
 
     @property
     def about(self) -> Mapping[str, Any]:
         """What was said of the series when it was made."""
-        self._database.read(self._look)
+        if self._entry is None:
+            self._take(self._database.read(self._found))
         about: dict[str, Any] = from_text(self._about)
         return about
 
@@ -102,8 +121,14 @@ class Series:
         found = {row["digest"]: row for row in (self._row(key, data) for key, data in rows)}
         if not found:
             return
-        about = self._text("about", {})
-        self._database.write(lambda connection: _put(connection, self._make(connection, about), found))
+
+        def put(connection: Connection) -> _Entry:
+            entry = self._known(connection) or self._made(connection)
+            _put(connection, entry.number, found)
+            return entry
+
+        # Not before that is written: what is undone has made no series either.
+        self._take(self._database.write(put))
 
     def _row(self, key: str, data: Mapping[str, Any]) -> dict[str, Any]:
         from epypes.store.tables import digest_of
@@ -126,7 +151,8 @@ class Series:
         digest = digest_of(to_word(key))
 
         def read(connection: Connection) -> Any:
-            return connection.execute(row_data, {"series": self._look(connection), "digest": digest}).scalar()
+            wanted = {"series": self._number(connection), "digest": digest}
+            return connection.execute(row_data, wanted).scalar()
 
         text = self._database.read(read)
         return None if text is None else self._data(key, text)
@@ -137,7 +163,8 @@ class Series:
 
         from epypes.store.tables import rows
 
-        return frozenset(from_word(word) for (word,) in self._selected(select(rows.c.key)))
+        found = self._selected(select(rows.c.key))
+        return frozenset(from_word(word) for (word,) in found)
 
     def items(self) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """Yield keys with their rows in the order of writing, a page at a time; what comes meanwhile may come too."""
@@ -159,7 +186,8 @@ class Series:
         from epypes.store.tables import rows
 
         def read(connection: Connection) -> list[Any]:
-            return list(connection.execute(wanted.where(rows.c.series_id == self._look(connection))))
+            mine = rows.c.series_id == self._number(connection)
+            return list(connection.execute(wanted.where(mine)))
 
         return self._database.read(read)
 

@@ -29,17 +29,20 @@ class Store:
     ------
     StoreError
         It can't be opened; the text says why, and never the password.
+    TypeError
+        It is neither a path nor a URL.
 
     Notes
     -----
     Any thread may use it, and many processes at the same time. Its tables are made when it is opened; their names
-    begin with ``epypes_``, so it may share a database with others.
+    begin with ``epypes_``, so it may share a database with others. A file that is deleted, moved or replaced while it
+    is open is told in the log; what comes from then on is written to the file of that name, made anew if need be.
     """
 
     def __init__(self, place: str | Path) -> None:
         self._database = Database(place)
         # A store that nobody closed, as in a notebook, leaves no connection behind.
-        self._close = weakref.finalize(self, self._database.engine.dispose)
+        weakref.finalize(self, self._database.engine.dispose)
 
     @property
     def place(self) -> str:
@@ -87,8 +90,8 @@ class Store:
         return [(from_word(kind), from_word(name)) for kind, name in found]
 
     def close(self) -> None:
-        """Close it; a second time does nothing."""
-        self._close()
+        """Close it; a second time does nothing. It and its series can't be read or written any more."""
+        self._database.close()
 
     def __enter__(self) -> Self:
         return self

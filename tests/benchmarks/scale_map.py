@@ -100,7 +100,7 @@ def rows(effort: Effort) -> list[Row]:
 def _cluster(stack: ExitStack) -> object:
     from distributed import Client, LocalCluster
 
-    options = {"host": "127.0.0.1", "dashboard_address": None, "silence_logs": logging.CRITICAL}
+    options = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
     cluster = stack.enter_context(LocalCluster(n_workers=2, threads_per_worker=1, **options))
     return stack.enter_context(Client(cluster))
 

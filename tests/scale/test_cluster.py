@@ -15,6 +15,7 @@ import pytest
 from distributed import Client, LocalCluster
 
 import epypes as ep
+from epypes.errors import ExecutorBroken
 from epypes.scale.spreading import worker_count
 from tests.bundle.cells import cell
 from tests.scale.test_spreading import mixed, mortal_runner, without_times
@@ -26,12 +27,20 @@ _WAIT_S = 30.0
 def client():
     """A cluster of two worker processes; what kills three of them is given up."""
     with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 1}),
+        dask.config.set(
+            {
+                "distributed.scheduler.allowed-failures": 1,
+                # On a machine that is busy with other tests a worker takes its time to begin.
+                "distributed.comm.timeouts.connect": "120s",
+            }
+        ),
         LocalCluster(
             n_workers=2,
             threads_per_worker=1,
             host="127.0.0.1",
-            dashboard_address=None,
+            # Without an address it listens on port 8787 all the same, and warns if another cluster does so already.
+            dashboard_address="127.0.0.1:0",
+            scheduler_kwargs={"dashboard": False},
             silence_logs=logging.CRITICAL,
         ) as cluster,
         Client(cluster) as made,
@@ -44,6 +53,15 @@ def until(condition, what):
     while not condition():
         assert time.monotonic() < deadline, what
         threading.Event().wait(0.005)
+
+
+def test_a_client_that_was_closed_is_told_with_the_way_out(client, runner, crops):
+    with Client(client.scheduler.address) as other:
+        executor = other.get_executor()
+        assert worker_count(executor) == 2
+    with pytest.raises(ExecutorBroken, match=r"takes no jobs .* Make a new one") as told:
+        ep.map(runner, crops, executor)
+    assert told.value.done == 0
 
 
 def test_a_cluster_gives_what_this_thread_gives(client, runner, crops, folder):

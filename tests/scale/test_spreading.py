@@ -25,6 +25,8 @@ from epypes.errors import ExecutorBroken, PromotionRefused, ScaleError
 from epypes.scale.items import items_of
 from epypes.scale.job import Job
 from epypes.scale.spreading import spread, worker_count
+from epypes.scale.start import Start
+from epypes.scale.travel import packed_job
 from tests.bundle.cells import cell
 
 _WAIT_S = 20.0
@@ -74,6 +76,19 @@ def test_settings_are_the_same_whoever_does_the_jobs(runner, crops, processes):
     found.sort(key=lambda outcome: (outcome.number, outcome.setting["canny_lo"]))
     assert without_times(found) == without_times(expected)
     assert len({outcome.values["edge_pixels"] for outcome in found}) == 9
+
+
+def test_where_a_job_starts_stays_in_this_process(runner, crops, processes):
+    (item,) = items_of(crops[:1], runner)
+    jobs = [Job((item,), ({"canny_lo": low},), start=start) for start in [Start()] for low in (10, 60)]
+
+    def pixels(executor):
+        outcomes = [outcome for outcomes in spread(runner, jobs, executor) for outcome in outcomes]
+        return {outcome.setting["canny_lo"]: outcome.values["edge_pixels"] for outcome in outcomes}
+
+    assert pixels(processes) == pixels(None)
+    assert packed_job(jobs[0]).start is None
+    assert jobs[0].start is not None
 
 
 def test_members_of_the_notebooks_enumerations_travel(processes, crops):
@@ -261,6 +276,29 @@ def test_a_pool_whose_worker_dies_says_how_many_were_done_and_a_store_lets_it_go
         4,
         5,
     ]
+
+
+@pytest.mark.parametrize("kind", [ThreadPoolExecutor, ProcessPoolExecutor])
+def test_a_pool_that_was_shut_down_is_told_with_the_way_out(kind, runner, crops):
+    pool = kind(1)
+    pool.shutdown()
+    with pytest.raises(ExecutorBroken, match=r"takes no jobs after 0 outcomes: it was shut down.*Make a new") as told:
+        ep.map(runner, crops, pool)
+    assert told.value.done == 0
+    assert "RuntimeError: cannot schedule new futures" in str(told.value)
+
+
+def test_a_pool_that_is_shut_down_half_way_says_how_many_were_done(runner, crops):
+    pool = ThreadPoolExecutor(1)
+
+    def images():
+        yield from crops[:6]
+        pool.shutdown(wait=False)
+        yield from crops[6:]
+
+    with pytest.raises(ExecutorBroken, match=r"takes no jobs after \d outcomes?: it was shut down") as told:
+        ep.map(runner, images(), pool, ahead=1)
+    assert 1 <= told.value.done <= 6
 
 
 # -- stopping ---------------------------------------------------------------------------------------------------

@@ -92,6 +92,20 @@ def test_a_database_that_is_held_up_holds_no_answer_up_and_is_told_in_the_metric
     assert len(rows_of(path)) == 50
 
 
+def test_a_file_that_is_deleted_under_a_service_is_made_anew_and_nothing_is_lost_from_then_on(acting, tmp_path, caplog):
+    path = tmp_path / "events.sqlite"
+    with serving(acting, store=path) as (service, peer):
+        peer.ask(number=1)
+        until(lambda: service.event_log.counts()["written"] == 1)
+        path.unlink()
+        for number in (2, 3):
+            peer.ask(number=number)
+        until(lambda: service.event_log.counts()["written"] == 3)
+        assert [row["seq"] for row in rows_of(path)] == [2, 3]
+    assert [row["seq"] for row in rows_of(path)] == [2, 3]
+    assert caplog.text.count(f"{path} was deleted, moved or replaced") == 1
+
+
 def test_a_service_without_a_store_has_no_such_metrics(acting):
     with serving(acting) as (service, peer):
         peer.ask()

@@ -106,6 +106,14 @@ def test_what_is_no_json_is_refused_with_its_row_and_nothing_of_the_batch_is_wri
     assert len(series) == 0
 
 
+def test_keys_that_are_no_texts_are_refused_before_one_takes_the_place_of_another(store):
+    series = store.series("map", "edges")
+    for bad in ({1: "one", "1": "text"}, {None: 1}, {True: 1}, {"deep": [{"in": {1.5: 2}}]}, {"nan": {1: math.nan}}):
+        with pytest.raises(TypeError, match=r"Row 'bad' of map 'edges' can't be stored: key .* is no text"):
+            series.append("bad", bad)
+    assert len(series) == 0
+
+
 def test_a_row_of_many_megabytes_comes_back(store):
     series = store.series("map", "large")
     series.append("large", {"text": "é" * 5_000_000})

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sqlite3
 import subprocess
 import sys
+import threading
 import traceback
+from concurrent.futures import ThreadPoolExecutor
 from time import monotonic
 
 import pytest
@@ -31,6 +34,43 @@ def test_there_must_be_a_folder_for_the_file(tmp_path):
     assert said == f"There is no folder {tmp_path}/none to store 'results.sqlite' in. Make it first."
     assert "is a folder. Name a file in it" in refused(tmp_path)
     assert "There is no folder" in refused(f"sqlite:///{tmp_path}/none/results.sqlite")
+
+
+def test_what_is_neither_a_path_nor_a_url_is_refused_by_name():
+    for wrong in (None, 3, b"results.sqlite"):
+        with pytest.raises(TypeError, match=f"A store is a path or a URL, not {wrong!r}"):
+            Store(wrong)
+
+
+def test_what_is_no_file_is_refused_before_it_is_opened(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for place in ("/dev/null", tmp_path / "pipe", "sqlite:////dev/null"):
+        assert "is no file but a device or a pipe. Name a file" in refused(place)
+
+
+def test_a_store_that_was_closed_is_neither_read_nor_written(place):
+    with Store(place) as store:
+        series = store.series("map", "edges")
+        series.append("a", {})
+    for doing in (
+        lambda: series.append("b", {}),
+        lambda: series.get("a"),
+        lambda: len(series),
+        lambda: list(series.rows()),
+        lambda: store.series("map", "edges"),
+        store.kinds,
+    ):
+        with pytest.raises(StoreError, match=r"was closed. Open it again: ep.Store"):
+            doing()
+    with Store(place) as store:
+        assert store.series("map", "edges").keys() == {"a"}
+
+
+def test_a_series_whose_store_nobody_holds_any_more_goes_on(place):
+    series = Store(place).series("map", "edges")
+    series.append("a", {})
+    assert series.keys() == {"a"}
+    series._database.close()
 
 
 @pytest.mark.parametrize(
@@ -231,6 +271,128 @@ def test_who_reads_for_long_holds_no_writer_up(tmp_path, monkeypatch):
         series.append("b", {})
         assert len(other.execute("SELECT * FROM epypes_rows").fetchall()) == 1
         other.close()
+
+
+# -- a file that is another one now -----------------------------------------------------------------------------
+
+
+def keys_in(path):
+    with Store(path) as store:
+        return store.series("map", "edges").keys()
+
+
+def test_a_file_that_is_deleted_is_made_anew_with_all_that_comes_then_and_told_once(tmp_path, caplog):
+    path = tmp_path / "results.sqlite"
+    with Store(path) as store:
+        other, series = store.series("map", "other"), store.series("map", "edges", about={"k": 3})
+        series.append("before", {})
+        path.unlink()
+        assert series.keys() == frozenset(), "who reads sees what is there"
+        assert caplog.text.count("was deleted, moved or replaced") == 1
+        for number in range(3):
+            series.append(f"{number}", {"n": number})
+        assert path.is_file()
+        assert series.keys() == keys_in(path) == {"0", "1", "2"}
+        assert store.names("map") == ("edges",)
+        assert store.series("map", "edges").about == {"k": 3}
+        other.append("a", {})
+        assert store.names("map") == ("edges", "other")
+        assert caplog.text.count("was deleted, moved or replaced") == 1
+        path.unlink()
+        series.append("again", {})
+        assert caplog.text.count("was deleted, moved or replaced") == 2
+    assert keys_in(path) == {"again"}
+
+
+def test_a_file_that_is_deleted_with_all_beside_it_is_made_anew(tmp_path):
+    path = tmp_path / "results.sqlite"
+    with Store(path) as store:
+        series = store.series("map", "edges")
+        for key in "ab":
+            for left in tmp_path.iterdir():
+                left.unlink()
+            series.append(key, {})
+    assert keys_in(path) == {"b"}
+
+
+def test_a_file_that_is_moved_away_has_all_until_then(tmp_path):
+    path, moved = tmp_path / "results.sqlite", tmp_path / "monday.sqlite"
+    with Store(path) as store:
+        series = store.series("map", "edges")
+        series.append("before", {})
+        path.rename(moved)
+        series.append("after", {})
+    assert keys_in(path) == {"after"}
+    assert keys_in(moved) == {"before"}
+
+
+def test_a_file_that_is_replaced_by_another_is_gone_on_with_and_stays_whole(tmp_path):
+    path, fresh = tmp_path / "results.sqlite", tmp_path / "fresh.sqlite"
+    with Store(fresh) as store:
+        # Series and rows have other numbers there.
+        store.series("sweep", "first").append_all((f"{number}", {"text": "x" * 500}) for number in range(50))
+        store.series("map", "edges").append("theirs", {})
+    with Store(path) as store:
+        series = store.series("map", "edges")
+        series.append_all((f"{number}", {"text": "y" * 500}) for number in range(50))
+        fresh.rename(path)
+        assert series.keys() == {"theirs"}
+        series.append("ours", {})
+        assert series.keys() == keys_in(path) == {"theirs", "ours"}
+        assert len(store.series("sweep", "first")) == 50
+    whole = sqlite3.connect(path)
+    assert whole.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+    whole.close()
+
+
+def test_threads_lose_nothing_once_their_file_was_deleted(tmp_path):
+    path = tmp_path / "results.sqlite"
+    with Store(path) as store, ThreadPoolExecutor(4) as pool:
+        series = store.series("map", "edges")
+        # So that there are four connections to the file that is deleted.
+        together = threading.Barrier(4)
+        list(pool.map(lambda _: store._database.read(lambda _connection: together.wait(10)), range(4)))
+        path.unlink()
+        list(pool.map(lambda number: series.append(f"{number}", {}), range(200)))
+        assert len(series) == 200
+    assert len(keys_in(path)) == 200
+
+
+def test_two_stores_go_on_with_the_same_new_file(tmp_path):
+    path = tmp_path / "results.sqlite"
+    with Store(path) as one, Store(path) as other:
+        ours, theirs = one.series("map", "edges"), other.series("map", "edges")
+        ours.append("before", {})
+        path.unlink()
+        for number in range(20):
+            ours.append(f"ours {number}", {})
+            theirs.append(f"theirs {number}", {})
+        assert len(ours.keys()) == 40
+        assert ours.keys() == theirs.keys()
+    assert len(keys_in(path)) == 40
+
+
+def test_a_file_whose_folder_is_gone_is_told(tmp_path):
+    folder = tmp_path / "results"
+    folder.mkdir()
+    with Store(folder / "results.sqlite") as store:
+        series = store.series("map", "edges")
+        shutil.rmtree(folder)
+        with pytest.raises(StoreError, match="can't be opened or written"):
+            series.append("a", {})
+        folder.mkdir()
+        series.append("b", {})
+        assert series.keys() == {"b"}
+
+
+def test_a_url_of_sqlite_with_options_follows_its_file_too(tmp_path):
+    path = tmp_path / "odd name.sqlite"
+    with Store(f"sqlite:///file:{tmp_path}/odd%20name.sqlite?uri=true") as store:
+        series = store.series("map", "edges")
+        series.append("before", {})
+        path.unlink()
+        series.append("after", {})
+        assert keys_in(path) == {"after"}
 
 
 def test_a_store_without_sqlalchemy_says_what_to_install():
