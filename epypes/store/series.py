@@ -43,13 +43,14 @@ class Series:
     def __init__(self, database: Database, kind: str, name: str, about: Mapping[str, Any] | None = None) -> None:
         self._database, self.kind, self.name = database, kind, name
         self._about = self._text("about", about or {})
-        # Nobody has made it yet, as far as is known.
-        self._entry = _Entry(None, _NONE, self._about)
-        if about is None:
-            database.read(self._number)
-        else:
-            self._entry = database.write(self._made)
-            self._about = self._entry.about
+        # None as long as nobody has made it: to look for a series is not to make it.
+        self._entry: _Entry | None = None
+        self._take(database.read(self._found) if about is None else database.write(self._made))
+
+    def _take(self, entry: _Entry | None) -> None:
+        """Know from now on what the database knows of this series, and go on with what is said of it there."""
+        if entry is not None:
+            self._entry, self._about = entry, entry.about
 
     def _made(self, connection: Connection) -> _Entry:
         """Return the entry of this series; it is made if it is not there."""
@@ -76,25 +77,21 @@ class Series:
         found = connection.execute(select(series.c.id, series.c.about).where(series.c.digest == digest)).one_or_none()
         return None if found is None else _Entry(file_of(connection), found[0], found[1])
 
-    def _is_known(self, connection: Connection) -> bool:
-        """Whether its number is known in the file that is there now."""
-        return self._entry.number != _NONE and self._entry.file == file_of(connection)
-
     def _number(self, connection: Connection) -> int:
-        """Return the number of this series in the file that is there now, to read it; 0 if nobody has made it."""
-        if self._is_known(connection):
-            return self._entry.number
-        found = self._found(connection)
-        if found is None:
-            return _NONE
-        if self._entry.number == _NONE:
-            self._about, self._entry = found.about, found
-        return found.number
+        """Return the number of this series in the file that is there now, to read it."""
+        found = self._known(connection) or self._found(connection)
+        return _NONE if found is None else found.number
+
+    def _known(self, connection: Connection) -> _Entry | None:
+        """Return the entry that is known; None if there is none, or it is of another file than the one there now."""
+        entry = self._entry
+        return entry if entry is not None and entry.file == file_of(connection) else None
 
     @property
     def about(self) -> Mapping[str, Any]:
         """What was said of the series when it was made."""
-        self._database.read(self._number)
+        if self._entry is None:
+            self._take(self._database.read(self._found))
         about: dict[str, Any] = from_text(self._about)
         return about
 
@@ -126,12 +123,12 @@ class Series:
             return
 
         def put(connection: Connection) -> _Entry:
-            entry = self._entry if self._is_known(connection) else self._made(connection)
+            entry = self._known(connection) or self._made(connection)
             _put(connection, entry.number, found)
             return entry
 
         # Not before that is written: what is undone has made no series either.
-        self._entry = self._database.write(put)
+        self._take(self._database.write(put))
 
     def _row(self, key: str, data: Mapping[str, Any]) -> dict[str, Any]:
         from epypes.store.tables import digest_of
