@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+from epypes.bundle.apart import without_unfrozen
 from epypes.run import CompGraphRunner
 from epypes.run.guard import is_array, is_plain_array
 
@@ -43,4 +44,4 @@ def lasting_each(values: Iterable[Any]) -> Iterator[Any]:
 def settled_runner(runner: CompGraphRunner) -> CompGraphRunner:
     """Return a runner of one's own, which no longer changes when somebody sets, or writes into, hyperparameters."""
     own = {token: lasting(value) for token, value in runner.hyperparameters.items()}
-    return CompGraphRunner(runner.cg, own, workers=runner.workers, guard=runner.guard)
+    return CompGraphRunner(without_unfrozen(runner.cg, own), own, workers=runner.workers, guard=runner.guard)

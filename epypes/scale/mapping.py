@@ -100,7 +100,8 @@ def map_images(
         In a dict a text stands for itself, unless it has the ending of an image and there is such a file.
     executor
         Who does it: this thread without. A ThreadPoolExecutor runs the graph as it is; any other executor, of
-        processes or a Dask cluster (``client.get_executor()``), a bundle that is made of it. The results are the same.
+        processes or a Dask cluster (``client.get_executor()``), a bundle that is made of it. The results are the
+        same, unless a function keeps something from one item to the next: a bundle refuses it, threads can't know.
         Functions of a module that is not installed, such as a file next to the notebook, can't go to other processes.
     keep
         Tokens whose values are kept, in ``outcome.kept``; nothing else but numbers and texts is.

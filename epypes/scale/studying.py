@@ -187,7 +187,8 @@ class Search:
         """Return the trials of a study that goes on, numbered as they will be in memory."""
         found = [trial for trial in written.get_trials() if trial.state.is_finished()]
         others = next((trial for trial in found if trial.distributions != self._distributions), None)
-        changed = changed_in(written.user_attrs.get(_ABOUT, {}), self._about)
+        # A study without trials is of nothing yet.
+        changed = changed_in(written.user_attrs.get(_ABOUT, {}), self._about) if found else ""
         if written.direction.name.lower() == self.direction and others is None and not changed:
             self._note(written)
             return found
