@@ -47,7 +47,10 @@ ROWS = {
             "{bundle} does not pass {cases}: 1 of 1 case failed: none.png. First: none.png, runs: ",
         ),
         (["{bundle}", "{cases}", "--json"], "1 of 1 case failed"),
-        (["{bundle}", "{cases}", "--junit", "{folder}/none/a.xml"], "'{folder}/none/a.xml' can't be written: there is no folder"),
+        (
+            ["{bundle}", "{cases}", "--junit", "{folder}/none/a.xml"],
+            "'{folder}/none/a.xml' can't be written: there is no folder",
+        ),
     ],
     "serve": [
         (["{folder}/none"], "{folder}/none does not exist"),
