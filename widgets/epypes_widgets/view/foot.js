@@ -28,7 +28,7 @@ export function footPart(panel) {
   const name = element("input", "epypes-input epypes-setting", { type: "text", "aria-label": "Name of the settings", placeholder: "name of settings", list: list.id, spellcheck: "false" });
   const save = textButton("Save", () => onSetting("save"), "epypes-save", "Save the values as a TOML file");
   const load = textButton("Load", () => onSetting("load"), "epypes-load", "Load saved values");
-  const said = element("span", "epypes-said", { role: "status" });
+  const said = element("span", "epypes-said epypes-setting-said", { role: "status" });
   const to = element("input", "epypes-input epypes-target", { type: "text", "aria-label": "Promote to", placeholder: "folder", spellcheck: "false" });
   const promote = textButton("Promote", onPromote, "epypes-promote", "Write the graph with these values as a folder of plain text, and check it");
   const outcome = element("span", "epypes-outcome", { role: "status" });
