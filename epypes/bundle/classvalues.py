@@ -7,7 +7,6 @@ as they can do no harm, and compared; a value that can't be evaluated is to be w
 from __future__ import annotations
 
 import ast
-import builtins
 import collections
 import dataclasses
 import enum
@@ -20,7 +19,7 @@ import types
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
-from epypes.bundle.evaluate import UNKNOWN, value_of
+from epypes.bundle.evaluate import UNKNOWN, evaluated, value_of
 from epypes.bundle.literal import is_data, is_same_data
 from epypes.bundle.text import first_line
 from epypes.run.guard import is_plain_array
@@ -158,11 +157,7 @@ def evaluated_safely(expression: ast.expr, names: Mapping[str, Any]) -> Any:
         return UNKNOWN
     if not all(_is_harmless(part.func, names) for part in parts if isinstance(part, ast.Call)):
         return UNKNOWN
-    try:
-        code = compile(ast.Expression(expression), "class", "eval", dont_inherit=True)
-        return eval(code, {"__builtins__": vars(builtins), **names})  # noqa: S307 - the notebook's own text, as checked
-    except Exception:
-        return UNKNOWN
+    return evaluated(expression, names)
 
 
 def _is_harmless(called: ast.expr, names: Mapping[str, Any]) -> bool:

@@ -30,9 +30,14 @@ def value_of(expression: ast.expr, names: Mapping[str, Any]) -> Any:
     parts = list(ast.walk(expression))
     if not all(isinstance(part, _PLAIN) for part in parts) or any(map(_may_be_huge, parts)):
         return UNKNOWN
+    return evaluated(expression, names)
+
+
+def evaluated(expression: ast.expr, names: Mapping[str, Any]) -> Any:
+    """Return the value of an expression that was found to do nothing else; UNKNOWN if it raises."""
     try:
-        code = compile(ast.Expression(expression), "default", "eval", dont_inherit=True)
-        return eval(code, {"__builtins__": vars(builtins), **names})  # noqa: S307 - the notebook's own text, without calls
+        code = compile(ast.Expression(expression), "notebook", "eval", dont_inherit=True)
+        return eval(code, {"__builtins__": vars(builtins), **names})  # noqa: S307 - the notebook's own text, as checked
     except Exception:
         return UNKNOWN
 

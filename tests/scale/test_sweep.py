@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 import re
 import threading
-from collections import Counter
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from pathlib import Path
@@ -19,23 +17,8 @@ import pytest
 import epypes as ep
 from epypes.errors import PayloadError, ScaleError, UnknownName
 from tests.bundle.cells import cell
+from tests.calls import Calls
 from tests.scale.conftest import counting_runner
-
-
-class Calls:
-    """Counts calls, from any thread."""
-
-    def __init__(self) -> None:
-        self.counts: Counter[str] = Counter()
-        self._lock = threading.Lock()
-
-    def of(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        def counted(*args: Any) -> Any:
-            with self._lock:
-                self.counts[function.__name__] += 1
-            return function(*args)
-
-        return counted
 
 
 def load(image: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import pytest
 
 import epypes as ep
 from epypes_widgets import Panel, tune
+from tests.calls import Calls
 
 
 def brighten(image: Any, gain: int) -> Any:
@@ -20,23 +21,6 @@ def above(image_bright: Any, threshold: int) -> Any:
     if threshold == 13:
         raise ValueError("13 is not a threshold")
     return np.where(image_bright > threshold, 255, 0).astype(np.uint8)
-
-
-class Calls:
-    """Counts the calls of the functions that it wraps."""
-
-    def __init__(self) -> None:
-        self.counts: dict[str, int] = {}
-
-    def of(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        def counted(*args: Any) -> Any:
-            self.counts[function.__name__] = self.counts.get(function.__name__, 0) + 1
-            return function(*args)
-
-        return counted
-
-    def clear(self) -> None:
-        self.counts.clear()
 
 
 @pytest.fixture
