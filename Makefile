@@ -1,5 +1,6 @@
 # Set-up and checks. Everything happens in .venv; nothing else on the machine is changed, except that `make test`
-# installs Chromium and PostgreSQL with apt when they are missing and you are root.
+# installs Chromium, PostgreSQL, RabbitMQ, NATS and mosquitto with apt when they are missing and you are root; no
+# server is started but those of the tests.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -10,7 +11,7 @@ PIP := $(BIN)/python -m uv pip install --quiet --python $(BIN)/python
 demo: $(VENV)/.all
 	$(BIN)/epypes demo notebooks/01_edge_detection.ipynb --name runner --output edges --to demo-output
 
-test: $(VENV)/.test chromium postgres
+test: $(VENV)/.test chromium postgres brokers
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -49,8 +50,10 @@ $(VENV)/.bench: pyproject.toml | $(BIN)/python
 	$(PIP) --editable '.[all,test,bench]'
 	touch $@ $(VENV)/.test $(VENV)/.all
 
-.PHONY: chromium postgres
+.PHONY: chromium postgres brokers
 chromium:
 	@sh .ci/chromium
 postgres:
 	@sh .ci/postgres
+brokers:
+	@sh .ci/brokers

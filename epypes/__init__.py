@@ -63,7 +63,7 @@ if TYPE_CHECKING:
     from epypes.service.failures.reopen import load_failure
     from epypes.service.remote.connection import connect
     from epypes.store import Store
-    from epypes.transport import ZMQPublisher, ZMQSubscriber
+    from epypes.transport import Publisher, Subscriber, ZMQPublisher, ZMQSubscriber
 
 _HOMES = {
     "errors": "epypes",
@@ -110,6 +110,8 @@ _HOMES = {
     "Stage": "epypes.pipeline",
     "Stages": "epypes.pipeline",
     "Store": "epypes.store",
+    "Publisher": "epypes.transport",
+    "Subscriber": "epypes.transport",
     "ZMQPublisher": "epypes.transport",
     "ZMQSubscriber": "epypes.transport",
     "connect": "epypes.service.remote.connection",
@@ -148,6 +150,7 @@ __all__ = [
     "Placeholder",
     "Plan",
     "Preview",
+    "Publisher",
     "Roi",
     "Run",
     "RunReport",
@@ -156,6 +159,7 @@ __all__ = [
     "Stage",
     "Stages",
     "Store",
+    "Subscriber",
     "SweepResult",
     "TimingSummary",
     "TokenManager",

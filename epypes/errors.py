@@ -21,6 +21,7 @@ Everything an error's text mentions is an attribute of it::
     +-- FrameUnavailable        no frame is near enough to a time; .requested_ns, .oldest_ns, .newest_ns
     +-- MessageError            a message can't be made or understood; .reason
     +-- AddressError            an address can't be bound or connected to; .address
+    |   +-- BrokerError         a broker can't be reached, or refuses; .address, without the password
     +-- KeysError               keys can't be made, read or used; .path
     +-- RecordingError          a recording of messages can't be written or read; .path
     +-- SettingsError           settings of hyperparameters can't be written or read; .path, .reasons
@@ -69,10 +70,9 @@ class Finding:
     Attributes
     ----------
     kind
-        ``"cycle"``, ``"two producers"``, ``"no io"``, ``"no function"``, ``"bad io"``, ``"arity"``,
-        ``"not callable"``, ``"selector"``, ``"used up"``, ``"types"`` or ``"colour"``; where a graph is made of
-        functions or of graphs also ``"no name"``, ``"no signature"``, ``"two functions"``, ``"one name"``,
-        ``"defaults"`` or ``"not a placeholder"``.
+        ``"cycle"``, ``"two producers"``, ``"no io"``, ``"no function"``, ``"bad io"``, ``"arity"``, ``"not callable"``,
+        ``"selector"``, ``"used up"``, ``"types"`` or ``"colour"``; where a graph is made of functions or of graphs also
+        ``"no name"``, ``"no signature"``, ``"two functions"``, ``"one name"``, ``"defaults"``, ``"not a placeholder"``.
     text
         What is wrong and the way out, as a sentence.
     names
@@ -265,6 +265,10 @@ class AddressError(EpypesError, OSError):
     def __init__(self, address: str, text: str) -> None:
         self.address = address
         super().__init__(text)
+
+
+class BrokerError(AddressError):
+    """A broker that can't be reached, or refuses what is asked of it."""
 
 
 class KeysError(EpypesError, ValueError):

@@ -27,6 +27,8 @@ def call(
     as_json: Annotated[bool, typer.Option("--json", help="Print the times as JSON, in nanoseconds.")] = False,
     keys: Keys = None,
     allow: Allow = None,
+    sub: Annotated[str, typer.Option(help="As of epypes serve, where a broker asks for a password.")] = "",
+    pub: Annotated[str, typer.Option(help="As of epypes serve, likewise.")] = "",
 ) -> None:
     """Send one image to the service of a bundle, write what comes back to files and print the rest."""
     from epypes.acquisition import read_image
@@ -41,7 +43,7 @@ def call(
     files = by_token(images, settings.inputs, "input")
     targets = by_token(out_file or [], settings.outputs, "output")
     payload = {token: read_image(file, settings.order(token)) for token, file in files.items()}
-    with Client(bundle, timeout_s=timeout, keys=keys, allow=allow) as client:
+    with Client(bundle, timeout_s=timeout, keys=keys, allow=allow, sub=sub, pub=pub) as client:
         answers = [client.call(payload) for _ in range(count)]
     answer = min(answers, key=lambda answer: answer.round_trip_ns)
     for token, file in targets.items():

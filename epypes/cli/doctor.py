@@ -18,7 +18,8 @@ _STYLES = {"ok": "green", "warning": "yellow", "failed": "red"}
 def doctor(
     bundle: Annotated[Path | None, typer.Argument(help="A bundle that is to be served, or is.")] = None,
     address: Annotated[
-        list[str] | None, typer.Option(help="Where a service is to bind; is it free? May be repeated.")
+        list[str] | None,
+        typer.Option(help="Where a service is to bind: is it free? Or a broker's: is it there? May be repeated."),
     ] = None,
     keys: Annotated[list[Path] | None, typer.Option(help="A file of keys that is to be used; may be repeated.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the checks as JSON.")] = False,

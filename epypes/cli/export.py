@@ -36,7 +36,7 @@ def systemd(
     if to is None:
         out.print(unit, end="")
         return
-    file = to / unit_name(bundle) if to.is_dir() else to
+    file = to / unit_name(bundle, options or ()) if to.is_dir() else to
     try:
         file.write_text(unit, encoding="utf-8")
     except OSError as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
@@ -79,11 +79,11 @@ def _when(record: FailureRecord) -> str:
 
 
 def _raised(record: FailureRecord) -> str:
-    summary = record.summary if record.kind == "raised" else f"{record.kind}: {' '.join(record.message.split())}"
+    summary = record.summary if record.kind == "raised" else f"{record.kind}: {record.text}"
     return summary[:_MOST_CHARACTERS]
 
 
-def _print_table(records: Iterable[FailureRecord]) -> None:
+def _print_table(records: Sequence[FailureRecord]) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
@@ -93,10 +93,13 @@ def _print_table(records: Iterable[FailureRecord]) -> None:
     table.add_column("when", no_wrap=True, min_width=8)
     table.add_column("function", no_wrap=True, min_width=8, max_width=24)
     table.add_column("exception", no_wrap=True, overflow="ellipsis", ratio=1)
-    table.add_column("attempt", justify="right", min_width=7)
-    table.add_column("dead\nletter", min_width=6)
+    # A column that has nothing to say would only take its room.
+    has_attempts, has_dead = any(each.attempt != 1 for each in records), any(each.dead_letter for each in records)
+    if has_attempts:
+        table.add_column("attempt", justify="right", min_width=7)
+    if has_dead:
+        table.add_column("dead\nletter", min_width=6)
     for record in records:
-        dead = "yes" if record.dead_letter else ""
-        cells = (record.id, _when(record), record.function, _raised(record), str(record.attempt), dead)
-        table.add_row(*cells)
+        more = [str(record.attempt)] * has_attempts + ["yes" if record.dead_letter else ""] * has_dead
+        table.add_row(record.id, _when(record), record.function, _raised(record), *more)
     out.print(table)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, TextIO, cast
 import typer
 
 from epypes.cli.options import Allow, Keys
-from epypes.cli.terminal import out
+from epypes.cli.terminal import failures_at, out
 
 if TYPE_CHECKING:
     from epypes.service.state import ServiceState
@@ -19,9 +19,21 @@ _ANY_PORT = "tcp://127.0.0.1:*"
 
 def serve(
     bundle: Annotated[Path, typer.Argument(help="The folder of the bundle.")],
-    sub: Annotated[str, typer.Option(help="Where events come from; connect:ADDRESS connects.")] = _ANY_PORT,
-    pub: Annotated[str, typer.Option(help="Where answers go; connect:ADDRESS connects.")] = _ANY_PORT,
-    failures: Annotated[str, typer.Option(help="Where failures go; connect:ADDRESS connects.")] = _ANY_PORT,
+    sub: Annotated[
+        str,
+        typer.Option(
+            help="Where events come from: an address to bind, connect:ADDRESS, or a broker's queue, as amqp://HOST/QUEUE."
+        ),
+    ] = _ANY_PORT,
+    pub: Annotated[
+        str, typer.Option(help="Where answers go: an address to bind, connect:ADDRESS, or a place of a broker.")
+    ] = _ANY_PORT,
+    failures: Annotated[
+        str,
+        typer.Option(
+            help="Where failures are published besides, for who wants them alone: likewise. They arrive as answers too."
+        ),
+    ] = _ANY_PORT,
     http: Annotated[str, typer.Option(help="Where it is controlled, as 127.0.0.1:8642; nowhere without.")] = "",
     threads: Annotated[
         int, typer.Option(help="How many events are worked on at once, in order; at most 64.", min=1, max=64)
@@ -44,8 +56,22 @@ def serve(
     store: Annotated[
         str | None, typer.Option(help="Where a row of each event is kept: a SQLite file, or a database's URL.")
     ] = None,
+    replica: Annotated[
+        str, typer.Option(help="What it is called among those that share a broker's queue; a number without.")
+    ] = "",
+    ordered: Annotated[
+        bool, typer.Option("--ordered", help="Keep the order of events over all replicas of a broker's queue.")
+    ] = False,
 ) -> None:
-    """Serve a bundle between a SUB and a PUB socket, until SIGTERM or Ctrl+C."""
+    """Serve a bundle between a SUB and a PUB socket, or a broker's queues, until SIGTERM or Ctrl+C.
+
+    A broker's address is amqp://, nats:// or mqtt://[USER@]HOST/NAME.
+
+    Its password is in a file, which ?password_file=PATH names: lists of processes show addresses.
+
+    More options follow with & (quote the address): create=true, attempts=3, dead=NAME, group=NAME, kind=broadcast,
+    vhost=NAME, ca=FILE.
+    """
     from epypes.service import serve as serve_bundle
     from epypes.service.words import STANDARD_ERROR
 
@@ -57,8 +83,11 @@ def serve(
 
     def on_ready(state: ServiceState) -> None:
         more = f", control at {state.http}" if state.http else ""
-        where = f"events at {state.sub}, answers at {state.pub}, failures at {state.failures}{more}"
-        out.print(f"READY {bundle}: {where}, process {state.pid}.")
+        where = (
+            f"events at {state.sub}, answers at {state.pub}{failures_at(state.failures, state.shows_failures)}{more}"
+        )
+        named = f" (replica {state.replica})" if state.replica else ""
+        out.print(f"READY {bundle}{named}: {where}, process {state.pid}.")
         if state.http:
             # A log is read by others than a terminal.
             token = f"#token={Path(state.token_file).read_text(encoding='utf-8').strip()}" if out.is_terminal else ""
@@ -84,6 +113,8 @@ def serve(
         keys=keys,
         allow=allow,
         store=store,
+        replica=replica,
+        ordered=ordered,
         on_ready=on_ready,
         on_fault=on_fault,
     )

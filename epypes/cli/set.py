@@ -16,10 +16,17 @@ def set_parameters(
     source: Source,
     values: Annotated[list[str], typer.Argument(help="NAME=VALUE, as sigma=1.4 or method=sobel; all are set or none.")],
     token_file: TokenFile = None,
+    replica: Annotated[
+        str,
+        typer.Option(
+            help="Which of several services of the bundle here is told; without, the first that has --http."
+            " Those that share its queue follow it."
+        ),
+    ] = "",
 ) -> None:
     """Set hyperparameters of a running service between two events, all or none; epypes deploy forgets them."""
     wanted = dict(_read(text) for text in values)
-    with connected(source, token_file) as service:
+    with connected(source, token_file, replica) as service:
         before = service.parameters().entries
         now = service.set(**wanted)
     told = (f"{name} {_text(before[name])} -> {_text(now.entries[name])}" for name in wanted)

@@ -24,26 +24,40 @@ def is_url(source: str) -> bool:
     return source.startswith(("http://", "https://"))
 
 
-def state_of(source: str) -> ServiceState:
-    """Return what a running service of this user's says of itself.
+def state_of(source: str, replica: str = "") -> ServiceState:
+    """Return what a running service of this user's says of itself; of several replicas the first one.
 
     Raises
     ------
     ServiceError
         None runs for this bundle, or at this address.
     """
-    from epypes.service.state import read_state, running_at
+    return states_of(source, replica)[0]
 
-    found = running_at(source) if is_url(source) else read_state(_bundle(source))
-    if found is None:
-        way_out = (
-            "Is it another user's, or another machine's?" if is_url(source) else f"Start it: epypes serve {source}"
-        )
-        raise ServiceError(source, f"No service of yours runs for {source}. {way_out}")
+
+def states_of(source: str, replica: str = "") -> list[ServiceState]:
+    """Return what the running services of this user's say of themselves: one, or all replicas of a bundle.
+
+    Raises
+    ------
+    ServiceError
+        None runs for this bundle, or at this address.
+    """
+    from epypes.service.state import read_states, running_at
+
+    if is_url(source):
+        at = running_at(source)
+        found = [] if at is None else [at]
+        way_out = "Is it another user's, or another machine's?"
+    else:
+        found, way_out = read_states(_bundle(source), replica), f"Start it: epypes serve {source}"
+    if not found:
+        named = f" as replica {replica!r}" if replica else ""
+        raise ServiceError(source, f"No service of yours runs for {source}{named}. {way_out}")
     return found
 
 
-def url_of(source: str) -> str:
+def url_of(source: str, replica: str = "") -> str:
     """Return where a running service is controlled.
 
     Raises
@@ -53,17 +67,18 @@ def url_of(source: str) -> str:
     """
     if is_url(source):
         return source
-    http = state_of(source).http
+    states = states_of(source, replica)
+    http = next((state.http for state in states if state.http), "")
     if not http:
         raise ServiceError(source, f"The service of {source} has no HTTP address. Start it with --http 127.0.0.1:8642.")
     return http
 
 
-def connected(source: str, token_file: Path | None) -> Connection:
+def connected(source: str, token_file: Path | None, replica: str = "") -> Connection:
     """Return a connection to the service that is meant."""
     from epypes.service.remote.connection import connect
 
-    return connect(url_of(source), token=None if token_file is None else _token(token_file))
+    return connect(url_of(source, replica), token=None if token_file is None else _token(token_file))
 
 
 def _bundle(source: str) -> Path:

@@ -32,6 +32,11 @@ def progress(*, auto_refresh: bool = True, disable: bool = False) -> Iterator[Pr
         yield shown
 
 
+def failures_at(address: str, is_shown: bool) -> str:
+    """Return what is said after other addresses of where failures are published; nothing where nobody asks for it."""
+    return f", failures at {address}" if is_shown else ""
+
+
 def print_answer(title: str, answer: Answer) -> None:
     """Print the times of a service's answer as a table."""
     from rich.table import Table

@@ -17,10 +17,11 @@ FOut = Callable[[EventView], Any]
 
 
 class OfThread(threading.local):
-    """The stamps of the event that a thread works on."""
+    """The stamps of the event that a thread works on, and the event whose keeper has been told."""
 
     def __init__(self) -> None:
         self.stamps = Stamps()
+        self.settled: Any = None
 
 
 class Answering:

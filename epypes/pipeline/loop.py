@@ -13,6 +13,7 @@ from typing import Any
 
 from epypes.errors import StillRunning
 from epypes.pipeline.log import log_error
+from epypes.pipeline.settling import settle
 
 # How long one take from a queue may block before the stop flag is looked at. Queues that others made can't be
 # woken without putting a sentinel into them, which would be an event of theirs.
@@ -36,7 +37,8 @@ class EventLoop:
         Called on the loop's thread.
     f_in
         Makes the callback's keyword arguments from an event. Events can be anything, arrays and None included.
-        Without it the callback takes the event itself.
+        Without it the callback takes the event itself. One whose class has ``ack`` and ``reject``, as a broker's has,
+        is told so when the callback has returned, or raised; after a BrokerError it is left to be delivered again.
     on_error
         Called with the event and the exception when f_in or the callback raises; logged without one. The loop
         goes on in any case.
@@ -44,6 +46,8 @@ class EventLoop:
         For the thread's name and for errors.
     busy
         Returns the functions that have not returned; for errors.
+    settle
+        Called with an event, and the exception or None, when it is over; tells whoever keeps the event.
 
     Notes
     -----
@@ -59,9 +63,10 @@ class EventLoop:
         on_error: Callable[[Any, BaseException], None] | None = None,
         name: str = "EventLoop",
         busy: Callable[[], Sequence[str]] = tuple,
+        settle: Callable[[Any, BaseException | None], None] = settle,
     ) -> None:
         self.q_in, self.callback, self.f_in, self.on_error = q_in, callback, f_in, on_error
-        self.name, self._busy = name, busy
+        self.name, self._busy, self._settle = name, busy, settle
         self.handled = 0
         self._stop = threading.Event()
         self._draining = threading.Event()
@@ -157,6 +162,9 @@ class EventLoop:
                     self.callback(**self.f_in(event))
             except BaseException as exception:  # a function's SystemExit must not end the thread in silence
                 self._report(event, exception)
+                self._settle(event, exception)
+            else:
+                self._settle(event, None)
             poll_s = POLL_S
             # An event may be large: it shall not live on until another comes.
             del event

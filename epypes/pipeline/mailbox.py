@@ -11,6 +11,7 @@ from typing import Any, Final, Literal, get_args
 
 from epypes.errors import MailboxOverflow
 from epypes.pipeline.log import log_error
+from epypes.pipeline.settling import reject
 
 Policy = Literal["latest", "drop_oldest", "block", "fault"]
 _POLICIES: Final = get_args(Policy)
@@ -30,7 +31,8 @@ class Mailbox:
         How many items it holds; 1 for ``"latest"``.
     on_drop
         Called with each item that was dropped, on the thread that put the newer one, when that is in the mailbox. What
-        it raises is logged (``epypes.pipeline``) and not raised from `put`, which has done what it should.
+        it raises is logged (``epypes.pipeline``) and not raised from `put`, which has done what it should. An item with
+        a ``reject``, as a broker's events have it, is rejected as well.
 
     Attributes
     ----------
@@ -83,8 +85,8 @@ class Mailbox:
         """Have each item handed over within `put`, on the thread that puts, instead of kept; return what ends that.
 
         So nobody has to wait in `get`, and no thread has to be woken up: what a ZMQPublisher takes has been sent when
-        ``put`` returns. What is kept already is handed over first. ``take`` must not raise, and must let several
-        threads call it at once.
+        ``put`` returns. What is kept already is handed over first, and then ``take`` must not raise; later what it
+        raises comes out of ``put``. It must let several threads call it at once.
 
         Raises
         ------
@@ -125,6 +127,7 @@ class Mailbox:
         return None
 
     def _tell(self, dropped: Any) -> None:
+        reject(dropped, _DROPPED[self.policy])
         if self._on_drop is None:
             return
         try:

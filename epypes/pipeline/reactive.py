@@ -18,6 +18,7 @@ from epypes.pipeline.attempts import Attempts, event_id
 from epypes.pipeline.log import log_error
 from epypes.pipeline.loop import EventLoop
 from epypes.pipeline.pipeline import Pipeline
+from epypes.pipeline.settling import settle
 from epypes.pipeline.stages import Stages, function_stage, loop_stage, queue_stage
 from epypes.pipeline.stamps import Stamps
 from epypes.run import Failure, Run
@@ -72,6 +73,9 @@ class SourcePipeline(Answering, Pipeline):
 class SinkPipeline(Pipeline):
     """A Pipeline that runs for every event on ``q_in``.
 
+    An event that a broker has delivered is acknowledged when it has been answered, and rejected, with the reason, when
+    it failed.
+
     Parameters
     ----------
     q_in
@@ -109,7 +113,7 @@ class SinkPipeline(Pipeline):
         # Where the last event that failed did so, what was raised, and how many had been worked on.
         self._failed_last: tuple[Where | None, str, int] = (None, "", 0)
         self._own = OfThread()
-        self.loop = EventLoop(q_in, self.handle, name=name, busy=self._busy)
+        self.loop = EventLoop(q_in, self.handle, name=name, busy=self._busy, settle=self._settle_if_not_yet)
 
     def handle(self, event: Any) -> None:
         """Work on one event; every failure is reported, none is raised. The hook for subclasses."""
@@ -130,9 +134,12 @@ class SinkPipeline(Pipeline):
             run = self.run(**payload)
             where = "f_out"
             self.emit(event, run)
+            where = None
         except BaseException as exception:  # a function's SystemExit is a failure of this event, not the loop's end
             failed_in, where = where, None
             self._fail(event, failed_in, exception, run)
+        else:
+            self._settle(event)
         self.working_on = None
         del before
 
@@ -181,6 +188,18 @@ class SinkPipeline(Pipeline):
         self._failed_last = where, f"{failure.kind}: {failure.message}", self.run_count
         failed_id = event_id(event)
         self._report(replace(failure, event_id=failed_id, attempt=self._attempts.count(failed_id), source=self.name))
+        # When it has been told: whoever keeps the event may have nothing else to do with it.
+        self._settle(event, exception, str(failure))
+
+    def _settle(self, event: Any, exception: BaseException | None = None, text: str = "") -> None:
+        self._own.settled = event
+        settle(event, exception, text)
+
+    def _settle_if_not_yet(self, event: Any, exception: BaseException | None) -> None:
+        """Settle an event of the loop, unless `handle` has: that of a subclass need not call this one's."""
+        settled, self._own.settled = self._own.settled, None
+        if settled is not event:
+            settle(event, exception)
 
     def _failure_of(
         self, event: Any, where: Where | None, exception: BaseException, run: Run | None

@@ -16,7 +16,8 @@ from epypes.bundle.ports import REQUEST, in_order
 from epypes.bundle.settings import read_settings
 from epypes.errors import RemoteFailure, ServiceError
 from epypes.service.state import ServiceState, read_state
-from epypes.transport import ZMQPublisher, ZMQSubscriber
+from epypes.transport import Publisher, Subscriber, ZMQPublisher, ZMQSubscriber
+from epypes.transport.channels import is_brokered, place_of
 
 if TYPE_CHECKING:
     from epypes.transport import Keys
@@ -63,6 +64,8 @@ class Client:
         The caller's own pair of CURVE keys, or the path of its .key_secret file, where the service has keys.
     allow
         With keys: the service's public key, or its .key file.
+    sub, pub
+        The addresses that the service was given, where a broker asks for a password; nobody writes down that one.
 
     Raises
     ------
@@ -79,6 +82,8 @@ class Client:
         timeout_s: float = 10.0,
         keys: Keys | str | Path | None = None,
         allow: PublicKey | Collection[PublicKey] | None = None,
+        sub: str = "",
+        pub: str = "",
     ) -> None:
         self.path, self.timeout_s = path, timeout_s
         self._has_keys = keys is not None
@@ -87,16 +92,15 @@ class Client:
         self._rgb = read_settings(Path(path) / SETTINGS).rgb
         self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._subscriber = ZMQSubscriber(state.pub, self._answers, keys=keys, allow=allow)
-        self._publisher = ZMQPublisher(state.sub, self._requests, bind=False, keys=keys, allow=allow)
+        self._subscriber = _heard(path, pub or state.pub, self._answers, keys=keys, allow=allow)
+        self._publisher = _sent(sub or state.sub, self._requests, keys=keys, allow=allow)
 
     def __enter__(self) -> Self:
         deadline = monotonic() + self.timeout_s
         try:
             self._subscriber.start()
             self._publisher.start()
-            joined = self._subscriber.wait_joined(self.timeout_s)
-            if not joined or not self._publisher.wait_for_subscriber(max(deadline - monotonic(), 0)):
+            if not self._has_joined(deadline):
                 text = f"The service of {self.path} can't be reached within {self.timeout_s:g} s."
                 raise ServiceError(self.path, f"{text} {why_unreachable(self._has_keys)}")
         except BaseException:
@@ -107,6 +111,16 @@ class Client:
     def __exit__(self, *exception: object) -> None:
         self._publisher.stop()
         self._subscriber.stop()
+
+    def _has_joined(self, deadline_s: float) -> bool:
+        """Whether what is sent arrives, and what is answered too; a broker has said so by now."""
+        subscriber, publisher = self._subscriber, self._publisher
+        is_heard = isinstance(subscriber, Subscriber) or subscriber.wait_joined(self.timeout_s)
+        left_s = max(deadline_s - monotonic(), 0.0)
+        return is_heard and (isinstance(publisher, Publisher) or publisher.wait_for_subscriber(left_s))
+
+    def _lost(self) -> int:
+        return 0 if isinstance(self._subscriber, Subscriber) else sum(self._subscriber.lost.values())
 
     def call(self, payload: Mapping[str, Any]) -> Answer:
         """Send one event and wait for its answer.
@@ -133,7 +147,7 @@ class Client:
         from epypes.wire import Envelope
 
         deadline = monotonic() + self.timeout_s
-        refused, lost = self._publisher.rejected, sum(self._subscriber.lost.values())
+        refused, lost = self._publisher.rejected, self._lost()
         start_ns = perf_counter_ns()
         self._requests.put(request)
         while (left_s := deadline - monotonic()) > 0:
@@ -145,7 +159,7 @@ class Client:
             if isinstance(answer, Envelope) and answer.correlation_id == request.id:
                 return _read(self.path, answer, perf_counter_ns() - start_ns, self._rgb)
         text = f"The service of {self.path} did not answer within {self.timeout_s:g} s."
-        lost = sum(self._subscriber.lost.values()) - lost
+        lost = self._lost() - lost
         raise ServiceError(self.path, f"{text} {lost} answers were lost on the way meanwhile." if lost else text)
 
     def _check_alive(self, refused_before: Counter[str]) -> None:
@@ -184,10 +198,39 @@ def _running(path: str | Path) -> ServiceState:
     if state is None:
         raise ServiceError(path, f"No service runs for {path}. Start one: epypes serve {path}")
     for address in (state.sub, state.pub):
+        # A broker is connected to by everybody.
         if address.startswith("connect:"):
             text = f"The service of {path} connects to {address.removeprefix('connect:')}; send your events there."
             raise ServiceError(path, text)
     return state
+
+
+def _heard(path: str | Path, address: str, answers: Any, **secured: Any) -> Subscriber | ZMQSubscriber:
+    """Return what gets the answers of a service, without taking one from whoever they are for.
+
+    Raises
+    ------
+    ServiceError
+        They go to a queue.
+    """
+    if not is_brokered(address):
+        return ZMQSubscriber(address, answers, **secured)
+    place = place_of(address)
+    if place.kind == "queue":
+        text = (
+            f"The answers of the service of {path} go to the queue {place}, where each is for one reader: a call would "
+            "take answers from it. Send the event with ep.Publisher, and read the answers where you read the others; "
+            "or have the service tell everybody who listens: --pub with ?kind=broadcast."
+        )
+        raise ServiceError(path, text)
+    return Subscriber(place, answers, acknowledge="received")
+
+
+def _sent(address: str, requests: Any, **secured: Any) -> Publisher | ZMQPublisher:
+    """Return what sends events to a service."""
+    return (
+        Publisher(address, requests) if is_brokered(address) else ZMQPublisher(address, requests, bind=False, **secured)
+    )
 
 
 def _read(path: str | Path, answer: Envelope, round_trip_ns: int, rgb: Collection[str]) -> Answer:

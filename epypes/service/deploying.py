@@ -120,7 +120,7 @@ class Deployer:
             text = f"{before.path} was promoted anew just after the values were written. Deploy it."
             raise BundleError(before.path, text)
         with self._dispatcher.changed:
-            self._supervisor.served = after
+            self._supervisor.served = self._tuning.served = after
             self._tell_served("wrote parameters back into", before)
 
     def _tell_served(self, how: str, before: Served) -> None:
@@ -177,8 +177,9 @@ class Deployer:
             ended = self._dispatcher.wait_for(lambda: not self._dispatcher.ledger.running(), self._timeout_s)
             if ended and self._supervisor.can_switch(link):
                 before = self._supervisor.served
-                values = differing_values(before.entries, self._tuning.current.entries, link.served.entries)
-                self._tuning.take_over(link.served.entries)
+                tuned = self._tuning.current.entries
+                self._tuning.take_over(link.served)
+                values = differing_values(before.entries, tuned, self._tuning.current.entries)
                 self._supervisor.switch(link)
                 self._tell_served(how, before)
                 return values

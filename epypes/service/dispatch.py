@@ -8,6 +8,7 @@ when it has given the lock back.
 from __future__ import annotations
 
 import logging
+import queue
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -16,9 +17,20 @@ from time import perf_counter_ns
 from typing import Any
 
 from epypes.errors import EpypesError, ServiceError
+from epypes.service.desk import Desk
 from epypes.service.ledger import Entry, Ledger
 from epypes.service.link import Link
-from epypes.service.outcome import Desk, Result, Setting, dead_letter, dropped, failed_without_worker, refused, reported
+from epypes.service.outcome import (
+    Result,
+    Setting,
+    acknowledge,
+    dead_letter,
+    dropped,
+    exhausted,
+    failed_without_worker,
+    refused,
+    reported,
+)
 from epypes.service.stuck import Where
 from epypes.wire import Envelope, decode, encode
 
@@ -41,6 +53,10 @@ class Dispatcher:
     ----------
     changed
         The lock, and whom to wake up when anything changes.
+    is_closed
+        Whether a broker's events are left with it.
+    on_accepted, on_done
+        Called with each event that comes, and with each entry whose end has arrived; at once, and without the lock.
     is_unwatched
         Whether the supervisor wants to be woken up by the next event.
     answered_in_row
@@ -48,21 +64,32 @@ class Dispatcher:
     """
 
     def __init__(self, ledger: Ledger, desk: Desk, setting: Callable[[], Setting]) -> None:
-        self.changed = threading.Condition(threading.RLock())
+        lock = threading.RLock()
+        self.changed, self._room = threading.Condition(lock), threading.Condition(lock)
         self.ledger, self.answered_in_row = ledger, 0
         self._desk, self._setting = desk, setting
         self._link: Link | None = None
         self._holds: set[str] = set()
         self.is_unwatched, self._waiting = False, 0
-        self._why_refused = ""
+        self._why_refused, self.is_closed = "", False
+        self.on_accepted: Callable[[Any], object] = lambda event: None
+        self.on_done: Callable[[Entry], object] = lambda entry: None
         self._to_tell: deque[Callable[[], object]] = deque()
         self._publishing, self._publisher = threading.Lock(), 0
 
     # -- as the subscriber's queue --------------------------------------------------------------------------------
 
-    def put(self, item: Any, *, block: bool = False) -> None:
-        """Accept an event; never blocks. Called on the I/O thread."""
+    def put(self, item: Any, *, block: bool = False, timeout: float | None = 0.0) -> None:
+        """Accept an event; waits for room only if its broker keeps it meanwhile. Called on the subscriber's thread.
+
+        Raises
+        ------
+        queue.Full
+            There is no room within ``timeout`` seconds.
+        """
         with self.changed:
+            if self.ledger.waits and not self._room.wait_for(self._has_room, timeout if block else 0.0):
+                raise queue.Full
             for entry in self.ledger.accept(item, perf_counter_ns()):
                 self._tell_at_once(entry, dropped(entry, self.ledger.policy, self.ledger.size, self._setting()))
             if self._why_refused:
@@ -72,11 +99,22 @@ class Dispatcher:
                 # Who watches over events that take too long has one to watch now, for as long as one may take.
                 self.is_unwatched = False
                 self.changed.notify_all()
+        self.on_accepted(item)
         if self._to_tell:
             self.publish()
 
+    def _has_room(self) -> bool:
+        return not (self.is_closed or self._why_refused) and self.ledger.has_room
+
+    def exhausted(self, item: Any) -> None:
+        """Put an event aside that was delivered too often: no worker is given it."""
+        with self.changed:
+            entry = self.ledger.accept_resolved(item, perf_counter_ns(), item.attempt - 1, "dead_letters")
+            self._tell_at_once(entry, exhausted(entry, self._setting()))
+        self.publish()
+
     def _tell_at_once(self, entry: Entry, result: Result) -> None:
-        self.tell(lambda: self._desk.settle(entry, result))
+        self.tell(lambda: self._settle(entry, result))
 
     def tell(self, telling: Callable[[], object]) -> None:
         """Have something told by the next `publish`, after what was resolved before."""
@@ -137,6 +175,8 @@ class Dispatcher:
                 self._link.post({"kind": "event", "seq": entry.seq, "raw": is_raw}, frames)
             except EpypesError as error:
                 self._resolve(entry, failed_without_worker(entry, error, self._setting(), "raised", function="f_in"))
+        if self.ledger.waits and self.ledger.has_room:
+            self._room.notify_all()
 
     # -- from the worker ------------------------------------------------------------------------------------------
 
@@ -223,8 +263,17 @@ class Dispatcher:
         self.ledger.flowing = False
 
     def give_up(self, why: str, functions: Mapping[int, str] | None = None) -> int:
-        """Answer everything that is not resolved with a failure that says why; return how many events that were."""
+        """Answer everything that is not resolved with a failure that says why; return how many events that were.
+
+        What came from a broker is given back instead, which delivers it again.
+        """
         with self.changed:
+            if self.ledger.waits:
+                given_back = self.ledger.give_back()
+                for entry in given_back:
+                    entry.event.give_back()
+                self.changed.notify_all()
+                return len(given_back)
             waiting, begun = self.ledger.give_up()
             for entry in waiting:
                 self._tell_at_once(entry, refused(entry, why, self._setting()))
@@ -266,7 +315,26 @@ class Dispatcher:
             return found
 
     def _released(self) -> list[Callable[[], object]]:
-        return [partial(self._desk.settle, entry, entry.outputs) for entry in self.ledger.release()]
+        return [partial(self._settle, entry, entry.outputs) for entry in self.ledger.release()]
+
+    def _settle(self, entry: Entry, result: Result) -> None:
+        self._desk.settle(entry, result, partial(self._arrived, entry))
+
+    def _arrived(self, entry: Entry, result: Result, error: Exception | None) -> None:
+        """Note that the answer to an event has arrived, or could not: then its broker will deliver the event again."""
+        if error is not None:
+            if self.ledger.waits:
+                return
+            result = self._desk.lost(entry, result, error)
+        if self.ledger.is_confirmed:
+            with self.changed:
+                if not self.ledger.confirm(entry.seq, result.outcome):
+                    # It was given back meanwhile.
+                    return
+                self._assign()
+                self._tell_waiting()
+        acknowledge(entry.event, result)
+        self.on_done(entry)
 
     def wait_for(self, is_so: Callable[[], bool], timeout_s: float | None) -> bool:
         """Wait until something is so; return whether it is."""

@@ -22,13 +22,13 @@ from typing import Any, Final, Literal
 
 from epypes.bundle.seal import check_seal
 from epypes.errors import EpypesError
-from epypes.service.state import read_state
+from epypes.service.state import read_states
 
 Outcome = Literal["ok", "warning", "failed"]
 
 _OLDEST_PYTHON: Final = (3, 11)
 # What is not there is missed by a part of EPypes alone, which installing its extra brings.
-_EXTRAS: Final = ("notebook", "vision", "service", "scale")
+_EXTRAS: Final = ("notebook", "vision", "service", "scale", "rabbitmq", "nats", "mqtt")
 _BROWSERS: Final = ("chromium", "chromium-browser", "google-chrome", "firefox", "safari", "microsoft-edge")
 _ROUND_TRIPS: Final = 100
 _ROUND_TRIP_TIMEOUT_S: Final = 5.0
@@ -68,23 +68,20 @@ def examine(
     bundle
         A bundle that is to be served, or is: its seal and its service are looked at too.
     addresses
-        Where a service is to bind: ``tcp://127.0.0.1:5555``, ``http://127.0.0.1:8642``.
+        Where a service is to bind: ``tcp://127.0.0.1:5555``, ``http://127.0.0.1:8642``; or a place of a broker.
     keys
         Files of keys that are to be used.
     """
     checks: list[tuple[str, Callable[[], Check]]] = [
         ("Python", _python),
         ("EPypes", _epypes),
-        *(
-            (f"extra {extra}", lambda extra=extra: _extra(extra))
-            for extra in ("notebook", "vision", "service", "scale")
-        ),
+        *((f"extra {extra}", lambda extra=extra: _extra(extra)) for extra in _EXTRAS),
         ("OpenCV", _opencv),
         ("Graphviz", _graphviz),
         ("browser", _browser),
         ("state folder", _state_folder),
         ("loopback ports", _loopback),
-        *((f"address {address}", lambda address=address: _address(address)) for address in addresses),
+        *((f"address {_shown(address)}", lambda address=address: _address(address)) for address in addresses),
         *((f"keys {path}", lambda path=path: _keys(Path(path))) for path in keys),
         ("round trip", _round_trip),
     ]
@@ -92,6 +89,12 @@ def examine(
         checks += [("bundle", lambda: _bundle(Path(bundle))), ("service", lambda: _service(Path(bundle)))]
     for name, look in checks:
         yield _looked(name, look)
+
+
+def _shown(address: str) -> str:
+    """Return an address without the password that it may have."""
+    before, at, host = address.rpartition("@")
+    return f"{before.partition('://')[0]}://{host}" if at else address
 
 
 def _looked(name: str, look: Callable[[], Check]) -> Check:
@@ -207,11 +210,15 @@ def _loopback() -> Check:
 
 
 def _address(address: str) -> Check:
-    """Look whether an address can be bound at this moment."""
+    """Look whether an address can be bound at this moment, or whether a broker has such a place."""
     from urllib.parse import urlsplit
 
+    from epypes.transport.channels import is_brokered
+
+    if is_brokered(address):
+        return _place(address)
     name = f"address {address}"
-    way_out = "Write tcp://127.0.0.1:5555 or http://127.0.0.1:8642."
+    way_out = "Write tcp://127.0.0.1:5555, http://127.0.0.1:8642, or a broker's, as amqp://HOST/QUEUE."
     try:
         parts = urlsplit(address)
         host, port = parts.hostname, parts.port
@@ -229,6 +236,14 @@ def _address(address: str) -> Check:
             reason = error.strerror or str(error)
             return Check(name, "failed", reason, f"Name another port, or find who has it: ss -ltnp 'sport = :{port}'")
     return Check(name, "ok", "free")
+
+
+def _place(address: str) -> Check:
+    from epypes.transport.channels import open_channel, place_of
+
+    place = place_of(address)
+    open_channel(place).close()
+    return Check(f"address {place}", "ok", "the broker answers, and has it")
 
 
 def _keys(path: Path) -> Check:
@@ -282,7 +297,12 @@ def _bundle(path: Path) -> Check:
 
 
 def _service(path: Path) -> Check:
-    running = read_state(path)
-    if running is None:
+    running = read_states(path)
+    if not running:
         return Check("service", "warning", "none runs for this bundle", f"epypes serve {path}")
-    return Check("service", "ok", f"process {running.pid}: events at {running.sub}, answers at {running.pub}")
+    told = (
+        f"process {state.pid}{f' (replica {state.replica})' if state.replica else ''}: "
+        f"events at {state.sub}, answers at {state.pub}"
+        for state in running
+    )
+    return Check("service", "ok", "; ".join(told))

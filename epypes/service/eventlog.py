@@ -31,6 +31,8 @@ class EventLog:
         Of the bundle.
     setting
         Returns what events are worked on with.
+    replica
+        What the service is called among several.
 
     Raises
     ------
@@ -38,14 +40,20 @@ class EventLog:
         There can be no such database. One that is away is told in the log.
     """
 
-    def __init__(self, store: str | Path | None, name: str, setting: Callable[[], Setting]) -> None:
-        self._setting, self._began_ns = setting, time_ns()
+    def __init__(self, store: str | Path | None, name: str, setting: Callable[[], Setting], replica: str = "") -> None:
+        self._setting, self._began_ns, self._replica = setting, time_ns(), replica
         self._writer = None if store is None else SeriesWriter(store, KIND, name)
 
     def keep(self, entry: Entry, result: Result, failure: FailureRecord | None) -> None:
         """Have a row of an event written; returns at once and raises nothing."""
         if self._writer is not None:
-            self._writer.append(f"{self._began_ns}-{entry.seq}", _row(entry, result, failure, self._setting().digest))
+            row = {**_row(entry, result, failure, self._setting().digest), **self._of_broker(entry)}
+            self._writer.append(f"{self._began_ns}-{entry.seq}", row)
+
+    def _of_broker(self, entry: Entry) -> dict[str, Any]:
+        """Return what a row has besides where replicas share the events of a broker."""
+        deliveries = getattr(entry.event, "attempt", None)
+        return {} if deliveries is None else {"deliveries": deliveries, "replica": self._replica}
 
     def counts(self) -> Mapping[str, int]:
         """Return how many rows were written, skipped and so on, as `SeriesWriter.counts`; none without a store."""

@@ -13,6 +13,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from importlib import metadata
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -22,6 +23,7 @@ from epypes.bundle.requirements import pins
 from epypes.bundle.seal import check_seal
 from epypes.bundle.settings import read_settings
 from epypes.errors import ServiceError
+from epypes.transport.channels import extra_of, is_brokered
 
 # Python 3.11 is the oldest that EPypes runs on; the container takes the one that the bundle was proved with.
 _PYTHON: Final = f"{sys.version_info.major}.{sys.version_info.minor}"
@@ -35,19 +37,19 @@ _UNIT: Final = """\
 #
 #   sudo install -m 644 {file} /etc/systemd/system/{file}
 #   sudo systemctl daemon-reload
-#   sudo systemctl enable --now {file}
-#   journalctl --follow --unit {file}
+#   sudo systemctl enable --now {units}
+#   journalctl --follow --unit {unit}
 #
 # Commands find the service by the state file that it keeps, as user {user}:
 #
 #   XDG_RUNTIME_DIR=/run/{name} XDG_STATE_HOME=/var/lib/{name} epypes call {shown} image.png
 #
-# After a new promotion: epypes deploy, or sudo systemctl restart {file}
+# After a new promotion: epypes deploy, or sudo systemctl restart {units}
 
 [Unit]
 Description={description}
-After=network.target
-StartLimitIntervalSec=300
+After=network{online}.target
+{wants}StartLimitIntervalSec=300
 StartLimitBurst=5
 
 [Service]
@@ -64,7 +66,7 @@ KillMode=mixed
 TimeoutStopSec={stop_s}
 RuntimeDirectory={name}
 RuntimeDirectoryMode=0700
-StateDirectory={name}
+{kept}StateDirectory={name}
 StateDirectoryMode=0700
 Environment=XDG_RUNTIME_DIR=/run/{name}
 Environment=XDG_STATE_HOME=/var/lib/{name}
@@ -123,29 +125,61 @@ def systemd_unit(bundle: str | Path, options: Sequence[str] = (), *, user: str, 
     ------
     BundleError
         The folder is not the bundle that was promoted.
+    ServiceError
+        An address has a password in it, which everybody could read.
 
     Notes
     -----
+    Replicas, which share the events of a broker, have one unit: a template, of which each is an instance.
+
     systemd.service(5), systemd.exec(5); quoting by systemd.syntax(7).
     """
     folder, name = _checked(bundle)
+    _check_secrets(bundle, options)
+    is_template, file = _is_template(options), unit_name(bundle, options)
     command = [sys.executable, "-m", "epypes.cli", "serve", str(folder), *options]
+    units = [file.replace("@.", f"@{number}.") for number in ((1, 2) if is_template else (1,))]
     return _UNIT.format(
+        units=" ".join(units),
+        unit=units[0],
+        # All replicas share the folder, which would go with the first that is stopped.
+        kept="RuntimeDirectoryPreserve=yes\n" if is_template else "",
+        online="-online" if is_template else "",
+        wants="Wants=network-online.target\n" if is_template else "",
         bundle=_one_line(str(folder)),
         shown=_one_line(shlex.quote(str(folder))),
         name=f"epypes-{name}",
-        file=unit_name(bundle),
-        description=_specifiers(_one_line(f"EPypes service {name}")),
-        command=" ".join(map(_quoted, command)),
+        file=file,
+        description=_specifiers(_one_line(f"EPypes service {name}")) + (", replica %i" if is_template else ""),
+        command=" ".join([*map(_quoted, command), *(["--replica", "%i"] if is_template else [])]),
         user=_specifiers(user),
         start_s=_START_LIMIT_S,
         stop_s=stop_s,
     )
 
 
-def unit_name(bundle: str | Path) -> str:
-    """Return how the unit of a bundle is called: ``epypes-edges.service``."""
-    return f"epypes-{_checked(bundle)[1]}.service"
+def unit_name(bundle: str | Path, options: Sequence[str] = ()) -> str:
+    """Return how the unit of a bundle is called: ``epypes-edges.service``; ``epypes-edges@.service`` for replicas."""
+    return f"epypes-{_checked(bundle)[1]}{'@' if _is_template(options) else ''}.service"
+
+
+def _is_template(options: Sequence[str]) -> bool:
+    """Whether there may be several services of the bundle."""
+    has_name = any(option.partition("=")[0] == "--replica" for option in options)
+    subs = [option.removeprefix("--sub=") for option in options if option.startswith("--sub=")]
+    subs += [after for option, after in pairwise(options) if option == "--sub"]
+    return not has_name and any(map(is_brokered, subs))
+
+
+def _check_secrets(bundle: str | Path, options: Sequence[str]) -> None:
+    """Raise ServiceError for an address with a password in it: units, images and lists of processes are read by all."""
+    for option in options:
+        found = re.search(r"\b([a-z]+://[^/@\s:]*):[^/@\s]*@", option)
+        if found:
+            text = (
+                f"{found[1]}:... has the password in it, which others could read. Put it in a file: ?password_file=PATH"
+            )
+            raise ServiceError(bundle, text)
 
 
 def write_container(bundle: str | Path, to: str | Path, options: Sequence[str] = ()) -> Path:
@@ -170,9 +204,10 @@ def write_container(bundle: str | Path, to: str | Path, options: Sequence[str] =
     BundleError
         The folder is not the bundle that was promoted.
     ServiceError
-        The folder can't be written, or no wheel can be built.
+        The folder can't be written, no wheel can be built, or an address has a password in it.
     """
     folder, name = _checked(bundle)
+    _check_secrets(bundle, options)
     target = Path(to)
     try:
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
@@ -182,7 +217,8 @@ def write_container(bundle: str | Path, to: str | Path, options: Sequence[str] =
         pinned = (folder / "requirements.txt").read_text(encoding="utf-8")
         kept = [line for line in pinned.splitlines() if not _is_epypes(line)]
         has_wheel = _add_wheel(target, epypes_source(pins(pinned.splitlines())))
-        own = f"epypes[service]=={metadata.version('epypes')}"
+        extras = sorted({"service", *filter(None, map(extra_of, options))})
+        own = f"epypes[{','.join(extras)}]=={metadata.version('epypes')}"
         (target / "requirements.txt").write_text("\n".join([*kept, own]) + "\n", encoding="utf-8")
         entrypoint = ["epypes", "serve", "/service/bundle", *options]
         text = _CONTAINERFILE.format(

@@ -18,6 +18,8 @@ POLICIES: Final = get_args(Policy)
 Outcome = Literal["answered", "failed", "dead_letters"]
 # Events that may be done before the eldest is, for each that is worked on at once; more would only fill the memory.
 _AHEAD: Final = 8
+# Events whose answers a broker has not confirmed, likewise.
+_MOST_UNCONFIRMED: Final = 256
 
 
 @dataclass(slots=True, eq=False)
@@ -58,6 +60,8 @@ class _Totals:
     dropped: int = 0
     dead_letters: int = 0
     retried: int = 0
+    given_back: int = 0
+    redelivered: int = 0
 
 
 @dataclass(slots=True)
@@ -73,6 +77,10 @@ class Ledger:
         How many events the worker works on at once.
     retries
         How often an event that killed the worker while it was alone is tried again.
+    waits
+        Whether events come from a broker, who keeps them while there is no room: none comes then.
+    is_confirmed
+        Whether an event is resolved only when `confirm` says that its answer has arrived: until then it is in flight.
 
     Raises
     ------
@@ -84,6 +92,8 @@ class Ledger:
     size: int = 8
     slots: int = 1
     retries: int = 1
+    waits: bool = False
+    is_confirmed: bool = False
     # Whether a worker takes events: then each that is accepted is to be taken at once, if a slot is free.
     flowing: bool = False
     _last: int = 0
@@ -96,6 +106,7 @@ class Ledger:
     _alone: bool = False
     # Those that were given to a worker at least once, by their order, until they are released.
     _begun: dict[int, Entry] = field(default_factory=dict)
+    _unconfirmed: dict[int, Entry] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.policy not in POLICIES:
@@ -107,12 +118,10 @@ class Ledger:
 
     def accept(self, event: Any, now_ns: int) -> list[Entry]:
         """Take an event; return those that are dropped, which is told at once and not in the order of acceptance."""
-        self._last += 1
-        self._totals.received += 1
-        entry = Entry(self._last, event, now_ns)
+        entry = self._accepted(event, now_ns)
         dropped: list[Entry] = []
-        if not self._waiting and self._may_begin() and not self._again:
-            # It is taken before another comes, so it needs no room.
+        if self._is_taken_at_once():
+            # So it needs no room.
             self._waiting.append(entry)
         elif len(self._waiting) >= self.size and self.policy == "fault":
             dropped.append(entry)
@@ -123,10 +132,33 @@ class Ledger:
         self._totals.dropped += len(dropped)
         return dropped
 
+    @property
+    def has_room(self) -> bool:
+        """Whether an event that comes now is neither dropped nor has another one dropped."""
+        return self._is_taken_at_once() or self.waiting + len(self._unconfirmed) < self.size
+
+    def _is_taken_at_once(self) -> bool:
+        """Whether an event that comes now is taken before another comes."""
+        return not self._waiting and self._may_begin() and not self._again
+
+    def _accepted(self, event: Any, now_ns: int) -> Entry:
+        self._last += 1
+        self._totals.received += 1
+        # A broker counts its deliveries.
+        self._totals.redelivered += getattr(event, "attempt", 0) > 1
+        return Entry(self._last, event, now_ns)
+
+    def accept_resolved(self, event: Any, now_ns: int, attempts: int, outcome: Outcome) -> Entry:
+        """Take an event that no worker is to be given, since it is known what becomes of it; it is to be told."""
+        entry = self._accepted(event, now_ns)
+        entry.attempts, entry.outcome = attempts, outcome
+        self._count(entry)
+        return entry
+
     def _may_begin(self) -> bool:
         held = len(self._begun) - len(self._running) - len(self._again) - len(self._suspects)
         is_free = self.flowing and not self._suspects and not self._alone and len(self._running) < self.slots
-        return is_free and held < _AHEAD * self.slots
+        return is_free and held < _AHEAD * self.slots and len(self._unconfirmed) < _MOST_UNCONFIRMED
 
     def take(self, now_ns: int) -> Entry | None:
         """Return the event that the worker is to be given next; None while there is none, or no slot is free.
@@ -208,15 +240,37 @@ class Ledger:
         self._suspects.clear()
         return waiting, sorted(self._running.values(), key=lambda entry: entry.seq)
 
+    def give_back(self) -> list[Entry]:
+        """Forget every event that is not resolved, and return them: somebody else is to be given them."""
+        entries = [*self._unconfirmed.values(), *self._begun.values(), *self._waiting]
+        for kept in (self._waiting, self._again, self._suspects, self._running, self._begun, self._unconfirmed):
+            kept.clear()
+        self._alone = False
+        self._totals.given_back += len(entries)
+        return entries
+
     def release(self) -> Iterator[Entry]:
-        """Give what is resolved, in the order of acceptance; it is counted, and forgotten."""
+        """Give what is resolved, in the order of acceptance; it is counted, or is so when it is confirmed."""
         while self._begun:
             entry = self._eldest()
             if entry is None or entry.outcome is None:
                 return
             del self._begun[entry.seq]
-            setattr(self._totals, entry.outcome, getattr(self._totals, entry.outcome) + 1)
+            self._count(entry)
             yield entry
+
+    def _count(self, entry: Entry) -> None:
+        if self.is_confirmed:
+            self._unconfirmed[entry.seq] = entry
+        elif entry.outcome is not None:
+            setattr(self._totals, entry.outcome, getattr(self._totals, entry.outcome) + 1)
+
+    def confirm(self, seq: int, outcome: Outcome) -> bool:
+        """Note that the answer to an event has arrived; return whether it was waited for."""
+        entry = self._unconfirmed.pop(seq, None)
+        if entry is not None:
+            setattr(self._totals, outcome, getattr(self._totals, outcome) + 1)
+        return entry is not None
 
     def _eldest(self) -> Entry | None:
         # Begun in order of acceptance; tried again they keep their place.
@@ -225,7 +279,7 @@ class Ledger:
     @property
     def is_empty(self) -> bool:
         """Whether every event is resolved."""
-        return not (self._begun or self._waiting)
+        return not (self._begun or self._waiting or self._unconfirmed)
 
     @property
     def waiting(self) -> int:
@@ -234,12 +288,13 @@ class Ledger:
 
     @property
     def in_flight(self) -> int:
-        """How many events the worker has, or has done while one before them is not."""
-        return len(self._begun) - len(self._again) - len(self._suspects)
+        """How many events the worker has, or has done while one before them is not, or their answer is on its way."""
+        return len(self._begun) - len(self._again) - len(self._suspects) + len(self._unconfirmed)
 
     def counts(self) -> dict[str, int]:
-        """Return the counts: received is the sum of all others but ``retried``."""
+        """Return the counts: received is the sum of all others but ``retried`` and ``redelivered``."""
         totals = self._totals
+        of_broker = {"given_back": totals.given_back, "redelivered": totals.redelivered} if self.waits else {}
         return {
             "received": totals.received,
             "answered": totals.answered,
@@ -249,4 +304,5 @@ class Ledger:
             "dead_letters": totals.dead_letters,
             "waiting": self.waiting,
             "in_flight": self.in_flight,
+            **of_broker,
         }

@@ -24,7 +24,7 @@ Status = Literal["loading", "ready", "refused", "gone"]
 Message = tuple[dict[str, Any], list[memoryview]]
 ASK_S: Final = 2.0
 # How a worker settles a change of parameters.
-SETTLING: Final = ("parameters", "parameters_refused", "parameters_withdrawn")
+SETTLING: Final = ("parameters", "parameters_refused", "parameters_tried", "parameters_withdrawn")
 # How long a worker may take to say whether a change that nobody waits for any more was made.
 _WITHDRAW_S: Final = 0.5
 
@@ -98,8 +98,12 @@ class Link:
 
         return self._exchange(("asked", number), lambda: self.post(header), timeout_s, late)
 
-    def change(self, revision: int, values: Mapping[str, Any], timeout_s: float) -> dict[str, str]:
+    def change(
+        self, revision: int, values: Mapping[str, Any], timeout_s: float, *, is_trial: bool = False
+    ) -> dict[str, str]:
         """Have it take values of hyperparameters, by token as in pipeline.toml; return its problems, if it has any.
+
+        With ``is_trial`` it only says whether it would take them.
 
         Raises
         ------
@@ -107,16 +111,21 @@ class Link:
             It is gone, or works on an event for longer than ``timeout_s``.
         """
         key = ("parameters", revision)
-        answer, _ = self._exchange(key, lambda: self.tell_parameters(revision, values), timeout_s, self._withdraw)
+
+        def send() -> None:
+            self.tell_parameters(revision, values, is_trial=is_trial)
+
+        answer, _ = self._exchange(key, send, timeout_s, self._withdraw)
         if answer["kind"] == "parameters_withdrawn":
             text = f"The worker works on an event for longer than {timeout_s:g} s, so nothing was changed. Try again."
             raise ServiceError(self.served.path, text)
         return dict(answer.get("problems") or {})
 
-    def tell_parameters(self, revision: int, values: Mapping[str, Any]) -> None:
+    def tell_parameters(self, revision: int, values: Mapping[str, Any], *, is_trial: bool = False) -> None:
         """Have it take values of hyperparameters as soon as it works on no event; it says whether it has."""
         # Not in the header, which is bounded: a table may be large.
-        self.post({"kind": "parameters", "revision": revision}, [json.dumps(values).encode()])
+        header = {"kind": "parameters", "revision": revision, "is_trial": is_trial}
+        self.post(header, [json.dumps(values).encode()])
 
     def _withdraw(self, key: tuple[str, int], answers: queue.SimpleQueue[Message | None]) -> Message | None:
         """Have it forget a change that it has not made yet; return what has become of that.

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import socket
 from collections.abc import Mapping
-from time import CLOCK_MONOTONIC, clock_gettime_ns
+from time import CLOCK_MONOTONIC, clock_gettime_ns, monotonic
 from typing import Final
 
 SOCKET: Final = "NOTIFY_SOCKET"
@@ -61,3 +61,19 @@ def watchdog_s(environment: Mapping[str, str] = os.environ) -> float | None:
         return None
     # Half of it, as sd_watchdog_enabled(3) recommends.
     return int(micros) / 2e6 or None
+
+
+class Watchdog:
+    """When systemd is to be told next that the service is alive, which it does if it was asked to."""
+
+    def __init__(self) -> None:
+        self._every_s, self._told_s = watchdog_s(), 0.0
+
+    def due_in_s(self) -> float | None:
+        """Return in how many seconds that is, 0 or less if it is late; None if nobody asks."""
+        return None if self._every_s is None else self._told_s + self._every_s - monotonic()
+
+    def tell(self) -> None:
+        """Tell it: that somebody comes here shows that no lock is held for ever."""
+        self._told_s = monotonic()
+        notify("WATCHDOG=1")

@@ -1,32 +1,21 @@
-"""What has become of an event, and who is told?"""
+"""What has become of an event?"""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from time import perf_counter_ns, time_ns
-from typing import TYPE_CHECKING, Any, Final, Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from time import time_ns
+from typing import Any, Final, Literal
 
 from epypes.errors import MailboxOverflow, MessageError, ServiceError
 from epypes.run import Failure
 from epypes.service.failures.record import FailureRecord
-from epypes.service.failures.store import FailureStore
-from epypes.service.latency import Stopwatch
 from epypes.service.ledger import Entry, Outcome
 from epypes.wire import Envelope
 from epypes.wire.failures import failure_event
 
-if TYPE_CHECKING:
-    from epypes.service.eventlog import EventLog
-
 FAILURE_TOPIC: Final = "failure"
-_LOG_PAUSE_NS: Final = 5_000_000_000
-Kind = Literal["raised", "killed", "stuck", "dropped"]
-# Called with a kind of happening ("state", "run", "failure", "parameters", "deployed") and what there is to know of it.
-Listener = Callable[[str, dict[str, Any]], None]
-
-_log = logging.getLogger("epypes.service")
+Kind = Literal["raised", "killed", "stuck", "dropped", "exhausted"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +60,14 @@ class Result:
 
 
 def event_id(event: object) -> str:
-    """Return the id of an event; empty if it has none."""
-    return str(getattr(event, "id", ""))
+    """Return the id of an event, or that of the message that it came in; empty if it has none."""
+    return str(getattr(event, "id", "") or getattr(getattr(event, "received", None), "id", ""))
+
+
+def answer_id(event: object, number: int) -> str:
+    """Return what the answers to an event are known by, so that one that is published twice is told."""
+    own = event_id(event)
+    return f"{own}/{number}" if own and number > 1 else own
 
 
 def reported(entry: Entry, told: Mapping[str, Any], setting: Setting, kind: Kind) -> FailureRecord:
@@ -132,82 +127,18 @@ def dead_letter(entry: Entry, ending: str, function: str, setting: Setting) -> R
     return failed_without_worker(entry, error, setting, "killed", function=function, is_dead=True)
 
 
-class Desk:
-    """Publishes results, keeps failures and tells listeners.
+def exhausted(entry: Entry, setting: Setting) -> Result:
+    """Return the result of an event that a broker has delivered too often: whoever had it before has not answered."""
+    text = f"This event was delivered {entry.attempts} times before, and nobody has answered it. It is put aside."
+    return failed_without_worker(entry, ServiceError(setting.bundle, text), setting, "exhausted", is_dead=True)
 
-    Parameters
-    ----------
-    answer, report
-        Publish an answer, and a failure event on the failures' own socket.
-    store
-        Where failures are kept.
-    event_log
-        Where what has become of each event is kept.
-    """
 
-    def __init__(
-        self,
-        answer: Callable[[Any], object],
-        report: Callable[[Any], object],
-        store: Callable[[], FailureStore],
-        event_log: EventLog,
-    ) -> None:
-        self._answer, self._report, self._store, self._event_log = answer, report, store, event_log
-        self._listeners: list[Listener] = []
-        self.latency = Stopwatch()
-        self._logged_ns, self._unlogged = -_LOG_PAUSE_NS, 0
-
-    def listen(self, callback: Listener) -> Callable[[], None]:
-        """Have everything told to a callback; return what ends that."""
-        self._listeners.append(callback)
-
-        def forget() -> None:
-            if callback in self._listeners:
-                self._listeners.remove(callback)
-
-        return forget
-
-    def tell(self, kind: str, data: dict[str, Any]) -> None:
-        """Tell listeners; what they raise is logged."""
-        for callback in tuple(self._listeners):
-            try:
-                callback(kind, data)
-            except Exception:
-                _log.exception("a listener failed")
-
-    def settle(self, entry: Entry, result: Result) -> None:
-        """Publish what has become of an event, and tell of it."""
-        for answer in result.answers:
-            self._answer(answer)
-        if result.failure is not None:
-            self._event_log.keep(entry, result, self._settle_failure(entry, result, result.failure))
-            return
-        self._event_log.keep(entry, result, None)
-        self.latency.observe(perf_counter_ns() - entry.accepted_ns, result.total_ns, result.durations_ns)
-        if self._listeners:
-            told = {"seq": entry.seq, "event_id": event_id(entry.event), "revision": result.revision}
-            self.tell("run", {**told, "total_ns": result.total_ns})
-
-    def _log(self, failure: FailureRecord) -> None:
-        if failure.kind == "dropped":
-            # In a storm a line for each would take longer than the answer.
-            self._unlogged += 1
-            now_ns = perf_counter_ns()
-            if now_ns - self._logged_ns < _LOG_PAUSE_NS:
-                return
-            _log.warning("%s; %d events since this was said last", failure.summary, self._unlogged)
-            self._logged_ns, self._unlogged = now_ns, 0
-            return
-        _log.warning("event %s failed in %s: %s", failure.event_id or "without id", failure.function, failure.summary)
-
-    def _settle_failure(self, entry: Entry, result: Result, failure: FailureRecord) -> FailureRecord:
-        self._log(failure)
-        # In a storm dropped events would fill the store's memory with images of no interest.
-        kept = self._store().keep(failure, None if failure.kind == "dropped" else entry.event)
-        # With its id, so that who hears of it can have it run again.
-        more = {"id": kept.id, "kind": kept.kind, "dead_letter": kept.dead_letter, "when_ns": kept.when_ns}
-        for answer in result.answers:
-            if isinstance(answer, Envelope) and answer.failure is not None:
-                self._report(replace(answer, attributes={**answer.attributes, **more}))
-        self.tell("failure", asdict(kept))
-        return kept
+def acknowledge(event: Any, result: Result) -> None:
+    """Tell the broker that has delivered an event that it is done with, or to be put aside; nobody, if none has."""
+    kind = type(event)
+    if not (hasattr(kind, "ack") and hasattr(kind, "reject")):
+        return
+    if result.failure is not None and result.failure.dead_letter:
+        event.reject(result.failure.summary)
+    else:
+        event.ack()

@@ -132,6 +132,32 @@ def value_of(entry: Mapping[str, Any]) -> dict[str, Any]:
     return {key: entry[key] for key in _VALUE_KEYS if key in entry}
 
 
+def with_value(entry: Mapping[str, Any], value: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an entry with another value, as `value_of` returns one, and its own range."""
+    return {**value_of(value), **{key: part for key, part in entry.items() if key not in _VALUE_KEYS}}
+
+
+def misfits(entries: Entries, values: Mapping[str, Any]) -> dict[str, str]:
+    """Return a reason for each value, as `value_of` returns one, that no change could have given to its entry."""
+    problems: dict[str, str] = {}
+    for token, value in others_than(entries, values).items():
+        if token not in entries:
+            continue
+        try:
+            is_so = value_of(_with_value(entries, token, value.get("value"))) == value
+        except ValueError as error:
+            problems[token] = str(error)
+            continue
+        if not is_so:
+            problems[token] = f"{token!r} can't be {_brief(value)}: it is of another kind."
+    return problems
+
+
+def others_than(entries: Entries, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those of some values, by token, that are others than those of entries."""
+    return {token: value for token, value in values.items() if value != value_of(entries.get(token, {}))}
+
+
 def differing_values(written: Entries, before: Entries, after: Entries) -> list[str]:
     """Return a line for each hyperparameter that has another value after a bundle has taken another's place.
 

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from epypes.bundle.load import SETTINGS
 from epypes.bundle.seal import check_seal
 from epypes.bundle.settings import Settings, read_settings
-from epypes.errors import BundleError, ServiceError
+from epypes.errors import BundleError
 from epypes.service.parameters import read_entries
-
-MOST_THREADS: Final = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,18 +51,6 @@ def read_served(path: str | Path) -> Served:
     if check_seal(folder) != digest:
         raise BundleError(folder, f"{folder} was promoted anew while it was read. Try again.")
     return served
-
-
-def check_limits(path: str | Path, threads: int, job_timeout_s: float, drain_timeout_s: float) -> None:
-    """Raise ServiceError for what a bundle can't be served with."""
-    if not 1 <= threads <= MOST_THREADS:
-        text = f"A service works on 1 to {MOST_THREADS} events at once, not on {threads}."
-        raise ServiceError(path, text)
-    if not (math.isfinite(job_timeout_s) and job_timeout_s > 0):
-        text = f"An event may take a number of seconds above 0, not {job_timeout_s}. For one that takes long: 3600."
-        raise ServiceError(path, text)
-    if not (math.isfinite(drain_timeout_s) and drain_timeout_s >= 0):
-        raise ServiceError(path, f"Draining takes a number of seconds from 0, not {drain_timeout_s}.")
 
 
 def differing_ports(before: Settings, after: Settings) -> list[str]:

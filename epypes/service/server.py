@@ -4,43 +4,42 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from time import monotonic, time_ns
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from epypes.service.about import about
+from epypes.service.announcing import Announcer
 from epypes.service.asks import Asks
 from epypes.service.deploying import Deployer
+from epypes.service.desk import Desk, Listener
 from epypes.service.dispatch import Dispatcher
 from epypes.service.eventlog import EventLog
 from epypes.service.failures.record import FailureRecord
 from epypes.service.failures.store import FailureStore, failures_folder
+from epypes.service.group.peers import Parts, peers_of
 from epypes.service.intake import Intake
 from epypes.service.latency import Latency
-from epypes.service.ledger import Ledger, Policy
 from epypes.service.notify import notify
-from epypes.service.outcome import Desk, Listener, Setting
+from epypes.service.options import ANY_PORT, Options
+from epypes.service.outcome import Setting
 from epypes.service.parameters import Parameters
-from epypes.service.served import check_limits, read_served
+from epypes.service.served import read_served
 from epypes.service.sockets import Sockets
 from epypes.service.state import ServiceState
-from epypes.service.states import Facts, State, state_of
+from epypes.service.states import Facts, State
 from epypes.service.supervisor import Supervisor
 from epypes.service.tuning import Tuning
 
 if TYPE_CHECKING:
     from epypes.bundle.writeback import WriteBack
-    from epypes.transport.keys import Keys, PublicKey
 
-# How many events wait while one is computed.
-MAILBOX_SIZE: Final = 8
-DRAIN_TIMEOUT_S: Final = 5.0
-JOB_TIMEOUT_S: Final = 30.0
 # What of a drain's time is left for reporting what could not be worked off, and for closing.
 _DRAIN_SHARE: Final = 0.7
 _CHANGE_S: Final = 10.0
-ANY_PORT: Final = "tcp://127.0.0.1:*"
+# While it is so, other replicas are better off with a broker's events.
+_OF_NO_USE: Final = ("STOPPED", "LOADING", "FAULTED")
 
 
 class Service:
@@ -50,24 +49,8 @@ class Service:
     ----------
     path
         The bundle.
-    sub, pub, failures
-        Where events come from, where answers go, and where failures are published with the topic ``failure``: an
-        address is bound, ``connect:ADDRESS`` is connected to. ``tcp://127.0.0.1:*`` takes any free port.
-    threads
-        How many events are worked on at once; answers keep the order of the events.
-    job_timeout_s
-        How long an event may take, in seconds. One that takes longer has failed, and the worker is replaced.
-    retries
-        How often an event that killed the worker while it was alone is tried again.
-    drain_timeout_s
-        How long `stop` works off what was accepted, in seconds.
-    mailbox_policy, mailbox_size
-        What happens when more events wait: ``"drop_oldest"``, ``"latest"`` (of size 1) or ``"fault"``, which refuses
-        the new one. Each that is dropped is counted and answered.
-    insecure, keys, allow
-        As for ZMQSubscriber and ZMQPublisher.
-    store
-        Where a row of each event is kept: a SQLite file or a database's URL. Nothing waits for it.
+    sub, pub, options
+        As the attributes of `Options`.
 
     Attributes
     ----------
@@ -84,49 +67,37 @@ class Service:
         The mailbox, a time or the number of threads can't be; or the database.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        sub: str = ANY_PORT,
-        pub: str = ANY_PORT,
-        *,
-        failures: str = ANY_PORT,
-        threads: int = 1,
-        job_timeout_s: float = JOB_TIMEOUT_S,
-        retries: int = 1,
-        drain_timeout_s: float = DRAIN_TIMEOUT_S,
-        mailbox_policy: Policy = "drop_oldest",
-        mailbox_size: int = MAILBOX_SIZE,
-        insecure: bool = False,
-        keys: Keys | str | Path | None = None,
-        allow: PublicKey | Collection[PublicKey] | None = None,
-        store: str | Path | None = None,
-    ) -> None:
-        check_limits(path, threads, job_timeout_s, drain_timeout_s)
+    def __init__(self, path: str | Path, sub: str = ANY_PORT, pub: str = ANY_PORT, **options: Any) -> None:
+        self.options = given = Options(sub, pub, **options)
+        given.check(path)
         served = read_served(path)
-        self.path, self.threads = served.path, threads
-        self.job_timeout_s, self.drain_timeout_s = job_timeout_s, drain_timeout_s
+        self.path, self.threads = served.path, given.threads
+        self.job_timeout_s, self.drain_timeout_s = given.job_timeout_s, given.drain_timeout_s
         self.http = self.token_file = ""
         self.failure_store = FailureStore(failures_folder(served.path))
-        ledger = Ledger(mailbox_policy, mailbox_size, threads, retries)
-        self.event_log = EventLog(store, served.settings.name, self._setting)
+        self.event_log = EventLog(given.store, served.settings.name, self._setting, given.replica)
         self._desk = Desk(
-            lambda item: self._sockets.answer(item),
+            lambda *answer: self._sockets.answer(*answer),
             lambda item: self._sockets.report(item),
             lambda: self.failure_store,
             self.event_log,
+            self._setting,
         )
-        self._dispatcher = Dispatcher(ledger, self._desk, self._setting)
-        self._tuning = Tuning(served, self._dispatcher, self._desk, min(job_timeout_s, _CHANGE_S))
-        settling = self._tuning.for_new_worker, self._look, self._tuning.heard
-        self._supervisor = Supervisor(self._dispatcher, served, threads, job_timeout_s, *settling)
+        self._dispatcher = Dispatcher(given.ledger(), self._desk, self._setting)
+        self._tuning = Tuning(served, self._dispatcher, self._desk, min(given.job_timeout_s, _CHANGE_S))
+        self._announcer = Announcer(self._dispatcher, self._desk, self._facts, self._follow)
+        settling = self._tuning.for_new_worker, self._announcer.look, self._tuning.heard
+        self._supervisor = Supervisor(self._dispatcher, served, given.threads, given.job_timeout_s, *settling)
         self._asks = Asks(lambda: self._supervisor.served, lambda: self._dispatcher.link)
-        self._sockets = Sockets(sub, pub, failures, self._dispatcher, insecure=insecure, keys=keys, allow=allow)
-        self._intake = Intake(self._dispatcher, self._sockets, self._changed)
+        self._sockets = Sockets(given, self._dispatcher, self._changed)
+        self._intake = Intake(self._dispatcher, self._sockets, self._changed, lambda: self.state not in _OF_NO_USE)
         self._is_running = False
-        self._told: tuple[str, str] = ("STOPPED", "")
         self._started_ns = 0
-        self._deployer = Deployer(self._dispatcher, self._supervisor, self._tuning, job_timeout_s, self._desk.tell)
+        self._deployer = Deployer(
+            self._dispatcher, self._supervisor, self._tuning, given.job_timeout_s, self._desk.tell
+        )
+        told = self._health, self._sockets.entrance.seen, self._changed
+        self._peers = peers_of(Parts(given, self._dispatcher, self._desk, self._tuning, *told))
         self._turn = threading.Lock()
 
     # -- beginning and end ----------------------------------------------------------------------------------------
@@ -147,6 +118,7 @@ class Service:
                 self._is_running = True
                 self._started_ns = time_ns()
                 self._dispatcher.refuse("")
+                self._peers.start()
                 self._supervisor.start()
                 self._changed()
         self._dispatcher.wait_for(lambda: self.state != "LOADING", None)
@@ -158,7 +130,15 @@ class Service:
         where = self._sockets.addresses
         digest = self._supervisor.served.digest
         return ServiceState(
-            os.getpid(), where["sub"], where["pub"], digest, where["failures"], self.http, self.token_file
+            os.getpid(),
+            where["sub"],
+            where["pub"],
+            digest,
+            where["failures"],
+            self.http,
+            self.token_file,
+            self.options.replica,
+            self.options.shows_failures,
         )
 
     def stop(self, timeout_s: float | None = None) -> None:
@@ -174,12 +154,16 @@ class Service:
             notify("STOPPING=1")
             self._intake.close(timeout_s, for_good=True)
             self._intake.work_off(timeout_s * _DRAIN_SHARE)
+            self._peers.give_up()
             self._intake.give_up()
             self._supervisor.stop()
             self.failure_store.flush(max(deadline_s - monotonic(), 0.1))
             self.event_log.close(max(deadline_s - monotonic(), 0.1))
-            self._sockets.stop(max(deadline_s - monotonic(), 0.5))
-            self._is_running = self._intake.is_draining = self._intake.is_stopping = False
+            # A broker that does not answer may take all the time that there is, from the group too.
+            share = 0.5 if self.options.has_broker else 1.0
+            self._sockets.stop(max((deadline_s - monotonic()) * share, 0.5))
+            self._peers.stop(max(deadline_s - monotonic(), 0.5))
+            self._is_running = self._intake.is_draining = self._intake.is_stopping = self._dispatcher.is_closed = False
             self._changed()
 
     def abandon(self) -> int:
@@ -209,9 +193,12 @@ class Service:
         return self._state()[1]
 
     def _state(self) -> tuple[State, str]:
+        return self._announcer.state()
+
+    def _facts(self) -> Facts:
         health, has_worker = self._supervisor.health, self._dispatcher.link is not None
         is_so = self._is_running, self._intake.is_draining, self._intake.is_paused
-        return state_of(Facts(*is_so, has_worker, health.was_ready, health.fault, health.trouble))
+        return Facts(*is_so, has_worker, health.was_ready, health.fault, health.trouble, self._sockets.trouble)
 
     def alive(self) -> str:
         """Return why nothing is computed, or will be; empty if something is, however busy it is."""
@@ -229,12 +216,23 @@ class Service:
     def counts(self) -> dict[str, int]:
         """Return how many events are where.
 
-        ``received`` is the sum of answered, failed, dropped, dead_letters, waiting and in_flight; ``retried`` is how
-        often events were tried again, ``rejected`` how many messages were no events.
+        ``received`` is the sum of answered, failed, dropped, dead_letters, waiting, in_flight and, where a broker
+        delivers them, given_back; ``retried`` is how often events were tried again, ``redelivered`` how many had been
+        delivered before, ``rejected`` how many messages were no events.
         """
         with self._dispatcher.changed:
             counts = self._dispatcher.ledger.counts()
-        return {**counts, "rejected": self._sockets.rejected}
+        entrance = self._sockets.entrance
+        return {**counts, "rejected": entrance.rejected, **entrance.counts(), **self._peers.counts()}
+
+    def group(self) -> dict[str, Any]:
+        """Return what there is to know of the replicas that share its events, this one among them, JSON-ready."""
+        return self._peers.told()
+
+    def _health(self) -> dict[str, Any]:
+        state, reason = self._state()
+        name = self._supervisor.served.settings.name
+        return {"name": name, "state": state, "reason": reason, "counts": self.counts(), "http": self.http}
 
     def latency(self) -> Latency:
         """Return how long events took, from their acceptance to their answer."""
@@ -247,9 +245,11 @@ class Service:
             **about(self._supervisor.served, self._dispatcher.link),
             "state": state,
             "reason": reason,
+            "replica": self.options.replica,
             "threads": self.threads,
             "revision": self._tuning.current.revision,
             "addresses": {**self._sockets.addresses, "http": self.http},
+            "shows_failures": self.options.shows_failures,
             "started_ns": self._started_ns,
             "restarts": self._supervisor.health.restarts,
             "counts": self.counts(),
@@ -267,22 +267,12 @@ class Service:
         """
         return self._desk.listen(callback)
 
-    def _look(self) -> None:
-        """Tell listeners if the state is another one. With the lock held."""
-        found = self._state()
-        if found == self._told:
-            return
-        self._told = found
-        data = {"state": found[0], "reason": found[1]}
-        self._dispatcher.tell(lambda: self._desk.tell("state", data))
-        self._dispatcher.changed.notify_all()
-        if found[0] == "READY":
-            self._dispatcher.tell(lambda: notify("READY=1"))
-
     def _changed(self) -> None:
-        with self._dispatcher.changed:
-            self._look()
-        self._dispatcher.publish()
+        self._announcer.changed()
+
+    def _follow(self, before: State, now: State) -> None:
+        if (before in _OF_NO_USE) != (now in _OF_NO_USE):
+            self._intake.follow()
 
     def _setting(self) -> Setting:
         served, current = self._supervisor.served, self._tuning.current
@@ -306,7 +296,10 @@ class Service:
             if not self._is_running:
                 return True
             self._intake.close(timeout_s)
-        return self._intake.work_off(timeout_s)
+        is_done = self._intake.work_off(timeout_s)
+        if is_done and self._intake.is_draining:
+            self._intake.leave(timeout_s)
+        return is_done
 
     def deploy(self, path: str | Path) -> dict[str, Any]:
         """Serve another bundle from now on; return what there is to know of the service then.
@@ -361,7 +354,7 @@ class Service:
         ServiceError
             There is no worker, or it is busy for too long.
         """
-        return self._tuning.set(values, revision)
+        return self._peers.set(values, revision)
 
     def write_back(self, *, dry_run: bool = False) -> WriteBack:
         """Write the parameters into the pipeline.toml of the bundle that is served; return the diff and its digest.

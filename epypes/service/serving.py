@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from epypes.errors import ServiceError
+from epypes.service.options import Options
 from epypes.service.server import Service
 from epypes.service.signals import Signals
 from epypes.service.state import ServiceState, StateLock
@@ -48,8 +49,10 @@ def serve(
     BundleError, AddressError
         As for Service.
     """
-    with Signals() as signals, StateLock(path) as lock, ExitStack() as control:
-        service = Service(path, sub, pub, insecure=insecure, **options)
+    given = Options(sub, pub, insecure=insecure, **options)
+    given.check(path)
+    with Signals() as signals, _lock(path, given) as lock, ExitStack() as control:
+        service = Service(path, sub, pub, insecure=insecure, **{**options, "replica": lock.replica})
         if http:
             _serve_http(service, http, token_file, insecure, control)
         fault: list[str] = []
@@ -60,6 +63,13 @@ def serve(
         if fault:
             raise ServiceError(service.path, fault[0])
         return service.counts()
+
+
+def _lock(path: str | Path, options: Options) -> StateLock:
+    """Return the right to serve a bundle: alone, or beside other replicas."""
+    if options.has_broker and not options.replica:
+        return StateLock.of_next(path)
+    return StateLock(path, options.replica)
 
 
 def _serve_http(

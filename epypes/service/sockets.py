@@ -1,67 +1,45 @@
-"""Which sockets does a service have? One where events come in, one for answers, one for failures."""
+"""Where do a service's events come from, and where do answers and failures go? To sockets, or to brokers."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from pathlib import Path
+from collections.abc import Callable
+from contextlib import ExitStack
+from time import monotonic
 from typing import Any, Final
 
-from epypes.pipeline import Mailbox
+from epypes.service.desk import Arrived
+from epypes.service.entrances import Accepting, BrokerEntrance, SocketEntrance, entrance_of
+from epypes.service.exits import BrokerExit, SocketExit, exit_to
+from epypes.service.options import Options
 from epypes.service.outcome import FAILURE_TOPIC
-from epypes.transport import ZMQPublisher, ZMQSubscriber
-from epypes.transport.keys import Keys, PublicKey
 
-CONNECT: Final = "connect:"
-# Answers kept for a subscriber that does not read; images are large, so this bounds the memory that one can cost.
-_KEPT_ANSWERS: Final = 256
+# For one end, however late it is.
+_LEAST_S: Final = 0.5
 
 
 class Sockets:
-    """The sockets of a service.
+    """The ends of a service.
 
     Parameters
     ----------
-    sub, pub, failures
-        An address is bound, ``connect:ADDRESS`` is connected to.
+    options
+        Of the service: addresses and keys.
     accept
-        Whose ``put`` takes what comes.
-    insecure, keys, allow
-        As for ZMQSubscriber and ZMQPublisher.
+        Who takes what comes.
+    on_change
+        Called when a broker is away, or there again.
 
     Attributes
     ----------
-    subscriber, publisher, reporter
-        The sockets.
+    entrance, answers
+        Where events come from, and where answers go.
     """
 
-    def __init__(
-        self,
-        sub: str,
-        pub: str,
-        failures: str,
-        accept: Any,
-        *,
-        insecure: bool = False,
-        keys: Keys | str | Path | None = None,
-        allow: PublicKey | Collection[PublicKey] | None = None,
-    ) -> None:
-        self._given = {"sub": sub, "pub": pub, "failures": failures}
-        self._accept = accept
-        self._secured: dict[str, Any] = {"insecure": insecure, "keys": keys, "allow": allow}
-        self._rejected_before = 0
-        # Sent within put, on the thread that puts.
-        self._answers, self._failures = Mailbox("drop_oldest", _KEPT_ANSWERS), Mailbox("drop_oldest", _KEPT_ANSWERS)
-        self._closed_at = ""
-        self.subscriber = self._made_subscriber(sub)
-        self.publisher = self._made_publisher(pub, self._answers, "")
-        self.reporter = self._made_publisher(failures, self._failures, FAILURE_TOPIC)
-
-    def _made_subscriber(self, address: str) -> ZMQSubscriber:
-        return ZMQSubscriber(_bare(address), self._accept, "", not address.startswith(CONNECT), **self._secured)
-
-    def _made_publisher(self, address: str, queue: Mailbox, topic: str) -> ZMQPublisher:
-        bind = not address.startswith(CONNECT)
-        return ZMQPublisher(_bare(address), queue, topic, bind, high_water_mark=_KEPT_ANSWERS, **self._secured)
+    def __init__(self, options: Options, accept: Accepting, on_change: Callable[[], object]) -> None:
+        secured = {name: getattr(options, name) for name in ("insecure", "keys", "allow")}
+        self.entrance = entrance_of(options, accept, secured, on_change)
+        self.answers = exit_to(options.pub, "", secured, on_change)
+        self._failures = exit_to(options.failures, FAILURE_TOPIC, secured, on_change)
 
     def start(self) -> None:
         """Open them; those that others may wait for first.
@@ -69,62 +47,47 @@ class Sockets:
         Raises
         ------
         AddressError
-            An address can't be bound.
+            An address can't be bound, or a broker can't be reached.
         """
-        self._closed_at = ""
         try:
-            self.publisher.start()
-            self.reporter.start()
-            self.subscriber.start()
+            self.answers.start()
+            self._failures.start()
+            self.entrance.open()
         except Exception:
             self.stop(1.0)
             raise
 
-    def answer(self, item: Any) -> None:
-        """Publish an answer."""
-        self._answers.put(item)
+    def answer(self, item: Any, id: str, then: Arrived) -> None:  # noqa: A002 - as everywhere
+        """Publish an answer, which is known by an id; tell when it has arrived."""
+        self.answers.publish(item, id, then)
 
     def report(self, item: Any) -> None:
         """Publish a failure."""
-        self._failures.put(item)
-
-    def close_subscriber(self, timeout_s: float) -> None:
-        """Take no more events; may be called twice."""
-        self._closed_at = self.addresses["sub"]
-        self.subscriber.stop(timeout_s)
-
-    def open_subscriber(self) -> None:
-        """Take events again, at the address where they were taken before."""
-        self._rejected_before = self.rejected
-        self.subscriber = self._made_subscriber(self._closed_at)
-        self.subscriber.start()
-        self._closed_at = ""
+        self._failures.publish(item, "", lambda error: None)
 
     def stop(self, timeout_s: float) -> None:
-        """Close them; what was published still leaves."""
-        try:
-            self.subscriber.stop(timeout_s)
-        finally:
-            try:
-                self.publisher.stop(timeout_s)
-            finally:
-                self.reporter.stop(timeout_s)
+        """Close them, within one time for all; what was published still leaves.
+
+        Brokers that may not answer have equal shares of it.
+        """
+        until_s, following = monotonic() + timeout_s, 0
+        with ExitStack() as closing:
+            # The last that is pushed is the first that is called; all are, whichever of them fails.
+            for end in (self._failures, self.answers, self.entrance):
+                closing.callback(_stop, end, until_s, 1 + following)
+                following += isinstance(end, BrokerEntrance | BrokerExit)
 
     @property
     def addresses(self) -> dict[str, str]:
-        """Where they are, ``connect:`` in front of those that connect; those that are bound once they are.
-
-        Where events are not taken just now, it is where they were taken, and will be again.
-        """
-        sub = self._closed_at or self.subscriber.address
-        bound = {"sub": sub, "pub": self.publisher.address, "failures": self.reporter.address}
-        return {name: given if given.startswith(CONNECT) else bound[name] for name, given in self._given.items()}
+        """Where they are, ``connect:`` in front of those that connect; those that are bound once they are."""
+        ends = {"sub": self.entrance, "pub": self.answers, "failures": self._failures}
+        return {name: end.address for name, end in ends.items()}
 
     @property
-    def rejected(self) -> int:
-        """How many messages were no events."""
-        return self._rejected_before + sum(self.subscriber.rejected.values())
+    def trouble(self) -> str:
+        """Why a broker is not there; empty if all are."""
+        return self.entrance.trouble or self.answers.trouble or self._failures.trouble
 
 
-def _bare(address: str) -> str:
-    return address.removeprefix(CONNECT)
+def _stop(end: SocketEntrance | BrokerEntrance | SocketExit | BrokerExit, until_s: float, shares: int) -> None:
+    end.stop(max((until_s - monotonic()) / shares, _LEAST_S))

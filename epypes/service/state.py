@@ -1,27 +1,34 @@
 """Where does a running service leave its addresses, so that others find it?
 
 The state file is held locked by its service, so a service that was killed is told from one that runs: the system
-releases the lock of a process that is gone.
+releases the lock of a process that is gone. Replicas, which share the events of a broker, have a file each.
 """
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import hashlib
 import json
 import os
+import re
 import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import monotonic, sleep
 from types import TracebackType
-from typing import Final, Self
+from typing import Any, Final, Self
 
 from epypes.errors import ServiceError
 
+REPLICA: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,39}")
+_MOST_REPLICAS: Final = 1_000
 # Who only reads the state holds the lock for some microseconds; a lock held longer is a service's.
 _LOCK_TIMEOUT_S: Final = 1.0
 _LOCK_RETRY_S: Final = 0.02
+_LOCK_TRIES: Final = 3
+# What a state that an earlier version wrote may lack.
+_MAY_HAVE: Final = ("failures", "http", "token_file", "replica")
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +49,10 @@ class ServiceState:
         Where it answers over HTTP; empty if it does not.
     token_file
         Where the token for that is kept.
+    replica
+        What it is called among the services of the bundle; empty for the one that is alone.
+    shows_failures
+        Whether people are told where failures are published.
     """
 
     pid: int
@@ -51,12 +62,14 @@ class ServiceState:
     failures: str = ""
     http: str = ""
     token_file: str = ""
+    replica: str = ""
+    shows_failures: bool = True
 
 
-def state_file(bundle: str | Path) -> Path:
+def state_file(bundle: str | Path, replica: str = "") -> Path:
     """Return where the state of a bundle's service is kept: in a folder of this user's, not in the bundle."""
     name = hashlib.sha256(str(Path(bundle).resolve()).encode()).hexdigest()[:20]
-    return _folder() / f"{name}.json"
+    return _folder() / (f"{name}.{replica}.json" if replica else f"{name}.json")
 
 
 def _folder() -> Path:
@@ -71,23 +84,50 @@ def _folder() -> Path:
 class StateLock:
     """The right to serve a bundle, held for as long as the service runs.
 
+    Parameters
+    ----------
+    bundle
+        Its folder.
+    replica
+        What the service is called among several; empty for one that is alone.
+
     Raises
     ------
     ServiceError
-        The bundle is being served; the process is named.
+        The bundle is being served, by one of this name; the process is named. Or that can't be a name.
     """
 
-    def __init__(self, bundle: str | Path) -> None:
-        self._file = state_file(bundle).open("a+", encoding="utf-8")
+    def __init__(self, bundle: str | Path, replica: str = "") -> None:
+        if replica and not REPLICA.fullmatch(replica):
+            text = f"A replica can't be called {replica!r:.60}. Take at most 40 letters, digits, '.', '_' and '-'."
+            raise ServiceError(bundle, text)
+        self.replica = replica
+        self._file = os.open(state_file(bundle, replica), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         deadline = monotonic() + _LOCK_TIMEOUT_S
         while not self._locked():
-            running = read_state(bundle)
+            running = _read(state_file(bundle, replica))
             if running or monotonic() > deadline:
-                self._file.close()
+                os.close(self._file)
                 by = f"by process {running.pid} at {running.sub}" if running else "by a process that is starting"
-                raise ServiceError(bundle, f"{bundle} is being served already, {by}. Stop that one first.")
+                named = f" as replica {replica!r}" if replica else ""
+                raise ServiceError(bundle, f"{bundle} is being served already{named}, {by}. Stop that one first.")
             sleep(_LOCK_RETRY_S)
         self._write("")
+
+    @classmethod
+    def of_next(cls, bundle: str | Path) -> Self:
+        """Return the right to be the replica with the first number that no other has.
+
+        Raises
+        ------
+        ServiceError
+            There are too many.
+        """
+        for number in range(1, _MOST_REPLICAS + 1):
+            if _is_free(state_file(bundle, str(number))):
+                with contextlib.suppress(ServiceError):  # another one was faster
+                    return cls(bundle, str(number))
+        raise ServiceError(bundle, f"{bundle} has {_MOST_REPLICAS} replicas on this machine already. Stop some first.")
 
     def _locked(self) -> bool:
         try:
@@ -101,9 +141,9 @@ class StateLock:
         self._write(json.dumps(asdict(state)))
 
     def _write(self, text: str) -> None:
-        self._file.truncate(0)
-        self._file.write(text)
-        self._file.flush()
+        # In one step, over all that was there: who reads meanwhile finds the one or the other, and never nothing.
+        data = text.encode()
+        os.pwrite(self._file, data.ljust(os.fstat(self._file).st_size), 0)
 
     def __enter__(self) -> Self:
         return self
@@ -113,12 +153,26 @@ class StateLock:
     ) -> None:
         # The file stays: removing it would let a second service lock a new one while a third waits for this.
         self._write("")
-        self._file.close()
+        os.close(self._file)
 
 
-def read_state(bundle: str | Path) -> ServiceState | None:
-    """Return the state of the service that runs now, or None if none is ready."""
-    return _read(state_file(bundle))
+def read_state(bundle: str | Path, replica: str = "") -> ServiceState | None:
+    """Return the state of the service that runs now, or None if none is ready; of several the first one's."""
+    return next(iter(read_states(bundle, replica)), None)
+
+
+def read_states(bundle: str | Path, replica: str = "") -> list[ServiceState]:
+    """Return the states of the services of a bundle that run now: of all replicas, or of one by its name."""
+    alone = state_file(bundle)
+    found = [alone, *sorted(alone.parent.glob(f"{alone.stem}.*.json"), key=_order)]
+    files = [state_file(bundle, replica)] if replica else found
+    return [state for file in files if (state := _read(file)) is not None]
+
+
+def _order(file: Path) -> tuple[int, str]:
+    """Return by what replicas are sorted: 2 before 10."""
+    name = file.stem.partition(".")[2]
+    return (int(name) if name.isdecimal() else _MOST_REPLICAS), name
 
 
 def running_at(http: str) -> ServiceState | None:
@@ -128,13 +182,27 @@ def running_at(http: str) -> ServiceState | None:
     return next((state for state in found if state is not None and state.http.rstrip("/") == wanted), None)
 
 
+def _is_free(path: Path) -> bool:
+    """Whether no service holds a state file; who only reads it holds it for a moment."""
+    for _ in range(_LOCK_TRIES):
+        try:
+            with path.open("a", encoding="utf-8") as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return True
+        except OSError:
+            if _read(path) is not None:
+                return False
+            sleep(_LOCK_RETRY_S)
+    return False
+
+
 def _read(path: Path) -> ServiceState | None:
     try:
         with path.open(encoding="utf-8") as file:
             if _can_lock(file.fileno()):
                 return None
             text = file.read()
-        return _state(json.loads(text)) if text else None
+        return _state(json.loads(text)) if text.strip() else None
     except (FileNotFoundError, ValueError, TypeError):
         return None
 
@@ -143,11 +211,12 @@ def _state(entries: object) -> ServiceState:
     """Return a state; raise TypeError for anything else that somebody may have written into the file."""
     if not isinstance(entries, dict):
         raise TypeError
-    needed = [entries.get(key) for key in ("sub", "pub", "digest")]
-    pid, texts = entries.get("pid"), [*needed, *(entries.get(key, "") for key in ("failures", "http", "token_file"))]
-    if not isinstance(pid, int) or not all(isinstance(text, str) for text in texts):
+    given: dict[str, Any] = {key: entries.get(key) for key in ("sub", "pub", "digest")}
+    given |= {key: entries.get(key, "") for key in _MAY_HAVE}
+    pid = entries.get("pid")
+    if not isinstance(pid, int) or not all(isinstance(text, str) for text in given.values()):
         raise TypeError
-    return ServiceState(pid, *map(str, texts))
+    return ServiceState(pid, **given, shows_failures=entries.get("shows_failures") is not False)
 
 
 def _can_lock(descriptor: int) -> bool:

@@ -32,6 +32,10 @@ class Facts:
         Why there will be none any more; empty if that is not so.
     trouble
         Why there is none just now.
+    away
+        Why a broker can't be reached just now; empty if all can.
+    is_joining
+        Whether it reads yet which parameters the other replicas of its bundle have.
     """
 
     is_running: bool = False
@@ -41,6 +45,8 @@ class Facts:
     was_ready: bool = False
     fault: str = ""
     trouble: str = ""
+    away: str = ""
+    is_joining: bool = False
 
 
 def state_of(facts: Facts) -> tuple[State, str]:
@@ -52,9 +58,17 @@ def state_of(facts: Facts) -> tuple[State, str]:
     if facts.fault:
         return "FAULTED", facts.fault
     if not facts.has_worker:
-        if facts.was_ready:
-            return "DEGRADED", facts.trouble or "The worker is started again."
-        return "LOADING", facts.trouble or "The bundle is loaded, and its samples are replayed."
+        return _without_worker(facts)
+    if facts.away:
+        return "DEGRADED", facts.away
+    if facts.is_joining:
+        return "LOADING", "The parameters that the other replicas have agreed on are read."
     if facts.is_paused:
         return "PAUSED", "Events wait until it is resumed."
     return "READY", ""
+
+
+def _without_worker(facts: Facts) -> tuple[State, str]:
+    if facts.was_ready:
+        return "DEGRADED", facts.trouble or "The worker is started again."
+    return "LOADING", facts.trouble or "The bundle is loaded, and its samples are replayed."

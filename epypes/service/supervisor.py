@@ -17,7 +17,8 @@ from epypes.errors import ServiceError
 from epypes.service.dispatch import Dispatcher
 from epypes.service.health import DEATHS_BEFORE_FAULT, GOOD_EVENTS, PAUSE_S, Health
 from epypes.service.link import SETTLING, Link, Message
-from epypes.service.notify import notify, watchdog_s
+from epypes.service.notify import Watchdog
+from epypes.service.parameters import others_than
 from epypes.service.served import Served
 from epypes.service.stuck import whereabouts
 
@@ -72,7 +73,7 @@ class Supervisor:
         self._loading_until_s = 0.0
         self._is_ending = False
         self._thread: threading.Thread | None = None
-        self._watchdog_s, self._notified_s = watchdog_s(), 0.0
+        self._watchdog = Watchdog()
 
     def start(self) -> None:
         """Begin, with a worker of the bundle."""
@@ -128,9 +129,7 @@ class Supervisor:
         now_s = monotonic()
         due_in_s = self._dispatcher.due_in_s(self._timeout_ns)
         self._dispatcher.is_unwatched = due_in_s is None
-        waits = [due_in_s]
-        if self._watchdog_s is not None:
-            waits.append(self._notified_s + self._watchdog_s - now_s)
+        waits = [due_in_s, self._watchdog.due_in_s()]
         if self._restart_s is not None:
             waits.append(self._restart_s - now_s)
         if self._is_loading:
@@ -143,9 +142,8 @@ class Supervisor:
         now_s = monotonic()
         if self._is_ending:
             return _nothing
-        if self._watchdog_s is not None and self._notified_s + self._watchdog_s <= now_s:
-            self._notified_s = now_s
-            return _tell_alive
+        if (told_in_s := self._watchdog.due_in_s()) is not None and told_in_s <= 0:
+            return self._watchdog.tell
         if self._to_start:
             return self._start_for_deploy
         if self._restart_s is not None and self._restart_s <= now_s:
@@ -383,16 +381,11 @@ class Supervisor:
             self._dispatcher.refuse("")
             parameters = self._parameters()
             if parameters is not None:
-                # It has proved its own values; what it is told is their revision, which can't be refused.
-                link.tell_parameters(parameters[0], {})
+                # Its own values it has proved; others are those that other workers of this bundle have taken.
+                link.tell_parameters(parameters[0], others_than(link.served.entries, parameters[1]))
             self._use(link)
         if before is not None:
             threading.Thread(target=before.dismiss, args=(_END_S,), name="epypes last worker", daemon=True).start()
-
-
-def _tell_alive() -> None:
-    """Tell systemd: that the supervisor comes here shows that no lock is held for ever."""
-    notify("WATCHDOG=1")
 
 
 def _nothing() -> None:

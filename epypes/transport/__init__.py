@@ -11,14 +11,18 @@ if TYPE_CHECKING:
     from epypes.transport.mcapreader import RecordingInfo, recording_info
     from epypes.transport.playing import Player
     from epypes.transport.publisher import ZMQPublisher
+    from epypes.transport.receiving import Subscriber
     from epypes.transport.recording import Recorder
+    from epypes.transport.sending import Publisher
     from epypes.transport.subscriber import ZMQSubscriber
 
 __all__ = [
     "Keys",
     "Player",
+    "Publisher",
     "Recorder",
     "RecordingInfo",
+    "Subscriber",
     "ZMQPublisher",
     "ZMQSubscriber",
     "check_bind",
@@ -32,8 +36,10 @@ __all__ = [
 _HOME = {
     "Keys": "keys",
     "Player": "playing",
+    "Publisher": "sending",
     "Recorder": "recording",
     "RecordingInfo": "mcapreader",
+    "Subscriber": "receiving",
     "ZMQPublisher": "publisher",
     "ZMQSubscriber": "subscriber",
     "check_bind": "addresses",

@@ -1,4 +1,4 @@
-"""Which frames does an item become?"""
+"""Which frames does an item become, and which envelope do frames make?"""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from epypes.errors import MessageError
 from epypes.run import Failure
-from epypes.wire import Envelope, Limits, encode, failure_event, serialized
+from epypes.wire import Envelope, Limits, decode, encode, failure_event, serialized
 from epypes.wire.multipart import Stamp
 
 Frames = Sequence[bytes | memoryview]
@@ -38,6 +38,8 @@ class Framing:
             data = item
         elif isinstance(item, Envelope):
             return self._envelope_frames(item)
+        elif isinstance(item, tuple):
+            return self._made_frames(item)
         elif callable(getattr(item, "SerializeToString", None)):
             data = serialized(item)  # type: ignore[arg-type]  # google is imported in wire alone
         elif isinstance(item, Failure):
@@ -50,11 +52,19 @@ class Framing:
                 f"A publisher sends bytes, protobuf messages, Envelopes and Failures, not {type(item).__name__}. "
                 "Let f_out return one of these.",
             )
-        if len(data) > self._limits.total_bytes:
-            raise MessageError(
-                "too large", f"A message of {len(data):,} bytes; the limit is {self._limits.total_bytes:,}."
-            )
+        self._check_size(len(data))
         return (data,)
+
+    def _made_frames(self, frames: tuple[object, ...]) -> Frames:
+        made = [frame for frame in frames if isinstance(frame, bytes | memoryview)]
+        if not made or len(made) < len(frames):
+            raise MessageError("no codec", "A tuple is sent as the frames of a message, each bytes or a memoryview.")
+        self._check_size(sum(len(frame) for frame in made))
+        return made
+
+    def _check_size(self, size: int) -> None:
+        if size > self._limits.total_bytes:
+            raise MessageError("too large", f"A message of {size:,} bytes; the limit is {self._limits.total_bytes:,}.")
 
     def _envelope_frames(self, envelope: Envelope) -> Frames:
         check_source(envelope.source)
@@ -64,6 +74,13 @@ class Framing:
         # Counted when it can be sent: a rejected item is no loss on the way.
         self._sequences[envelope.source] = number
         return frames
+
+
+def envelope_of(frames: Sequence[bytes | memoryview], limits: Limits) -> Envelope:
+    """Return the envelope of a message of several frames; raise MessageError if they make none."""
+    envelope = decode(frames, limits)
+    check_source(envelope.source)
+    return envelope
 
 
 def check_source(source: str) -> None:

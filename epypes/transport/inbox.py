@@ -12,9 +12,9 @@ from typing import Any, Protocol
 import zmq
 
 from epypes.errors import MessageError
-from epypes.transport.framing import check_source
+from epypes.transport.framing import envelope_of
 from epypes.transport.joining import IDENTITY_BYTES, Guest
-from epypes.wire import Envelope, Limits, decode
+from epypes.wire import Envelope, Limits
 
 log = logging.getLogger("epypes.transport")
 
@@ -56,8 +56,7 @@ class Inbox:
             self.put(frames[0].bytes)
             return
         try:
-            envelope = decode([frame.buffer for frame in frames], self._limits)
-            check_source(envelope.source)
+            envelope = envelope_of([frame.buffer for frame in frames], self._limits)
         except MessageError as error:
             self.reject(error.reason, str(error))
             return

@@ -6,7 +6,6 @@ import contextlib
 import logging
 import os
 import threading
-import weakref
 from collections import Counter, deque
 from dataclasses import dataclass, field
 
@@ -14,6 +13,7 @@ import zmq
 
 from epypes.errors import MessageError
 from epypes.transport import io
+from epypes.transport.forked import forget_in_child
 from epypes.transport.framing import Frames, Framing
 from epypes.transport.joining import Doorkeeper
 from epypes.transport.security import Security
@@ -56,7 +56,7 @@ class Outlet:
         self._socket: io.Socket | None = None
         self.doorkeeper = Doorkeeper()
         self.address = ""
-        _outlets.add(self)
+        forget_in_child(self)
 
     def open(self, address: str, security: Security, high_water_mark: int) -> None:
         """Open the socket; raise AddressError if the address is refused."""
@@ -74,6 +74,15 @@ class Outlet:
             return thread.address_of(opened, address)
 
         self.address = io.call(open_socket, start=True)
+
+    @property
+    def name(self) -> str:
+        """Whose it is, for errors."""
+        return f"ZMQPublisher {self.address}"
+
+    def is_own_thread(self) -> bool:
+        """Return whether the caller runs on the I/O thread, which closing needs."""
+        return io.on_io_thread()
 
     def is_gone(self) -> bool:
         """Return whether this is a forked child, where there is neither thread nor socket."""
@@ -167,18 +176,6 @@ class Outlet:
         with self._lock:
             self._has_asked = False
             return self.doorkeeper.read()
-
-
-# Those of this process; their sockets must not be used in a forked child.
-_outlets: weakref.WeakSet[Outlet] = weakref.WeakSet()
-
-
-def _forget_outlets() -> None:
-    for outlet in list(_outlets):
-        outlet.forget()
-
-
-os.register_at_fork(after_in_child=_forget_outlets)
 
 
 def _can_be_lent(frame: bytes | memoryview) -> bool:

@@ -30,10 +30,11 @@ class ZMQPublisher:
     queue
         Any object with ``get(timeout=...)`` that raises queue.Empty. bytes, bytearray and memoryview go out as one
         frame, and so does a protobuf message (2019 mode: without a topic, for peers of the published system);
-        an Envelope goes out as topic, header and payload frames, a Failure as the Envelope that reports it. Anything
-        else is counted in `rejected`. From a Mailbox an item is sent within ``put``, on the thread that puts, whatever
-        its policy: buffers may be used again then. From other queues a thread takes it a little later, so leave
-        arrays alone, or make them read-only. Read-only arrays are sent without a copy.
+        an Envelope goes out as topic, header and payload frames, a Failure as the Envelope that reports it, a tuple
+        of bytes and memoryviews as these frames. Anything else is counted in `rejected`. From a Mailbox an item is
+        sent within ``put``, on the thread that puts, whatever its policy: buffers may be used again then. From other
+        queues a thread takes it a little later, so leave arrays alone, or make them read-only. Read-only arrays are
+        sent without a copy.
     topic
         Topic of the envelopes. 2019 mode knows none.
     bind

@@ -11,13 +11,13 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from epypes.errors import StillRunning
-from epypes.transport import io
-from epypes.transport.outlet import Outlet
 
 # How long the bridge sleeps in the user's queue before it looks at its stop flag, while items come and when none comes:
 # a stop takes this long at most. To wake up takes up to 100 us of a core.
 _TICK_S = 0.025
 _LONGEST_TICK_S = 0.045
+# What it takes to close an outlet, or to find out that it is closed, when the time for a stop is over.
+_CLOSE_S = 0.5
 
 
 class TakeQueue(Protocol):
@@ -25,6 +25,32 @@ class TakeQueue(Protocol):
 
     def get(self, *, timeout: float) -> Any:
         """Return the next item, or raise queue.Empty after ``timeout`` seconds."""
+
+
+class Outlet(Protocol):
+    """How an item leaves: through a socket, or by way of a broker. Closing twice is allowed."""
+
+    @property
+    def name(self) -> str:
+        """Whose it is, for errors."""
+
+    def publish(self, item: Any) -> None:
+        """Send an item. What it raises is counted, and whoever puts into a Mailbox gets it."""
+
+    def reject(self, reason: str, text: str, log_once: bool = False) -> None:
+        """Count an item that can't be sent."""
+
+    def close(self, timeout_s: float = 10.0) -> None:
+        """Send what was published, and end; raise TimeoutError if that takes longer."""
+
+    def close_soon(self) -> None:
+        """End without waiting, as the garbage collector must."""
+
+    def is_gone(self) -> bool:
+        """Return whether this is a forked child, where it is not open."""
+
+    def is_own_thread(self) -> bool:
+        """Return whether the caller runs on a thread that closing needs, so that it must not wait."""
 
 
 class Taker(Protocol):
@@ -71,7 +97,7 @@ class HandOver:
             self._outlet.close(timeout_s)
         except TimeoutError as error:
             # The I/O thread is held up in a subscriber's queue.
-            raise StillRunning(f"ZMQPublisher {self._outlet.address}", ["put"], timeout_s) from error
+            raise StillRunning(self._outlet.name, ["put"], timeout_s) from error
 
     def abandon(self) -> None:
         """Stop without waiting."""
@@ -87,6 +113,8 @@ class Bridge:
         self._queue, self._outlet = queue, outlet
         self._process = os.getpid()
         self._deadline = 0.0
+        # Whether the outlet could not be closed in time.
+        self._is_held_up = False
         # Not an Event: the garbage collector sets it, in any thread, where a lock could be held already.
         self.stopping = False
         self._thread = threading.Thread(target=self._run, name="epypes-publisher", daemon=True)
@@ -102,14 +130,24 @@ class Bridge:
             return
         self._deadline = time.monotonic() + timeout_s
         self.stopping = True
-        if self._thread is threading.current_thread() or io.on_io_thread():
+        if self._thread is threading.current_thread() or self._outlet.is_own_thread():
             # Called by the user's queue, in get() or in put(): the thread ends by itself once that returns, and
             # needs the I/O thread for it.
             return
         self._thread.join(timeout_s)
+        if self._thread.is_alive() or self._is_held_up:
+            self._close_in_its_stead(timeout_s)
         if self._thread.is_alive():
-            self._outlet.close(timeout_s)
-            raise StillRunning(f"ZMQPublisher {self._outlet.address}", ["get"], timeout_s)
+            raise StillRunning(self._outlet.name, ["get"], timeout_s)
+
+    def _close_in_its_stead(self, timeout_s: float) -> None:
+        try:
+            self._outlet.close(_CLOSE_S)
+        except TimeoutError as error:
+            raise StillRunning(self._outlet.name, ["put"], timeout_s) from error
+        self._is_held_up = False
+        # What waited for a broker has been told by that.
+        self._thread.join(_CLOSE_S)
 
     def abandon(self) -> None:
         """Stop without waiting."""
@@ -122,7 +160,11 @@ class Bridge:
                 tick_s = _TICK_S if self._take(tick_s) else _LONGEST_TICK_S
             self._drain()
         finally:
-            self._outlet.close()
+            try:
+                self._outlet.close(max(self._deadline - time.monotonic(), _CLOSE_S))
+            except TimeoutError:
+                # Told by stop, if somebody waits there.
+                self._is_held_up = True
 
     def _drain(self) -> None:
         # As many as there were: a producer that goes on must not keep it from stopping.

@@ -8,6 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from tests.benchmarks import (
+    brokers,
     case,
     engine,
     imports,
@@ -33,13 +34,16 @@ def main() -> None:
     console = Console()
     console = console if console.is_terminal else Console(width=_WIDTH)
     rows = []
-    for module in (imports, engine, pipeline, picture, sockets, service, scale_map, scale_sweep, case, tuning):
+    for module in (imports, engine, pipeline, picture, sockets, brokers, service, scale_map, scale_sweep, case, tuning):
         console.print(module.__doc__, style="dim")
         rows += module.rows(effort)
     console.print(as_table(rows))
     absent = {peer.name for peer in peers.ALL} - {peer.name for peer in peers.present(effort)}
     if absent:
         console.print(f"Left out: {', '.join(sorted(absent))}" + (" (quick)." if effort.quick else " (not installed)."))
+    for venue in brokers.venues.ALL:
+        if venue.missing():
+            console.print(f"Left out: {venue.missing()}.")
     if tuning.missing():
         console.print(f"Left out: tuning in a browser. {tuning.missing()}")
     write_json(rows, absent, Path("test-output") / "benchmarks.json")

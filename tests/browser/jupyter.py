@@ -30,7 +30,7 @@ from typing import Any, Self
 THEMES = {"light": "JupyterLab Light", "dark": "JupyterLab Dark"}
 START_TIMEOUT_S = 90
 STOP_TIMEOUT_S = 10
-CELLS_TIMEOUT_MS = 90_000
+CELLS_TIMEOUT_MS = 180_000
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 _FLAGS = [
     "--no-sandbox",

@@ -14,7 +14,11 @@ from tests.browser.panel import PanelOnScreen
 pytestmark = pytest.mark.browser
 
 
-@pytest.mark.parametrize("tutorial", TUTORIALS[1:], ids=lambda path: path.stem)
+# Each takes half a minute, so each in one theme; how both look is tested on the views and panels themselves.
+IN_TURN = [("dark" if number % 2 else "light", tutorial) for number, tutorial in enumerate(TUTORIALS[1:])]
+
+
+@pytest.mark.parametrize(("theme", "tutorial"), IN_TURN, indirect=["theme"], ids=[path.stem for _, path in IN_TURN])
 def test_every_cell_runs_and_every_graph_is_drawn(browser: Any, lab: JupyterLab, theme: str, tutorial: Path) -> None:
     notebook = Notebook(browser, lab, tutorial.name)
     try:

@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -14,7 +15,8 @@ from epypes.experiment.layouts import LAYOUTS, running
 from epypes.experiment.robot import Robot
 from epypes.wire import attributes
 from tests.apart import apart
-from tests.benchmarks import case, engine, pipeline, tuning
+from tests.benchmarks import brokers, case, engine, pipeline, tuning
+from tests.benchmarks.brokers.parties import replicas
 from tests.benchmarks.case.by_hand import ByHand
 from tests.benchmarks.peers import natural_functions
 from tests.benchmarks.row import OURS, Goal, Row, row
@@ -91,6 +93,38 @@ def test_hand_written_processes_answer_as_the_case_system_does(threads):
         answer = Robot(ours.requests, ours.inbox).ask()
     assert by_hand.contents == answer.contents
     assert attributes(by_hand).keys() == answer.attributes.keys()
+
+
+@pytest.mark.slow
+def test_a_quick_run_of_the_brokers_benchmark_keeps_every_row():
+    present = [venue for venue in brokers.venues.present() if venue.name in ("ZeroMQ", "NATS JetStream")]
+    rows = brokers.rows(QUICK, present)
+    parts = [f"{size}: {what}" for size in ("1 kB", "1 MB") for what in ("trip", "time per event")]
+    parts += ["an array of 1 kB: trip", "an array of 1 MB: trip"]
+    works = [f"{venue.name}, 1 replica, {part}" for venue in present for part in parts]
+    served = [
+        f"NATS JetStream, 1 replica of epypes serve, an array of 1 kB: {what}" for what in ("trip", "time per event")
+    ]
+    assert [found.work for found in rows] == works + served * (len(present) - 1)
+    assert all(found.limit_ns > 0 and found.ours_ns > 0 for found in rows)
+    assert all((found.reached is None) == ("NATS" not in found.work or "array" in found.work) for found in rows)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("venue", [venue for venue in brokers.venues.ALL if venue.is_brokered], ids=str)
+def test_what_is_asked_by_hand_comes_back_from_replicas_that_share_the_work(venue):
+    if venue.missing():
+        pytest.skip(venue.missing())
+    with venue.opened() as place:
+        meeting, _ = place("shared")
+        venue.by_hand.prepare(meeting)
+        with replicas(venue.by_hand, meeting, 2):
+            asker = venue.by_hand.Asker(meeting, 2)
+            image = np.arange(1_000_000, dtype=np.uint8).reshape(1000, 1000)
+            assert np.array_equal(asker.ask(image), image)
+            asker.ask_many(image[:10], 40)
+            assert np.array_equal(asker.ask(image), image), "none was left over"
+            asker.close()
 
 
 def test_contenders_that_compute_something_else_are_not_timed():

@@ -41,8 +41,17 @@ def test_failures_are_listed_the_newest_first_with_what_to_do_next(epypes, bundl
     assert len(epypes("failures", bundle, "--json", "--limit", 1).stdout.splitlines()) == 1
 
 
-def test_a_message_can_not_dress_up_as_markup_or_as_more_lines(epypes, bundle):
-    keep(bundle, request(RAISES), message="[bold]x[/]\n[/nothing]\x1b[31m")
+def test_columns_that_say_nothing_leave_their_room_to_the_exception(epypes, bundle, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    keep(bundle, request(RAISES), message="x" * 30)
+    head, _, row = filter(str.strip, epypes("failures", bundle).stdout.splitlines()[:4])
+    assert head.split() == ["id", "when", "function", "exception"]
+    assert row.rstrip().endswith("x" * 30)
+
+
+@pytest.mark.parametrize("kind", ["raised", "killed"])
+def test_a_message_can_not_dress_up_as_markup_or_as_more_lines(epypes, bundle, kind):
+    keep(bundle, request(RAISES), kind=kind, message="[bold]x[/]\n[/nothing]\x1b[31m")
     done = epypes("failures", bundle)
     assert done.returncode == 0
     assert "[bold]" in done.stdout

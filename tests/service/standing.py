@@ -102,6 +102,11 @@ class Standing:
             0,
         )
 
+    def group(self):
+        return {
+            "is_shared": False, "replicas": 1, "ready": 1, "agree": True, "counts": {}, "trouble": "", "rejected": 0, "members": [],
+        }  # fmt: skip
+
     def parameters(self):
         return Parameters(self.revision, self.entries)
 

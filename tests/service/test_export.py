@@ -46,6 +46,27 @@ def test_what_means_something_to_systemd_is_quoted(bundle):
     assert len(unit.splitlines()) == len(systemd_unit(bundle, user="vision").splitlines())
 
 
+def test_replicas_on_a_broker_have_one_unit_with_an_instance_for_each(bundle):
+    options = ["--sub", "amqp://robot@127.0.0.1/events?password_file=/etc/robot.password"]
+    unit = systemd_unit(bundle, options, user="vision")
+    assert unit_name(bundle, options) == "epypes-edges-of-50-1@.service"
+    assert command_of(unit).endswith("--replica %i")
+    assert "enable --now epypes-edges-of-50-1@1.service epypes-edges-of-50-1@2.service" in unit
+    assert "RuntimeDirectoryPreserve=yes" in unit
+    assert "RuntimeDirectoryPreserve" not in systemd_unit(bundle, [*options, "--replica", "a"], user="vision")
+
+
+def test_a_password_is_written_into_no_unit_and_no_image(bundle, tmp_path):
+    options = ["--pub=amqp://robot:hush@127.0.0.1/answers"]
+    for write in (
+        lambda: systemd_unit(bundle, options, user="vision"),
+        lambda: write_container(bundle, tmp_path, options),
+    ):
+        with pytest.raises(ServiceError, match="password_file") as error:
+            write()
+        assert "hush" not in str(error.value)
+
+
 @pytest.mark.skipif(SYSTEMD is None, reason="systemd is not installed here")
 def test_systemd_takes_the_unit(bundle, tmp_path):
     file = tmp_path / unit_name(bundle)

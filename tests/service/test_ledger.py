@@ -39,6 +39,35 @@ def test_what_is_done_early_waits_for_what_came_before():
     assert (counts["answered"], counts["failed"], counts["in_flight"]) == (2, 1, 0)
 
 
+def test_an_event_of_a_broker_is_in_flight_until_its_answer_is_confirmed():
+    ledger = open_ledger(slots=2, size=2, waits=True, is_confirmed=True)
+    first, second = begin(ledger, 2)
+    ledger.accept("third", 0)
+    assert ledger.has_room
+    ledger.accept("fourth", 0)
+    assert not ledger.has_room, "the broker keeps the next one"
+    ledger.resolve(first.seq, "answered")
+    ledger.resolve(second.seq, "failed")
+    assert released(ledger) == [0, 1]
+    assert (ledger.counts()["in_flight"], ledger.counts()["answered"], ledger.is_empty) == (2, 0, False)
+    assert ledger.confirm(first.seq, "answered")
+    assert not ledger.confirm(first.seq, "answered"), "once"
+    assert [entry.event for entry in ledger.give_back()] == [1, "third", "fourth"]
+    assert not ledger.confirm(second.seq, "failed"), "somebody else answers it"
+    counts = ledger.counts()
+    assert (counts["received"], counts["answered"], counts["failed"], counts["given_back"]) == (4, 1, 0, 3)
+    assert ledger.is_empty
+
+
+def test_what_comes_back_to_the_ledger_after_it_was_given_back_is_ignored():
+    ledger = open_ledger(slots=1, waits=True, is_confirmed=True)
+    (entry,) = begin(ledger, 1)
+    assert ledger.give_back() == [entry]
+    assert ledger.resolve(entry.seq, "answered") is None
+    assert released(ledger) == []
+    assert begin(ledger, 1), "the next one is worked on"
+
+
 @pytest.mark.parametrize(
     ("policy", "size", "dropped"), [("drop_oldest", 2, [1]), ("latest", 1, [1, 2]), ("fault", 2, [3])]
 )

@@ -8,7 +8,7 @@ import pytest
 
 from epypes.bundle.entries import Member, read
 from epypes.errors import BundleError
-from epypes.service.parameters import changed, read_entries, type_of
+from epypes.service.parameters import changed, misfits, read_entries, type_of, value_of
 
 ENTRIES = {
     "side": {"value": 5, "low": 1, "high": 31, "odd": True, "unit": "px"},
@@ -93,3 +93,53 @@ def test_entries_are_json_ready_whatever_the_file_says(tmp_path):
         file.write_text(text)
         with pytest.raises(BundleError, match="can't be read"):
             read_entries(file)
+
+
+GIVEN = {
+    "side": 7,
+    "step": 6,
+    "share": 1,
+    "whole": 1.5,
+    "sigma": 2,
+    "name": "sobel",
+    "flag": False,
+    "size": [4, 5],
+    "mask": [1, 2],
+    "byte": 8,
+    "single": 0.25,
+    "border": [1, 1],
+    "mode": "SLOW",
+}
+
+
+@pytest.mark.parametrize("token", GIVEN)
+def test_what_a_change_has_made_of_an_entry_fits_it(token):
+    after, problems = changed(ENTRIES, {token: GIVEN[token]})
+    assert not problems
+    values = json.loads(json.dumps({name: value_of(entry) for name, entry in after.items()}))
+    assert misfits(ENTRIES, values) == {}
+
+
+@pytest.mark.parametrize(
+    ("token", "value"),
+    [
+        ("side", {"value": 8}),
+        ("side", {"value": 33}),
+        ("side", {"value": True}),
+        ("side", {"value": {"kind": "enum", "enum": "Mode", "value": "FAST"}}),
+        ("side", {"value": 5, "kind": "numpy", "dtype": "uint8"}),
+        ("side", {}),
+        ("sigma", {"value": math.nan}),
+        ("sigma", {"value": math.inf}),
+        ("sigma", {"value": "x", "kind": "nan"}),
+        ("size", {"value": [3, 3]}),
+        ("size", {"value": [3, 3, 3], "kind": "tuple"}),
+        ("byte", {"value": 7, "kind": "numpy", "dtype": "uint16"}),
+        ("mode", {"value": "FAST", "kind": "enum", "enum": "Other"}),
+        ("table", {"value": {"b": 1}}),
+        ("name", {"value": "blur"}),
+    ],
+)
+def test_what_no_change_can_make_of_an_entry_does_not_fit_it(token, value):
+    assert list(misfits(ENTRIES, {token: value})) == [token]
+    assert misfits(ENTRIES, {"elsewhere": value}) == {}

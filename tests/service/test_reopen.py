@@ -160,6 +160,14 @@ def test_failures_are_found_by_how_their_id_begins_or_ends_and_by_latest(bright_
     assert failures_of().event(first).id == "77"
 
 
+def test_an_event_that_failed_in_two_replicas_opens_by_its_id_as_it_failed_last(bright_bundle):
+    event = request(RAISES)
+    first, last = (keep(bright_bundle, event, message=message) for message in ("in one", "in another"))
+    assert first != last
+    assert found_by(failures_of(bright_bundle), event.id).id == last
+    assert ep.load_failure(event.id, bright_bundle).last.failure.function == "check"
+
+
 def test_what_is_no_bundle_and_a_bundle_without_failures_are_told_apart(bright_bundle, tmp_path):
     with pytest.raises(BundleError, match="does not exist"):
         failures_of(tmp_path / "nothing")

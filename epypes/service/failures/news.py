@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Collection, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -12,8 +13,9 @@ from epypes.service.client import why_unreachable
 from epypes.service.failures.record import FailureRecord, record_of
 from epypes.service.failures.source import connected, path_of
 from epypes.service.outcome import FAILURE_TOPIC
-from epypes.service.state import read_state
+from epypes.service.state import read_states
 from epypes.transport import ZMQSubscriber
+from epypes.transport.channels import is_brokered
 from epypes.wire import Envelope
 
 if TYPE_CHECKING:
@@ -36,7 +38,8 @@ def failures_from_now_on(
     Parameters
     ----------
     source
-        The path of the bundle that is served: then the failures' socket is heard; or the http URL of the service.
+        The path of the bundle that is served: then the failures' sockets of all its replicas are heard; or the http
+        URL of the service.
     keys, allow
         As for ZMQSubscriber, where the service has keys.
 
@@ -46,7 +49,7 @@ def failures_from_now_on(
         No service runs, it can't be reached, or it has ended.
     """
     path = path_of(source)
-    return _of_connection(source) if path is None else _of_socket(path, keys, allow)
+    return _of_connection(source) if path is None else _of_sockets(path, keys=keys, allow=allow)
 
 
 def _of_connection(source: Any) -> Iterator[FailureRecord | None]:
@@ -61,30 +64,42 @@ def _of_connection(source: Any) -> Iterator[FailureRecord | None]:
     raise ServiceError(connection.url, f"The service at {connection.url} has ended.")
 
 
-def _of_socket(
-    path: Path, keys: Keys | str | Path | None, allow: PublicKey | Collection[PublicKey] | None
-) -> Iterator[FailureRecord | None]:
-    state = read_state(path)
-    if state is None:
+def _of_sockets(path: Path, **secured: Any) -> Iterator[FailureRecord | None]:
+    states = read_states(path)
+    if not states:
         raise ServiceError(path, f"No service runs for {path}. Start one: epypes serve {path}")
-    if state.failures.startswith("connect:"):
-        where = state.failures.removeprefix("connect:")
-        raise ServiceError(path, f"The service of {path} sends its failures to {where}; listen there.")
     found: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    with ZMQSubscriber(state.failures, found, FAILURE_TOPIC, keys=keys, allow=allow) as subscriber:
-        if not subscriber.wait_joined(_JOIN_S):
-            text = f"The failures of {path} can't be reached at {state.failures} within {_JOIN_S:g} s."
-            raise ServiceError(path, f"{text} {why_unreachable(keys is not None)}")
+    with ExitStack() as opened:
+        for address in sorted({state.failures for state in states}):
+            subscriber = opened.enter_context(ZMQSubscriber(_heard(path, address), found, FAILURE_TOPIC, **secured))
+            if not subscriber.wait_joined(_JOIN_S):
+                text = f"The failures of {path} can't be reached at {address} within {_JOIN_S:g} s."
+                raise ServiceError(path, f"{text} {why_unreachable(secured['keys'] is not None)}")
         yield None
         while True:
             try:
                 event = found.get(timeout=_LOOK_S)
             except queue.Empty:
-                if read_state(path) is None:
+                if not read_states(path):
                     raise ServiceError(path, f"The service of {path} has ended.") from None
                 continue
             if isinstance(event, Envelope) and event.failure is not None:
                 yield _record(event)
+
+
+def _heard(path: Path, address: str) -> str:
+    """Return where failures can be heard without anybody missing one for it.
+
+    Raises
+    ------
+    ServiceError
+        They are sent to somebody else.
+    """
+    where = address.removeprefix("connect:")
+    if where != address or is_brokered(where):
+        text = f"The service of {path} sends its failures to {where}; listen there, or ask its http URL."
+        raise ServiceError(path, text)
+    return address
 
 
 def _record(event: Envelope) -> FailureRecord:

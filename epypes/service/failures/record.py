@@ -42,7 +42,8 @@ class FailureRecord:
     trace
         The lines of the traceback.
     kind
-        ``"raised"``, ``"killed"`` (the worker with it), ``"stuck"`` (it took too long) or ``"dropped"``.
+        ``"raised"``, ``"killed"`` (the worker with it), ``"stuck"`` (it took too long), ``"dropped"``, or
+        ``"exhausted"`` (a broker has delivered it so often, and nobody has answered it).
     attempt
         Which try of the event it was, from 1.
     dead_letter
@@ -85,8 +86,16 @@ class FailureRecord:
     @property
     def summary(self) -> str:
         """What failed, in one line that every log and terminal can write."""
-        text = " ".join(self.message.split()).encode(errors="backslashreplace").decode()
-        return f"{self.exception}: {text}" if text else self.exception
+        return f"{self.exception}: {self.text}" if self.text else self.exception
+
+    @property
+    def text(self) -> str:
+        """The message in one line that every log and terminal can write."""
+        return "".join(map(_shown, " ".join(self.message.split())))
+
+
+def _shown(character: str) -> str:
+    return character if character.isprintable() else character.encode("unicode_escape").decode("ascii")
 
 
 class _Ids:

@@ -17,7 +17,7 @@ from epypes.service.failures.record import FailureRecord, values_of
 from epypes.service.failures.reproduce import reproduce
 from epypes.service.failures.source import bundle_of, failures_of, found_by, path_of
 
-_NOT_AGAIN = ("killed", "stuck")
+_NOT_AGAIN = ("killed", "stuck", "exhausted")
 
 
 def load_failure(id: str, source: Any = None, *, bundle: str | Path | None = None) -> CompGraphRunner:  # noqa: A002
@@ -107,6 +107,11 @@ def _payload(bundle: Bundle, event: Any) -> Mapping[str, Any]:
 
 
 def _stop(runner: CompGraphRunner, bundle: Bundle, record: FailureRecord, event: Any) -> str:
+    if record.kind == "exhausted":
+        # What it does is not known: it may end each process that works on it, and this one's too.
+        stop_at(runner, _payload(bundle, event))
+        told = f"it is not known which function it is, so none was run ({record.message})"
+        return f"{told}. rerun('token') goes on to a token"
     if record.function not in (*runner.cg.functions, "f_in"):
         # The service could not tell where its worker was; another process that may be lost can.
         record = replace(record, function=reproduce(record, event, bundle.path).function)

@@ -146,6 +146,8 @@ def path_of(source: Any) -> Path | None:
 def found_by(failures: Failures, given: str) -> FailureRecord:
     """Return the failure that is meant by its id, the first or last characters of it, its event's id, or ``latest``.
 
+    Of several failures of one event it is the last one.
+
     Raises
     ------
     UnknownName
@@ -154,7 +156,9 @@ def found_by(failures: Failures, given: str) -> FailureRecord:
         It can't be read.
     """
     records = failures.records()
-    meant = [record for record in records if given in (record.id, record.event_id)] or _meant(records, given)
+    # An event fails more than once if a broker has delivered it again: the last time, which comes first, is meant.
+    exact = [record for record in records if given in (record.id, record.event_id)]
+    meant = exact[:1] or _meant(records, given)
     if len(meant) == 1:
         return meant[0]
     if meant:

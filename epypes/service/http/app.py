@@ -8,7 +8,7 @@ from fastapi import FastAPI
 from fastapi.routing import APIRoute
 
 import epypes
-from epypes.service.http import events, failures, health, operating, page, parameters, pictures
+from epypes.service.http import events, failures, group, health, operating, page, parameters, pictures
 from epypes.service.http.answers import answer_errors
 from epypes.service.http.metrics import registry_of
 from epypes.service.http.served import Served
@@ -29,7 +29,7 @@ _TAGS: Final = [
 ]
 
 
-_ROOMS: Final = (health, pictures, parameters, events, failures, operating, page)
+_ROOMS: Final = (health, group, pictures, parameters, events, failures, operating, page)
 
 
 def app_of(served: Served) -> FastAPI:

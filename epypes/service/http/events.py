@@ -45,6 +45,8 @@ async def events(
 ) -> AsyncIterable[ServerSentEvent]:
     """Tell what happens, as server-sent events: `state`, `run`, `failure`, `parameters`, and `counts` each second.
 
+    So is `group` where events are shared with other replicas.
+
     Each has JSON as data. There are at most ten `run` events per second; `skipped` says how many runs were between.
     """
     async for message in listener.messages(math.inf if for_s is None else monotonic() + for_s):

@@ -25,6 +25,14 @@ _COUNTED: Final = {
     "retried": ("epypes_events_retried", "Further tries of events whose worker was killed."),
     "rejected": ("epypes_messages_rejected", "Messages that were no events."),
 }
+# Where a broker delivers the events.
+_COUNTED_OF_BROKER: Final = {
+    "redelivered": ("epypes_events_redelivered", "Events that the broker had delivered before."),
+    "duplicates": ("epypes_events_duplicate", "Events that came again while they were in hand, or done."),
+    "given_back": ("epypes_events_given_back", "Events that were left to the broker, which delivers them again."),
+    "reconnects": ("epypes_broker_reconnects", "How often the broker was there again."),
+    "overtaken": ("epypes_events_overtaken", "Answers that went on before that of an earlier event."),
+}
 _HELD: Final = {
     "waiting": ("epypes_events_waiting", "Events in the mailbox."),
     "in_flight": ("epypes_events_in_flight", "Events that are being computed."),
@@ -45,6 +53,7 @@ class Collector:
         yield _state(self.service.state)
         yield from _times(self.service.latency())
         yield from _stored(self.service.event_log.counts())
+        yield from _group(self.service.group())
 
 
 def registry_of(service: Service) -> CollectorRegistry:
@@ -78,7 +87,8 @@ def _identity(info: Mapping[str, Any]) -> Iterator[Metric]:
 def _events(counts: Mapping[str, int]) -> Iterator[Metric]:
     from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
-    for count, (name, about) in _COUNTED.items():
+    of_broker = {count: told for count, told in _COUNTED_OF_BROKER.items() if count in counts}
+    for count, (name, about) in {**_COUNTED, **of_broker}.items():
         yield CounterMetricFamily(name, about, counts.get(count, 0))
     resolved = CounterMetricFamily("epypes_events_resolved", "Events by how they ended.", labels=["outcome"])
     for outcome in _OUTCOMES:
@@ -98,6 +108,17 @@ def _stored(counts: Mapping[str, int]) -> Iterator[Metric]:
             rows.add_metric([outcome], counts[outcome])
         yield rows
         yield GaugeMetricFamily("epypes_event_rows_waiting", "Rows that wait for the database.", counts["waiting"])
+
+
+def _group(group: Mapping[str, Any]) -> Iterator[Metric]:
+    """Give how many replicas share the events; nothing where nobody could."""
+    from prometheus_client.core import GaugeMetricFamily
+
+    if group["is_shared"]:
+        yield GaugeMetricFamily("epypes_group_replicas", "Replicas that share the events.", group["replicas"])
+        yield GaugeMetricFamily("epypes_group_ready", "Those of them that are ready.", group["ready"])
+        agree = "1 if all of them have the same bundle and revision of the parameters."
+        yield GaugeMetricFamily("epypes_group_agrees", agree, float(group["agree"]))
 
 
 def _state(state: str) -> Metric:

@@ -91,6 +91,38 @@ class Info(BaseModel):
     versions: dict[str, str]
 
 
+class Member(BaseModel):
+    """A replica, as it was heard last."""
+
+    replica: str = Field(description="What it is called.", examples=["1"])
+    host: str
+    pid: int
+    state: str
+    reason: str
+    name: str = Field(description="Of the bundle that it serves.")
+    digest: str = Field(description="SHA-256 of the manifest of what it serves.")
+    revision: int = Field(description="Of the parameters that it computes with.")
+    ordered: bool = Field(description="Whether it keeps the order of events; all should, or none.")
+    counts: dict[str, int]
+    http: str = Field(description="Where it is controlled; empty if it is not.")
+    trouble: str = Field(description="Why it does not follow the others; empty if it does.")
+    heard_s: float = Field(description="How many seconds ago it was heard; after 3.5 it is not a member any more.")
+    is_self: bool = Field(description="Whether it is the one that answers.")
+
+
+class Group(BaseModel):
+    """The replicas that share the events of a broker."""
+
+    is_shared: bool = Field(description="Whether the events come from a broker; otherwise there is one member.")
+    replicas: int
+    ready: int = Field(description="How many of them answer events.")
+    agree: bool = Field(description="Whether all serve the same bundle with the same revision of its parameters.")
+    counts: dict[str, int] = Field(description="The sums of theirs.")
+    trouble: str = Field(description="Why this one does not hear the others; empty if it does.")
+    rejected: int = Field(description="How many messages among the replicas were none of theirs.")
+    members: list[Member]
+
+
 class Parameters(BaseModel):
     """The parameters of one revision."""
 
@@ -136,7 +168,7 @@ class Failure(BaseModel):
     exception: str
     message: str
     trace: list[str]
-    kind: str = Field(description="raised, killed, stuck or dropped.", examples=["raised"])
+    kind: str = Field(description="raised, killed, stuck, dropped or exhausted.", examples=["raised"])
     attempt: int
     dead_letter: bool
     when_ns: int

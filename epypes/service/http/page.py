@@ -18,6 +18,7 @@ _FILES: Final = {
     "server.js": "text/javascript",
     "graph.js": "text/javascript",
     "rates.js": "text/javascript",
+    "replicas.js": "text/javascript",
     "parameters.js": "text/javascript",
     "failures.js": "text/javascript",
     "icon.svg": "image/svg+xml",

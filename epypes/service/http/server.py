@@ -56,8 +56,9 @@ class HttpServer:
         self.address, self.insecure = address, insecure
         self.url = ""
         self._service = service
-        bundle = service.info()["bundle"]
-        self.token_file = Path(token_file) if token_file else state_file(bundle).with_suffix(".token")
+        info = service.info()
+        of_its_own = state_file(info["bundle"], info.get("replica", "")).with_suffix(".token")
+        self.token_file = Path(token_file) if token_file else of_its_own
         self._server: uvicorn.Server | None = None
         self._thread: threading.Thread | None = None
         self._started = threading.Event()

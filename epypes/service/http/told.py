@@ -29,7 +29,7 @@ _MOST_WAITING: Final = 100
 RUN_EVERY_S: Final = 0.1
 _COUNTS_EVERY_S: Final = 1.0
 # Of these the last one says all.
-_LATEST: Final = frozenset({"run", "counts", "parameters"})
+_LATEST: Final = frozenset({"run", "counts", "parameters", "group"})
 
 
 class Listener:
@@ -128,16 +128,21 @@ class Told:
         return [
             ("state", {"state": service.state, "reason": service.reason}),
             ("parameters", written(service.parameters())),
-            ("counts", service.counts()),
+            *self._each_second(),
         ]
 
+    def _each_second(self) -> list[tuple[str, Any]]:
+        group = self._service.group()
+        return [("counts", self._service.counts()), *([("group", group)] if group["is_shared"] else [])]
+
     async def _count(self) -> None:
-        """Tell the counts each second, as long as anybody listens."""
+        """Tell the counts each second, and how the group is where there is one, as long as anybody listens."""
         try:
             while self._listeners:
                 await asyncio.sleep(_COUNTS_EVERY_S)
                 with suppress(EpypesError):
-                    self._spread("counts", self._service.counts())
+                    for kind, data in self._each_second():
+                        self._spread(kind, data)
         finally:
             self._counting = None
 

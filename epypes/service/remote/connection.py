@@ -135,6 +135,10 @@ class Connection:
             self._view = self._seen()
         return dict(self._info)
 
+    def group(self) -> dict[str, Any]:
+        """Return which replicas share its events with it, how each is, and whether all compute with the same."""
+        return dict(self._control.get("/v1/group"))
+
     def parameters(self) -> Parameters:
         """Return the hyperparameters: their revision, and an entry by token as in pipeline.toml."""
         return parameters_of(self.url, self._control.get("/v1/parameters"))

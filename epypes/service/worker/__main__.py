@@ -104,7 +104,8 @@ class Worker:
 
     def _parameters(self, header: dict[str, Any], frames: list[memoryview]) -> None:
         revision, values = header["revision"], json.loads(bytes(frames[0]))
-        self._inbox.put(Change(revision, lambda: self._apply(revision, values)))
+        make = self._try if header.get("is_trial") else self._apply
+        self._inbox.put(Change(revision, lambda: make(revision, values)))
 
     def _withdraw(self, header: dict[str, Any], frames: list[memoryview]) -> None:
         # A change that is not there any more was made or refused, which is told.
@@ -116,6 +117,12 @@ class Worker:
         answer: dict[str, Any] = {"kind": "parameters", "revision": revision}
         if problems:
             answer = {"kind": "parameters_refused", "revision": revision, "problems": problems}
+        self._settle(answer)
+
+    def _try(self, revision: int, values: dict[str, Any]) -> None:
+        self._settle({"kind": "parameters_tried", "revision": revision, "problems": self._changes.refusals(values)})
+
+    def _settle(self, answer: dict[str, Any]) -> None:
         try:
             self._channel.send(answer)
         except EOFError:

@@ -52,6 +52,15 @@ class Changes:
             self.revision = revision
         return problems
 
+    def refusals(self, entries: Mapping[str, Any]) -> dict[str, str]:
+        """Return the reason by token for values that could not be set; nothing is set. While no slot works."""
+        before = self._trial.runner.hyperparameters
+        values, problems = _values(entries, self._enums)
+        problems |= self._tried(values)
+        if not problems:
+            self._trial.runner.set(**before)
+        return problems
+
     def _tried(self, values: Mapping[str, Any]) -> dict[str, str]:
         before, problems = self._trial.runner.hyperparameters, {}
         for token, value in values.items():

@@ -3,6 +3,7 @@ import { loadFailures, sawFailure } from "./failures.js";
 import { redraw, sawPlace, watchGraph } from "./graph.js";
 import { sawParameters, showButtons, watchParameters } from "./parameters.js";
 import { sawCounts, sawRun } from "./rates.js";
+import { sawGroup } from "./replicas.js";
 import { ask, confirmed, hasToken, isTokenKnown, hear, keepToken, make, part, Refused, say, takeToken } from "./server.js";
 
 /** @type {Record<string, string>} */
@@ -29,6 +30,7 @@ async function loadInfo() {
   part("name").textContent = info.name;
   document.title = `${info.name}: ${info.state}`;
   const facts = {
+    ...(info.replica ? { replica: info.replica } : {}),
     bundle: info.bundle,
     digest: info.digest.slice(0, DIGITS),
     worker: info.worker_pid === null ? "none" : `process ${info.worker_pid}`,
@@ -128,6 +130,7 @@ hear(
   {
     state: sawState,
     counts: sawCounts,
+    group: (group) => sawGroup(group, TONES),
     parameters: (now) => {
       sawParameters(now);
       redraw();

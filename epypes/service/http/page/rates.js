@@ -8,7 +8,10 @@ const LABELS = {
   received: "received", answered: "answered", failed: "failed", dropped: "dropped", dead_letters: "dead letters",
   retried: "tried again", rejected: "rejected", waiting: "waiting", in_flight: "in work",
 };
-const BAD = new Set(["failed", "dropped", "dead_letters", "rejected"]);
+// Where a broker delivers the events.
+/** @type {Record<string, string>} */
+const OF_BROKER = { redelivered: "delivered again", duplicates: "duplicates", given_back: "given back", overtaken: "overtaken" };
+const BAD = new Set(["failed", "dropped", "dead_letters", "rejected", "overtaken"]);
 
 /** @type {{at: number, ns: number}[]} */
 let runs = [];
@@ -24,7 +27,8 @@ export function sawRun(run) {
 
 /** @param {Record<string, number>} counts */
 export function sawCounts(counts) {
-  part("counts").replaceChildren(...Object.entries(LABELS).map(([name, label]) => entry(label, counts[name] ?? 0, BAD.has(name))));
+  const labels = Object.entries(OF_BROKER).filter(([name]) => name in counts);
+  part("counts").replaceChildren(...[...Object.entries(LABELS), ...labels].map(([name, label]) => entry(label, counts[name] ?? 0, BAD.has(name))));
   const now = performance.now();
   // A service that was started anew counts from 0.
   if (last && counts.answered >= last.answered && now - last.at > 300) {

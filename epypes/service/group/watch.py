@@ -1,0 +1,99 @@
+"""What of the others is worth a line in a replica's log? Pure: times are given."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from math import inf
+from typing import Final
+
+from epypes.service.group.membership import LOST_S, Member, Present
+
+# Who looks less often has not heard anybody meanwhile: the broker was away, or this replica was stopped.
+_DEAF_S: Final = 2.0
+_DIGITS: Final = 12
+
+Line = tuple[int, str]
+
+
+@dataclass(slots=True)
+class _Known:
+    """A replica that was there, when it was heard last, and what was found to be odd about it."""
+
+    member: Member
+    heard_at_s: float
+    odd: tuple[str, ...] = ()
+
+
+class Watch:
+    """What was known of the others at the last look."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, _Known] = {}
+        self._left: set[str] = set()
+        self._looked_s, self._sure_from_s = -inf, -inf
+
+    def left(self, member_id: str) -> None:
+        """Note that a replica has said that it ends."""
+        if member_id in self._known:
+            self._left.add(member_id)
+
+    def look(self, own: Member, present: list[Present], now_s: float) -> list[Line]:
+        """Return levels and lines for a log: who has come, who has gone, and who does not go with this replica."""
+        if now_s - self._looked_s > _DEAF_S:
+            self._sure_from_s = now_s + LOST_S
+        self._looked_s = now_s
+        others = {each.member.id: each for each in present if each.member.id != own.id}
+        lines = self._gone(others, now_s)
+        for each in others.values():
+            lines += self._met(own, each, now_s)
+        return lines
+
+    def _gone(self, others: dict[str, Present], now_s: float) -> list[Line]:
+        lines: list[Line] = []
+        for key in [key for key in self._known if key not in others]:
+            known = self._known[key]
+            if key in self._left:
+                lines.append((logging.INFO, f"{_called(known.member)} has left the group"))
+            elif now_s < self._sure_from_s:
+                continue
+            else:
+                text = f"is gone: it was heard last {now_s - known.heard_at_s:.1f} s ago, and has not said that it ends"
+                lines.append((logging.WARNING, f"{_called(known.member)} {text}"))
+            del self._known[key]
+        self._left.clear()
+        return lines
+
+    def _met(self, own: Member, other: Present, now_s: float) -> list[Line]:
+        member, lines = other.member, list[Line]()
+        known = self._known.get(member.id)
+        if known is None:
+            known = self._known[member.id] = _Known(member, now_s)
+            lines.append((logging.INFO, f"{_called(member)} is in the group"))
+        odd = tuple(odds(own, member))
+        lines += [(logging.WARNING, f"{_called(member)} {text}") for text in odd if text not in known.odd]
+        known.member, known.heard_at_s, known.odd = member, now_s - other.heard_s, odd
+        return lines
+
+
+def odds(own: Member, other: Member) -> list[str]:
+    """Return why another replica should not take events from the same queue as this one, each after its name."""
+    found = []
+    if own.name != other.name:
+        found.append(
+            f"serves another bundle from the same queue, {_served(other)}, and this one serves {_served(own)}: "
+            "each takes events of the other. Give each bundle a queue of its own."
+        )
+    if own.ordered != other.ordered:
+        does, own_does = ("keeps", "does not") if other.ordered else ("does not keep", "does")
+        text = f"{does} the order of events, and this one {own_does}: answers come out of order."
+        found.append(f"{text} Serve all replicas with --ordered, or none.")
+    return found
+
+
+def _served(member: Member) -> str:
+    return f"{member.name or 'without a name'} ({member.digest[:_DIGITS]})"
+
+
+def _called(member: Member) -> str:
+    return f"replica {member.replica} at {member.host}"

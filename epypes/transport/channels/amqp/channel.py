@@ -1,0 +1,147 @@
+"""How are messages carried by RabbitMQ?
+
+``amqp://USER:PASSWORD@HOST/QUEUE``, encrypted ``amqps://``. A queue is a quorum queue: what was confirmed is on the
+broker's disk (of most brokers of a cluster), and each message knows how often it was delivered. With a queue of
+another type that somebody else made, RabbitMQ tells only whether a message was delivered before: `Received.attempt`
+is 1 or 2 then. What a replica had been handed in advance counts as delivered too when it dies.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Any, Final
+
+from epypes.errors import EpypesError
+from epypes.transport.channels.amqp.connection import Connection, Line
+from epypes.transport.channels.amqp.outgoing import Outgoing, fits
+from epypes.transport.channels.amqp.places import aside, listen, make_sure
+from epypes.transport.channels.amqp.reasons import reason_of
+from epypes.transport.channels.amqp.turns import always, nothing
+from epypes.transport.channels.packing import ATTEMPTS, FROM, REASON, SIZES, arrived, packed, readable
+from epypes.transport.channels.place import Place
+from epypes.transport.channels.seam import Frames, Received
+
+# Quorum queues refuse more.
+_MOST_PREFETCH: Final = 2_000
+# Of what needs no acknowledgement so many are on their way at once.
+_AHEAD: Final = 100
+_LONGEST_REASON: Final = 4_000
+_COUNT: Final = "x-delivery-count"
+# What the broker writes for its own use; a dead letter of ours must not tell of deliveries of the queue it was in.
+_OF_THE_BROKER: Final = ("x-delivery-count", "x-death", "x-first-death-", "x-last-death-", "x-stream-offset")
+
+
+class AmqpChannel:
+    """A way to one place of a RabbitMQ; see `seam.Channel`."""
+
+    def __init__(self, place: Place, prefetch: int, timeout_s: float) -> None:
+        self._place = place
+        needed = prefetch if place.kind == "queue" else max(prefetch, _AHEAD)
+        self._prefetch = min(max(needed, 1), _MOST_PREFETCH)
+        self._connection = connection = Connection(place, timeout_s)
+        self._outgoing = Outgoing(connection)
+        self._incoming: Line | None = None
+        self._arrived: deque[tuple[Any, Any, bytes]] = deque()
+        try:
+            make_sure(connection, place)
+        except BaseException:
+            connection.close()
+            raise
+
+    def send(self, frames: Frames, *, id: str = "", headers: Mapping[str, str] | None = None) -> None:  # noqa: A002
+        """Send a message; see `seam.Channel.send`."""
+        body, told = packed(frames, id, headers or {})
+        self._connection.check()
+        self._outgoing.send(self._place, body, id, told)
+
+    def receive(self, timeout_s: float) -> Received | None:
+        """Return the next message; see `seam.Channel.receive`."""
+        connection, arrived = self._connection, self._arrived
+        connection.check()
+        if self._incoming is None:
+            self._listen()
+        if not arrived:
+            connection.turns.run(nothing, lambda: arrived or connection.trouble, timeout_s)
+            connection.check()
+        return self._received(*arrived.popleft()) if arrived else None
+
+    @property
+    def trouble(self) -> str:
+        """Why it is over; see `seam.Channel.trouble`."""
+        return self._connection.trouble
+
+    def _listen(self) -> None:
+        connection, place = self._connection, self._place
+        line = Line(connection)
+        error = listen(line, place, self._prefetch, self._heard)
+        if error is not None:
+            raise connection.error(f"{place} can't be received from: {reason_of(error)}.")
+        connection.turns.run(lambda: self._watch(line), always, 0.0)
+        self._incoming = line
+
+    def _watch(self, line: Line) -> None:
+        lose = self._connection.lose
+        line.amqp.add_on_cancel_callback(lambda _: lose(f"the queue {self._place.name!r} was deleted"))
+        line.amqp.add_on_close_callback(lambda _, error: lose(reason_of(error)))
+
+    def _heard(self, amqp: object, method: Any, properties: Any, body: bytes) -> None:
+        self._arrived.append((method, properties, body))
+
+    def _received(self, method: Any, properties: Any, body: bytes) -> Received:
+        told = dict(properties.headers or {})
+        headers = {name: _text(value) for name, value in told.items() if not name.startswith(_OF_THE_BROKER)}
+        message_id, tag = _text(properties.message_id or ""), method.delivery_tag
+        frames, shown = arrived(body, headers)
+        if self._place.kind != "queue":
+            self._ack(tag)
+            return Received(frames, message_id, 0, shown)
+        attempt = _attempt(told.get(_COUNT), method.redelivered)
+
+        def settle(reason: str | None) -> None:
+            if reason is not None and not self._put_aside(reason, body, message_id, headers, attempt):
+                return
+            self._ack(tag)
+
+        return Received(frames, message_id, attempt, shown, settle)
+
+    def _ack(self, tag: int) -> None:
+        line = self._incoming
+
+        def acknowledge() -> None:
+            if line is not None and not line.is_over and line.amqp.is_open:
+                line.amqp.basic_ack(tag)
+
+        self._connection.turns.run(acknowledge, always, 0.0)
+
+    def _put_aside(self, reason: str, body: bytes, id: str, headers: Mapping[str, str], attempt: int) -> bool:  # noqa: A002
+        """Send a message to the dead letters, and return whether it is there; else it stays where it was."""
+        more = {REASON: reason[:_LONGEST_REASON], FROM: self._place.name, ATTEMPTS: str(attempt)}
+        told = {**readable(body, headers), **more}
+        if not fits(told):
+            told = {name: value for name, value in told.items() if name in more or name == SIZES}
+        try:
+            self._outgoing.send(aside(self._place), body, id, told)
+        except EpypesError as error:
+            self._connection.lose(str(error))
+            return False
+        return True
+
+    def close(self) -> None:
+        """End it; see `seam.Channel.close`."""
+        self._connection.close()
+
+
+def _text(value: object) -> str:
+    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
+
+
+def _attempt(count: object, redelivered: bool) -> int:
+    if isinstance(count, int):
+        return count + 1
+    return 2 if redelivered else 1
+
+
+def open_channel(place: Place, prefetch: int, timeout_s: float) -> AmqpChannel:
+    """Open a way to a place of a RabbitMQ."""
+    return AmqpChannel(place, prefetch, timeout_s)

@@ -1,0 +1,7 @@
+"""How does NATS JetStream carry messages? By nats-py, whose event loop has a thread of its own."""
+
+from __future__ import annotations
+
+from epypes.transport.channels.jetstream.channel import open_channel
+
+__all__ = ["open_channel"]

@@ -1,0 +1,286 @@
+"""How do threads talk through a client that lives in an event loop? One connection to a NATS server.
+
+The loop has a thread of its own, so that heartbeats go on while nobody sends or receives. The library would wait, when
+it closes a connection, until all was sent: so we take a connection for lost before it does, and close the socket.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import threading
+import types
+from collections.abc import Callable, Coroutine, Generator
+from functools import partial
+from queue import Empty, SimpleQueue
+from typing import Any, Final
+
+from nats.aio.client import Client
+from nats.errors import Error as NatsError
+
+from epypes.errors import BrokerError
+from epypes.transport.channels.jetstream.entry import check_encryption, entry, refusal, said, unreachable
+from epypes.transport.channels.place import Place
+
+_log = logging.getLogger("epypes.transport")
+_THREAD: Final = "epypes nats"
+# A cut link is noticed after at most the sum of both.
+_BEAT_S: Final = 2.5
+_SILENCE_S: Final = 5.0
+_CLOSING_S: Final = 2.0
+
+
+def _is_not_ours(record: logging.LogRecord) -> bool:
+    """Return whether a record is not about one of our connections; what happens to those we say ourselves."""
+    return not (record.threadName or "").startswith(_THREAD)
+
+
+class Link:
+    """A connection, which never comes back once it is lost.
+
+    Parameters
+    ----------
+    place
+        A place of the server.
+    timeout_s
+        Longest wait for the server's word, in seconds.
+    lost
+        Called on the link's thread, once, when it is lost: with the error for who waits.
+    """
+
+    def __init__(self, place: Place, timeout_s: float, lost: Callable[[BrokerError], object]) -> None:
+        self._place, self._timeout_s, self._lost = place, timeout_s, lost
+        self.client = Client()
+        self._why: str | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._over = asyncio.Event()
+        self._tasks: set[asyncio.Task[Any]] = set()
+        self._asking: set[SimpleQueue[tuple[Any, BaseException | None]]] = set()
+        self._closing = threading.Lock()
+        self._is_closing = False
+        self._thread = threading.Thread(target=self._run, name=f"{_THREAD} {place.name}", daemon=True)
+        logging.getLogger("nats.aio.client").addFilter(_is_not_ours)
+
+    def open(self) -> None:
+        """Connect; BrokerError says why not."""
+        began: SimpleQueue[BrokerError | None] = SimpleQueue()
+        self._began = began
+        self._thread.start()
+        error = began.get()
+        if error is not None:
+            self._thread.join(_CLOSING_S)
+            raise error
+
+    # --- for any thread ---
+
+    def call(self, function: Callable[..., object], *args: object) -> bool:
+        """Have a function called on the link's thread; return False if there is none any more."""
+        loop = self._loop
+        try:
+            if loop is None:
+                return False
+            loop.call_soon_threadsafe(function, *args)
+        except RuntimeError:
+            return False
+        return True
+
+    def ask(self, question: Callable[[], Coroutine[Any, Any, Any]]) -> Any:
+        """Return what a coroutine returns that runs on the link's thread; raise what it raises, or BrokerError."""
+        answer: SimpleQueue[tuple[Any, BaseException | None]] = SimpleQueue()
+        if self._why is not None or not self.call(lambda: self.spawn(self._answer(question, answer))):
+            raise self.error()
+        try:
+            # The server's word is waited for within it: this is for a thread that is not given the processor.
+            value, error = answer.get(timeout=2 * self._timeout_s + _CLOSING_S)
+        except Empty:
+            raise self.error() from None
+        if error is not None:
+            raise error
+        return value
+
+    async def _answer(
+        self, question: Callable[[], Coroutine[Any, Any, Any]], answer: SimpleQueue[tuple[Any, BaseException | None]]
+    ) -> None:
+        self._asking.add(answer)
+        try:
+            async with asyncio.timeout(self._timeout_s):
+                answer.put((await question(), None))
+        except TimeoutError:
+            self.lose(f"it did not answer within {self._timeout_s:g} s")
+            answer.put((None, self.error()))
+        except asyncio.CancelledError:
+            answer.put((None, self.error()))
+            raise
+        except (NatsError, OSError) as error:
+            answer.put((None, error if isinstance(error, BrokerError) else self.failed(error)))
+        except Exception as error:  # it is the asking thread's
+            answer.put((None, error))
+        finally:
+            self._asking.discard(answer)
+
+    def error(self) -> BrokerError:
+        """Return what is said to who uses it now."""
+        why = self._why or "it was closed"
+        return BrokerError(str(self._place), f"The connection to {self._place} is over: {why}.")
+
+    def close(self, last: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        """End it, after a last coroutine, which has a moment; bounded."""
+        with self._closing:
+            if not self._is_closing:
+                self._is_closing = True
+                self.call(lambda: self.spawn(self._close(last)))
+        self._thread.join(min(self._timeout_s, _CLOSING_S) + _CLOSING_S)
+
+    async def _close(self, last: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        waiting = [task for task in self._tasks - {asyncio.current_task()} if task.get_name() != "beat"]
+        with contextlib.suppress(TimeoutError, NatsError, OSError):
+            if self._why is None:
+                async with asyncio.timeout(min(self._timeout_s, _CLOSING_S)):
+                    # What was acknowledged or rejected before is told before.
+                    await asyncio.gather(*waiting, return_exceptions=True)
+                    await last()
+                    await self.flush(_CLOSING_S)
+        self.lose("it was closed")
+        self._over.set()
+
+    # --- for the link's thread ---
+
+    def spawn(self, work: Coroutine[Any, Any, Any], name: str | None = None) -> None:
+        """Have a coroutine run beside the others."""
+        task = asyncio.get_running_loop().create_task(work, name=name)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    def start(self, work: Coroutine[Any, Any, Any]) -> None:
+        """Have a coroutine run to where it first waits, now, and raise what it raises; the rest runs beside the others.
+
+        To publish is to wait for nothing, mostly: a task for it takes longer than it does itself.
+        """
+        try:
+            awaited = work.send(None)
+        except StopIteration:
+            return
+        self.spawn(_going_on(work, awaited))
+
+    async def flush(self, timeout_s: float) -> None:
+        """Return when the server has read all that was sent so far."""
+        pause_s = 0.0
+        # The library's own question whether it has goes ahead of what still waits to be sent.
+        while self.client.pending_data_size and self._why is None:
+            await asyncio.sleep(pause_s)
+            pause_s = 0.001
+        await self.client.rtt(timeout_s)
+
+    def lose(self, why: str) -> None:
+        """Take it for lost, if it isn't already, and tell who waits."""
+        if self._why is None:
+            self._why = why
+            self._lost(self.error())
+            # The library goes on to wait for answers that can't come any more.
+            for answer in self._asking:
+                answer.put((None, self.error()))
+
+    def _run(self) -> None:
+        with contextlib.suppress(asyncio.CancelledError), asyncio.Runner() as runner:
+            runner.run(self._live())
+
+    async def _live(self) -> None:
+        loop = asyncio.get_running_loop()
+        loop.set_exception_handler(lambda loop, context: _log.debug("%s: %s", self._place, context))
+        try:
+            try:
+                await self._connect()
+            except Exception as error:
+                refused = unreachable(self._place, error, self._timeout_s)
+                self._why = str(refused)
+                self._began.put(refused)
+                return
+            self._loop = loop
+            self.spawn(self._beat(), "beat")
+            self._began.put(None)
+            await self._over.wait()
+        finally:
+            self._loop = None
+            self.lose("it was closed")
+            self._abort()
+
+    async def _connect(self) -> None:
+        self._refused = refused = asyncio.get_running_loop().create_future()
+        options = entry(self._place, self._timeout_s, self.client)
+        connecting = asyncio.ensure_future(self.client.connect(**options, error_cb=self._failed))
+        await asyncio.wait((connecting, refused), timeout=self._timeout_s, return_when=asyncio.FIRST_COMPLETED)
+        error = TimeoutError() if not connecting.done() else connecting.exception()
+        if refused.done():
+            error = refused.result()
+        refused.cancel()
+        connecting.cancel()
+        if error is None:
+            check_encryption(self._place, self.client)
+            self._watch_reading()
+            return
+        await asyncio.wait((connecting,), timeout=_CLOSING_S)
+        raise unreachable(self._place, error, self._timeout_s)
+
+    async def _failed(self, error: Exception) -> None:
+        """Hear of an error from the library: the first before the server has let us in says why it doesn't."""
+        if not self._refused.done():
+            self._refused.set_result(error)
+        elif "permissions violation" in str(error):
+            self.lose(f"the server refuses: {said(error)}")
+
+    def _watch_reading(self) -> None:
+        # The library tells of a lost connection only once it has closed it in good order, which may never be.
+        reading = getattr(self.client, "_reading_task", None)
+        if reading is not None:
+            reading.add_done_callback(lambda task: self._reading_ended())
+
+    def _reading_ended(self) -> None:
+        error = self.client.last_error
+        told = f" ({said(error)})" if error is not None and said(error) else ""
+        self.lose(f"the server has closed it, or has gone away{told}")
+
+    def failed(self, error: BaseException) -> BrokerError:
+        """Return what is said of an error of the library: that the server has gone, if it has, or that it refuses."""
+        if not self.client.is_connected:
+            self._reading_ended()
+        return refusal(self._place, error) if self._why is None else self.error()
+
+    async def _beat(self) -> None:
+        while True:
+            await asyncio.sleep(_BEAT_S)
+            # Asked twice: what came in the first half of the time says nothing of the second.
+            if not (await self._answers(_SILENCE_S / 2) or await self._answers(_SILENCE_S / 2)):
+                self.lose(f"nothing was heard of the server for {_SILENCE_S:g} s")
+                return
+
+    async def _answers(self, within_s: float) -> bool:
+        """Return whether anything is heard of the server."""
+        seen = self.client.stats["in_msgs"]
+        try:
+            await self.client.rtt(within_s)
+        except Exception:
+            return bool(self.client.is_connected and self.client.stats["in_msgs"] != seen)
+        return True
+
+    def _abort(self) -> None:
+        """Close the socket without waiting until all was sent: a cut link takes nothing."""
+        writer = getattr(getattr(self.client, "_transport", None), "_io_writer", None)
+        if writer is not None:
+            writer.transport.abort()
+
+
+@types.coroutine
+def _going_on(work: Coroutine[Any, Any, Any], awaited: Any) -> Generator[Any, Any, None]:
+    """Go on with a coroutine that has begun, and waits for something."""
+    while True:
+        try:
+            answer = yield awaited
+        except BaseException as error:
+            step = partial(work.throw, error)
+        else:
+            step = partial(work.send, answer)
+        try:
+            awaited = step()
+        except StopIteration:
+            return

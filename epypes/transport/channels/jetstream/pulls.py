@@ -1,0 +1,65 @@
+"""How many messages may still come without being asked for anew? What a receiver has asked a NATS server for, counted.
+
+A receiver never waits for an answer to "the next message, please": it has asked already. What it has asked for and what
+it holds are together no more than its prefetch, so a busy receiver leaves the rest to others. Each request ends by
+itself after a few seconds, and is replaced: a receiver whose link is cut is given nothing for longer than that.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from typing import Final
+
+# Shorter than the wait for an acknowledgement, so that what a cut receiver was given last comes to another one.
+EXPIRES_S: Final = 4.0
+_GRACE_S: Final = 1.0
+
+
+def request(batch: int) -> bytes:
+    """Return what the server is told: so many messages, as they come."""
+    return json.dumps({"batch": batch, "expires": int(EXPIRES_S * 1e9)}).encode()
+
+
+@dataclass(slots=True)
+class Pulls:
+    """What was asked for and has not come.
+
+    Attributes
+    ----------
+    room
+        How many messages may be held and asked for, together.
+    expected
+        How many were asked for and have not come.
+    """
+
+    room: int
+    expected: int = 0
+    _until_s: dict[int, float] = field(default_factory=dict)
+    _last: int = 0
+
+    def came(self) -> None:
+        """Count a message that came."""
+        self.expected = max(self.expected - 1, 0)
+
+    def ended(self, number: int, pending: int) -> None:
+        """Count a request that the server has ended, so many messages short."""
+        if self._until_s.pop(number, None) is not None:
+            self.expected = max(self.expected - pending, 0)
+
+    def wanted(self, held: int, now_s: float) -> tuple[int, int]:
+        """Return the number of a request to be made and how many messages it is for; 0 if none is to be made.
+
+        Not one by one as they are settled, but when half of the room is free: a request costs as much as a message.
+        """
+        for number in [number for number, until_s in self._until_s.items() if until_s < now_s]:
+            del self._until_s[number]
+        if not self._until_s:
+            self.expected = 0
+        free = self.room - held - self.expected
+        if free < max(self.room // 2, 1):
+            return 0, 0
+        self._last += 1
+        self._until_s[self._last] = now_s + EXPIRES_S + _GRACE_S
+        self.expected += free
+        return self._last, free

@@ -1,0 +1,1 @@
+"""Which real brokers do the tests start, and how?"""

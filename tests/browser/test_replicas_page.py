@@ -1,0 +1,70 @@
+"""Does the live page of one replica show them all?"""
+
+from __future__ import annotations
+
+import pytest
+
+from epypes.service import Service
+from epypes.service.http import HttpServer
+from tests.browser.conftest import SCREENSHOTS
+from tests.browser.contrast import unreadable
+from tests.service.served import acting_bundle, until
+from tests.service.test_brokered import line_of
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture(scope="module")
+def replicas(tmp_path_factory):
+    """Two replicas with their control, and who sends them events."""
+    folder = tmp_path_factory.mktemp("replicas")
+    bundle = acting_bundle(folder / "acting")
+    with pytest.MonkeyPatch.context() as own:
+        own.setenv("XDG_STATE_HOME", str(folder / "state"))
+        with line_of("replicas-page") as line:
+            first = Service(bundle, line.sub, line.pub, replica="1")
+            second = Service(bundle, line.sub, line.pub, replica="2")
+            with (
+                HttpServer(first, "127.0.0.1:*", token_file=folder / "first") as at_first,
+                HttpServer(second, "127.0.0.1:*", token_file=folder / "second") as at_second,
+            ):
+                first.http, second.http = at_first.url, at_second.url
+                with first:
+                    yield line, first, second
+
+
+def rows(page):
+    return [row.inner_text().split("\t") for row in page.locator("#replicas tbody tr").all()]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_page_shows_the_replicas_when_there_is_more_than_one(browser, replicas, scheme):
+    line, first, second = replicas
+    page = browser.new_page(viewport={"width": 1400, "height": 1000}, color_scheme=scheme)
+    try:
+        errors = []
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.goto(first.http)
+        page.wait_for_selector("#state:has-text('READY')")
+        assert page.locator("#replicas-section").is_hidden()
+        with second:
+            until(lambda: first.group()["replicas"] == 2)
+            for number in range(20):
+                line.send(number=number)
+            line.take(20)
+            page.wait_for_selector("#replicas tbody tr:nth-child(2)")
+            page.wait_for_selector("#replicas-note:has-text('2 of 2 are ready')")
+            assert [row[0] for row in rows(page)] == ["1 this one", "2"]
+            assert page.locator("#replicas tbody a").get_attribute("href") == second.http
+            answered = sum(replica.counts()["answered"] for replica in (first, second))
+            page.wait_for_selector(f"#replicas-note:has-text('answered {answered} events')")
+            assert unreadable(page, "#replicas-section") == []
+            SCREENSHOTS.mkdir(parents=True, exist_ok=True)
+            page.locator("#replicas-section").screenshot(path=SCREENSHOTS / f"replicas-{scheme}.png")
+            second.pause()
+            page.wait_for_selector("#replicas tbody tr:nth-child(2) .badge.warn:has-text('PAUSED')")
+            second.resume()
+        page.wait_for_selector("#replicas-section", state="hidden")
+        assert errors == []
+    finally:
+        page.close()

@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from epypes.service.group.membership import Member, Membership
+from epypes.service.group.watch import Watch, odds
+from tests.service.served import acting_bundle, until
+from tests.service.test_brokered import line_of, replica_of
+
+OWN = Member("own", "1", "here", name="edges", digest="d1")
+
+
+class Log:
+    """A group, one look a second, and what the looks have said."""
+
+    def __init__(self):
+        self.members, self.watch, self.lines = Membership(), Watch(), []
+
+    def second(self, at_s, *others):
+        for member in others:
+            self.members.heard(member, at_s)
+        self.lines += self.watch.look(OWN, self.members.present(at_s), at_s)
+
+    def take(self):
+        lines, self.lines = self.lines, []
+        return lines
+
+
+def peer(**fields):
+    return Member("other", "2", "there", **{"name": "edges", "digest": "d1", **fields})
+
+
+@pytest.fixture
+def log():
+    return Log()
+
+
+def test_who_comes_and_who_leaves_is_said_once(log):
+    for at_s in range(6):
+        log.second(at_s, OWN, peer())
+    assert log.take() == [(logging.INFO, "replica 2 at there is in the group")]
+    log.members.left("other")
+    log.watch.left("other")
+    log.watch.left("nobody")
+    for at_s in range(6, 12):
+        log.second(at_s, OWN)
+    assert log.take() == [(logging.INFO, "replica 2 at there has left the group")]
+
+
+def test_who_is_not_heard_any_more_is_said_to_be_gone_with_the_time_since(log):
+    for at_s in range(6):
+        log.second(at_s, OWN, peer())
+    log.take()
+    for at_s in range(6, 12):
+        log.second(at_s, OWN)
+    text = "replica 2 at there is gone: it was heard last 4.0 s ago, and has not said that it ends"
+    assert log.take() == [(logging.WARNING, text)]
+    log.second(12, peer())
+    assert log.take() == [(logging.INFO, "replica 2 at there is in the group")]
+
+
+def test_who_has_heard_nobody_says_of_nobody_that_he_is_gone(log):
+    for at_s in range(6):
+        log.second(at_s, OWN, peer())
+    log.take()
+    log.second(30, OWN)
+    for at_s in range(31, 40):
+        log.second(at_s, OWN, peer())
+    assert log.take() == []
+    log.second(60, OWN)
+    for at_s in range(61, 70):
+        log.second(at_s, OWN)
+    assert [text[:25] for _, text in log.take()] == ["replica 2 at there is gon"], "it has not come back"
+
+
+def test_what_is_odd_is_said_when_it_begins(log):
+    for at_s in range(4):
+        log.second(at_s, peer())
+    for at_s in range(4, 8):
+        log.second(at_s, peer(name="cells", digest="d2"))
+    for at_s in range(8, 12):
+        log.second(at_s, peer(name="cells", digest="d2", ordered=True))
+    _, *odd = log.take()
+    assert [level for level, _ in odd] == [logging.WARNING] * 2
+    assert "replica 2 at there serves another bundle from the same queue, cells (d2), and this one" in odd[0][1]
+    assert "replica 2 at there keeps the order of events, and this one does not" in odd[1][1]
+
+
+def test_another_state_of_the_same_bundle_is_nothing_odd():
+    assert odds(OWN, peer(digest="d2", revision=7)) == []
+
+
+def test_a_foreign_bundle_and_another_order_are_told_to_both_sides(acting, tmp_path, caplog):
+    foreign = acting_bundle(tmp_path / "foreign")
+    caplog.set_level(logging.INFO, logger="epypes.service")
+    with line_of("odd") as line, replica_of(acting, line, replica="1") as first:
+        with replica_of(foreign, line, replica="2", ordered=True) as second:
+            for replica in (first, second):
+                until(lambda replica=replica: replica.group()["replicas"] == 2)
+                told = replica.group()["members"]
+                assert [each["name"] for each in told] == [first.info()["name"], "foreign"]
+                assert [each["ordered"] for each in told] == [False, True]
+
+            def said(text):
+                return {each.args[0].split(" at ")[0] for each in caplog.records if text in each.getMessage()}
+
+            until(lambda: said("serves another bundle from the same queue") == {"replica 1", "replica 2"})
+            until(lambda: said("the order of events") == {"replica 1", "replica 2"})
+        until(lambda: said("has left the group") == {"replica 2"})

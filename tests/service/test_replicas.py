@@ -1,0 +1,168 @@
+"""Do replicas of a bundle answer every event once, on a real broker, whoever is killed?"""
+
+from __future__ import annotations
+
+import pytest
+
+import epypes as ep
+from tests.brokers.traffic import KILLS, KILLS_PARENT, PLAIN, RAISES, Reader, dead_letters, event, left, until
+from tests.service.replicated import control, promoted, replicas, stopped
+
+pytestmark = pytest.mark.slow
+
+COUNT = 1_000
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory):
+    return promoted(tmp_path_factory.mktemp("replicated"))
+
+
+@pytest.fixture(params=["rabbitmq", "nats"])
+def brokered(request):
+    """Each of the brokers that have work queues."""
+    return request.getfixturevalue(request.param)
+
+
+def kind_of(number):
+    """One in a hundred raises, and one of all kills its worker."""
+    if number == COUNT // 3:
+        return KILLS
+    return RAISES if number % 100 == 50 else PLAIN
+
+
+def outlived(bundle, broker, sub, pub, restarted_by):
+    """Send a thousand events; kill a replica half-way, and restart the broker. Check what became of each."""
+    outbox = ep.Mailbox("block")
+    with replicas(bundle, sub, pub) as members, Reader(pub) as reader, ep.Publisher(sub, outbox) as publisher:
+        for number in range(COUNT):
+            if number == COUNT // 2:
+                until(lambda: reader.look() > COUNT // 4, "a quarter of the answers")
+                members[0].kill()
+            if number == COUNT * 3 // 4:
+                restarted_by(broker)
+            outbox.put(event(number, kind_of(number)))
+        assert publisher.sent == COUNT
+        until(lambda: reader.look() >= COUNT, lambda: f"{reader.look()} answers of {COUNT}")
+        letters = dead_letters(sub, 1)
+        # What the killed one had answered, and not acknowledged, comes again.
+        until(lambda: left(sub) == 0, lambda: f"{left(sub)} events to be acknowledged")
+        counts = [stopped(member) for member in members[1:]]
+        check_answers(reader, letters)
+    assert (left(sub), left(pub)) == (0, 0)
+    check_counts(counts)
+
+
+def killed(broker):
+    broker.stop(at_once=True)
+    broker.start()
+
+
+def ended_in_order(broker):
+    broker.stop()
+    broker.start()
+
+
+def test_a_thousand_events_outlive_a_killed_replica_and_a_killed_broker(bundle, brokered):
+    sub = brokered.address("chaos.events", create=True, attempts=5)
+    outlived(bundle, brokered, sub, brokered.address("chaos.answers", create=True), killed)
+
+
+def test_a_thousand_events_outlive_a_killed_replica_over_mqtt_and_a_broker_that_ends_in_order(bundle, mosquitto):
+    sub = mosquitto.address("chaos/events", create=True)
+    outlived(bundle, mosquitto, sub, mosquitto.address("chaos/answers", create=True), ended_in_order)
+
+
+def check_answers(reader, letters):
+    """Every event was answered once: with its product, or with what failed."""
+    assert set(reader.ids().values()) == {1}
+    assert reader.ids().keys() == {f"event-{number}" for number in range(COUNT)}
+    failed = {answer.correlation_id: answer.failure for answer in reader.answers if answer.failure is not None}
+    assert failed.keys() == {f"event-{number}" for number in range(COUNT) if kind_of(number) != PLAIN}
+    assert letters.keys() == {f"event-{COUNT // 3}"}
+    for answer in reader.answers:
+        number = int(answer.correlation_id.removeprefix("event-"))
+        if kind_of(number) == PLAIN:
+            assert answer.parts["result"].tolist() == [number, 2, 2 * number]
+        elif kind_of(number) == RAISES:
+            assert f"event {number} is spoilt" in answer.failure.message
+    (letter,) = letters.values()
+    assert letter.headers["epypes-reason"]
+
+
+def check_counts(counts):
+    """Who survived has shared the load, and has answered what it says."""
+    for counted in counts:
+        assert counted["answered"] > COUNT // 50, counts
+        parts = "answered", "failed", "dead_letters", "given_back"
+        assert counted["received"] == sum(counted[name] for name in parts), counted
+        # Once in each replica at most: it comes to the other one if the broker dies before it knows.
+        assert counted["dead_letters"] <= 1
+    assert sum(counted["answered"] + counted["failed"] for counted in counts) >= COUNT // 2
+
+
+def test_an_event_that_takes_down_each_replica_is_a_dead_letter_that_can_be_opened(bundle, brokered):
+    sub = brokered.address("deadly.events", create=True, attempts=2)
+    pub = brokered.address("deadly.answers", create=True)
+    outbox = ep.Mailbox("block")
+    with replicas(bundle, sub, pub) as members, Reader(pub) as reader, ep.Publisher(sub, outbox):
+        outbox.put(event(0, KILLS_PARENT))
+        until(reader.look, "an answer of the one that is left")
+        (answer,) = reader.answers
+        letters = dead_letters(sub, 1)
+        (alive,) = (member for member in members if member.is_running)
+        counted = stopped(alive)
+    assert answer.correlation_id == "event-0"
+    assert "2 times" in answer.failure.message
+    assert "2 times" in letters["event-0"].headers["epypes-reason"]
+    assert (counted["dead_letters"], counted["answered"]) == (1, 0)
+    with pytest.warns(UserWarning, match="none was run"):
+        opened = ep.load_failure("event-0", bundle)
+    assert (opened["number"], opened["kind"]) == (0, KILLS_PARENT)
+
+
+def test_a_change_of_hyperparameters_reaches_all_replicas_with_one_revision(bundle, brokered):
+    sub = brokered.address("tuned.events", create=True)
+    pub = brokered.address("tuned.answers", create=True)
+    outbox = ep.Mailbox("block")
+    with replicas(bundle, sub, pub) as members, Reader(pub) as reader, ep.Publisher(sub, outbox):
+        controls = [control(member) for member in members]
+        gains = {controls[0].parameters().revision: 2}
+        for number in range(300):
+            if number in (60, 120, 180):
+                gain = number // 10
+                gains[controls[number // 60 - 1].set(gain=gain).revision] = gain
+            outbox.put(event(number))
+        until(lambda: reader.look() >= 300, lambda: f"{reader.look()} answers of 300")
+        last = max(gains)
+        until(lambda: {found.parameters().revision for found in controls} == {last}, "all to have the last revision")
+        assert {found.parameters().entries["gain"]["value"] for found in controls} == {gains[last]}
+        begun = reader.look()
+        for number in range(300, 360):
+            outbox.put(event(number))
+        until(lambda: reader.look() >= 360, lambda: f"{reader.look()} answers of 360")
+        assert {answer.revision for answer in reader.answers[begun:]} == {last}
+        for found in controls:
+            found.close()
+    assert len(gains) == 4
+    for answer in reader.answers:
+        assert int(answer.parts["result"][1]) == gains[answer.revision]
+    assert {answer.revision for answer in reader.answers} == set(gains)
+
+
+def test_replicas_that_keep_order_answer_in_the_order_of_the_events(bundle, brokered):
+    sub = brokered.address("ordered.events", create=True)
+    pub = brokered.address("ordered.answers", create=True)
+    outbox = ep.Mailbox("block")
+    with (
+        replicas(bundle, sub, pub, "--ordered", "--threads", "2") as members,
+        Reader(pub) as reader,
+        ep.Publisher(sub, outbox),
+    ):
+        for number in range(300):
+            outbox.put(event(number))
+        until(lambda: reader.look() >= 300, lambda: f"{reader.look()} answers of 300")
+        counts = [stopped(member) for member in members]
+    numbers = [int(answer.parts["result"][0]) for answer in reader.answers]
+    assert numbers == sorted(numbers)
+    assert all(counted["answered"] for counted in counts), counts
