@@ -88,6 +88,9 @@ class SocketEntrance:
     def seen(self, ids: Iterable[str]) -> None:
         """Do nothing: there are no others."""
 
+    def make_room(self, waiting: int) -> None:
+        """Do nothing: nobody waits for others."""
+
     def counts(self) -> dict[str, int]:
         """Return what is counted besides: nothing."""
         return {}
@@ -107,7 +110,7 @@ class BrokerEntrance:
     """
 
     def __init__(self, options: Options, accept: Accepting, on_change: Callable[[], object]) -> None:
-        self.place = place_of(bare(options.sub))
+        self.place, self._options = place_of(bare(options.sub)), options
         self.subscriber = Subscriber(self.place, accept, prefetch=options.prefetch, exhausted=accept.exhausted)
         self.subscriber.on_connection = lambda is_connected, reason: on_change()
         self._on_change = on_change
@@ -187,6 +190,15 @@ class BrokerEntrance:
     def seen(self, ids: Iterable[str]) -> None:
         """Note that other replicas are done with events."""
         self.subscriber.seen(ids)
+
+    def make_room(self, waiting: int) -> None:
+        """See that an event can come beside so many answers that wait for an earlier one; 0: as many as ever.
+
+        What they wait for may be with the broker, as what a killed replica had in hand is.
+        """
+        usual = self._options.prefetch
+        needed = max(usual + 1, waiting + self._options.threads)
+        self.subscriber.prefetch = min(needed, 2 * usual) if waiting else usual
 
     def counts(self) -> dict[str, int]:
         """Return how often events came again that were in hand or done already, and how often the broker was lost."""

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
 ANY_PORT: Final = "tcp://127.0.0.1:*"
 CONNECT: Final = "connect:"
 MOST_THREADS: Final = 64
-# Answers wait for those of other replicas, and others are computed meanwhile. As many as a killed replica
-# leaves must fit: what all wait for is with the broker then, and comes only to a hand that is not full.
+# Answers wait for those of other replicas, and others are computed meanwhile.
 _AHEAD_ORDERED: Final = 64
 
 

@@ -96,7 +96,7 @@ class Service:
         self._deployer = Deployer(
             self._dispatcher, self._supervisor, self._tuning, given.job_timeout_s, self._desk.tell
         )
-        told = self._health, self._sockets.entrance.seen, self._changed
+        told = self._health, self._sockets.entrance, self._changed
         self._peers = peers_of(Parts(given, self._dispatcher, self._desk, self._tuning, *told))
         self._turn = threading.Lock()
 

@@ -30,7 +30,7 @@ class Connection:
     place
         Where to.
     prefetch, timeout_s
-        See `open_channel`.
+        See `open_channel`; for the first, see the attribute too.
     tell
         Called with whether there is a connection, and why not, when that has changed; on the thread that uses it.
     before
@@ -46,6 +46,8 @@ class Connection:
         How often there was one again.
     number
         Of the connection, from 1.
+    prefetch
+        How many messages may be in hand; may be changed, by any thread.
     receives
         Whether it is for receiving just now, which a broker may refuse to who may connect: then it is tried when it is
         opened.
@@ -62,7 +64,7 @@ class Connection:
         receives: bool = False,
     ) -> None:
         self.place = place
-        self._prefetch, self._timeout_s, self._tell = prefetch, timeout_s, tell
+        self.prefetch, self._timeout_s, self._tell = prefetch, timeout_s, tell
         self.receives = receives
         self._channel: Channel | None = None
         # What came when it was opened.
@@ -94,7 +96,7 @@ class Connection:
         BrokerError
             The broker can't be reached, refuses, or has no such place.
         """
-        channel = open_channel(self.place, prefetch=self._prefetch, timeout_s=self._timeout_s)
+        channel = open_channel(self.place, prefetch=self.prefetch, timeout_s=self._timeout_s)
         try:
             self._first = channel.receive(0.0) if self.receives else None
         except BaseException:
@@ -119,6 +121,7 @@ class Connection:
     def receive(self, channel: Channel, timeout_s: float) -> Received | None:
         """Return the next message of the channel, as that does."""
         first, self._first = self._first, None
+        channel.prefetch = self.prefetch
         return first or channel.receive(timeout_s)
 
     def look(self) -> bool:

@@ -89,15 +89,13 @@ class Subscriber:
     ) -> None:
         if acknowledge not in get_args(Acknowledge):
             raise ValueError(f"acknowledge is {' or '.join(map(repr, get_args(Acknowledge)))}, not {acknowledge!r}.")
-        if prefetch < 1:
-            raise ValueError(f"prefetch is a whole number from 1, not {prefetch!r}.")
         self.place = address if isinstance(address, Place) else place_of(address)
         first = topic_frame(topic) if topic else b""
         limits = Limits(total_bytes=max_message_bytes)
         # Who settles even what is exhausted has a clock of its own for what takes long.
         self._most_in_hand = prefetch if self.place.kind == "queue" and exhausted is None else 0
         self._arrivals = Arrivals(queue, first, limits, self.place, acknowledge, exhausted)
-        self._prefetch, self._timeout_s = prefetch, timeout_s
+        self._prefetch, self._timeout_s = _checked(prefetch), timeout_s
         self.on_connection: Callable[[bool, str], object] | None = None
         self._lock = threading.Lock()
         self._receiving: _Receiving | None = None
@@ -107,6 +105,17 @@ class Subscriber:
     def address(self) -> str:
         """The address, without the password."""
         return str(self.place)
+
+    @property
+    def prefetch(self) -> int:
+        """How many messages may be in hand at once. It may be set to another number while the subscriber runs."""
+        return self._prefetch
+
+    @prefetch.setter
+    def prefetch(self, count: int) -> None:
+        self._prefetch, receiving = _checked(count), self._receiving
+        if receiving is not None:
+            receiving.connection.prefetch = count
 
     @property
     def received(self) -> int:
@@ -221,6 +230,12 @@ class Subscriber:
         receiving = self._receiving
         state = "stopped" if receiving is None or not receiving.is_alive() else "running"
         return f"<Subscriber {self.address[:50]} {state}: {self.received} received>"
+
+
+def _checked(prefetch: int) -> int:
+    if prefetch < 1:
+        raise ValueError(f"prefetch is a whole number from 1, not {prefetch!r}.")
+    return prefetch
 
 
 class _Receiving:

@@ -572,6 +572,34 @@ def test_a_receiver_asks_for_no_more_than_it_has_room_for():
     assert pulls.wanted(held=0, now_s=0.2) == (4, 4)
 
 
+def test_who_holds_more_than_half_of_what_he_may_asks_for_the_rest_now_and_then():
+    pulls = Pulls(8)
+    assert pulls.wanted(5, 0.0) == (0, 0)
+    assert pulls.wanted(5, 0.0, is_due=True) == (1, 3)
+    assert pulls.wanted(5, 0.1, is_due=True) == (0, 0)
+
+
+@pytest.mark.slow
+def test_who_waits_for_as_many_as_he_may_hold_gets_them_however_late_the_last_is_sent(opened):
+    sender, receiver = opened(), opened(prefetch=4)
+    for _ in range(3):
+        sender.send([b"early"])
+        assert receiver.receive(WAIT_S)
+    assert receiver.receive(EXPIRES_S + 2) is None
+    sender.send([b"late"])
+    assert frames_of(receiver.receive(WAIT_S)) == [b"late"]
+
+
+def test_what_may_be_held_for_a_while_is_asked_for_one_by_one():
+    pulls = Pulls(8)
+    assert pulls.wanted(8, 0.0) == (0, 0)
+    pulls.more = 1
+    assert pulls.wanted(8, 0.0) == (1, 1)
+    pulls.came()
+    assert pulls.wanted(9, 0.1) == (0, 0)
+    assert pulls.wanted(8, 0.1) == (2, 1)
+
+
 def test_a_request_that_the_server_never_ended_is_given_up():
     pulls = Pulls(1)
     pulls.wanted(0, 0.0)

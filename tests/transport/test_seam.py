@@ -239,6 +239,25 @@ def test_no_more_come_than_asked_for_until_one_is_settled(queue, opened):
     next_of(receiver)
 
 
+@pytest.mark.parametrize("peer", ["within", "rabbitmq", "nats"], indirect=True)
+def test_more_may_be_in_hand_for_a_while(queue, opened):
+    sender, receiver = opened(queue), opened(queue, prefetch=2)
+    for number in range(9):
+        sender.send([b"%d" % number])
+    held = all_of(receiver, 2)
+    for prefetch in (3, 5):
+        receiver.prefetch = prefetch
+        held += all_of(receiver, prefetch - len(held))
+        assert receiver.receive(ABSENT_S) is None
+    receiver.prefetch = 2
+    assert receiver.receive(ABSENT_S) is None
+    for received in held:
+        received.ack()
+    held += all_of(receiver, 2)
+    assert receiver.receive(ABSENT_S) is None
+    assert sorted(number for received in held for number in bodies(received)) == [b"%d" % n for n in range(7)]
+
+
 def test_receivers_of_a_queue_share_it(queue, opened):
     sender, receivers = opened(queue), [opened(queue, prefetch=4) for _ in range(3)]
     for receiver in receivers:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import threading
 from typing import Any
@@ -37,15 +38,21 @@ def test_the_last_value_is_shown_over_a_line_that_loses_doubles_delays_and_excha
     try:
         front_end = FrontEnd(panel, monkeypatch, down, up)
         front_end.tell("ready")
-        for value in range(101, 221):
+        for value in range(101, 220):
             move(panel, "threshold", value)
+        # How many messages that makes depends on how busy the machine is.
+        for value in itertools.cycle((101, 102)):
+            if down.lost + up.lost:
+                break
+            move(panel, "threshold", value)
+            panel.wait(10)
+        move(panel, "threshold", 220)
         panel.wait(10)
         # The browser says "ready" until it is heard: the page of a notebook is mounted for good.
         while not front_end.painted:
             front_end.tell("ready")
             panel._tuning.worker.wait(10)
         front_end.wait_for_values(10, threshold=220)
-        assert down.lost + up.lost > 0
         seqs = [frame["seq"] for frame in front_end.painted]
         assert seqs == sorted(seqs)
     finally:

@@ -50,6 +50,8 @@ class Group:
         Called with the ids of events that others are done with.
     changed
         Called when something may be another now; on threads of the group.
+    stands_still
+        Called with how many answers wait for their turn when none has passed for a while; with 0 when that is over.
     order_timeout_s
         How long an answer waits for those before it at most, in seconds; None: for none.
 
@@ -70,6 +72,7 @@ class Group:
         tuned: Tuned,
         seen: Callable[[Iterable[str]], object],
         changed: Callable[[], object],
+        stands_still: Callable[[int], object],
         order_timeout_s: float | None = None,
     ) -> None:
         self.id = uuid.uuid4().hex
@@ -77,7 +80,7 @@ class Group:
         self._talk = Talk(place.beside("group", "broadcast", create=True), self._hear)
         log = place.beside("parameters", "log", create=True)
         self.agreement = Agreement(log, tuned, _CHANGE_S, self._rank, self._noted)
-        self._order = None if order_timeout_s is None else Order(order_timeout_s, self._say_begun)
+        self._order = None if order_timeout_s is None else Order(order_timeout_s, self._say_begun, stands_still)
         self._members, self._watch = Membership(), Watch()
         self._lock = threading.Lock()
         self._unsaid = threading.Condition()

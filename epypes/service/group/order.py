@@ -13,6 +13,8 @@ from epypes.service.group.turnstile import FIRST, Stream, Turnstile, Waiting
 
 _log = logging.getLogger("epypes.service")
 _STOP_S: Final = 2.0
+# Longer than the others need to tell what is done.
+_STILL_S: Final = 0.5
 _MOST_SOURCE: Final = 256
 
 
@@ -25,11 +27,18 @@ class Order:
         How long an answer waits at most, in seconds.
     begun
         Called with the numbers of events that others must hear of.
+    stands_still
+        Called with how many answers wait, each time that none was let through for a while; with 0 when it is over.
     """
 
-    def __init__(self, timeout_s: float, begun: Callable[[Sequence[tuple[Stream, int]]], object]) -> None:
+    def __init__(
+        self,
+        timeout_s: float,
+        begun: Callable[[Sequence[tuple[Stream, int]]], object],
+        stands_still: Callable[[int], object],
+    ) -> None:
         self._turnstile = Turnstile(timeout_s)
-        self._begun = begun
+        self._begun, self._stands_still = begun, stands_still
         self._changed = threading.Condition()
         self._is_over = False
         self._thread = threading.Thread(target=self._run, name="epypes order", daemon=True)
@@ -111,20 +120,29 @@ class Order:
             return self._turnstile.known()
 
     def _run(self) -> None:
-        while True:
-            with self._changed:
-                passing = self._turnstile.passing(monotonic())
-                while not passing and not self._is_over:
-                    self._changed.wait(self._wait_s())
-                    passing = self._turnstile.passing(monotonic())
-                if self._is_over:
-                    return
+        told = 0
+        while not self._is_over:
+            passing = self._next()
             for each in passing:
                 _let_through(each)
+            waiting = self.waiting
+            if waiting != told and not (passing and waiting):
+                told = waiting
+                self._stands_still(waiting)
 
-    def _wait_s(self) -> float | None:
+    def _next(self) -> list[Waiting]:
+        """Return those whose turn it is; nobody if that is so for a while."""
+        until_s = monotonic() + _STILL_S
+        with self._changed:
+            passing = self._turnstile.passing(monotonic())
+            while not (passing or self._is_over or (self._turnstile.waiting and monotonic() >= until_s)):
+                self._changed.wait(self._wait_s(until_s))
+                passing = self._turnstile.passing(monotonic())
+            return [] if self._is_over else passing
+
+    def _wait_s(self, until_s: float) -> float | None:
         due_s = self._turnstile.due_s()
-        return None if due_s is None else max(due_s - monotonic(), 0.0)
+        return None if due_s is None else max(min(due_s, until_s) - monotonic(), 0.0)
 
 
 def place_in_stream(event: Any) -> tuple[Stream, int] | None:

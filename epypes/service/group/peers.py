@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from time import monotonic
 from typing import Any, Final
 
 from epypes.service.desk import Desk
 from epypes.service.dispatch import Dispatcher
+from epypes.service.entrances import BrokerEntrance, SocketEntrance
 from epypes.service.group.group import Group
 from epypes.service.group.membership import Member, Present, summary, told
 from epypes.service.ledger import Entry
@@ -37,8 +38,8 @@ class Parts:
         Its events, who tells what has become of them, its parameters.
     about
         Returns what its name, state, counts and address are, as fields of `Member`.
-    seen
-        Called with the ids of events that other replicas are done with.
+    entrance
+        Where its events come from.
     changed
         Called when the service's state may be another one.
     """
@@ -48,7 +49,7 @@ class Parts:
     desk: Desk
     tuning: Tuning
     about: Callable[[], Mapping[str, Any]]
-    seen: Callable[[Iterable[str]], object]
+    entrance: SocketEntrance | BrokerEntrance
     changed: Callable[[], object]
 
     def member(self, id: str = "") -> Member:  # noqa: A002
@@ -118,7 +119,8 @@ class Peers:
     def _made(self) -> Group:
         options, parts = self._parts.options, self._parts
         timeout_s = options.job_timeout_s if options.ordered else None
-        return Group(self._place, parts.member, parts.tuning, parts.seen, self._changed, timeout_s)
+        seen, make_room = parts.entrance.seen, parts.entrance.make_room
+        return Group(self._place, parts.member, parts.tuning, seen, self._changed, make_room, timeout_s)
 
     # -- beginning and end --------------------------------------------------------------------------------------------
 

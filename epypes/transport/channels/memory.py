@@ -69,7 +69,7 @@ class MemoryChannel:
     """A way to one place of a broker in this process; see `seam.Channel`."""
 
     def __init__(self, place: Place, prefetch: int) -> None:
-        self._place, self._prefetch = place, prefetch
+        self._place, self.prefetch = place, prefetch
         self._broker = broker = _broker(place.host)
         self._held: list[_Message] = []
         self._heard: deque[_Message] | None = None
@@ -110,7 +110,7 @@ class MemoryChannel:
             waiting = self._source()
             while True:
                 self._check()
-                if waiting and len(self._held) < self._prefetch:
+                if waiting and len(self._held) < self.prefetch:
                     return self._received(waiting.popleft())
                 if not broker.changed.wait(max(until_s - monotonic(), 0.0)) and monotonic() >= until_s:
                     return None

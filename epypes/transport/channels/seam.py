@@ -103,7 +103,15 @@ class Channel(Protocol):
     """An open way to one place of a broker. One thread sends, one receives; any may close, ack and reject.
 
     After a BrokerError it is of no use any more: close it, and open another.
+
+    Attributes
+    ----------
+    prefetch
+        How many messages may be received and not acknowledged, at most. Whoever receives may change it from one call
+        to the next; to a ZeroMQ socket it means nothing, and to MQTT no more once it is open.
     """
+
+    prefetch: int
 
     @property
     def trouble(self) -> str:

@@ -28,7 +28,7 @@ class ZeroMQChannel:
     """A way to all who listen at an address of ZeroMQ; see `seam.Channel`. Its sockets are opened by the first use."""
 
     def __init__(self, place: Place, prefetch: int, timeout_s: float) -> None:
-        self._place, self._timeout_s = place, timeout_s
+        self._place, self.prefetch, self._timeout_s = place, prefetch, timeout_s
         self._address = place.name.removeprefix(_CONNECT).removeprefix(_BIND)
         self._lock = threading.Lock()
         self._is_closed = False

@@ -68,8 +68,9 @@ class Replica:
 
     def __init__(self, place, name, digest="d1", timeout_s=None):
         self.values, self.name = Values(digest), name
-        self.seen, self.passed = [], []
-        self.group = Group(place, self.about, self.values, self.seen.extend, lambda: None, timeout_s)
+        self.seen, self.passed, self.stood_still = [], [], []
+        heard = self.seen.extend, lambda: None, self.stood_still.append
+        self.group = Group(place, self.about, self.values, *heard, timeout_s)
 
     def about(self, own_id):
         return Member(
@@ -309,6 +310,23 @@ def test_answers_of_all_replicas_are_published_in_order(place):
         until(lambda: len(published) == len(events))
         assert published == [event.sequence for event in events]
         assert first.group.overtaken == second.group.overtaken == 0
+
+
+def test_it_is_told_how_many_answers_wait_when_none_passes_for_a_while_and_that_it_is_over(place):
+    (replica,) = group_of(place, 1, timeout_s=TIMEOUT_S)
+    events = [Envelope(type="x", sequence=number, source="camera", epoch=1) for number in range(1, 5)]
+    with started(replica):
+        replica.finish(events[0])
+        until(lambda: replica.passed == [1])
+        assert replica.stood_still == []
+        replica.finish(events[2])
+        until(lambda: replica.stood_still == [1])
+        replica.finish(events[3])
+        until(lambda: replica.stood_still == [1, 2])
+        replica.finish(events[1])
+        until(lambda: replica.stood_still == [1, 2, 0])
+    assert replica.passed == [1, 2, 3, 4]
+    assert replica.group.overtaken == 0
 
 
 def test_an_event_without_a_number_waits_for_nobody(place):

@@ -36,12 +36,12 @@ class AmqpChannel:
     """A way to one place of a RabbitMQ; see `seam.Channel`."""
 
     def __init__(self, place: Place, prefetch: int, timeout_s: float) -> None:
-        self._place = place
-        needed = prefetch if place.kind == "queue" else max(prefetch, _AHEAD)
-        self._prefetch = min(max(needed, 1), _MOST_PREFETCH)
+        self._place, self.prefetch = place, prefetch
         self._connection = connection = Connection(place, timeout_s)
         self._outgoing = Outgoing(connection)
         self._incoming: Line | None = None
+        # How much each consumer lets be in hand, by its tag: RabbitMQ leaves that as it was when a consumer began.
+        self._consumers: dict[str, int] = {}
         self._arrived: deque[tuple[Any, Any, bytes]] = deque()
         try:
             make_sure(connection, place)
@@ -60,7 +60,8 @@ class AmqpChannel:
         connection, arrived = self._connection, self._arrived
         connection.check()
         if self._incoming is None:
-            self._listen()
+            self._incoming = self._listen()
+        self._make_room(self._incoming)
         if not arrived:
             connection.turns.run(nothing, lambda: arrived or connection.trouble, timeout_s)
             connection.check()
@@ -71,14 +72,37 @@ class AmqpChannel:
         """Why it is over; see `seam.Channel.trouble`."""
         return self._connection.trouble
 
-    def _listen(self) -> None:
-        connection, place = self._connection, self._place
-        line = Line(connection)
-        error = listen(line, place, self._prefetch, self._heard)
+    def _listen(self) -> Line:
+        line = Line(self._connection)
+        self._consume(line, self._room)
+        self._connection.turns.run(lambda: self._watch(line), always, 0.0)
+        return line
+
+    @property
+    def _room(self) -> int:
+        needed = self.prefetch if self._place.kind == "queue" else max(self.prefetch, _AHEAD)
+        return min(max(needed, 1), _MOST_PREFETCH)
+
+    def _consume(self, line: Line, prefetch: int) -> None:
+        tag = f"epypes.{len(self._consumers)}"
+        error = listen(line, self._place, prefetch, self._heard, tag)
         if error is not None:
-            raise connection.error(f"{place} can't be received from: {reason_of(error)}.")
-        connection.turns.run(lambda: self._watch(line), always, 0.0)
-        self._incoming = line
+            raise self._connection.error(f"{self._place} can't be received from: {reason_of(error)}.")
+        self._consumers[tag] = prefetch
+
+    def _make_room(self, line: Line) -> None:
+        """See that there are consumers for as much as may be in hand just now, and no more of them than it takes."""
+        missing = self._room - sum(self._consumers.values())
+        if missing > 0:
+            self._consume(line, missing)
+        while missing < 0 and len(self._consumers) > 1:
+            tag, prefetch = next(reversed(self._consumers.items()))
+            missing += prefetch
+            if missing > 0:
+                return
+            # What it has delivered can be acknowledged all the same.
+            line.ask(lambda amqp, done: amqp.basic_cancel(tag, callback=done))  # noqa: B023 - asked at once
+            del self._consumers[tag]
 
     def _watch(self, line: Line) -> None:
         lose = self._connection.lose

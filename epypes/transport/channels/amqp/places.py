@@ -95,8 +95,11 @@ def missing(connection: Connection, place: Place) -> BrokerError:
     return connection.error(text)
 
 
-def listen(line: Line, place: Place, prefetch: int, heard: Callable[..., object]) -> BaseException | None:
-    """Have the broker deliver what comes to a place; return None, or what it closed the channel with."""
+def listen(line: Line, place: Place, prefetch: int, heard: Callable[..., object], tag: str) -> BaseException | None:
+    """Have the broker deliver what comes to a place; return None, or what it closed the channel with.
+
+    The tag tells it from others of the same line, each of which has its own prefetch.
+    """
     queue: list[str] = [place.name]
     if place.kind == "broadcast":
         queue.clear()
@@ -107,7 +110,9 @@ def listen(line: Line, place: Place, prefetch: int, heard: Callable[..., object]
     error = line.ask(lambda amqp, done: amqp.basic_qos(prefetch_count=prefetch, callback=done))
     if error is not None:
         return error
-    return line.ask(lambda amqp, done: amqp.basic_consume(queue[0], heard, arguments=first, callback=done))
+    return line.ask(
+        lambda amqp, done: amqp.basic_consume(queue[0], heard, consumer_tag=tag, arguments=first, callback=done)
+    )
 
 
 def _own_queue(amqp: Any, place: Place, queue: list[str], done: Callable[[object], None]) -> None:

@@ -41,13 +41,14 @@ class JetStreamChannel:
     """A way to one place of a NATS server; see `seam.Channel`."""
 
     def __init__(self, place: Place, prefetch: int, timeout_s: float) -> None:
-        self._place, self._timeout_s = place, timeout_s
+        self._place, self.prefetch, self._timeout_s = place, max(prefetch, 1), timeout_s
         self._arrived: SimpleQueue[Msg | None] = SimpleQueue()
         # Of the link's thread alone, as is all that they are about: who waits for the server's word on what he has
         # sent, and what was received and is not settled, by the subject that it is acknowledged to.
         self._unconfirmed: dict[str, Callable[[Any], object]] = {}
         self._held: dict[str, Msg] = {}
-        self._pulls = pulls.Pulls(max(prefetch, 1) if place.kind == "queue" else _AHEAD)
+        self._pulls = pulls.Pulls(self.prefetch if place.kind == "queue" else _AHEAD)
+        self._asked_for = self.prefetch
         self._number = 0
         self._asked: Any = None
         self._is_listening = False
@@ -127,6 +128,9 @@ class JetStreamChannel:
         if not self._is_listening:
             self._link.ask(self._listen)
             self._is_listening = True
+        if self.prefetch != self._asked_for:
+            self._asked_for = self.prefetch
+            self._link.call(self._make_room, self.prefetch)
         try:
             message = self._arrived.get(timeout=max(timeout_s, 0.0))
         except Empty:
@@ -173,12 +177,17 @@ class JetStreamChannel:
         if status == "503" or "deleted" in told.lower():
             self._link.lose("the stream is gone, or the consumer that it is received by")
         elif status == "408":
-            await self._ask_for_more()
+            await self._ask_for_more(is_due=True)
 
-    async def _ask_for_more(self) -> None:
-        number, batch = self._pulls.wanted(len(self._held), monotonic())
+    async def _ask_for_more(self, *, is_due: bool = False) -> None:
+        number, batch = self._pulls.wanted(len(self._held), monotonic(), is_due=is_due)
         if batch:
             await self._client.publish(self._next, pulls.request(batch), f"{self._inbox}.{number}")
+
+    def _make_room(self, prefetch: int) -> None:
+        if self._place.kind == "queue":
+            self._pulls.more = max(prefetch - self._pulls.room, 0)
+            self._start(self._ask_for_more())
 
     async def _go_on(self, every_s: float) -> None:
         """Say of what is held that it is being worked on, as long as we live, and ask for what nobody answered to."""
@@ -187,7 +196,7 @@ class JetStreamChannel:
             if self._place.kind == "queue":
                 for reply in tuple(self._held):
                     await self._client.publish(reply, b"+WPI")
-            await self._ask_for_more()
+            await self._ask_for_more(is_due=True)
 
     @property
     def trouble(self) -> str:

@@ -29,11 +29,14 @@ class Pulls:
     ----------
     room
         How many messages may be held and asked for, together.
+    more
+        How many more than that just now: each is asked for as soon as it may be.
     expected
         How many were asked for and have not come.
     """
 
     room: int
+    more: int = 0
     expected: int = 0
     _until_s: dict[int, float] = field(default_factory=dict)
     _last: int = 0
@@ -47,17 +50,18 @@ class Pulls:
         if self._until_s.pop(number, None) is not None:
             self.expected = max(self.expected - pending, 0)
 
-    def wanted(self, held: int, now_s: float) -> tuple[int, int]:
+    def wanted(self, held: int, now_s: float, *, is_due: bool = False) -> tuple[int, int]:
         """Return the number of a request to be made and how many messages it is for; 0 if none is to be made.
 
         Not one by one as they are settled, but when half of the room is free: a request costs as much as a message.
+        Now and then, when it is due, also for less: who holds more than half may wait for another one to go on.
         """
         for number in [number for number, until_s in self._until_s.items() if until_s < now_s]:
             del self._until_s[number]
         if not self._until_s:
             self.expected = 0
-        free = self.room - held - self.expected
-        if free < max(self.room // 2, 1):
+        free = self.room + self.more - held - self.expected
+        if free < (1 if self.more or is_due else max(self.room // 2, 1)):
             return 0, 0
         self._last += 1
         self._until_s[self._last] = now_s + EXPIRES_S + _GRACE_S

@@ -58,7 +58,7 @@ class MqttChannel:
     """A way to one place of an MQTT 5 broker; see `seam.Channel`."""
 
     def __init__(self, place: Place, prefetch: int, timeout_s: float) -> None:
-        self._place, self._prefetch, self._timeout_s = place, prefetch, timeout_s
+        self._place, self.prefetch, self._timeout_s = place, prefetch, timeout_s
         self._lock = threading.Lock()
         self._receiving: Connection | None = None
         self._heirs: Heirs | None = None
@@ -111,9 +111,9 @@ class MqttChannel:
         place, session = self._place, ""
         if place.kind == "queue":
             session = session_of(place)
-            made = join(place, session, self._prefetch, self._timeout_s)
+            made = join(place, session, self.prefetch, self._timeout_s)
         else:
-            made = Connection(place, self._timeout_s, prefetch=max(self._prefetch, _AHEAD))
+            made = Connection(place, self._timeout_s, prefetch=max(self.prefetch, _AHEAD))
         try:
             if session:
                 self._heirs = Heirs(place, session, self._sending, self._timeout_s)
