@@ -56,7 +56,8 @@ class Dispatcher:
     is_closed
         Whether a broker's events are left with it.
     on_accepted, on_done
-        Called with each event that comes, and with each entry whose end has arrived; at once, and without the lock.
+        Called with each event that comes, and with each entry whose end has arrived and what acknowledges it, to be
+        called once; at once, and without the lock.
     is_unwatched
         Whether the supervisor wants to be woken up by the next event.
     answered_in_row
@@ -73,7 +74,7 @@ class Dispatcher:
         self.is_unwatched, self._waiting = False, 0
         self._why_refused, self.is_closed = "", False
         self.on_accepted: Callable[[Any], object] = lambda event: None
-        self.on_done: Callable[[Entry], object] = lambda entry: None
+        self.on_done: Callable[[Entry, Callable[[], object]], object] = lambda entry, then: then()
         self._to_tell: deque[Callable[[], object]] = deque()
         self._publishing, self._publisher = threading.Lock(), 0
 
@@ -326,15 +327,19 @@ class Dispatcher:
             if self.ledger.waits:
                 return
             result = self._desk.lost(entry, result, error)
-        if self.ledger.is_confirmed:
-            with self.changed:
-                if not self.ledger.confirm(entry.seq, result.outcome):
-                    # It was given back meanwhile.
-                    return
-                self._assign()
-                self._tell_waiting()
+        if self.ledger.is_confirmed and not self.ledger.is_waited_for(entry.seq):
+            # It was given back meanwhile.
+            return
+        self.on_done(entry, partial(self._acknowledge, entry, result))
+
+    def _acknowledge(self, entry: Entry, result: Result) -> None:
         acknowledge(entry.event, result)
-        self.on_done(entry)
+        if self.ledger.is_confirmed:
+            # Only now: whoever waits until nothing is in flight may end the connection then.
+            with self.changed:
+                if self.ledger.confirm(entry.seq, result.outcome):
+                    self._assign()
+                    self._tell_waiting()
 
     def wait_for(self, is_so: Callable[[], bool], timeout_s: float | None) -> bool:
         """Wait until something is so; return whether it is."""

@@ -265,6 +265,10 @@ class Ledger:
         elif entry.outcome is not None:
             setattr(self._totals, entry.outcome, getattr(self._totals, entry.outcome) + 1)
 
+    def is_waited_for(self, seq: int) -> bool:
+        """Return whether the answer to an event is on its way."""
+        return seq in self._unconfirmed
+
     def confirm(self, seq: int, outcome: Outcome) -> bool:
         """Note that the answer to an event has arrived; return whether it was waited for."""
         entry = self._unconfirmed.pop(seq, None)

@@ -85,6 +85,7 @@ class Group:
         self._lock = threading.Lock()
         self._unsaid = threading.Condition()
         self._done: deque[tuple[str, tuple[Stream, int] | None, bool]] = deque(maxlen=_MOST_UNSAID)
+        self._to_acknowledge: list[Callable[[], object]] = []
         self._begun: list[tuple[Stream, int]] = []
         self._said_revision, self._is_beat_due = -1, False
         self._is_over = False
@@ -169,20 +170,39 @@ class Group:
         else:
             self._order.wait_turn(event, publish)
 
-    def done(self, event: Any, has_overtaken: bool = False, *, is_aside: bool = False) -> None:
+    def done(
+        self,
+        event: Any,
+        has_overtaken: bool = False,
+        *,
+        is_aside: bool = False,
+        acknowledge: Callable[[], object] = lambda: None,
+    ) -> None:
         """Note that an event is done, and its answer published; the others are told. Returns at once.
 
         With ``is_aside``, of its place alone and not of its id: who is delivered it again puts it aside again.
+        ``acknowledge`` is called once. With an order the others are told before: if this replica is killed in between,
+        they would wait for an event that nobody has.
         """
-        # Said without an order here too: others may keep one.
         numbered = place_in_stream(event)
         if self._order is not None and numbered is not None:
             self._order.done([(*numbered, has_overtaken)])
+        said = ("" if is_aside else _id_of(event), numbered, has_overtaken)
         with self._unsaid:
-            is_first = not self._done
-            self._done.append(("" if is_aside else _id_of(event), numbered, has_overtaken))
-            if is_first:
-                self._unsaid.notify_all()
+            is_later = self._order is not None and not (self._talk.trouble or self._is_over)
+            if is_later:
+                self._to_acknowledge.append(acknowledge)
+                self._note(said)
+        if not is_later:
+            acknowledge()
+            # Without an order here too: others may keep one.
+            with self._unsaid:
+                self._note(said)
+
+    def _note(self, said: tuple[str, tuple[Stream, int] | None, bool]) -> None:
+        self._done.append(said)
+        if len(self._done) == 1:
+            self._unsaid.notify_all()
 
     def _say_begun(self, numbers: Iterable[tuple[Stream, int]]) -> None:
         with self._unsaid:
@@ -198,9 +218,21 @@ class Group:
                 next_beat_s, self._is_beat_due = monotonic() + BEAT_S, False
                 self._say([self._beat()])
                 self._changed()
-            self._say(self._news())
+            self._tell()
             self._wait(next_beat_s)
-        self._say([*self._news(), Left(self.id)])
+        self._tell(Left(self.id))
+
+    def _tell(self, *last: Notice) -> None:
+        """Say what is new, and acknowledge then what the others know of."""
+        with self._unsaid:
+            news, acknowledging = self._news(), tuple(self._to_acknowledge)
+            self._to_acknowledge.clear()
+        self._say([*news, *last])
+        for acknowledge in acknowledging:
+            try:
+                acknowledge()
+            except Exception:
+                _log.exception("an event could not be acknowledged")
 
     def _wait(self, until_s: float) -> None:
         with self._unsaid:

@@ -159,11 +159,12 @@ class Peers:
 
         self._group.wait_turn(entry.event, let_through)
 
-    def _done(self, entry: Entry) -> None:
+    def _done(self, entry: Entry, acknowledge: Callable[[], object]) -> None:
         has_overtaken = entry.seq in self._overtaking
         self._overtaking.discard(entry.seq)
         # What was put aside nobody else may call done: if the broker has not heard of it, it would be no dead letter.
-        self._group.done(entry.event, has_overtaken, is_aside=entry.outcome == "dead_letters")
+        is_aside = entry.outcome == "dead_letters"
+        self._group.done(entry.event, has_overtaken, is_aside=is_aside, acknowledge=acknowledge)
 
     # -- what is asked ------------------------------------------------------------------------------------------------
 

@@ -329,6 +329,34 @@ def test_it_is_told_how_many_answers_wait_when_none_passes_for_a_while_and_that_
     assert replica.group.overtaken == 0
 
 
+def test_with_an_order_an_event_is_acknowledged_once_the_others_are_told(place, monkeypatch):
+    first, second = replicas = group_of(place, 2, timeout_s=TIMEOUT_S)
+    told = []
+    with started(*replicas):
+        say = first.group._talk.say
+        monkeypatch.setattr(first.group._talk, "say", lambda data: (say(data), told.append("said")))
+        event = Envelope(type="x", sequence=1, source="camera", epoch=1)
+        first.group.done(event, acknowledge=lambda: told.append(event.id))
+        until(lambda: event.id in told)
+        assert "said" in told[: told.index(event.id)]
+        until(lambda: second.seen == [event.id])
+        with memory.away(place.host):
+            until(lambda: first.group.trouble != "")
+            # Nobody can be told, and the events to come shall not wait for that.
+            first.group.done(event, acknowledge=lambda: told.append("away"))
+            assert told[-1] == "away"
+    first.group.done(event, acknowledge=lambda: told.append("over"))
+    assert told[-1] == "over"
+
+
+def test_without_an_order_an_event_is_acknowledged_at_once(place):
+    (replica,) = group_of(place, 1)
+    told = []
+    with started(replica):
+        replica.group.done(Envelope(type="x", sequence=1), acknowledge=lambda: told.append("acknowledged"))
+        assert told == ["acknowledged"]
+
+
 def test_an_event_without_a_number_waits_for_nobody(place):
     (replica,) = group_of(place, 1, timeout_s=TIMEOUT_S)
     passed = []
