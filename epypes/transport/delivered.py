@@ -157,10 +157,16 @@ class DeliveredBytes(_Delivered, bytes):
     @classmethod
     def of(cls, data: Any, delivery: Delivery) -> Self:
         """Return bytes as some that were delivered; they are copied."""
-        made = cls(data)
+        made = cls(_bytes_of(data))
         made._delivery = delivery
         return made
 
     def __reduce__(self) -> tuple[type[bytes], tuple[bytes]]:
         # In another process, as in a copy, nobody hears a word on them.
         return bytes, (bytes(self),)
+
+
+def _bytes_of(frame: Any) -> Any:
+    """Return the bytes that a frame shows, if they are all of them: from others they would be copied twice."""
+    whole = frame.obj if isinstance(frame, memoryview) else frame
+    return whole if type(whole) is bytes and len(whole) == len(frame) else frame

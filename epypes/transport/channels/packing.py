@@ -30,7 +30,9 @@ def packed(frames: Frames, id: str, headers: Mapping[str, str]) -> tuple[bytes, 
     """
     check(frames, id, headers)
     if len(frames) == 1:
-        return bytes(frames[0]), dict(headers)
+        only = frames[0]
+        # Of a subclass too: to make plain bytes of it would be to copy it.
+        return only if isinstance(only, bytes) else bytes(only), dict(headers)
     return b"".join(frames), {**headers, SIZES: ",".join(str(len(frame)) for frame in frames)}
 
 

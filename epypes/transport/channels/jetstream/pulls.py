@@ -50,16 +50,22 @@ class Pulls:
         if self._until_s.pop(number, None) is not None:
             self.expected = max(self.expected - pending, 0)
 
+    def _give_up(self, now_s: float) -> None:
+        # In order of their ends; there may be a thousand, and this is asked at each message.
+        while self._until_s:
+            number, until_s = next(iter(self._until_s.items()))
+            if until_s >= now_s:
+                return
+            del self._until_s[number]
+        self.expected = 0
+
     def wanted(self, held: int, now_s: float, *, is_due: bool = False) -> tuple[int, int]:
         """Return the number of a request to be made and how many messages it is for; 0 if none is to be made.
 
         Not one by one as they are settled, but when half of the room is free: a request costs as much as a message.
         Now and then, when it is due, also for less: who holds more than half may wait for another one to go on.
         """
-        for number in [number for number, until_s in self._until_s.items() if until_s < now_s]:
-            del self._until_s[number]
-        if not self._until_s:
-            self.expected = 0
+        self._give_up(now_s)
         free = self.room + self.more - held - self.expected
         if free < (1 if self.more or is_due else max(self.room // 2, 1)):
             return 0, 0
