@@ -89,7 +89,7 @@ class Subscriber:
     ) -> None:
         if acknowledge not in get_args(Acknowledge):
             raise ValueError(f"acknowledge is {' or '.join(map(repr, get_args(Acknowledge)))}, not {acknowledge!r}.")
-        self.place = address if isinstance(address, Place) else place_of(address)
+        self.place = place_of(address)
         first = topic_frame(topic) if topic else b""
         limits = Limits(total_bytes=max_message_bytes)
         # Who settles even what is exhausted has a clock of its own for what takes long.

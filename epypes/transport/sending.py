@@ -68,7 +68,7 @@ class Publisher:
         max_message_bytes: int = Limits().total_bytes,
         timeout_s: float = TIMEOUT_S,
     ) -> None:
-        self.place = address if isinstance(address, Place) else place_of(address)
+        self.place = place_of(address)
         topic_frame(topic)
         self._queue, self._topic = queue, topic
         self._max_message_bytes, self._timeout_s = max_message_bytes, timeout_s

@@ -124,7 +124,7 @@ class Place:
         return replace(self, name=self.dead, kind="queue", dead="") if self.dead else self.beside("dead", "queue")
 
 
-def place_of(address: str) -> Place:
+def place_of(address: str | Place) -> Place:
     """Return what an address names: ``SCHEME://[USER[:PASSWORD]@]HOST[:PORT]/NAME[?OPTION=VALUE&...]``.
 
     Parameters
@@ -132,7 +132,7 @@ def place_of(address: str) -> Place:
     address
         Of RabbitMQ (``amqp``, encrypted ``amqps``), NATS (``nats``, encrypted ``tls``), MQTT (``mqtt``, encrypted
         ``mqtts``), ZeroMQ (``tcp``, ``ipc``; ``connect:`` before it has who sends connect, ``bind:`` who receives
-        bind) or a broker within this process, for tests (``memory``).
+        bind) or a broker within this process, for tests (``memory``). A Place is returned as it is.
 
         The options, each an attribute of `Place`: ``create=true``, ``attempts=3``, ``dead=NAME``, ``group=NAME``,
         ``kind=queue`` (or ``broadcast``, ``log``), ``vhost=NAME``, ``ca=FILE``, ``password_file=FILE``. Between two of
@@ -165,6 +165,8 @@ def place_of(address: str) -> Place:
     >>> place_of("mqtt://127.0.0.1/camera/1?kind=broadcast").kind
     'broadcast'
     """
+    if isinstance(address, Place):
+        return address
     scheme, found, _ = address.partition("://") if isinstance(address, str) else (type(address).__name__, "", "")
     side, _, plain = scheme.rpartition(":")
     if found and plain in ("tcp", "ipc") and side in _SIDES:

@@ -171,7 +171,7 @@ def open_channel(address: str | Place, *, prefetch: int = 1, timeout_s: float = 
     BrokerError
         The broker can't be reached, refuses the credentials, or has no such place.
     """
-    place = address if isinstance(address, Place) else place_of(address)
+    place = place_of(address)
     module, extra = _SPOKEN[place.scheme]
     try:
         spoken = importlib.import_module(f"epypes.transport.channels.{module}")
