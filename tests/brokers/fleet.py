@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import signal
 import subprocess
@@ -12,14 +11,9 @@ import threading
 from pathlib import Path
 
 from tests.brokers.traffic import until
+from tests.serving import with_parent
 
 ROOT = Path(__file__).parents[2]
-
-
-def _die_with_me():
-    """Have the process end with that of the tests, however that ends."""
-    set_death_signal = 1
-    ctypes.CDLL(None).prctl(set_death_signal, signal.SIGKILL)
 
 
 class Member:
@@ -34,7 +28,7 @@ class Member:
             stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,
-            preexec_fn=_die_with_me,
+            preexec_fn=with_parent(),
         )
         self.lines, self.errors = [], []
         # A full pipe would stop it.

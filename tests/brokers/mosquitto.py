@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import shutil
 import signal
@@ -17,6 +16,7 @@ from typing import Any
 from urllib.parse import quote, urlencode
 
 from tests.brokers.ports import free_ports
+from tests.serving import account, with_parent
 
 # Both have what must be quoted in an address.
 USER, PASSWORD = "epypes", "pa@ss:wörd/1"
@@ -32,12 +32,6 @@ def _binary(name: str) -> str | None:
 def is_installed() -> bool:
     """Return whether Debian's packages mosquitto and mosquitto-clients, or others like them, are here."""
     return _binary("mosquitto") is not None and _binary("mosquitto_passwd") is not None
-
-
-def _die_with_me() -> None:
-    """Have the broker end with the process of the tests, however that ends."""
-    set_death_signal = 1
-    ctypes.CDLL(None).prctl(set_death_signal, signal.SIGKILL)
 
 
 class Server:
@@ -100,9 +94,10 @@ class Server:
     def start(self) -> None:
         """Start it, and wait until it listens."""
         command = [str(_binary("mosquitto")), "-c", str(self._folder / "mosquitto.conf")]
+        # As root it would change its account by itself, and lose the death signal.
         with (self._folder / "log").open("ab") as log:
             started = subprocess.Popen(
-                command, cwd=self._folder, stdout=log, stderr=log, preexec_fn=_die_with_me, **_account()
+                command, cwd=self._folder, stdout=log, stderr=log, preexec_fn=with_parent(), **account(_ACCOUNT)
             )
         self._process = started
         end_s = monotonic() + _DEADLINE_S
@@ -137,11 +132,6 @@ class Server:
         told = {key: str(value).lower() if isinstance(value, bool) else str(value) for key, value in options.items()}
         query = f"?{urlencode(told)}" if told else ""
         return f"{self._scheme}://{secret}@{self.host}:{self.port}/{quote(name, safe='/')}{query}"
-
-
-def _account() -> dict[str, Any]:
-    """Return as whom the broker runs: as root it would change its account by itself, and lose the death signal."""
-    return {"user": _ACCOUNT, "group": _ACCOUNT, "extra_groups": []} if os.geteuid() == 0 else {}
 
 
 @contextlib.contextmanager

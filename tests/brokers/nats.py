@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import shutil
 import signal
 import socket
@@ -15,6 +14,7 @@ from time import monotonic
 from urllib.parse import quote, urlencode
 
 from tests.brokers.ports import free_ports
+from tests.serving import with_parent
 
 USER = "epypes"
 PASSWORD = "pa@ss:wörd/1"
@@ -29,12 +29,6 @@ def _binary() -> str | None:
 def is_installed() -> bool:
     """Return whether there is a NATS server on this machine."""
     return _binary() is not None
-
-
-def _die_with_me() -> None:
-    """Have the server end with the process of the tests, however that ends."""
-    set_death_signal = 1
-    ctypes.CDLL(None).prctl(set_death_signal, signal.SIGKILL)
 
 
 class Server:
@@ -82,7 +76,7 @@ class Server:
         with (self._folder / "log").open("ab") as log:
             command = [binary, "--config", f"{self._folder}/nats.conf"]
             self.process = subprocess.Popen(
-                command, cwd=self._folder, stdin=subprocess.DEVNULL, stdout=log, stderr=log, preexec_fn=_die_with_me
+                command, cwd=self._folder, stdin=subprocess.DEVNULL, stdout=log, stderr=log, preexec_fn=with_parent()
             )
         end_s = monotonic() + _DEADLINE_S
         while not self._answers():

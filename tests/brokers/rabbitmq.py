@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import shutil
 import signal
@@ -17,8 +16,10 @@ from typing import Any
 from urllib.parse import quote, urlencode
 
 from tests.brokers.ports import free_ports
+from tests.serving import account, with_parent
 
 _BINARIES = Path("/usr/lib/rabbitmq/bin")
+# Which Debian made for it.
 _ACCOUNT = "rabbitmq"
 _DEADLINE_S = 90.0
 # Two cores are shared by everybody: schedulers that spin while they wait for work would take them.
@@ -30,17 +31,6 @@ _HELLO = b"AMQP\x00\x00\x09\x01"
 def is_installed() -> bool:
     """Return whether this machine has RabbitMQ."""
     return (_BINARIES / "rabbitmq-server").exists()
-
-
-def _die_with_me() -> None:
-    """Have the server end with the process of the tests, however that ends."""
-    set_death_signal = 1
-    ctypes.CDLL(None).prctl(set_death_signal, signal.SIGKILL)
-
-
-def _account() -> dict[str, Any]:
-    """Return as whom the server runs: Debian made an account for it."""
-    return {"user": _ACCOUNT, "group": _ACCOUNT, "extra_groups": []} if os.geteuid() == 0 else {}
 
 
 class Server:
@@ -133,8 +123,8 @@ class Server:
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
-                preexec_fn=_die_with_me,
-                **_account(),
+                preexec_fn=with_parent(),
+                **account(_ACCOUNT),
             )
 
     def start(self) -> None:
@@ -188,7 +178,7 @@ class Server:
             capture_output=True,
             text=True,
             timeout=_DEADLINE_S,
-            **_account(),
+            **account(_ACCOUNT),
         )
         if done.returncode:
             raise RuntimeError(done.stderr or done.stdout)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import glob
 import os
 import shutil
@@ -14,9 +13,11 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from time import monotonic
-from typing import Any
+
+from tests.serving import account, with_parent
 
 PASSWORD = "pa@ss:wörd/1"
+# It refuses to be root.
 _USER = "postgres"
 _DEADLINE_S = 60.0
 
@@ -26,17 +27,6 @@ def _binary(name: str) -> str:
     if found is None:
         raise RuntimeError("No PostgreSQL was found. Install your system's package 'postgresql': sh .ci/postgres")
     return found
-
-
-def _die_with_me() -> None:
-    """Have the server end with the process of the tests, however that ends."""
-    set_death_signal = 1
-    ctypes.CDLL(None).prctl(set_death_signal, signal.SIGQUIT)
-
-
-def _account() -> dict[str, Any]:
-    """Return as whom the server runs: it refuses to be root."""
-    return {"user": _USER, "group": _USER, "extra_groups": []} if os.geteuid() == 0 else {}
 
 
 class Server:
@@ -62,7 +52,9 @@ class Server:
         self._run(_binary("initdb"), *told, "--encoding=UTF8", "--locale=C.UTF-8", "--no-instructions")
 
     def _run(self, *command: str) -> None:
-        subprocess.run(command, cwd=self._folder, check=True, capture_output=True, timeout=_DEADLINE_S, **_account())
+        subprocess.run(
+            command, cwd=self._folder, check=True, capture_output=True, timeout=_DEADLINE_S, **account(_USER)
+        )
 
     def start(self) -> None:
         options = {"port": self.port, "listen_addresses": "127.0.0.1", "unix_socket_directories": "", "fsync": "off"}
@@ -70,7 +62,12 @@ class Server:
         with (self._folder / "log").open("ab") as log:
             command = [_binary("postgres"), "-D", f"{self._folder}/data", *told]
             self._process = subprocess.Popen(
-                command, cwd=self._folder, stdout=log, stderr=log, preexec_fn=_die_with_me, **_account()
+                command,
+                cwd=self._folder,
+                stdout=log,
+                stderr=log,
+                preexec_fn=with_parent(signal.SIGQUIT),
+                **account(_USER),
             )
         end_s = monotonic() + _DEADLINE_S
         while True:
