@@ -13,7 +13,6 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import zmq
@@ -24,6 +23,7 @@ from epypes.transport.joining import Doorkeeper
 from epypes.transport.keys import Keys, PublicKey
 from epypes.transport.mcapreader import BrokenOff, Recorded, messages
 from epypes.transport.security import Security, security
+from epypes.transport.within import Within
 
 # Small, since what is kept here when the last one has been handed over must still be sent before the process ends.
 _HIGH_WATER_MARK = 64
@@ -42,7 +42,7 @@ def _nothing() -> None:
     return
 
 
-class Player:
+class Player(Within):
     """Publishes what a Recorder has written: the same frames, in the same order, at the same distances in time.
 
     Parameters
@@ -172,14 +172,6 @@ class Player:
         """Return whether a subscriber, of any topic, is there within ``timeout_s`` seconds."""
         playing = self._playing
         return playing is not None and playing.doorkeeper.wait(timeout_s)
-
-    def __enter__(self) -> Self:
-        return self.start()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
 
     def __repr__(self) -> str:
         running = self._playing is not None and self._playing.is_running()

@@ -8,19 +8,19 @@ import weakref
 from collections import Counter
 from collections.abc import Collection
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from epypes.transport.keys import Keys, PublicKey
 from epypes.transport.outlet import Counts, Outlet
 from epypes.transport.security import security
 from epypes.transport.takers import TakeQueue, Taker, taker
+from epypes.transport.within import Within
 from epypes.wire import Limits, topic_frame
 
 HIGH_WATER_MARK = 1_000
 
 
-class ZMQPublisher:
+class ZMQPublisher(Within):
     """Publishes what is put into a queue, on a ZeroMQ XPUB socket.
 
     Parameters
@@ -166,14 +166,6 @@ class ZMQPublisher:
         """Return whether a subscriber, of any topic, is there within ``timeout_s`` seconds."""
         outlet = self._outlet
         return outlet is not None and outlet.doorkeeper.wait(timeout_s)
-
-    def __enter__(self) -> Self:
-        return self.start()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
 
     def __repr__(self) -> str:
         state = "stopped" if self._taker is None else "running"

@@ -9,7 +9,6 @@ import warnings
 import weakref
 from collections import Counter
 from collections.abc import Callable, Iterable
-from types import TracebackType
 from typing import Any, Final, Self, get_args
 
 from epypes.errors import StillRunning
@@ -18,6 +17,7 @@ from epypes.transport.channels.place import Place, place_of
 from epypes.transport.channels.seam import Received
 from epypes.transport.connection import Connection, reporter
 from epypes.transport.inhand import InHand
+from epypes.transport.within import Within
 from epypes.wire import Limits, topic_frame
 
 log = logging.getLogger("epypes.transport")
@@ -28,7 +28,7 @@ TIMEOUT_S: Final = 10.0
 _TICK_S: Final = 0.1
 
 
-class Subscriber:
+class Subscriber(Within):
     """Puts what is delivered from a place, of a broker or of ZeroMQ, into a queue.
 
     Parameters
@@ -217,14 +217,6 @@ class Subscriber:
         """Return whether the broker is there within ``timeout_s`` seconds."""
         receiving = self._receiving
         return receiving is not None and receiving.connection.wait(timeout_s)
-
-    def __enter__(self) -> Self:
-        return self.start()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
 
     def __repr__(self) -> str:
         receiving = self._receiving

@@ -7,7 +7,6 @@ import time
 import weakref
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from epypes.errors import RecordingError, StillRunning
@@ -15,6 +14,7 @@ from epypes.transport.backlog import Backlog
 from epypes.transport.mcapformat import Counts
 from epypes.transport.mcapwriter import RecordingWriter
 from epypes.transport.subscriber import ZMQSubscriber
+from epypes.transport.within import Within
 
 # What may wait for the disk: some seconds of images, and more than the largest message.
 BACKLOG_BYTES = 512 * 1024**2
@@ -28,7 +28,7 @@ def _nothing() -> None:
     return
 
 
-class Recorder:
+class Recorder(Within):
     """Writes what is published into an MCAP file: every message as it came, with the time at which it did.
 
     Parameters
@@ -156,14 +156,6 @@ class Recorder:
     def wait_joined(self, timeout_s: float = 5.0, publishers: int = 1) -> bool:
         """Return whether publishers have confirmed: what they send from then on is recorded. See `ZMQSubscriber`."""
         return self._subscriber.wait_joined(timeout_s, publishers)
-
-    def __enter__(self) -> Self:
-        return self.start()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
 
     def __repr__(self) -> str:
         state = "running" if self._recording.is_running() else "stopped"

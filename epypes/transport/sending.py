@@ -7,17 +7,17 @@ import warnings
 import weakref
 from collections import Counter
 from collections.abc import Callable
-from types import TracebackType
 from typing import Any, Self
 
 from epypes.transport.channels.place import Place, place_of
 from epypes.transport.connection import reporter
 from epypes.transport.outbox import TIMEOUT_S, Outbox, Tally
 from epypes.transport.takers import TakeQueue, Taker, taker
+from epypes.transport.within import Within
 from epypes.wire import Limits, topic_frame
 
 
-class Publisher:
+class Publisher(Within):
     """Sends what is put into a queue to a place, of a broker or of ZeroMQ.
 
     Parameters
@@ -176,14 +176,6 @@ class Publisher:
         """Return whether the broker is there within ``timeout_s`` seconds."""
         outbox = self._outbox
         return outbox is not None and outbox.is_alive() and outbox.wait_connected(timeout_s)
-
-    def __enter__(self) -> Self:
-        return self.start()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
 
     def __repr__(self) -> str:
         state = "stopped" if self._outbox is None or not self._outbox.is_alive() else "running"

@@ -10,7 +10,6 @@ import weakref
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import zmq
@@ -23,6 +22,7 @@ from epypes.transport.inbox import Inbox, PutQueue, Source
 from epypes.transport.joining import Guest
 from epypes.transport.keys import Keys, PublicKey
 from epypes.transport.security import Security, security
+from epypes.transport.within import Within
 from epypes.wire import Limits, topic_frame
 
 log = logging.getLogger("epypes.transport")
@@ -32,7 +32,7 @@ HIGH_WATER_MARK = 1_000
 HEARTBEAT_S = 1.0
 
 
-class ZMQSubscriber:
+class ZMQSubscriber(Within):
     """Puts what arrives on a ZeroMQ SUB socket into a queue.
 
     Parameters
@@ -219,14 +219,6 @@ class ZMQSubscriber:
             (zmq.SUBSCRIBE, self._subscription),
             (zmq.SUBSCRIBE, guest.topic),
         ]
-
-    def __enter__(self) -> Self:
-        return self.start()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
 
     def __repr__(self) -> str:
         state = "stopped" if self._opened is None else "running"
