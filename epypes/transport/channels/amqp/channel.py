@@ -17,10 +17,10 @@ from epypes.transport.channels.amqp.connection import Connection, Line
 from epypes.transport.channels.amqp.outgoing import Outgoing, fits
 from epypes.transport.channels.amqp.places import aside, listen, make_sure
 from epypes.transport.channels.amqp.reasons import reason_of
-from epypes.transport.channels.amqp.turns import always, nothing
 from epypes.transport.channels.packing import ATTEMPTS, FROM, REASON, SIZES, arrived, packed, readable
 from epypes.transport.channels.place import Place
 from epypes.transport.channels.seam import Frames, Received
+from epypes.transport.channels.turns import always, nothing
 
 # Quorum queues refuse more.
 _MOST_PREFETCH: Final = 2_000

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import logging
 import ssl
-import threading
 from collections.abc import Callable
 from typing import Any, Final
 
 import pika
+from pika.adapters.select_connection import IOLoop
 from pika.exceptions import AMQPError
 
 from epypes.errors import BrokerError
 from epypes.transport.channels.amqp.reasons import opening_reason, reason_of
-from epypes.transport.channels.amqp.turns import Turns, always, nothing
 from epypes.transport.channels.place import Place
+from epypes.transport.channels.turns import Turns, always, nothing
 
 _HEARTBEAT_S: Final = 4
 # Both sides say something every two seconds: who is silent at so many looks is cut off, whatever TCP thinks of it.
@@ -94,8 +94,33 @@ class Line:
             self.amqp.close()
 
 
+class _PikaLoop:
+    """Pika's own loop, as `turns.Loop`."""
+
+    def __init__(self) -> None:
+        self.io = IOLoop()
+        self.io.activate_poller()
+
+    def step(self, timeout_s: float) -> None:
+        alarm = self.io.call_later(timeout_s, nothing)
+        try:
+            self.io.poll()
+            self.io.process_timeouts()
+        finally:
+            self.io.remove_timeout(alarm)
+
+    def wake(self) -> None:
+        self.io.add_callback_threadsafe(nothing)
+
+    def suits(self) -> bool:
+        return True
+
+    def close(self) -> None:
+        self.io.close()
+
+
 class Connection:
-    """A connection to a broker, whose heartbeats a thread of its own sees to while nobody else works on it.
+    """A connection to a broker.
 
     Attributes
     ----------
@@ -116,21 +141,19 @@ class Connection:
         self.trouble = self._blocked = ""
         self._is_open = self._is_ended = False
         self._opening: BaseException | None = None
-        self._ended = threading.Event()
         self._heard = self._silent = 0
         parameters = _parameters(place, timeout_s)
-        self.turns = Turns(self.lose)
+        self._loop = _PikaLoop()
         self.pika = pika.SelectConnection(
-            parameters, self._opened, self._not_opened, self._closed, custom_ioloop=self.turns.loop
+            parameters, self._opened, self._not_opened, self._closed, custom_ioloop=self._loop.io
         )
+        self.turns = Turns(self._loop, self.lose, f"epypes keeps {place.host}")
         self.turns.run(nothing, lambda: self._is_open or self._opening, timeout_s)
         if not self._is_open:
             text = opening_reason(self._opening, place, timeout_s)
             self._abandon()
             raise BrokerError(str(place), text)
         self.turns.run(self._watch, always, 0.0)
-        self._keeper = threading.Thread(target=self._keep, name=f"epypes keeps {place.host}", daemon=True)
-        self._keeper.start()
 
     def _opened(self, connection: object) -> None:
         self._is_open = True
@@ -144,6 +167,7 @@ class Connection:
     def _watch(self) -> None:
         self.pika.add_on_connection_blocked_callback(lambda _, frame: self._block(frame.method.reason))
         self.pika.add_on_connection_unblocked_callback(lambda _, frame: self._block(""))
+        self._loop.io.call_later(_KEEPING_S, self._listen)
 
     def _block(self, reason: object) -> None:
         self._blocked = f" It takes no messages just now: {reason}." if reason else ""
@@ -161,10 +185,6 @@ class Connection:
         if self.trouble:
             raise self.error(f"The connection to {self.place} is over: {self.trouble}.")
 
-    def _keep(self) -> None:
-        while not self._ended.wait(_KEEPING_S) and not self.trouble:
-            self.turns.run(self._listen, always, 0.0)
-
     def _listen(self) -> None:
         """Notice a broker that says nothing any more: a link that was cut tells nobody."""
         # Counted, not timed: what has come while this process itself stood still is read before the next look.
@@ -174,13 +194,14 @@ class Connection:
             self._silent += 1
         if self._silent > _MOST_SILENT:
             self.lose(f"nothing was heard from the broker for {_MOST_SILENT * _KEEPING_S:g} s")
+        if not self.trouble:
+            self._loop.io.call_later(_KEEPING_S, self._listen)
 
     def close(self, reason: str = "it was closed") -> None:
         """End it; as often as you like, bounded by two times two seconds."""
         if self._is_ended:
             return
         self._is_ended = True
-        self._ended.set()
         was_open = not self.trouble
         self.turns.run(lambda: self._part(reason), lambda: self.pika.is_closed, _CLOSING_S if was_open else 0.0)
         self._abandon()

@@ -1,4 +1,4 @@
-"""How does NATS JetStream carry messages? By nats-py, whose event loop has a thread of its own."""
+"""How does NATS JetStream carry messages? By nats-py, whose event loop is driven by whoever waits."""
 
 from __future__ import annotations
 

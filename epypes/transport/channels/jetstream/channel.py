@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import deque
 from collections.abc import Callable, Coroutine, Mapping
 from functools import partial
-from queue import Empty, SimpleQueue
 from time import monotonic
 from types import MappingProxyType
 from typing import Any, Final
@@ -42,8 +42,8 @@ class JetStreamChannel:
 
     def __init__(self, place: Place, prefetch: int, timeout_s: float) -> None:
         self._place, self.prefetch, self._timeout_s = place, max(prefetch, 1), timeout_s
-        self._arrived: SimpleQueue[Msg | None] = SimpleQueue()
-        # Of the link's thread alone, as is all that they are about: who waits for the server's word on what he has
+        self._arrived: deque[Msg] = deque()
+        # Of the link's loop alone, as is all that they are about: who waits for the server's word on what he has
         # sent, and what was received and is not settled, by the subject that it is acknowledged to.
         self._unconfirmed: dict[str, Callable[[Any], object]] = {}
         self._held: dict[str, Msg] = {}
@@ -78,16 +78,14 @@ class JetStreamChannel:
         check_sending(self._place)
         body, more = packed(frames, id, headers)
         told = headers_of(self._place, id, more, len(body), self._client.max_payload)
-        answer: SimpleQueue[BrokerError | MessageError | None] = SimpleQueue()
+        answers: list[BrokerError | MessageError | None] = []
         publish = self._broadcast if self._place.kind == "broadcast" else self._publish
-        if self._error is not None or not self._link.call(publish, self._place.name, body, told, answer.put):
-            raise self._error or self._link.error()
-        try:
-            error = answer.get(timeout=self._timeout_s)
-        except Empty:
-            self._link.call(self._link.lose, f"what was sent was not confirmed within {self._timeout_s:g} s")
+        work = partial(publish, self._place.name, body, told, answers.append)
+        if self._error is None and not self._link.run(work, lambda: answers or self._error, self._timeout_s):
+            self._link.call(partial(self._link.lose, f"what was sent was not confirmed within {self._timeout_s:g} s"))
             text = f"{self._place} has not confirmed a message within {self._timeout_s:g} s. It may have it."
-            raise BrokerError(str(self._place), text) from None
+            raise BrokerError(str(self._place), text)
+        error = answers[0] if answers else self._error
         if error is not None:
             raise error
 
@@ -118,6 +116,7 @@ class JetStreamChannel:
         then = self._unconfirmed.pop(number, None)
         if then is not None:
             then(error)
+            self._link.changed()
 
     # --- receive ---
 
@@ -130,15 +129,14 @@ class JetStreamChannel:
             self._is_listening = True
         if self.prefetch != self._asked_for:
             self._asked_for = self.prefetch
-            self._link.call(self._make_room, self.prefetch)
-        try:
-            message = self._arrived.get(timeout=max(timeout_s, 0.0))
-        except Empty:
-            message = None
+            self._link.call(partial(self._make_room, self.prefetch))
+        if not self._arrived:
+            self._link.wait(lambda: self._arrived or self._error, timeout_s)
         if self._error is not None:
             raise self._error
-        if message is None:
+        if not self._arrived:
             return None
+        message = self._arrived.popleft()
         if self._place.kind == "queue":
             return received(message, attempt_of(message), partial(self._settle, message))
         self._settle(message, None)
@@ -157,15 +155,17 @@ class JetStreamChannel:
         self._link.spawn(self._go_on(min(_PROGRESS_S, wait_s / 4)), "beat")
 
     async def _overhear(self, message: Msg) -> None:
-        if self._arrived.qsize() < _MOST_BROADCASTS:
-            self._arrived.put(message)
+        if len(self._arrived) < _MOST_BROADCASTS:
+            self._arrived.append(message)
+            self._link.changed()
 
     async def _hear(self, message: Msg) -> None:
         """Take what has come to our inbox: a message, a confirmation, or that a request has ended."""
         if message.reply.startswith("$JS.ACK."):
             self._pulls.came()
             self._held[message.reply] = message
-            self._arrived.put(message)
+            self._arrived.append(message)
+            self._link.changed()
             return
         number = message.subject.rpartition(".")[2]
         if number.startswith("p"):
@@ -206,7 +206,7 @@ class JetStreamChannel:
     # --- settle ---
 
     def _settle(self, message: Msg, reason: str | None) -> None:
-        self._link.call(self._settled, message, reason)
+        self._link.call(partial(self._settled, message, reason))
 
     def _settled(self, message: Msg, reason: str | None) -> None:
         if self._error is not None or message.reply not in self._held:
@@ -253,7 +253,6 @@ class JetStreamChannel:
         self._error = error
         for number in tuple(self._unconfirmed):
             self._confirm(number, error)
-        self._arrived.put(None)
 
     def close(self) -> None:
         """End it; see `seam.Channel.close`."""

@@ -1,7 +1,7 @@
 """How do threads talk through a client that lives in an event loop? One connection to a NATS server.
 
-The loop has a thread of its own, so that heartbeats go on while nobody sends or receives. The library would wait, when
-it closes a connection, until all was sent: so we take a connection for lost before it does, and close the socket.
+The loop is driven by whoever waits, see `turns`. The library would wait, when it closes a connection, until all was
+sent: so we take a connection for lost before it does, and close the socket.
 """
 
 from __future__ import annotations
@@ -9,11 +9,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import threading
 import types
 from collections.abc import Callable, Coroutine, Generator
 from functools import partial
-from queue import Empty, SimpleQueue
 from typing import Any, Final
 
 from nats.aio.client import Client
@@ -22,18 +20,54 @@ from nats.errors import Error as NatsError
 from epypes.errors import BrokerError
 from epypes.transport.channels.jetstream.entry import check_encryption, entry, refusal, said, unreachable
 from epypes.transport.channels.place import Place
+from epypes.transport.channels.turns import Turns, always, nothing, own_selector
 
 _log = logging.getLogger("epypes.transport")
-_THREAD: Final = "epypes nats"
 # A cut link is noticed after at most the sum of both.
 _BEAT_S: Final = 2.5
 _SILENCE_S: Final = 5.0
 _CLOSING_S: Final = 2.0
 
+# What is said goes out within so many rounds: to publish is to wake the library's own task, which writes.
+_ROUNDS: Final = 3
+
+
+class _OwnLoop(asyncio.SelectorEventLoop):
+    """An event loop, as `turns.Loop`."""
+
+    def __init__(self) -> None:
+        super().__init__(own_selector())
+
+    def step(self, timeout_s: float) -> None:
+        if timeout_s <= 0:
+            for _ in range(_ROUNDS):
+                self.call_soon(self.stop)
+                self.run_forever()
+            return
+        alarm = self.call_later(timeout_s, self.stop)
+        try:
+            self.run_forever()
+        finally:
+            alarm.cancel()
+
+    def wake(self) -> None:
+        self.call_soon_threadsafe(self.stop)
+
+    def suits(self) -> bool:
+        # A cell of a notebook runs within a loop of its thread, which can't run another one meanwhile.
+        return _running() is None
+
+
+def _running() -> asyncio.AbstractEventLoop | None:
+    try:
+        return asyncio.get_running_loop()
+    except RuntimeError:
+        return None
+
 
 def _is_not_ours(record: logging.LogRecord) -> bool:
     """Return whether a record is not about one of our connections; what happens to those we say ourselves."""
-    return not (record.threadName or "").startswith(_THREAD)
+    return not isinstance(_running(), _OwnLoop)
 
 
 class Link:
@@ -46,105 +80,117 @@ class Link:
     timeout_s
         Longest wait for the server's word, in seconds.
     lost
-        Called on the link's thread, once, when it is lost: with the error for who waits.
+        Called within the loop, once, when it is lost: with the error for who waits.
     """
 
     def __init__(self, place: Place, timeout_s: float, lost: Callable[[BrokerError], object]) -> None:
         self._place, self._timeout_s, self._lost = place, timeout_s, lost
         self.client = Client()
         self._why: str | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._over = asyncio.Event()
+        self._is_closing = self._is_over = False
         self._tasks: set[asyncio.Task[Any]] = set()
-        self._asking: set[SimpleQueue[tuple[Any, BaseException | None]]] = set()
-        self._closing = threading.Lock()
-        self._is_closing = False
-        self._thread = threading.Thread(target=self._run, name=f"{_THREAD} {place.name}", daemon=True)
+        self._loop = _OwnLoop()
+        self._loop.set_exception_handler(lambda loop, context: _log.debug("%s: %s", place, context))
+        self._turns = Turns(self._loop, lambda error: self.lose(said(error)), f"epypes nats {place.name}")
         logging.getLogger("nats.aio.client").addFilter(_is_not_ours)
 
     def open(self) -> None:
         """Connect; BrokerError says why not."""
-        began: SimpleQueue[BrokerError | None] = SimpleQueue()
-        self._began = began
-        self._thread.start()
-        error = began.get()
+        began: list[BrokerError | None] = []
+        within_s = self._timeout_s + 2 * _CLOSING_S
+        self.run(lambda: self.spawn(self._begin(began.append)), lambda: began, within_s)
+        error = began[0] if began else unreachable(self._place, TimeoutError(), self._timeout_s)
         if error is not None:
-            self._thread.join(_CLOSING_S)
+            self._why = str(error)
+            self.close()
             raise error
 
     # --- for any thread ---
 
-    def call(self, function: Callable[..., object], *args: object) -> bool:
-        """Have a function called on the link's thread; return False if there is none any more."""
-        loop = self._loop
-        try:
-            if loop is None:
-                return False
-            loop.call_soon_threadsafe(function, *args)
-        except RuntimeError:
-            return False
-        return True
+    def run(self, function: Callable[[], object], is_done: Callable[[], object], timeout_s: float) -> bool:
+        """Have a function called within the loop, wait until something is so, and return whether it is."""
+        return self._turns.run(partial(self._loop.call_soon, function), is_done, timeout_s)
+
+    def wait(self, is_done: Callable[[], object], timeout_s: float) -> bool:
+        """Wait until something is so that `changed` tells of, and return whether it is."""
+        return self._turns.run(nothing, is_done, timeout_s)
+
+    def call(self, function: Callable[[], object]) -> None:
+        """Have a function called within the loop, without waiting; not at all if it is over."""
+        self.run(function, always, 0.0)
 
     def ask(self, question: Callable[[], Coroutine[Any, Any, Any]]) -> Any:
-        """Return what a coroutine returns that runs on the link's thread; raise what it raises, or BrokerError."""
-        answer: SimpleQueue[tuple[Any, BaseException | None]] = SimpleQueue()
-        if self._why is not None or not self.call(lambda: self.spawn(self._answer(question, answer))):
+        """Return what a coroutine returns that runs in the loop; raise what it raises, or BrokerError."""
+        answers: list[tuple[Any, BaseException | None]] = []
+        # The server's word is waited for within it: this is for a thread that is not given the processor.
+        within_s = 2 * self._timeout_s + _CLOSING_S
+        if self._why is None:
+            # Once it is lost, the library goes on to wait for answers that can't come any more.
+            is_done = lambda: answers or self._why is not None  # noqa: E731
+            self.run(lambda: self.spawn(self._answer(question, answers.append)), is_done, within_s)
+        if not answers:
             raise self.error()
-        try:
-            # The server's word is waited for within it: this is for a thread that is not given the processor.
-            value, error = answer.get(timeout=2 * self._timeout_s + _CLOSING_S)
-        except Empty:
-            raise self.error() from None
+        value, error = answers[0]
         if error is not None:
             raise error
         return value
 
     async def _answer(
-        self, question: Callable[[], Coroutine[Any, Any, Any]], answer: SimpleQueue[tuple[Any, BaseException | None]]
+        self,
+        question: Callable[[], Coroutine[Any, Any, Any]],
+        then: Callable[[tuple[Any, BaseException | None]], object],
     ) -> None:
-        self._asking.add(answer)
         try:
             async with asyncio.timeout(self._timeout_s):
-                answer.put((await question(), None))
+                then((await question(), None))
         except TimeoutError:
             self.lose(f"it did not answer within {self._timeout_s:g} s")
-            answer.put((None, self.error()))
-        except asyncio.CancelledError:
-            answer.put((None, self.error()))
-            raise
         except (NatsError, OSError) as error:
-            answer.put((None, error if isinstance(error, BrokerError) else self.failed(error)))
+            then((None, error if isinstance(error, BrokerError) else self.failed(error)))
         except Exception as error:  # it is the asking thread's
-            answer.put((None, error))
-        finally:
-            self._asking.discard(answer)
+            then((None, error))
+        self.changed()
 
     def error(self) -> BrokerError:
         """Return what is said to who uses it now."""
         why = self._why or "it was closed"
         return BrokerError(str(self._place), f"The connection to {self._place} is over: {why}.")
 
-    def close(self, last: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    def close(self, last: Callable[[], Coroutine[Any, Any, None]] | None = None) -> None:
         """End it, after a last coroutine, which has a moment; bounded."""
-        with self._closing:
-            if not self._is_closing:
-                self._is_closing = True
-                self.call(lambda: self.spawn(self._close(last)))
-        self._thread.join(min(self._timeout_s, _CLOSING_S) + _CLOSING_S)
+        within_s = min(self._timeout_s, _CLOSING_S) + 2 * _CLOSING_S
+        self.run(lambda: self._close(last), lambda: self._is_over, within_s)
+        self._turns.end(_CLOSING_S)
 
-    async def _close(self, last: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    # --- within the loop ---
+
+    def _close(self, last: Callable[[], Coroutine[Any, Any, None]] | None) -> None:
+        if not self._is_closing:
+            self._is_closing = True
+            self.spawn(self._end(last))
+
+    async def _end(self, last: Callable[[], Coroutine[Any, Any, None]] | None) -> None:
         waiting = [task for task in self._tasks - {asyncio.current_task()} if task.get_name() != "beat"]
         with contextlib.suppress(TimeoutError, NatsError, OSError):
-            if self._why is None:
+            if self._why is None and last is not None:
                 async with asyncio.timeout(min(self._timeout_s, _CLOSING_S)):
                     # What was acknowledged or rejected before is told before.
                     await asyncio.gather(*waiting, return_exceptions=True)
                     await last()
                     await self.flush(_CLOSING_S)
         self.lose("it was closed")
-        self._over.set()
+        self._abort()
+        others = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in others:
+            task.cancel()
+        # Bounded, and with it what else is to be done: to close the socket takes one round more.
+        await asyncio.wait(others | {asyncio.ensure_future(asyncio.sleep(0))}, timeout=_CLOSING_S)
+        self._is_over = True
+        self.changed()
 
-    # --- for the link's thread ---
+    def changed(self) -> None:
+        """Have who waits look whether it is so."""
+        self._loop.stop()
 
     def spawn(self, work: Coroutine[Any, Any, Any], name: str | None = None) -> None:
         """Have a coroutine run beside the others."""
@@ -177,33 +223,17 @@ class Link:
         if self._why is None:
             self._why = why
             self._lost(self.error())
-            # The library goes on to wait for answers that can't come any more.
-            for answer in self._asking:
-                answer.put((None, self.error()))
+            self.changed()
 
-    def _run(self) -> None:
-        with contextlib.suppress(asyncio.CancelledError), asyncio.Runner() as runner:
-            runner.run(self._live())
-
-    async def _live(self) -> None:
-        loop = asyncio.get_running_loop()
-        loop.set_exception_handler(lambda loop, context: _log.debug("%s: %s", self._place, context))
+    async def _begin(self, then: Callable[[BrokerError | None], object]) -> None:
         try:
-            try:
-                await self._connect()
-            except Exception as error:
-                refused = unreachable(self._place, error, self._timeout_s)
-                self._why = str(refused)
-                self._began.put(refused)
-                return
-            self._loop = loop
+            await self._connect()
+        except Exception as error:
+            then(unreachable(self._place, error, self._timeout_s))
+        else:
             self.spawn(self._beat(), "beat")
-            self._began.put(None)
-            await self._over.wait()
-        finally:
-            self._loop = None
-            self.lose("it was closed")
-            self._abort()
+            then(None)
+        self.changed()
 
     async def _connect(self) -> None:
         self._refused = refused = asyncio.get_running_loop().create_future()

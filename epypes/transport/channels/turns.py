@@ -1,0 +1,180 @@
+"""Whose turn is it to work on one connection that several threads use?
+
+A client's connection belongs to one thread at a time. Here that is whichever thread waits for something: it works for
+the others too, until it has what it waits for, and then the next one does. So a single thread that sends and waits
+needs no other one in between, which would cost two switches of threads a message. When nobody has waited for a while,
+a thread that does nothing else takes the turn, until somebody wants it: heartbeats go on, and nothing that comes waits.
+"""
+
+from __future__ import annotations
+
+import selectors
+import threading
+from collections import deque
+from collections.abc import Callable
+from time import monotonic
+from typing import Final, Protocol
+
+# For so long nobody has waited when the thread takes over that does nothing else.
+_IDLE_S: Final = 0.25
+_LONG_S: Final = 60.0
+
+
+class Loop(Protocol):
+    """What a client's connection is driven by."""
+
+    def step(self, timeout_s: float) -> None:
+        """Do what is ready, and wait at most so long until there was something; with 0 see that what is said goes out.
+
+        What it raises is taken for the end of the connection.
+        """
+
+    def wake(self) -> None:
+        """Have a step end soon; from any thread."""
+
+    def suits(self) -> bool:
+        """Return whether the calling thread may take steps."""
+
+    def close(self) -> None:
+        """Take no more steps."""
+
+
+def own_selector() -> selectors.BaseSelector:
+    """Return a selector that a forked child has a copy of: through one of the kernel's it would change what we hear."""
+    return getattr(selectors, "PollSelector", selectors.DefaultSelector)()
+
+
+def nothing() -> None:
+    """Do nothing: for who has only to wait."""
+
+
+def always() -> bool:
+    """Return True: for who waits for nothing."""
+    return True
+
+
+class Turns:
+    """One loop, driven by one thread at a time.
+
+    Parameters
+    ----------
+    loop
+        To be driven.
+    failed
+        Called, by the thread whose turn it is, with what the loop or a piece of work raised.
+    name
+        Of the thread that drives it while nobody else does.
+    """
+
+    def __init__(self, loop: Loop, failed: Callable[[Exception], object], name: str) -> None:
+        self._loop, self._failed = loop, failed
+        lock = threading.RLock()
+        # Two of one lock: whatever changes does not wake the keeper.
+        self._changed, self._called = threading.Condition(lock), threading.Condition(lock)
+        self._work: deque[Callable[[], object]] = deque()
+        self._leader: int | None = None
+        # How often somebody else than the keeper has led, and whether he shall, or shall no more.
+        self._taken = 0
+        self._is_called = self._is_wanted = self._is_over = False
+        self._keeper = threading.Thread(target=self._keep, name=name, daemon=True)
+        self._keeper.start()
+
+    def run(self, work: Callable[[], object], is_done: Callable[[], object], timeout_s: float) -> bool:
+        """Have some work done on the connection, wait until ``is_done``, and return whether it is. From any thread.
+
+        With a time of 0 nobody waits: the work is done here, or by the thread whose turn it is. Nobody waits for
+        himself either: a signal's handler, or what the connection calls, may only leave work.
+        """
+        until_s = monotonic() + timeout_s
+        me = threading.get_ident()
+        with self._changed:
+            if self._is_over:
+                return bool(is_done())
+            self._work.append(work)
+            if self._leader is None:
+                self._drive(is_done, until_s)
+            elif self._leader != me:
+                self._loop.wake()
+            while not (is_done() or self._is_over or self._leader == me or monotonic() >= until_s):
+                if self._leader is None:
+                    self._drive(is_done, until_s)
+                else:
+                    self._wait(until_s)
+            return bool(is_done())
+
+    def _drive(self, is_done: Callable[[], object], until_s: float) -> None:
+        """Lead, or have the keeper do so; called with the lock."""
+        if self._loop.suits():
+            self._taken += 1
+            self._lead(is_done, until_s)
+        else:
+            self._is_called = True
+            self._called.notify()
+            self._changed.wait(max(until_s - monotonic(), 0.0))
+
+    def _wait(self, until_s: float) -> None:
+        """Wait for whoever leads; called with the lock. The keeper makes way."""
+        if self._leader == self._keeper.ident and not self._is_wanted and self._loop.suits():
+            self._is_wanted = True
+            self._loop.wake()
+        self._changed.wait(max(until_s - monotonic(), 0.0))
+
+    def _lead(self, is_done: Callable[[], object], until_s: float) -> None:
+        """Take the turn; called with the lock, and held again afterwards."""
+        self._leader = threading.get_ident()
+        try:
+            self._changed.release()
+            try:
+                self._turn(is_done, until_s)
+            finally:
+                self._changed.acquire()
+            while self._work:
+                # Who left it relied on us; under the lock nobody can leave more.
+                self._step(always, 0.0)
+        finally:
+            self._leader = None
+            if self._is_over:
+                self._loop.close()
+            self._changed.notify_all()
+
+    def _turn(self, is_done: Callable[[], object], until_s: float) -> None:
+        while True:
+            self._step(is_done, until_s)
+            with self._changed:
+                self._changed.notify_all()
+            if not self._work and (is_done() or self._is_over or monotonic() >= until_s):
+                return
+
+    def _step(self, is_done: Callable[[], object], until_s: float) -> None:
+        try:
+            while self._work:
+                self._work.popleft()()
+            self._loop.step(0.0 if is_done() else max(until_s - monotonic(), 0.0))
+        except Exception as error:  # whatever a library raises here must not end the thread of whoever waits
+            self._failed(error)
+
+    def _keep(self) -> None:
+        with self._changed:
+            while not self._is_over:
+                taken = self._taken
+                if not self._is_called:
+                    self._called.wait(_IDLE_S)
+                is_due = self._is_called or taken == self._taken
+                self._is_called = self._is_wanted = False
+                if is_due and self._leader is None and not self._is_over:
+                    self._lead(lambda: self._is_wanted, monotonic() + _LONG_S)
+
+    def end(self, timeout_s: float) -> None:
+        """Close the loop; work that comes later is not done. If a thread works on it that does so when it is done."""
+        until_s = monotonic() + timeout_s
+        with self._changed:
+            if not self._is_over:
+                self._is_over = True
+                self._called.notify()
+                if self._leader is None:
+                    self._loop.close()
+            while self._leader not in (None, threading.get_ident()) and monotonic() < until_s:
+                self._loop.wake()
+                self._changed.wait(max(until_s - monotonic(), 0.0))
+        if self._keeper is not threading.current_thread():
+            self._keeper.join(max(until_s - monotonic(), 0.0))
