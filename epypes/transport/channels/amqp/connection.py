@@ -8,10 +8,10 @@ from collections.abc import Callable
 from typing import Any, Final
 
 import pika
-from pika.adapters.select_connection import IOLoop
 from pika.exceptions import AMQPError
 
 from epypes.errors import BrokerError
+from epypes.transport.channels.amqp.loop import PikaLoop
 from epypes.transport.channels.amqp.reasons import opening_reason, reason_of
 from epypes.transport.channels.place import Place
 from epypes.transport.channels.turns import Turns, always, nothing
@@ -94,31 +94,6 @@ class Line:
             self.amqp.close()
 
 
-class _PikaLoop:
-    """Pika's own loop, as `turns.Loop`."""
-
-    def __init__(self) -> None:
-        self.io = IOLoop()
-        self.io.activate_poller()
-
-    def step(self, timeout_s: float) -> None:
-        alarm = self.io.call_later(timeout_s, nothing)
-        try:
-            self.io.poll()
-            self.io.process_timeouts()
-        finally:
-            self.io.remove_timeout(alarm)
-
-    def wake(self) -> None:
-        self.io.add_callback_threadsafe(nothing)
-
-    def suits(self) -> bool:
-        return True
-
-    def close(self) -> None:
-        self.io.close()
-
-
 class Connection:
     """A connection to a broker.
 
@@ -143,7 +118,7 @@ class Connection:
         self._opening: BaseException | None = None
         self._heard = self._silent = 0
         parameters = _parameters(place, timeout_s)
-        self._loop = _PikaLoop()
+        self._loop = PikaLoop()
         self.pika = pika.SelectConnection(
             parameters, self._opened, self._not_opened, self._closed, custom_ioloop=self._loop.io
         )

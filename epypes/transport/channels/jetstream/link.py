@@ -19,55 +19,15 @@ from nats.errors import Error as NatsError
 
 from epypes.errors import BrokerError
 from epypes.transport.channels.jetstream.entry import check_encryption, entry, refusal, said, unreachable
+from epypes.transport.channels.jetstream.loop import OwnLoop, is_not_ours
 from epypes.transport.channels.place import Place
-from epypes.transport.channels.turns import Turns, always, nothing, own_selector
+from epypes.transport.channels.turns import Turns, always, nothing
 
 _log = logging.getLogger("epypes.transport")
 # A cut link is noticed after at most the sum of both.
 _BEAT_S: Final = 2.5
 _SILENCE_S: Final = 5.0
 _CLOSING_S: Final = 2.0
-
-# What is said goes out within so many rounds: to publish is to wake the library's own task, which writes.
-_ROUNDS: Final = 3
-
-
-class _OwnLoop(asyncio.SelectorEventLoop):
-    """An event loop, as `turns.Loop`."""
-
-    def __init__(self) -> None:
-        super().__init__(own_selector())
-
-    def step(self, timeout_s: float) -> None:
-        if timeout_s <= 0:
-            for _ in range(_ROUNDS):
-                self.call_soon(self.stop)
-                self.run_forever()
-            return
-        alarm = self.call_later(timeout_s, self.stop)
-        try:
-            self.run_forever()
-        finally:
-            alarm.cancel()
-
-    def wake(self) -> None:
-        self.call_soon_threadsafe(self.stop)
-
-    def suits(self) -> bool:
-        # A cell of a notebook runs within a loop of its thread, which can't run another one meanwhile.
-        return _running() is None
-
-
-def _running() -> asyncio.AbstractEventLoop | None:
-    try:
-        return asyncio.get_running_loop()
-    except RuntimeError:
-        return None
-
-
-def _is_not_ours(record: logging.LogRecord) -> bool:
-    """Return whether a record is not about one of our connections; what happens to those we say ourselves."""
-    return not isinstance(_running(), _OwnLoop)
 
 
 class Link:
@@ -89,10 +49,10 @@ class Link:
         self._why: str | None = None
         self._is_closing = self._is_over = False
         self._tasks: set[asyncio.Task[Any]] = set()
-        self._loop = _OwnLoop()
+        self._loop = OwnLoop()
         self._loop.set_exception_handler(lambda loop, context: _log.debug("%s: %s", place, context))
         self._turns = Turns(self._loop, lambda error: self.lose(said(error)), f"epypes nats {place.name}")
-        logging.getLogger("nats.aio.client").addFilter(_is_not_ours)
+        logging.getLogger("nats.aio.client").addFilter(is_not_ours)
 
     def open(self) -> None:
         """Connect; BrokerError says why not."""

@@ -6,10 +6,9 @@ import contextlib
 import logging
 import socket
 import ssl
-import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from time import monotonic
+from functools import partial
 from typing import Any, Final
 
 import paho.mqtt.client as paho
@@ -21,13 +20,14 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from epypes.errors import BrokerError, MessageError
 from epypes.transport.channels.mqtt.headers import Packed
+from epypes.transport.channels.mqtt.loop import Client, PahoLoop
 from epypes.transport.channels.place import Place
+from epypes.transport.channels.turns import Turns, always, nothing
 
 log = logging.getLogger("epypes.transport")
 
 # The broker looks after one and a half of it, paho after two: a cut link is noticed within 9 s.
 _KEEP_ALIVE_S: Final = 4
-_LOOK_S: Final = 0.5
 _CLOSE_S: Final = 2.0
 # Somebody may come back for what is kept, but not for ever.
 _KEPT_S: Final = 7 * 24 * 3600
@@ -44,7 +44,7 @@ _SAID: Final[Mapping[str, str]] = {
 
 
 class Connection:
-    """A connection, its thread, and what has come; any thread may use it.
+    """A connection, and what has come; any thread may use it.
 
     Parameters
     ----------
@@ -69,16 +69,13 @@ class Connection:
         self, place: Place, timeout_s: float, *, session: str = "", notice: str = "", prefetch: int = 64
     ) -> None:
         self._place, self._timeout_s, self._session = place, timeout_s, session
-        # Two of one lock: who waits for a message is not woken by the broker's word on what another has sent.
-        lock = threading.RLock()
-        self._changed, self._come = threading.Condition(lock), threading.Condition(lock)
         self._answers: dict[int, ReasonCode | None] = {}
         self._arrived: deque[paho.MQTTMessage] = deque()
         self._held: set[int] = set()
         self._prefetch = min(max(prefetch, 1), 65_535)
         self._greeting: tuple[ReasonCode, Properties | None] | None = None
         self._trouble = ""
-        self._is_too_large = self._is_over = False
+        self._is_too_large = False
         self.has_session = False
         self._client = client = self._made(session, notice)
         wish = _told(PacketTypes.CONNECT)
@@ -89,8 +86,7 @@ class Connection:
             client.connect(place.host, place.port, keepalive=_KEEP_ALIVE_S, clean_start=not session, properties=wish)
         except (OSError, ValueError) as error:
             raise BrokerError(str(place), f"{place} can't be reached: {_why(error)}. {_WAY_OUT}") from error
-        self._thread = threading.Thread(target=self._run, name=f"epypes mqtt {place.host}", daemon=True)
-        self._thread.start()
+        self._turns = Turns(PahoLoop(client), self._broke, f"epypes mqtt {place.host}")
         try:
             self._greeted()
         except BaseException:
@@ -98,7 +94,7 @@ class Connection:
             raise
 
     def _made(self, session: str, notice: str) -> paho.Client:
-        client = paho.Client(
+        client = Client(
             CallbackAPIVersion.VERSION2,
             client_id=session,
             protocol=paho.MQTTv5,
@@ -119,39 +115,24 @@ class Connection:
         client.on_unsubscribe = lambda _client, _data, mid, codes, _told: self._answer(mid, None)
         client.on_message = lambda _client, _data, message: self._arrive(message)
         client.on_disconnect = lambda _client, _data, flags, code, _told: self._lose(code)
-        # Without it paho writes on whichever thread asks, and two that write at a time would mix their bytes.
+        # Without it paho writes on whichever thread asks: only whose turn it is shall do so.
         client.on_socket_register_write = lambda _client, _data, _socket: None
         client.on_socket_open = lambda _client, _data, opened: _without_delay(opened)
         return client
 
-    # On the connection's thread.
-
-    def _run(self) -> None:
-        client = self._client
-        try:
-            while not self._is_over and client.loop(_LOOK_S) == paho.MQTT_ERR_SUCCESS:
-                pass
-        except Exception as error:
-            self._break(f"what came is no MQTT ({error or type(error).__name__})")
-        self._break("the connection was closed")
-        # Else the client and what it calls would hold each other, and its sockets would wait for the garbage collector.
-        for name in ("connect", "publish", "subscribe", "unsubscribe", "message", "disconnect", "socket_open"):
-            setattr(client, f"on_{name}", None)
+    # On the thread whose turn it is.
 
     def _greet(self, has_session: bool, code: ReasonCode, told: Properties | None) -> None:
-        with self._changed:
-            self.has_session, self._greeting = has_session, (code, told)
-            self._changed.notify_all()
+        self.has_session, self._greeting = has_session, (code, told)
 
     def _answer(self, mid: int, code: ReasonCode | None) -> None:
-        with self._changed:
-            self._answers[mid] = code
-            self._changed.notify_all()
+        self._answers[mid] = code
 
     def _arrive(self, message: paho.MQTTMessage) -> None:
-        with self._come:
-            self._arrived.append(message)
-            self._come.notify_all()
+        self._arrived.append(message)
+
+    def _broke(self, error: Exception) -> None:
+        self._break("the connection was closed" if isinstance(error, ConnectionError) else _no_mqtt(error))
 
     def _lose(self, code: ReasonCode) -> None:
         self._is_too_large = self._is_too_large or code.value == _TOO_LARGE
@@ -159,10 +140,7 @@ class Connection:
         self._break(_SAID.get(name, "the connection broke" if name == "Unspecified error" else f"{name.lower()}"))
 
     def _break(self, trouble: str) -> None:
-        with self._changed:
-            self._trouble = self._trouble or trouble
-            self._changed.notify_all()
-            self._come.notify_all()
+        self._trouble = self._trouble or trouble
 
     # On the threads of those who use it.
 
@@ -182,12 +160,9 @@ class Connection:
 
     def _wait(self, is_so: Callable[[], bool], missing: str) -> None:
         """Wait for the broker's word; from whatever comes in its stead there is no way back."""
-        with self._changed:
-            self._changed.wait_for(lambda: is_so() or self._trouble, self._timeout_s)
-            if is_so():
-                return
-            if not self._trouble:
-                self._trouble = f"the broker {missing} within {self._timeout_s:g} s"
+        self._turns.run(nothing, lambda: is_so() or self._trouble, self._timeout_s)
+        if not is_so():
+            self._break(f"the broker {missing} within {self._timeout_s:g} s")
             raise self._error()
 
     def _error(self) -> BrokerError:
@@ -279,30 +254,27 @@ class Connection:
         BrokerError
             The connection is over.
         """
-        until_s = monotonic() + timeout_s
-        with self._come:
-            while not self._trouble:
-                # mosquitto sends one more than it is asked for after an acknowledgement.
-                if self._arrived and len(self._held) < self._prefetch:
-                    message = self._arrived.popleft()
-                    if message.qos:
-                        self._held.add(message.mid)
-                    return message
-                if not self._come.wait(max(until_s - monotonic(), 0.0)) and monotonic() >= until_s:
-                    return None
-            raise self._error()
+        if not self._has_come() and not self._trouble:
+            self._turns.run(nothing, lambda: self._has_come() or self._trouble, timeout_s)
+        self.check()
+        if not self._has_come():
+            return None
+        message = self._arrived.popleft()
+        if message.qos:
+            self._held.add(message.mid)
+        return message
+
+    def _has_come(self) -> bool:
+        # mosquitto sends one more than it is asked for after an acknowledgement.
+        return bool(self._arrived) and len(self._held) < self._prefetch
 
     def acknowledge(self, message: paho.MQTTMessage) -> None:
         """Tell the broker that a message is done with; nothing happens if the connection is over."""
-        with self._changed:
-            # With QoS 0 nobody waits for it, and to be told is an error.
-            if self._trouble or not message.qos:
-                return
-            self._held.discard(message.mid)
-            if self._arrived:
-                self._come.notify_all()
-        with contextlib.suppress(OSError, ValueError):
-            self._client.ack(message.mid, 1)
+        # With QoS 0 nobody waits for it, and to be told is an error.
+        if self._trouble or not message.qos:
+            return
+        self._held.discard(message.mid)
+        self._turns.run(lambda: self._client.ack(message.mid, 1), always, 0.0)
 
     def close(self, *, with_notice: bool = False, with_session: bool = False) -> None:
         """End it, within a few seconds; as often as you like.
@@ -319,19 +291,23 @@ class Connection:
             told.SessionExpiryInterval = 0
         was_over = self.is_lost
         self._break("it was closed")
+        client, within_s = self._client, min(self._timeout_s, _CLOSE_S)
         if not was_over:
             code = ReasonCode(PacketTypes.DISCONNECT, identifier=_WITH_WILL if with_notice else 0)
-            with contextlib.suppress(OSError, ValueError):
-                self._client.disconnect(code, told if with_session else None)
-            self._thread.join(min(self._timeout_s, _CLOSE_S))
-        self._is_over = True
+            part = partial(client.disconnect, code, told if with_session else None)
+            self._turns.run(part, lambda: client.socket() is None, within_s)
+        self._turns.run(self._cut, lambda: client.socket() is None, within_s)
+        self._turns.end(_CLOSE_S)
+        # Else the client and what it calls would hold each other, and its sockets would wait for the garbage collector.
+        for name in ("connect", "publish", "subscribe", "unsubscribe", "message", "disconnect", "socket_open"):
+            setattr(client, f"on_{name}", None)
+
+    def _cut(self) -> None:
         opened = self._client.socket()
-        if self._thread.is_alive() and isinstance(opened, socket.socket):
-            # What is left to be written will never be: wake the thread.
+        if isinstance(opened, socket.socket):
+            # What is left to be written never will be: to read the end has paho close it.
             with contextlib.suppress(OSError):
                 opened.shutdown(socket.SHUT_RDWR)
-        if threading.current_thread() is not self._thread:
-            self._thread.join(_CLOSE_S)
 
 
 _WAY_OUT: Final = "See that the broker runs there, and try again."
@@ -339,6 +315,10 @@ _WAY_OUT: Final = "See that the broker runs there, and try again."
 
 def _why(error: Exception) -> str:
     return str(getattr(error, "strerror", None) or error or type(error).__name__)
+
+
+def _no_mqtt(error: Exception) -> str:
+    return f"what came is no MQTT ({error or type(error).__name__})"
 
 
 def _too_large(size: int, place: Place, most: int) -> MessageError:

@@ -1,0 +1,53 @@
+"""How is an event loop driven, step by step, by whoever waits?"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import Final
+
+from epypes.transport.channels.turns import own_selector
+
+# What is said goes out within so many rounds: to publish is to wake the library's own task, which writes.
+_ROUNDS: Final = 3
+
+
+class OwnLoop(asyncio.SelectorEventLoop):
+    """An event loop, as `turns.Loop`."""
+
+    def __init__(self) -> None:
+        super().__init__(own_selector())
+
+    def step(self, timeout_s: float) -> None:
+        """Take a step; see `turns.Loop.step`."""
+        if timeout_s <= 0:
+            for _ in range(_ROUNDS):
+                self.call_soon(self.stop)
+                self.run_forever()
+            return
+        alarm = self.call_later(timeout_s, self.stop)
+        try:
+            self.run_forever()
+        finally:
+            alarm.cancel()
+
+    def wake(self) -> None:
+        """Have a step end soon; see `turns.Loop.wake`."""
+        self.call_soon_threadsafe(self.stop)
+
+    def suits(self) -> bool:
+        """Return whether the calling thread may take steps; see `turns.Loop.suits`."""
+        # A cell of a notebook runs within a loop of its thread, which can't run another one meanwhile.
+        return _running() is None
+
+
+def _running() -> asyncio.AbstractEventLoop | None:
+    try:
+        return asyncio.get_running_loop()
+    except RuntimeError:
+        return None
+
+
+def is_not_ours(record: logging.LogRecord) -> bool:
+    """Return whether a record is not about one of our connections; what happens to those we say ourselves."""
+    return not isinstance(_running(), OwnLoop)
