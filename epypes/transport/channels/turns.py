@@ -8,7 +8,6 @@ a thread that does nothing else takes the turn, until somebody wants it: heartbe
 
 from __future__ import annotations
 
-import selectors
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -37,11 +36,6 @@ class Loop(Protocol):
 
     def close(self) -> None:
         """Take no more steps."""
-
-
-def own_selector() -> selectors.BaseSelector:
-    """Return a selector that a forked child has a copy of: through one of the kernel's it would change what we hear."""
-    return getattr(selectors, "PollSelector", selectors.DefaultSelector)()
 
 
 def nothing() -> None:
@@ -93,8 +87,15 @@ class Turns:
             self._work.append(work)
             if self._leader is None:
                 self._drive(is_done, until_s)
-            elif self._leader != me:
-                self._loop.wake()
+                if timeout_s <= 0.0:
+                    return bool(is_done())
+            is_left = self._leader not in (None, me)
+        # Not with the lock, which who is woken takes first.
+        if is_left:
+            self._loop.wake()
+        if timeout_s <= 0.0:
+            return bool(is_done())
+        with self._changed:
             while not (is_done() or self._is_over or self._leader == me or monotonic() >= until_s):
                 if self._leader is None:
                     self._drive(is_done, until_s)

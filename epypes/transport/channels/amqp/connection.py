@@ -11,7 +11,7 @@ import pika
 from pika.exceptions import AMQPError
 
 from epypes.errors import BrokerError
-from epypes.transport.channels.amqp.loop import PikaLoop
+from epypes.transport.channels.amqp.loop import JoiningConnection, PikaLoop
 from epypes.transport.channels.amqp.reasons import opening_reason, reason_of
 from epypes.transport.channels.place import Place
 from epypes.transport.channels.turns import Turns, always, nothing
@@ -119,8 +119,8 @@ class Connection:
         self._heard = self._silent = 0
         parameters = _parameters(place, timeout_s)
         self._loop = PikaLoop()
-        self.pika = pika.SelectConnection(
-            parameters, self._opened, self._not_opened, self._closed, custom_ioloop=self._loop.io
+        self.pika = JoiningConnection(
+            parameters, self._opened, self._not_opened, self._closed, custom_ioloop=self._loop
         )
         self.turns = Turns(self._loop, self.lose, f"epypes keeps {place.host}")
         self.turns.run(nothing, lambda: self._is_open or self._opening, timeout_s)
@@ -131,7 +131,7 @@ class Connection:
         self.turns.run(self._watch, always, 0.0)
 
     def _opened(self, connection: object) -> None:
-        self._is_open = True
+        self._is_open = self._loop.is_eager = True
 
     def _not_opened(self, connection: object, error: BaseException) -> None:
         self._opening = error
@@ -142,7 +142,7 @@ class Connection:
     def _watch(self) -> None:
         self.pika.add_on_connection_blocked_callback(lambda _, frame: self._block(frame.method.reason))
         self.pika.add_on_connection_unblocked_callback(lambda _, frame: self._block(""))
-        self._loop.io.call_later(_KEEPING_S, self._listen)
+        self._loop.call_later(_KEEPING_S, self._listen)
 
     def _block(self, reason: object) -> None:
         self._blocked = f" It takes no messages just now: {reason}." if reason else ""
@@ -170,7 +170,7 @@ class Connection:
         if self._silent > _MOST_SILENT:
             self.lose(f"nothing was heard from the broker for {_MOST_SILENT * _KEEPING_S:g} s")
         if not self.trouble:
-            self._loop.io.call_later(_KEEPING_S, self._listen)
+            self._loop.call_later(_KEEPING_S, self._listen)
 
     def close(self, reason: str = "it was closed") -> None:
         """End it; as often as you like, bounded by two times two seconds."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 from typing import Final
 
-from epypes.transport.channels.turns import own_selector
+from epypes.transport.channels.waking import own_selector
 
 # What is said goes out within so many rounds: to publish is to wake the library's own task, which writes.
 _ROUNDS: Final = 3
@@ -33,7 +34,9 @@ class OwnLoop(asyncio.SelectorEventLoop):
 
     def wake(self) -> None:
         """Have a step end soon; see `turns.Loop.wake`."""
-        self.call_soon_threadsafe(self.stop)
+        # Closed, there is nobody to be woken.
+        with contextlib.suppress(RuntimeError):
+            self.call_soon_threadsafe(self.stop)
 
     def suits(self) -> bool:
         """Return whether the calling thread may take steps; see `turns.Loop.suits`."""

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
-import selectors
-import socket
 from typing import Any, Final
 
 import paho.mqtt.client as paho
 
-from epypes.transport.channels.turns import own_selector
+from epypes.transport.channels.waking import READ, WRITE, Waiting
 
 # So often paho looks after its heartbeats.
 _LOOK_S: Final = 0.5
-_MOST_WAKES: Final = 4_096
 
 
 class Client(paho.Client):
@@ -28,15 +24,10 @@ class PahoLoop:
 
     def __init__(self, client: paho.Client) -> None:
         self._client = client
-        self._waking, self._woken = socket.socketpair()
-        for end in (self._waking, self._woken):
-            end.setblocking(False)
-        self._selector = own_selector()
-        self._selector.register(self._woken, selectors.EVENT_READ)
         opened: Any = client.socket()
-        self._socket = opened
-        self._events = selectors.EVENT_READ
-        self._selector.register(opened, self._events)
+        self._socket, self._events = opened, READ
+        self._waiting = Waiting()
+        self._waiting.sockets.register(opened, READ)
 
     def step(self, timeout_s: float) -> None:
         """Take a step; see `turns.Loop.step`."""
@@ -45,14 +36,11 @@ class PahoLoop:
             client.loop_write()
         if client.socket() is None:
             raise ConnectionError("it is closed")
-        self._watch(selectors.EVENT_READ | (selectors.EVENT_WRITE if client.want_write() else 0))
+        self._watch(READ | (WRITE if client.want_write() else 0))
         # What is encrypted may have come, and wait to be read, already.
         is_there = bool(getattr(self._socket, "pending", int)())
-        for key, events in self._selector.select(0.0 if is_there else min(timeout_s, _LOOK_S)):
-            if key.fileobj is self._woken:
-                self._woken.recv(_MOST_WAKES)
-            elif events & selectors.EVENT_READ:
-                is_there = True
+        for _, events in self._waiting.wait(0.0 if is_there else min(timeout_s, _LOOK_S)):
+            is_there = is_there or bool(events & READ)
         if is_there:
             client.loop_read()
         client.loop_misc()
@@ -60,12 +48,11 @@ class PahoLoop:
     def _watch(self, events: int) -> None:
         if events != self._events:
             self._events = events
-            self._selector.modify(self._socket, events)
+            self._waiting.sockets.modify(self._socket, events)
 
     def wake(self) -> None:
         """Have a step end soon; see `turns.Loop.wake`."""
-        with contextlib.suppress(BlockingIOError):
-            self._waking.send(b"0")
+        self._waiting.wake()
 
     def suits(self) -> bool:
         """Return whether the calling thread may take steps; see `turns.Loop.suits`."""
@@ -73,6 +60,4 @@ class PahoLoop:
 
     def close(self) -> None:
         """Take no more steps; see `turns.Loop.close`."""
-        self._selector.close()
-        self._waking.close()
-        self._woken.close()
+        self._waiting.close()
