@@ -26,6 +26,7 @@ from epypes.transport.forked import forget_in_child
 from epypes.transport.framing import Framing
 from epypes.wire import Envelope, Limits, failure_event
 from epypes.wire.arrays import is_settled
+from epypes.wire.ids import new_id
 
 log = logging.getLogger("epypes.transport")
 
@@ -198,7 +199,7 @@ class Outbox:
             with self._changed:
                 frames = self._framing.frames(item)
         own = tuple(map(_own, frames))
-        known_as = known_as or (item.id if isinstance(item, Envelope) else "") or os.urandom(16).hex()
+        known_as = known_as or (item.id if isinstance(item, Envelope) else "") or new_id()
         return _Parcel(own, known_as, headers, then)
 
     def _refuse(self, error: Exception, then: Then) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
+
+from epypes.wire.ids import new_id
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,10 +39,6 @@ class FailureRecord:
 
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
-
-
-def _new_id() -> str:
-    return os.urandom(16).hex()
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -81,7 +78,7 @@ class Envelope:
 
     type: str
     parts: Mapping[str, Any] = field(default_factory=dict)
-    id: str = field(default_factory=_new_id)
+    id: str = field(default_factory=new_id)
     source: str = ""
     epoch: int = 0
     sequence: int = 0

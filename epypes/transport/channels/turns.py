@@ -11,8 +11,9 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import AbstractContextManager, suppress
 from time import monotonic
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 # For so long nobody has waited when the thread takes over that does nothing else.
 _IDLE_S: Final = 0.25
@@ -22,11 +23,15 @@ _LONG_S: Final = 60.0
 class Loop(Protocol):
     """What a client's connection is driven by."""
 
-    def step(self, timeout_s: float) -> None:
+    def step(self, timeout_s: float, aside: AbstractContextManager[object]) -> None:
         """Do what is ready, and wait at most so long until there was something; with 0 see that what is said goes out.
 
-        What it raises is taken for the end of the connection.
+        While it only waits it may step ``aside``: others may use the connection then. What it raises is taken for the
+        end of the connection.
         """
+
+    def flush(self) -> None:
+        """See that what is said goes out; by another thread, while a step is aside."""
 
     def wake(self) -> None:
         """Have a step end soon; from any thread."""
@@ -36,6 +41,19 @@ class Loop(Protocol):
 
     def close(self) -> None:
         """Take no more steps."""
+
+
+class _Aside:
+    """Leaves the connection to others within a with block."""
+
+    def __init__(self, hands: Any) -> None:
+        self._hands = hands
+
+    def __enter__(self) -> None:
+        self._hands.release()
+
+    def __exit__(self, *_: object) -> None:
+        self._hands.acquire()
 
 
 def nothing() -> None:
@@ -66,7 +84,12 @@ class Turns:
         # Two of one lock: whatever changes does not wake the keeper.
         self._changed, self._called = threading.Condition(lock), threading.Condition(lock)
         self._work: deque[Callable[[], object]] = deque()
+        # Held by who uses the connection.
+        self._hands = threading.RLock()
+        self._aside = _Aside(self._hands)
         self._leader: int | None = None
+        # What the leader waits for.
+        self._is_done: Callable[[], object] = always
         # How often somebody else than the keeper has led, and whether he shall, or shall no more.
         self._taken = 0
         self._is_called = self._is_wanted = self._is_over = False
@@ -87,14 +110,28 @@ class Turns:
             self._work.append(work)
             if self._leader is None:
                 self._drive(is_done, until_s)
-                if timeout_s <= 0.0:
-                    return bool(is_done())
-            is_left = self._leader not in (None, me)
-        # Not with the lock, which who is woken takes first.
+            is_left = self._leader not in (None, me) and not self._is_done_here(timeout_s)
         if is_left:
+            # Without the lock, which who is woken takes first.
             self._loop.wake()
-        if timeout_s <= 0.0:
-            return bool(is_done())
+        return bool(is_done()) if timeout_s <= 0.0 else self._waited(is_done, until_s)
+
+    def _is_done_here(self, timeout_s: float) -> bool:
+        """Do what nobody waits for, if the leader only waits, and return whether it was done; called with the lock."""
+        if timeout_s > 0.0 or not self._hands.acquire(blocking=False):
+            return False
+        try:
+            self._do()
+            self._loop.flush()
+        except Exception as error:  # as in a step
+            self._failed(error)
+        finally:
+            self._hands.release()
+        self._changed.notify_all()
+        return not self._is_done()
+
+    def _waited(self, is_done: Callable[[], object], until_s: float) -> bool:
+        me = threading.get_ident()
         with self._changed:
             while not (is_done() or self._is_over or self._leader == me or monotonic() >= until_s):
                 if self._leader is None:
@@ -122,7 +159,7 @@ class Turns:
 
     def _lead(self, is_done: Callable[[], object], until_s: float) -> None:
         """Take the turn; called with the lock, and held again afterwards."""
-        self._leader = threading.get_ident()
+        self._leader, self._is_done = threading.get_ident(), is_done
         try:
             self._changed.release()
             try:
@@ -147,12 +184,20 @@ class Turns:
                 return
 
     def _step(self, is_done: Callable[[], object], until_s: float) -> None:
+        self._hands.acquire()
         try:
-            while self._work:
-                self._work.popleft()()
-            self._loop.step(0.0 if is_done() else max(until_s - monotonic(), 0.0))
+            self._do()
+            self._loop.step(0.0 if is_done() else max(until_s - monotonic(), 0.0), self._aside)
         except Exception as error:  # whatever a library raises here must not end the thread of whoever waits
             self._failed(error)
+        finally:
+            # A signal may have come as it wanted them back.
+            with suppress(RuntimeError):
+                self._hands.release()
+
+    def _do(self) -> None:
+        while self._work:
+            self._work.popleft()()
 
     def _keep(self) -> None:
         with self._changed:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import selectors
 import socket
-from collections.abc import Iterator
 from typing import Any, Final
 
 READ: Final = selectors.EVENT_READ
@@ -19,28 +18,37 @@ def own_selector() -> selectors.BaseSelector:
 
 
 class Waiting:
-    """A selector whose wait any thread may end.
-
-    Attributes
-    ----------
-    sockets
-        What is waited for is registered there.
-    """
+    """What is waited for at some sockets; any thread may end the wait."""
 
     def __init__(self) -> None:
-        self.sockets = own_selector()
+        self._selector = own_selector()
         self._waking, self._woken = socket.socketpair()
         for end in (self._waking, self._woken):
             end.setblocking(False)
-        self.sockets.register(self._woken, READ)
+        self._selector.register(self._woken, READ)
 
-    def wait(self, timeout_s: float) -> Iterator[tuple[Any, int]]:
-        """Yield what is ready within so many seconds, and for what: `READ`, `WRITE` or both."""
-        for key, events in self.sockets.select(timeout_s):
-            if key.fileobj is self._woken:
+    def watch(self, opened: Any, events: int) -> None:
+        """Wait for something at a socket from now on: `READ`, `WRITE` or both. Who waits just now is woken."""
+        known = self._selector.get_map().get(opened)
+        if known is None:
+            self._selector.register(opened, events)
+        elif known.events != events:
+            self._selector.modify(opened, events)
+            self.wake()
+
+    def forget(self, opened: Any) -> None:
+        """Wait for nothing at a socket any more."""
+        self._selector.unregister(opened)
+
+    def wait(self, timeout_s: float) -> list[tuple[Any, int]]:
+        """Return what is ready within so many seconds, and for what."""
+        ready = [(key.fileobj, events) for key, events in self._selector.select(timeout_s)]
+        for found in ready:
+            if found[0] is self._woken:
                 self._woken.recv(_MOST_WAKES)
-            else:
-                yield key.fileobj, events
+                ready.remove(found)
+                break
+        return ready
 
     def wake(self) -> None:
         """End the wait, or the next one; from any thread, as often as you like."""
@@ -50,6 +58,6 @@ class Waiting:
 
     def close(self) -> None:
         """Wait no more."""
-        self.sockets.close()
+        self._selector.close()
         self._waking.close()
         self._woken.close()

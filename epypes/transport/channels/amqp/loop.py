@@ -10,6 +10,7 @@ import heapq
 import itertools
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from time import monotonic
 from typing import Final
 
@@ -56,27 +57,31 @@ class PikaLoop:
 
     # --- turns.Loop ---
 
-    def step(self, timeout_s: float) -> None:
+    def step(self, timeout_s: float, aside: AbstractContextManager[object]) -> None:
         """Take a step; see `turns.Loop.step`."""
-        self._write()
-        for fd, events in self._waiting.wait(self._patience_s(timeout_s)):
+        self.flush()
+        patience_s = self._patience_s(timeout_s)
+        with aside:
+            ready = self._waiting.wait(patience_s)
+        for fd, events in ready:
             handler = self._handlers.get(fd)
             if handler is not None:
                 handler(fd, events)
         self._call()
-        self._write()
+        self.flush()
 
     def _patience_s(self, timeout_s: float) -> float:
         if self._callbacks:
             return 0.0
         return max(min(timeout_s, self._timers[0][0] - monotonic()), 0.0) if self._timers else timeout_s
 
-    def _write(self) -> None:
+    def flush(self) -> None:
+        """Write what can be written; see `turns.Loop.flush`."""
         while self._unwritten:
             fd = self._unwritten.pop()
             self._handlers[fd](fd, WRITE)
             if self._events.get(fd, 0) & WRITE:
-                self._waiting.sockets.modify(fd, self._events[fd])
+                self._waiting.watch(fd, self._events[fd])
 
     def _call(self) -> None:
         for _ in range(len(self._callbacks)):
@@ -124,18 +129,18 @@ class PikaLoop:
     def add_handler(self, fd: int, handler: Handler, events: int) -> None:
         """Have what is ready at a socket told to a handler."""
         self._handlers[fd], self._events[fd] = handler, events
-        self._waiting.sockets.register(fd, events)
+        self._waiting.watch(fd, events)
 
     def update_handler(self, fd: int, events: int) -> None:
         """Have something else told."""
         if self.is_eager and events & WRITE:
             self._unwritten.add(fd)
-        elif self._waiting.sockets.get_key(fd).events != events:
-            self._waiting.sockets.modify(fd, events)
+        else:
+            self._waiting.watch(fd, events)
         self._events[fd] = events
 
     def remove_handler(self, fd: int) -> None:
         """Have nothing told any more."""
         self._unwritten.discard(fd)
         del self._handlers[fd], self._events[fd]
-        self._waiting.sockets.unregister(fd)
+        self._waiting.forget(fd)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+from contextlib import AbstractContextManager
 from typing import Final
 
 from epypes.transport.channels.waking import own_selector
@@ -19,8 +20,8 @@ class OwnLoop(asyncio.SelectorEventLoop):
     def __init__(self) -> None:
         super().__init__(own_selector())
 
-    def step(self, timeout_s: float) -> None:
-        """Take a step; see `turns.Loop.step`."""
+    def step(self, timeout_s: float, aside: AbstractContextManager[object]) -> None:
+        """Take a step, aside never: a task may be anywhere; see `turns.Loop.step`."""
         if timeout_s <= 0:
             for _ in range(_ROUNDS):
                 self.call_soon(self.stop)
@@ -31,6 +32,9 @@ class OwnLoop(asyncio.SelectorEventLoop):
             self.run_forever()
         finally:
             alarm.cancel()
+
+    def flush(self) -> None:
+        """Do nothing, since no step is aside; see `turns.Loop.flush`."""
 
     def wake(self) -> None:
         """Have a step end soon; see `turns.Loop.wake`."""

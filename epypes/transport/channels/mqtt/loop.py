@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from typing import Any, Final
 
 import paho.mqtt.client as paho
@@ -25,30 +26,27 @@ class PahoLoop:
     def __init__(self, client: paho.Client) -> None:
         self._client = client
         opened: Any = client.socket()
-        self._socket, self._events = opened, READ
-        self._waiting = Waiting()
-        self._waiting.sockets.register(opened, READ)
+        self._socket, self._waiting = opened, Waiting()
 
-    def step(self, timeout_s: float) -> None:
+    def step(self, timeout_s: float, aside: AbstractContextManager[object]) -> None:
         """Take a step; see `turns.Loop.step`."""
+        self.flush()
+        # What is encrypted may have come, and wait to be read, already.
+        is_there = bool(getattr(self._socket, "pending", int)())
+        with aside:
+            ready = self._waiting.wait(0.0 if is_there else min(timeout_s, _LOOK_S))
+        if is_there or any(events & READ for _, events in ready):
+            self._client.loop_read()
+        self._client.loop_misc()
+
+    def flush(self) -> None:
+        """Write what can be written; see `turns.Loop.flush`."""
         client = self._client
         if client.want_write():
             client.loop_write()
         if client.socket() is None:
             raise ConnectionError("it is closed")
-        self._watch(READ | (WRITE if client.want_write() else 0))
-        # What is encrypted may have come, and wait to be read, already.
-        is_there = bool(getattr(self._socket, "pending", int)())
-        for _, events in self._waiting.wait(0.0 if is_there else min(timeout_s, _LOOK_S)):
-            is_there = is_there or bool(events & READ)
-        if is_there:
-            client.loop_read()
-        client.loop_misc()
-
-    def _watch(self, events: int) -> None:
-        if events != self._events:
-            self._events = events
-            self._waiting.sockets.modify(self._socket, events)
+        self._waiting.watch(self._socket, READ | (WRITE if client.want_write() else 0))
 
     def wake(self) -> None:
         """Have a step end soon; see `turns.Loop.wake`."""
