@@ -15,6 +15,8 @@ from contextlib import AbstractContextManager, suppress
 from time import monotonic
 from typing import Any, Final, Protocol
 
+from epypes.transport.forked import forget_in_child
+
 # For so long nobody has waited when the thread takes over that does nothing else.
 _IDLE_S: Final = 0.25
 _LONG_S: Final = 60.0
@@ -80,13 +82,8 @@ class Turns:
 
     def __init__(self, loop: Loop, failed: Callable[[Exception], object], name: str) -> None:
         self._loop, self._failed = loop, failed
-        lock = threading.RLock()
-        # Two of one lock: whatever changes does not wake the keeper.
-        self._changed, self._called = threading.Condition(lock), threading.Condition(lock)
+        self._make_locks()
         self._work: deque[Callable[[], object]] = deque()
-        # Held by who uses the connection.
-        self._hands = threading.RLock()
-        self._aside = _Aside(self._hands)
         self._leader: int | None = None
         # What the leader waits for.
         self._is_done: Callable[[], object] = always
@@ -95,6 +92,20 @@ class Turns:
         self._is_called = self._is_wanted = self._is_over = False
         self._keeper = threading.Thread(target=self._keep, name=name, daemon=True)
         self._keeper.start()
+        forget_in_child(self)
+
+    def _make_locks(self) -> None:
+        lock = threading.RLock()
+        # Two of one lock: whatever changes does not wake the keeper.
+        self._changed, self._called = threading.Condition(lock), threading.Condition(lock)
+        # Held by who uses the connection.
+        self._hands = threading.RLock()
+        self._aside = _Aside(self._hands)
+
+    def forget(self) -> None:
+        """Do nothing more, in a forked child: the connection is the parent's."""
+        self._make_locks()
+        self._is_over = True
 
     def run(self, work: Callable[[], object], is_done: Callable[[], object], timeout_s: float) -> bool:
         """Have some work done on the connection, wait until ``is_done``, and return whether it is. From any thread.

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import contextlib
-import selectors
 import socket
+import sys
+from selectors import EVENT_READ as READ
+from selectors import EVENT_WRITE as WRITE
 from typing import Any, Final
 
-READ: Final = selectors.EVENT_READ
-WRITE: Final = selectors.EVENT_WRITE
+# Of which a forked child has a copy: through one that is the kernel's it would change what we hear.
+if sys.platform == "win32":
+    from selectors import SelectSelector as OwnSelector
+else:
+    from selectors import PollSelector as OwnSelector
+
+__all__ = ["READ", "WRITE", "OwnSelector", "Waiting"]
+
 _MOST_WAKES: Final = 4_096
-
-
-def own_selector() -> selectors.BaseSelector:
-    """Return a selector that a forked child has a copy of: through one of the kernel's it would change what we hear."""
-    return getattr(selectors, "PollSelector", selectors.DefaultSelector)()
 
 
 class Waiting:
     """What is waited for at some sockets; any thread may end the wait."""
 
     def __init__(self) -> None:
-        self._selector = own_selector()
+        self._selector = OwnSelector()
         self._waking, self._woken = socket.socketpair()
         for end in (self._waking, self._woken):
             end.setblocking(False)

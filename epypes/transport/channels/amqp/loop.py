@@ -115,6 +115,7 @@ class PikaLoop:
         """Call something after so many seconds, unless what is returned is removed before."""
         timer = [callback]
         heapq.heappush(self._timers, (monotonic() + delay, next(self._numbers), timer))
+        self._waiting.wake()
         return timer
 
     def remove_timeout(self, timeout_handle: list[Callable[[], object]]) -> None:

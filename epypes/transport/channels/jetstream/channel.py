@@ -66,10 +66,7 @@ class JetStreamChannel:
 
     async def _begin(self) -> None:
         self._stream = await streams_of(self._client, self._place, self._timeout_s)
-        # Without limits: what comes was asked for.
-        self._asked = await self._client.subscribe(
-            f"{self._inbox}.*", cb=self._hear, pending_msgs_limit=0, pending_bytes_limit=0
-        )
+        self._asked = await self._link.hear(f"{self._inbox}.*", self._hear)
 
     # --- send ---
 
@@ -144,9 +141,7 @@ class JetStreamChannel:
 
     async def _listen(self) -> None:
         if self._place.kind == "broadcast":
-            await self._client.subscribe(
-                self._place.name, cb=self._overhear, pending_msgs_limit=0, pending_bytes_limit=0
-            )
+            await self._link.hear(self._place.name, self._overhear)
             await self._link.flush(self._timeout_s)
             return
         consumer, wait_s = await consumer_of(self._client, self._place, self._stream, self._timeout_s)
@@ -154,12 +149,12 @@ class JetStreamChannel:
         await self._ask_for_more()
         self._link.spawn(self._go_on(min(_PROGRESS_S, wait_s / 4)), "beat")
 
-    async def _overhear(self, message: Msg) -> None:
+    def _overhear(self, message: Msg) -> None:
         if len(self._arrived) < _MOST_BROADCASTS:
             self._arrived.append(message)
             self._link.changed()
 
-    async def _hear(self, message: Msg) -> None:
+    def _hear(self, message: Msg) -> None:
         """Take what has come to our inbox: a message, a confirmation, or that a request has ended."""
         if message.reply.startswith("$JS.ACK."):
             self._pulls.came()
@@ -177,7 +172,7 @@ class JetStreamChannel:
         if status == "503" or "deleted" in told.lower():
             self._link.lose("the stream is gone, or the consumer that it is received by")
         elif status == "408":
-            await self._ask_for_more(is_due=True)
+            self._start(self._ask_for_more(is_due=True))
 
     async def _ask_for_more(self, *, is_due: bool = False) -> None:
         number, batch = self._pulls.wanted(len(self._held), monotonic(), is_due=is_due)

@@ -15,6 +15,8 @@ from functools import partial
 from typing import Any, Final
 
 from nats.aio.client import Client
+from nats.aio.msg import Msg
+from nats.aio.subscription import Subscription
 from nats.errors import Error as NatsError
 
 from epypes.errors import BrokerError
@@ -28,6 +30,22 @@ _log = logging.getLogger("epypes.transport")
 _BEAT_S: Final = 2.5
 _SILENCE_S: Final = 5.0
 _CLOSING_S: Final = 2.0
+
+
+class _Hearing:
+    """What the library takes for a future: it gets each message at once; for a callback a task would be woken first."""
+
+    def __init__(self, hear: Callable[[Msg], object]) -> None:
+        self._hear = hear
+
+    def cancelled(self) -> bool:
+        return False
+
+    def set_result(self, message: Msg) -> None:
+        try:
+            self._hear(message)
+        except Exception:  # what others send to our inbox must not end the connection
+            _log.debug("a message to %s was not understood", message.subject, exc_info=True)
 
 
 class Link:
@@ -168,6 +186,11 @@ class Link:
         except StopIteration:
             return
         self.spawn(_going_on(work, awaited))
+
+    async def hear(self, subject: str, hear: Callable[[Msg], object]) -> Subscription:
+        """Have a function called with what comes to a subject; it must not wait."""
+        hearing: Any = _Hearing(hear)
+        return await self.client.subscribe(subject, future=hearing)
 
     async def flush(self, timeout_s: float) -> None:
         """Return when the server has read all that was sent so far."""

@@ -6,19 +6,38 @@ import asyncio
 import contextlib
 import logging
 from contextlib import AbstractContextManager
+from selectors import SelectorKey
 from typing import Final
 
-from epypes.transport.channels.waking import own_selector
+from epypes.transport.channels.waking import OwnSelector
 
 # What is said goes out within so many rounds: to publish is to wake the library's own task, which writes.
 _ROUNDS: Final = 3
+_ROUNDS_UNASKED: Final = 8
+
+
+class _Sparing(OwnSelector):
+    """A selector that does not ask the kernel at each round of a loop that has something else to do.
+
+    A message takes five rounds, and at each the interpreter's lock would be let go of.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._spared = 0
+
+    def select(self, timeout: float | None = None) -> list[tuple[SelectorKey, int]]:
+        self._spared = self._spared + 1 if timeout == 0 else 0
+        if self._spared % _ROUNDS_UNASKED:
+            return []
+        return super().select(timeout)
 
 
 class OwnLoop(asyncio.SelectorEventLoop):
     """An event loop, as `turns.Loop`."""
 
     def __init__(self) -> None:
-        super().__init__(own_selector())
+        super().__init__(_Sparing())
 
     def step(self, timeout_s: float, aside: AbstractContextManager[object]) -> None:
         """Take a step, aside never: a task may be anywhere; see `turns.Loop.step`."""
