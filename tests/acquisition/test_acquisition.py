@@ -115,6 +115,7 @@ def test_a_request_older_than_the_ring_is_refused_with_the_times():
         assert began_ns <= info.value.oldest_ns <= info.value.newest_ns <= time.time_ns()
 
 
+@pytest.mark.slow
 def test_a_camera_that_has_died_never_answers_with_an_old_picture():
     camera = Fed(gray(1))
     with ep.ImageAcquisition(gray(1), camera, max_age_s=0.5) as acquisition:
@@ -262,6 +263,7 @@ def test_a_camera_that_gives_nothing_once_is_tried_again(caplog):
     assert not caplog.records
 
 
+@pytest.mark.slow
 def test_an_outage_is_reported_once_and_survived():
     outage = [CameraUnavailable("mine", f"gone {number}") for number in range(6)]
     errors = queue.SimpleQueue()
@@ -272,6 +274,7 @@ def test_an_outage_is_reported_once_and_survived():
     assert errors.empty()
 
 
+@pytest.mark.slow
 def test_single_misses_add_up_to_no_outage():
     miss = [CameraUnavailable("mine", "not now")] * 4
     errors = queue.SimpleQueue()
@@ -497,6 +500,7 @@ def test_its_repr_is_short():
 # Left running
 
 
+@pytest.mark.slow
 def test_what_is_left_running_warns_and_its_threads_end():
     acquisition = ep.ImageAcquisition(gray(1), gray(2)).start()
     assert acquisition.wait_for_frames(5)
@@ -528,6 +532,7 @@ print("captured")
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["busy", "stuck"])
 def test_the_interpreter_exits_although_cameras_run(tmp_path, kind):
     path = tmp_path / "film.avi"

@@ -52,6 +52,7 @@ def test_the_version_is_the_packages():
     assert epypes.__version__ == project["version"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_every_module_says_first_which_question_it_answers_and_is_short(path):
     text = path.read_text()

@@ -57,6 +57,7 @@ def bits(value):
     return type(value), value
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(VALUES)
 @example({"kind": "tuple", "value": [1]})

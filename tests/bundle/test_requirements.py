@@ -75,6 +75,7 @@ def requirements(folder, *modules):
     return [line for line in done.stdout.splitlines() if not line.startswith(("epypes=", "# epypes "))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("last", ["opencv-python", "opencv-python-headless", "opencv-contrib-python"])
 def test_of_two_builds_of_opencv_the_one_that_was_loaded_is_named_with_a_warning(tmp_path, last):
     names = ["opencv-python", "opencv-python-headless", "opencv-contrib-python"]
@@ -90,12 +91,14 @@ def test_of_two_builds_of_opencv_the_one_that_was_loaded_is_named_with_a_warning
     assert "uninstall all but one" in warning
 
 
+@pytest.mark.slow
 def test_the_headless_build_that_is_installed_here_is_named_alone():
     (line,) = requirements("/nowhere", "cv2", "cv2.data")
     assert line == f"opencv-python-headless=={metadata.version('opencv-python-headless')}"
     assert cv2.__version__ in line
 
 
+@pytest.mark.slow
 def test_parts_of_a_namespace_are_told_apart(tmp_path):
     distribution(tmp_path, "lab-left", "1", [("lab/left/__init__.py", "")])
     distribution(tmp_path, "Lab_Right", "2.0+cpu", [("lab/right/__init__.py", "")])
@@ -106,6 +109,7 @@ def test_parts_of_a_namespace_are_told_apart(tmp_path):
     ]
 
 
+@pytest.mark.slow
 def test_an_editable_install_is_named_with_a_comment(tmp_path):
     checkout, site = tmp_path / "checkout", tmp_path / "site"
     checkout.mkdir(), site.mkdir()
@@ -118,6 +122,7 @@ def test_an_editable_install_is_named_with_a_comment(tmp_path):
     assert comment == "# mine was installed as editable, from a folder, not from an index: install it from there first."
 
 
+@pytest.mark.slow
 def test_python_itself_and_what_nobody_installed_are_no_requirements(tmp_path):
     (tmp_path / "loose.py").write_text("")
     assert requirements(tmp_path, "json", "email.message", "loose") == []

@@ -47,6 +47,7 @@ def path(runner, tmp_path_factory):
     return ep.promote(runner, tmp_path_factory.mktemp("bundles") / "ends").path
 
 
+@pytest.mark.slow
 def test_the_graph_has_its_io_defaults_and_leniency(runner, path):
     cg = ep.load(path).cg
     assert (cg.func_io, cg.types) == (runner.cg.func_io, False)

@@ -26,6 +26,7 @@ def bundle(tmp_path_factory):
     return promoted(tmp_path_factory.mktemp("bundles"))
 
 
+@pytest.mark.slow
 def test_failures_are_listed_the_newest_first_with_what_to_do_next(epypes, bundle):
     first = keep(bundle, request(RAISES), attempt=2)
     second = keep(bundle, request(KILLS), kind="killed", function="worker", message="SIGKILL", dead_letter=True)
@@ -75,6 +76,7 @@ REPLAYS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("value", "status", "text"), REPLAYS)
 def test_a_replay_tells_whether_it_fails_again(epypes, bundle, value, status, text):
     failure = keep(bundle, request(value))
@@ -86,6 +88,7 @@ def test_a_replay_tells_whether_it_fails_again(epypes, bundle, value, status, te
         assert "raise ValueError" in (bundle / "pipeline.py").read_text().splitlines()[line - 1]
 
 
+@pytest.mark.slow
 def test_a_replay_prints_the_whole_traceback_when_asked_to(epypes, bundle):
     keep(bundle, request(RAISES))
     done = epypes("replay", "latest", bundle, "--trace")
@@ -93,6 +96,7 @@ def test_a_replay_prints_the_whole_traceback_when_asked_to(epypes, bundle):
     assert "too bright: 95" in done.stdout
 
 
+@pytest.mark.slow
 def test_a_failure_that_is_another_one_now_is_said_to_be(epypes, bundle):
     failure = keep(bundle, request(RAISES), function="half", exception="TypeError", message="x")
     done = epypes("replay", failure)
@@ -100,6 +104,7 @@ def test_a_failure_that_is_another_one_now_is_said_to_be(epypes, bundle):
     assert "fails otherwise than in the service ('half': TypeError: x): in 'check'" in done.stdout
 
 
+@pytest.mark.slow
 def test_a_bundle_that_was_mended_since_is_told_to_have_changed_and_to_be_fine(epypes, bundle, tmp_path):
     mended = shutil.copytree(bundle, tmp_path / "mended")
     failure = keep(mended, request(RAISES))
@@ -137,6 +142,7 @@ def test_an_event_that_was_not_kept_cannot_be_replayed(epypes, bundle):
     assert "was not kept: the service had none to give" in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["socket", pytest.param("http", marks=pytest.mark.slow)])
 def test_failures_are_told_as_they_happen_with_the_id_to_replay_them(epypes, bundle, way):
     requests = queue.SimpleQueue()

@@ -95,6 +95,7 @@ def test_a_folder_without_keys_says_how_to_make_some(epypes, tmp_path):
     assert "There are no keys in" in epypes("keys", "--list", "--to", tmp_path).stderr
 
 
+@pytest.mark.slow
 def test_a_caller_with_a_known_key_is_answered(guarded, bundle, keys, epypes, photograph, tmp_path):
     write_image(tmp_path / "photo.png", photograph)
     own = ("--keys", keys / "known" / "caller.key_secret", "--allow", keys / "service.key")
@@ -103,6 +104,7 @@ def test_a_caller_with_a_known_key_is_answered(guarded, bundle, keys, epypes, ph
     assert (tmp_path / "edges.png").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("own", "server", "hint"),
     [
@@ -139,6 +141,7 @@ def test_an_address_that_other_machines_reach_needs_keys(epypes, bundle, option)
     assert "tcp://0.0.0.0:5998 can be reached from other machines" in done.stderr
 
 
+@pytest.mark.slow
 def test_the_failures_socket_is_guarded_too(guarded, bundle, keys):
     own = {"keys": keys / "known" / "caller", "allow": keys / "service.key"}
     heard = failures_from_now_on(bundle, **own)
@@ -155,6 +158,7 @@ def test_the_failures_socket_is_guarded_too(guarded, bundle, keys):
         assert not subscriber.wait_joined(0.3)
 
 
+@pytest.mark.slow
 def test_a_service_with_keys_is_started_on_the_command_line(bundle, keys, photograph):
     command = [sys.executable, "-m", "epypes.cli", "serve", str(bundle), "--keys", str(keys / "service")]
     with subprocess.Popen(
@@ -174,6 +178,7 @@ def test_a_service_with_keys_is_started_on_the_command_line(bundle, keys, photog
             process.communicate(timeout=WAIT_S)
 
 
+@pytest.mark.slow
 def test_what_is_recorded_and_played_is_guarded(keys, epypes, tmp_path):
     out, into = queue.SimpleQueue(), queue.SimpleQueue()
     known, service = keys / "known" / "caller", keys / "service"
@@ -200,6 +205,7 @@ def test_what_is_recorded_and_played_is_guarded(keys, epypes, tmp_path):
         assert "not whose are allowed" in refused.stderr
 
 
+@pytest.mark.slow
 def test_a_stranger_that_knocks_is_counted_by_its_key(guarded, keys):
     own = {"keys": keys / "stranger", "allow": keys / "service.key"}
     stranger = read_keys(keys / "stranger").public

@@ -102,6 +102,7 @@ def test_root_may_start_it_too():
     assert "--allow-root" not in lab_arguments([])
 
 
+@pytest.mark.slow
 def test_a_folder_that_is_not_there_is_said_in_a_sentence(tmp_path):
     with pytest.raises(ServiceError, match="There is no folder '.*nowhere' to show in JupyterLab"):
         lab_arguments([str(tmp_path / "nowhere")])
@@ -110,6 +111,7 @@ def test_a_folder_that_is_not_there_is_said_in_a_sentence(tmp_path):
     assert len(done.stderr.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_without_jupyterlab_it_says_what_to_install(tmp_path):
     code = (
         "import importlib.util as u; find = u.find_spec\n"

@@ -44,6 +44,7 @@ def test_replicas_take_the_first_number_that_is_free_and_are_found_in_order(tmp_
         assert held.enter_context(StateLock.of_next(tmp_path)).replica == "4"
 
 
+@pytest.mark.slow
 def test_two_replicas_of_one_name_and_names_that_are_no_file_names_are_refused(tmp_path):
     with StateLock(tmp_path, "left"), StateLock(tmp_path, "right"), StateLock(tmp_path):
         with pytest.raises(ServiceError, match="being served already as replica 'left'"):
@@ -53,6 +54,7 @@ def test_two_replicas_of_one_name_and_names_that_are_no_file_names_are_refused(t
                 StateLock(tmp_path, name)
 
 
+@pytest.mark.slow
 def test_a_replica_that_says_nothing_keeps_nobody_from_hearing_of_the_others(acting):
     with StateLock(acting, "1") as mute, StateLock(acting, "2") as other:
         mute.publish(state(11, http="http://127.0.0.1:1", replica="1"))
@@ -65,6 +67,7 @@ def test_a_replica_that_says_nothing_keeps_nobody_from_hearing_of_the_others(act
     assert alone.returncode == 1
 
 
+@pytest.mark.slow
 def test_all_replicas_are_stopped_though_one_is_late_and_one_has_just_ended(acting):
     sleeping, deaf = ["sleep", "100"], ["bash", "-c", "trap '' TERM; echo deaf; read line"]
     ended = subprocess.Popen(["true"])

@@ -331,6 +331,7 @@ def grouped_graphs(draw):
     return cg
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(grouped_graphs(), st.sampled_from(["down", "right"]))
 def test_any_grouping_keeps_every_function_and_edge_and_can_be_painted(cg, direction):

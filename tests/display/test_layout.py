@@ -504,6 +504,7 @@ def test_a_very_large_graph_is_drawn_in_rows_without_a_word(capfd):
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.slow
 def test_a_graph_of_200_functions_is_laid_out_once_whatever_its_values():
     io = {f"f{index}": ((f"t{index - index % 4}", f"k{index}"), f"t{index + 1}") for index in range(200)}
     runner = ep.CompGraphRunner(

@@ -63,6 +63,7 @@ class HostileArray:
     dtype, shape = property(lambda self: 1 / 0), (3, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "value",
     [
@@ -121,6 +122,7 @@ def test_a_mask_keeps_its_thin_lines_when_it_shrinks():
     assert shown.any(axis=0).all()
 
 
+@pytest.mark.slow
 def test_full_size_masks_are_encoded_without_loss(straight_edges):
     shown = np.asarray(Image.open(io.BytesIO(encode_image(straight_edges).data)))
     assert np.array_equal(shown, straight_edges > 0)
@@ -316,6 +318,7 @@ def test_what_is_inside_stands_in_rows(value, rows):
     assert preview(value).rows == rows
 
 
+@pytest.mark.slow
 def test_a_subclass_of_a_container_is_bounded_too():
     class Many(list):
         pass
@@ -632,6 +635,7 @@ def test_a_field_that_is_computed_is_left_out():
 # Same object, same bytes
 
 
+@pytest.mark.slow
 def test_sets_and_objects_look_the_same_in_every_process():
     code = (
         "import functools, types, pathlib; from epypes.display.previews.preview import preview\n"

@@ -70,6 +70,7 @@ def test_so_many_can_be_asked_for():
         assert left_out == 61 - expected
 
 
+@pytest.mark.slow
 def test_all_chosen_thumbnails_together_stay_within_their_part_of_the_picture():
     for count in (5, 23, 60):
         run = ep.CompGraphRunner(chain(count)).run(t0=noise())
@@ -173,6 +174,7 @@ def functions_of_a_number() -> dict[str, Any]:
     }
 
 
+@pytest.mark.slow
 def test_fifty_runs_with_other_values_ask_for_one_layout(fresh_layouts):
     functions = functions_of_a_number()
     io = {name: (("n", "sigma"), f"{name}_made") for name in functions}

@@ -30,6 +30,7 @@ def check(results: Results, layout: str, requests: int, experiments: int) -> Non
     assert (table["vision.t_rp"] > table["vision.t_p"] + table["vision.t_fin"] + table["vision.t_fout"] - 2e-6).all()
 
 
+@pytest.mark.slow
 def test_the_experiment_in_one_process(images):
     seen = []
     results = run_experiment("one", **SMALL, cameras=images, progress=lambda *counts: seen.append(counts))
@@ -49,6 +50,7 @@ def test_the_experiment_as_it_is_by_default_but_shorter():
     check(run_experiment(requests=5, experiments=1), "paper", 5, 1)
 
 
+@pytest.mark.slow
 def test_pickled_contents_are_sent_and_read_when_they_are_asked_for(images):
     check(run_experiment("one", **SMALL, cameras=images, unsafe_pickle=True), "one", 3, 2)
 

@@ -167,6 +167,7 @@ def test_a_cycle_of_5000_functions_is_found():
     assert len(error.value.findings[0].names) == 2 * count + 1
 
 
+@pytest.mark.slow
 def test_order_and_picture_are_the_same_under_any_hash_seed():
     code = (
         "import epypes as ep; from epypes.display import to_svg\n"

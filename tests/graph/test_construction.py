@@ -18,6 +18,7 @@ def chain(count):
     return functions, {f"f{index}": (f"t{index}", f"t{index + 1}") for index in range(count)}
 
 
+@pytest.mark.slow
 def test_ten_times_the_functions_cost_about_ten_times_as_much():
     def cost(count):
         given, best = chain(count), float("inf")

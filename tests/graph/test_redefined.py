@@ -128,6 +128,7 @@ def test_odd_objects_never_make_a_repr_fail(cell):
     assert len(repr(cg)) < 100
 
 
+@pytest.mark.slow
 def test_the_repr_stays_short_when_names_are_long(cell):
     name = "a_function_with_a_very_long_name"
     functions = {f"f{index}": abs for index in range(20_000)} | {name: cell(BLUR).blur}

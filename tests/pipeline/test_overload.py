@@ -111,6 +111,7 @@ def test_memory_stays_flat_over_as_many_frames_as_a_minute_of_overload_has(polic
     assert (pipe.failed > 0) == (function is fails_often)
 
 
+@pytest.mark.slow
 def test_a_kept_failure_keeps_its_own_event_alive_and_no_other():
     class Frame:
         pass

@@ -435,6 +435,7 @@ def test_draining_works_off_what_is_in_the_queue():
     pipe.stop()
 
 
+@pytest.mark.slow
 def test_a_loop_that_has_not_ended_is_not_started_beside_itself():
     started, release = threading.Event(), threading.Event()
 
@@ -502,6 +503,7 @@ def test_an_answer_whose_put_drops_an_older_one_is_no_failure_if_on_drop_raises(
     assert (pipe.failed, q_out.get_nowait()) == (0, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("policy", "size"), [("latest", 1), ("drop_oldest", 3)])
 def test_a_signal_handler_that_puts_never_makes_a_mailbox_hold_more_than_its_size(policy, size):
     mailbox, by_handler, put, most = ep.Mailbox(policy, size), itertools.count(), 0, 0

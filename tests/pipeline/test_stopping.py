@@ -113,6 +113,7 @@ def test_a_pipeline_that_is_stopped_and_started_inside_an_event_goes_on():
     assert not pipe.loop.is_running
 
 
+@pytest.mark.slow
 def test_a_loop_that_was_to_drain_and_is_started_again_does_not_end_when_its_queue_is_empty():
     gate, inside = threading.Event(), threading.Event()
 

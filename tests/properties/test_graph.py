@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import networkx as nx
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,6 +26,7 @@ def as_networkx(graph: BipartiteDigraph) -> nx.DiGraph:
     return oracle
 
 
+@pytest.mark.slow
 @settings(max_examples=500, deadline=None)
 @given(digraphs())
 def test_the_cycle_that_is_named_is_a_shortest_one(graph):
@@ -36,6 +38,7 @@ def test_the_cycle_that_is_named_is_a_shortest_one(graph):
         assert made in graph.outputs[function]
 
 
+@pytest.mark.slow
 @settings(max_examples=500, deadline=None)
 @given(digraphs())
 def test_the_run_order_is_the_topological_order_that_comes_first_by_definition(graph):

@@ -297,6 +297,7 @@ class Machine(RuleBasedStateMachine):
 MACHINE = settings(max_examples=60, stateful_step_count=12, deadline=None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["the loop", "compiled at once", "in threads"])
 def test_after_any_edits_what_is_read_equals_a_run_from_scratch_and_nothing_runs_in_vain(way, monkeypatch):
     monkeypatch.setattr(compiled, "_RUNS_BEFORE", 0 if way == "compiled at once" else 10_000)
@@ -308,6 +309,7 @@ def test_after_any_edits_what_is_read_equals_a_run_from_scratch_and_nothing_runs
     run_state_machine_as_test(Machine, settings=MACHINE)
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(graphs(placeholders=False), st.data())
 def test_side_by_side_ends_as_one_after_another(graph, data):

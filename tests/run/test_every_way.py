@@ -484,6 +484,7 @@ def test_an_input_that_cannot_be_told_does_not_hide_the_users_exception(way, val
         assert runner.last.failure.function == "f"
 
 
+@pytest.mark.slow
 def test_runs_that_fail_one_after_another_do_not_keep_each_other(way):
     class Value:
         pass

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from tests.seeds import printed
 
 PROGRAM = """
@@ -63,6 +65,7 @@ told(lambda: ep.CompGraphRunner(sketch).run(x=1))
 """
 
 
+@pytest.mark.slow
 def test_what_is_joined_planned_and_run_has_one_order_under_any_hash_seed():
     texts = printed(PROGRAM)
     assert len(texts) == 1

@@ -139,6 +139,7 @@ def test_the_context_of_the_caller_goes_along(always):
     assert ep.CompGraphRunner(fork(2, read), workers=2).run(x=1)["out"] == ("mine", "mine")
 
 
+@pytest.mark.slow
 def test_threads_are_tried_where_functions_are_long_and_kept_where_they_are_faster():
     def wait(x):
         device.wait(WAIT_S)  # as a function that releases the interpreter's lock
@@ -149,6 +150,7 @@ def test_threads_are_tried_where_functions_are_long_and_kept_where_they_are_fast
     assert [report.side_by_side for report in runner.reports] == [False] * 3 + [True] * 5
 
 
+@pytest.mark.slow
 def test_threads_are_given_up_where_they_are_slower():
     lock = threading.Lock()
 
@@ -165,6 +167,7 @@ def test_threads_are_given_up_where_they_are_slower():
     assert [report.side_by_side for report in runner.reports][-4:] == [False] * 4
 
 
+@pytest.mark.slow
 def test_threads_are_tried_when_functions_become_long_later(monkeypatch):
     monkeypatch.setattr(gain, "_LOOK_AGAIN_AFTER", 4)
 

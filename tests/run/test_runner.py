@@ -407,6 +407,7 @@ def test_a_plan_says_what_would_run_and_what_is_missing(chain):
     assert functions["add"].calls == 1
 
 
+@pytest.mark.slow
 def test_a_chain_of_10000_functions_is_planned_run_and_run_again():
     count = 10_000
     io = {f"f{place}": (f"t{place}", f"t{place + 1}") for place in range(count)} | {"side": ("k", "z")}
@@ -442,6 +443,7 @@ def test_reprs_are_short_and_without_times(state):
         assert " ms" not in repr(thing)
 
 
+@pytest.mark.slow
 def test_what_is_read_beside_a_rerun_in_another_thread_is_never_an_old_value():
     cg = ep.CompGraph({"a": lambda x, h: (x, h), "b": lambda a: a}, {"a": (("x", "h"), "A"), "b": ("A", "B")})
     runner, done = ep.CompGraphRunner(cg, {"h": 0}), threading.Event()
@@ -613,6 +615,7 @@ def test_hyperparameters_that_are_no_mapping_are_refused(hparams):
         ep.CompGraphRunner(ep.CompGraph({"f": abs}, {"f": ("x", "y")}), hparams)
 
 
+@pytest.mark.slow
 def test_an_interrupt_never_leaves_a_runner_locked():
     code = """
 import contextlib, signal

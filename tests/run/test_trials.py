@@ -145,6 +145,7 @@ def test_names_that_are_wrong_are_refused_as_in_rerun(runner: ep.CompGraphRunner
         runner.trial({}, payload={"a": 1})
 
 
+@pytest.mark.slow
 def test_a_dropped_trial_keeps_nothing_alive(runner: ep.CompGraphRunner) -> None:
     runner.guard = False
     first = weakref.ref(runner.trial({"k": 20}))

@@ -210,6 +210,7 @@ def test_a_number_on_the_threshold_passes_and_the_next_one_does_not(runner, coin
     assert not passes(None, n - 1)
 
 
+@pytest.mark.slow
 def test_a_share_that_is_almost_one_does_not_read_as_one(runner):
     image = np.full((2000, 2000), 200, np.uint8)
     label = np.ones_like(image, bool)
@@ -222,6 +223,7 @@ def test_a_share_that_is_almost_one_does_not_read_as_one(runner):
     ]
 
 
+@pytest.mark.slow
 def test_threads_and_processes_say_the_same(runner, coins):
     masks = [coins > level for level in (100, 101)]
     cases = [ep.Case(coins, {"mask": mask}, {"count": {"token": "points", "min": 1}}) for mask in masks]
@@ -304,6 +306,7 @@ def test_one_pixel_that_differs_is_seen_in_the_picture_of_the_difference(runner)
     assert ((blue - red) > 50).any()
 
 
+@pytest.mark.slow
 def test_many_failures_stay_a_small_page(runner, coins):
     label = np.random.default_rng(1).integers(0, 2, coins.shape, np.uint8) * 255
     result = ep.check(runner, [ep.Case(coins, {"mask": label}, name=f"case {number}") for number in range(120)])
@@ -351,6 +354,7 @@ def test_a_result_of_nothing_that_failed_is_true():
     assert CheckResult(())
 
 
+@pytest.mark.slow
 def test_of_many_cases_not_all_pictures_are_kept(runner):
     image = np.full((8, 8), 200, np.uint8)
     mask = np.ones((8, 8), bool)

@@ -20,6 +20,8 @@ from epypes.scale.spreading import worker_count
 from tests.bundle.cells import cell
 from tests.scale.test_spreading import mixed, mortal_runner, without_times
 
+pytestmark = pytest.mark.slow
+
 _WAIT_S = 30.0
 
 
@@ -122,7 +124,6 @@ def test_a_worker_killed_half_way_loses_nothing_and_nothing_comes_twice(client, 
     assert without_times(result) == without_times(expected)
 
 
-@pytest.mark.slow
 def test_an_image_that_kills_every_worker_is_a_row_that_says_so(client):
     runner, levels = mortal_runner(), (0, 1, 2, 7, 3)
     result = ep.map(runner, [np.full((2, 2), level) for level in levels], client.get_executor())

@@ -106,6 +106,7 @@ def test_what_a_person_can_read_stays_readable():
     assert told(image(1)).startswith("uint8 (100, 100) ")
 
 
+@pytest.mark.slow
 def test_another_process_finds_the_same(tmp_path):
     text = "from epypes.scale.digests import digest_of; print(digest_of({'a': {'x', 'y', 'z'}, 'b': [1.5, None]}))"
     found = {

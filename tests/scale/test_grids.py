@@ -98,6 +98,7 @@ STEPPED = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("hint", "present", "allowed"), STEPPED)
 def test_a_sweep_and_a_search_take_the_same_values_of_a_range_and_its_hint_allows_them(
     hint: ep.Param, present: float, allowed: list[float], tmp_path: Path

@@ -35,6 +35,7 @@ WRAPPED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrapped", WRAPPED.values(), ids=WRAPPED)
 @pytest.mark.parametrize("threads", [0, 2])
 def test_a_generator_may_fill_one_array_again_and_again(wrapped, threads, tmp_path):
@@ -49,6 +50,7 @@ def test_a_generator_may_fill_one_array_again_and_again(wrapped, threads, tmp_pa
     assert [one.values["out"] for one in ep.map(runner, images, store=tmp_path / "r.sqlite")] == LEVELS
 
 
+@pytest.mark.slow
 def test_processes_get_what_was_given(processes):
     assert [one.values["out"] for one in ep.map(runner_of(mean, "image"), refilled(), processes)] == LEVELS
 

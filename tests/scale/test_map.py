@@ -70,6 +70,7 @@ def test_images_of_other_shapes_are_rows_that_say_so(bright):
     assert result[1].trouble.message == "grey only"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [0, 2])
 def test_a_long_set_is_never_in_memory_as_a_whole(bright, threads):
     alive, most = set(), 0
@@ -128,6 +129,7 @@ def test_it_shows_itself_as_a_table_with_failures_marked(runner, crops):
     assert repr(result) == "<MapResult: 2 images, 1 failed>"
 
 
+@pytest.mark.slow
 def test_many_rows_with_thumbnails_stay_small(runner, crops):
     result = ep.map(runner, crops * 10, show=None)
     html = result._repr_mimebundle_()["text/html"]

@@ -115,6 +115,7 @@ def test_what_nobody_can_say_is_refused(metric: Any) -> None:
         function_digest(metric)
 
 
+@pytest.mark.slow
 def test_a_metric_is_the_same_in_another_process(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(

@@ -23,6 +23,7 @@ def two_masks(draw):
     return [draw(arrays.arrays(np.bool_, shape)) for _ in range(2)]
 
 
+@pytest.mark.slow
 @given(two_masks())
 def test_the_iou_of_masks_counts_pixels_in_both_and_in_either(masks):
     one, other = masks

@@ -331,6 +331,7 @@ def test_if_all_trials_fail_the_reason_of_the_first_is_raised() -> None:
     assert str(told.value) == said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [0, 2])
 def test_a_file_that_can_not_be_read_ends_the_search_before_the_second_trial(tmp_path: Path, workers: int) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((5, 5, 3), np.uint8))
@@ -442,6 +443,7 @@ def test_stopped_before_it_began_there_is_no_best(runner: ep.CompGraphRunner) ->
 # -- stores -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_search_goes_on_where_it_was_stopped(runner: ep.CompGraphRunner, tmp_path: Path) -> None:
     store = tmp_path / "trials.sqlite"
     told: list[Any] = []
@@ -455,6 +457,7 @@ def test_a_search_goes_on_where_it_was_stopped(runner: ep.CompGraphRunner, tmp_p
     assert again.to_frame().equals(more.to_frame())
 
 
+@pytest.mark.slow
 def test_failures_are_stored_too_and_a_store_may_be_shared(tmp_path: Path) -> None:
     runner = runner_of(lambda x, k: 1 / k, k=0)
     with ep.Store(tmp_path / "s.sqlite") as store:
@@ -465,6 +468,7 @@ def test_failures_are_stored_too_and_a_store_may_be_shared(tmp_path: Path) -> No
         assert store.kinds() == ()
 
 
+@pytest.mark.slow
 def test_without_a_name_it_follows_from_what_is_searched(tmp_path: Path) -> None:
     cg = ep.CompGraph({"f": cv2.subtract}, {"f": (("x", "k"), "y")})
     runner, options = ep.CompGraphRunner(cg, {"k": 1.0}), {"store": tmp_path / "s.sqlite", "ranges": {"k": (0.0, 5.0)}}
@@ -488,6 +492,7 @@ def test_without_a_name_it_follows_from_what_is_searched(tmp_path: Path) -> None
         ep.optimize(runner_of(lambda x, k: (stop, k), k=1), "y", [0], 1, store=tmp_path / "s.sqlite", ranges={"k": [1]})
 
 
+@pytest.mark.slow
 def test_a_study_of_something_else_is_left_alone(runner: ep.CompGraphRunner, tmp_path: Path) -> None:
     options: dict[str, Any] = {"store": tmp_path / "s.sqlite", "name": "s"}
     ep.optimize(runner, "score", [0], 1, **options)
@@ -520,6 +525,7 @@ OTHERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", OTHERS)
 def test_trials_of_other_cases_and_of_another_metric_are_not_taken_for_its_own(what: str, tmp_path: Path) -> None:
     runner = runner_of(lambda x, k, j: x + k + j, k=1, j=0)
@@ -536,6 +542,7 @@ def test_trials_of_other_cases_and_of_another_metric_are_not_taken_for_its_own(w
     assert len(ep.optimize(runner, near, [CASE], 1, name="s", **options)) == 2
 
 
+@pytest.mark.slow
 def test_another_graph_and_other_hyperparameters_are_refused_under_a_name(tmp_path: Path) -> None:
     options: dict[str, Any] = {"store": tmp_path / "s.sqlite", "ranges": {"k": (0, 9)}, "name": "s"}
     ep.optimize(runner_of(lambda x, k, j: x + k + j, k=1, j=0), "y", [1], 1, **options)
@@ -545,6 +552,7 @@ def test_another_graph_and_other_hyperparameters_are_refused_under_a_name(tmp_pa
         ep.optimize(runner_of(lambda x, k, j: x - k + j, k=1, j=0), "y", [1], 2, **options)
 
 
+@pytest.mark.slow
 def test_a_metric_that_nobody_can_tell_apart_needs_a_name(tmp_path: Path) -> None:
     runner = runner_of(lambda x, k: x + k, k=1)
     options: dict[str, Any] = {"store": tmp_path / "s.sqlite", "ranges": {"k": (0, 9)}}
@@ -554,6 +562,7 @@ def test_a_metric_that_nobody_can_tell_apart_needs_a_name(tmp_path: Path) -> Non
         assert len(ep.optimize(runner, Nearest(), [CASE], count, name="s", **options)) == count
 
 
+@pytest.mark.slow
 def test_a_metric_that_changes_what_it_reads_goes_on_under_a_name(tmp_path: Path) -> None:
     seen: list[float] = []
 
@@ -629,6 +638,7 @@ def test_figures_are_matplotlibs_without_pyplot(runner: ep.CompGraphRunner) -> N
     assert all(figure.number is None if hasattr(figure, "number") else True for figure in (history, importance))
 
 
+@pytest.mark.slow
 def test_nothing_is_printed_and_optunas_logging_is_as_it_was(
     runner: ep.CompGraphRunner, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -89,6 +89,7 @@ def test_sweeps_tell_values_beside_a_file_too(files, store):
         assert [one.values["out"] for one in found] == [400, 800, 0, 0]
 
 
+@pytest.mark.slow
 def test_searches_tell_values_beside_a_file_too(files, store):
     runner = runner_of(above, "image", "level", level=50)
     options = {"n": 1, "ranges": {"level": [50]}, "store": store}

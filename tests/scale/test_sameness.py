@@ -50,6 +50,7 @@ def test_code_that_no_text_can_be_made_of_is_told_by_what_it_does(functions):
     assert one == again != other
 
 
+@pytest.mark.slow
 def test_a_name_given_twice_does_not_make_two_graphs_one(tmp_path):
     options = {"store": tmp_path / "r.sqlite", "name": "n"}
     images = [np.ones((2, 2))]

@@ -172,6 +172,7 @@ def test_the_page_has_a_picture_a_cell_and_marks_failures_with_their_message(run
     assert len(repr(result.sheet())) < 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [5, 30, 130, 700])
 def test_the_page_is_no_larger_than_other_pictures_and_says_what_is_left_out(
     runner: ep.CompGraphRunner, count: int

@@ -91,6 +91,7 @@ def test_where_a_job_starts_stays_in_this_process(runner, crops, processes):
     assert jobs[0].start is not None
 
 
+@pytest.mark.slow
 def test_members_of_the_notebooks_enumerations_travel(processes, crops):
     made = cell(
         """
@@ -154,6 +155,7 @@ def test_no_function_of_the_notebook_is_ever_pickled(runner, crops, processes):
         Looking(io.BytesIO(sent)).load()
 
 
+@pytest.mark.slow
 def test_a_large_bundle_is_sent_to_whom_asks_for_it(processes):
     made = cell(
         "import numpy as np\nTABLE = np.arange(40_000.0)\n\ndef look_up(image):\n    return float(TABLE[image].sum())"
@@ -185,6 +187,7 @@ def test_a_graph_that_can_not_be_promoted_is_refused_with_the_reasons(crops, pro
     assert "A ThreadPoolExecutor runs it as it is." in refused.value.__notes__[0]
 
 
+@pytest.mark.slow
 def test_a_module_next_to_the_notebook_is_named_first_with_who_can_run_it(processes, tmp_path, monkeypatch):
     (tmp_path / "beside_the_notebook.py").write_text("def half(image):\n    return image // 2\n")
     monkeypatch.syspath_prepend(tmp_path)
@@ -207,6 +210,7 @@ def test_a_function_that_keeps_something_is_refused_and_told_to_be_run_without_a
     assert "keeps something from one item to the next, run it without an executor" in refused.value.__notes__[0]
 
 
+@pytest.mark.slow
 def test_a_kept_value_without_a_codec_is_refused_with_the_way_out(processes):
     made = cell("class Plain:\n    pass\n\ndef make(image):\n    return Plain()\n\ndef use(plain):\n    return 1")
     cg = ep.CompGraph({"make": made["make"], "use": made["use"]}, {"make": ("image", "plain"), "use": ("plain", "n")})
@@ -225,6 +229,7 @@ def have_no_place():
     tempfile.tempdir = "/nowhere"
 
 
+@pytest.mark.slow
 def test_a_worker_that_lacks_what_the_graph_imports_is_told_with_the_way_out(runner, crops):
     with (
         ProcessPoolExecutor(1, mp_context=spawn(), initializer=have_no_opencv) as pool,
@@ -236,6 +241,7 @@ def test_a_worker_that_lacks_what_the_graph_imports_is_told_with_the_way_out(run
     assert str(os.getpid()) not in str(told.value)
 
 
+@pytest.mark.slow
 def test_a_worker_that_can_not_unpack_the_bundle_is_told(runner, crops):
     with (
         ProcessPoolExecutor(1, mp_context=spawn(), initializer=have_no_place) as pool,
@@ -263,6 +269,7 @@ def mortal_runner():
     return ep.CompGraphRunner(cg, {"notebook": os.getpid()})
 
 
+@pytest.mark.slow
 def test_a_pool_whose_worker_dies_says_how_many_were_done_and_a_store_lets_it_go_on(tmp_path):
     runner, images = mortal_runner(), [np.full((2, 2), level) for level in (0, 1, 2, 3, 7, 4, 5)]
     store = tmp_path / "r.sqlite"
@@ -438,6 +445,7 @@ def test_workers_are_counted(processes):
     assert worker_count(Careful(processes)) == os.cpu_count()
 
 
+@pytest.mark.slow
 def test_the_threads_of_opencv_work_in_a_pool_that_forks(forked, crops):
     large = [cv2.resize(crop, (600, 600)) for crop in crops[:2]]
     cg = ep.CompGraph({"blur": cv2.medianBlur}, {"blur": (("image", "k"), "out")})

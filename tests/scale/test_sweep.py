@@ -73,6 +73,7 @@ def by_hand(image: Any, kernel: int, threshold: int) -> int:
 EXECUTORS = [None, 1, 4]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", EXECUTORS)
 @pytest.mark.parametrize("count", [None, 1, 3, 9])
 def test_what_does_not_depend_on_what_varies_runs_once_an_image(
@@ -249,6 +250,7 @@ def test_a_token_that_is_not_there_is_named(runner: ep.CompGraphRunner) -> None:
             ep.sweep(runner, {"threshold": [1]}, **{name: ["masc"]})
 
 
+@pytest.mark.slow
 def test_what_is_in_a_store_is_not_run_again(runner: ep.CompGraphRunner, calls: Calls, tmp_path: Path) -> None:
     place = str(tmp_path / "results.sqlite")
     first = ep.sweep(runner, {"threshold": [10, 13, 20], "kernel": [1, 2]}, store=place, name="tried")
@@ -267,6 +269,7 @@ def test_what_is_in_a_store_is_not_run_again(runner: ep.CompGraphRunner, calls: 
     assert calls.counts["load"] == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [None, 1, 5])
 def test_processes_give_the_same(processes: Any, crops: list[Any], count: int | None) -> None:
     runner = counting_runner()
@@ -285,6 +288,7 @@ def test_processes_give_the_same(processes: Any, crops: list[Any], count: int | 
     )
 
 
+@pytest.mark.slow
 def test_an_interrupted_sweep_goes_on_where_it_was(runner: ep.CompGraphRunner, calls: Calls, tmp_path: Path) -> None:
     place, mended = str(tmp_path / "results.sqlite"), threading.Event()
 

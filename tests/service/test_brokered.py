@@ -15,6 +15,8 @@ from epypes.transport.channels import memory, open_channel, place_of
 from epypes.wire import Envelope
 from tests.service.served import TIMEOUT_S, acting_bundle, event, until
 
+pytestmark = pytest.mark.slow
+
 _numbers = itertools.count(1)
 
 

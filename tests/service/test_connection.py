@@ -48,6 +48,7 @@ def test_where_nothing_answers_the_way_out_is_told():
         ep.connect("http://127.0.0.1:9")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("body", [b"<html>hello</html>", b"[]", b'{"name": "nginx"}'])
 def test_what_is_no_service_of_ours_is_said_to_be_none(body):
     class Other(http.server.BaseHTTPRequestHandler):
@@ -92,6 +93,7 @@ def test_looking_needs_no_token_and_changing_says_where_it_is(service, server):
     assert service.revision == 0
 
 
+@pytest.mark.slow
 def test_the_token_is_taken_from_the_address_the_environment_or_the_state_of_the_service(service, server, monkeypatch):
     with ep.connect(f"{server.url}/#token={server.token}") as connection:
         assert connection.set(canny_lo=60).revision == 1
@@ -108,6 +110,7 @@ def test_the_token_is_taken_from_the_address_the_environment_or_the_state_of_the
             assert connection.set(canny_lo=62).revision == 3
 
 
+@pytest.mark.slow
 def test_values_are_set_all_or_none_and_only_with_the_revision_that_was_seen(connection, service):
     seen = connection.parameters()
     assert connection.set(seen.revision, canny_lo=60, canny_hi=180).revision == 1
@@ -123,6 +126,7 @@ def test_values_are_set_all_or_none_and_only_with_the_revision_that_was_seen(con
     assert service.entries["canny_lo"]["value"] == 60
 
 
+@pytest.mark.slow
 def test_values_of_the_last_run_come_as_they_are(connection, service, photograph, straight_edges):
     with pytest.raises(NotComputed, match="No event has been completed yet"):
         connection.run()
@@ -135,6 +139,7 @@ def test_values_of_the_last_run_come_as_they_are(connection, service, photograph
     assert connection.preview("blur_kernel") == ("text/plain", b"11")
 
 
+@pytest.mark.slow
 def test_the_addresses_of_the_line_are_told(connection, service):
     assert (connection.addresses.sub, connection.addresses.pub) == ("tcp://127.0.0.1:1", "tcp://127.0.0.1:2")
     assert connection.addresses.failures == ""
@@ -150,6 +155,7 @@ def test_what_happens_is_told_as_it_happens(connection, service, photograph):
     events.close()
 
 
+@pytest.mark.slow
 def test_a_connection_shows_the_graph_it_has_seen_also_when_the_service_is_gone(service, photograph):
     service.event(image=photograph)
     with standing(service) as server:

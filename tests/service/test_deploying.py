@@ -17,6 +17,8 @@ from epypes.service.state import read_state
 from tests.service.processes import run_cli, running
 from tests.service.served import SOURCE, acting_bundle, serving, until
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def better(tmp_path):
@@ -48,7 +50,6 @@ def test_failures_of_a_bundle_that_was_deployed_are_found_by_its_path_and_by_the
         found_by(failures_of(better), "0" * 32)
 
 
-@pytest.mark.slow
 def test_values_that_were_written_back_are_those_of_the_bundle_that_is_served(own, better, caplog):
     caplog.set_level("INFO", "epypes.service")
     told = []
@@ -84,7 +85,6 @@ def test_values_that_were_written_back_are_those_of_the_bundle_that_is_served(ow
         assert any(line.startswith(begin) for line in lines), begin
 
 
-@pytest.mark.slow
 def test_the_state_file_has_the_digest_of_what_is_served(acting, better):
     with running(acting, "--http", "127.0.0.1:0"):
         state = read_state(acting)

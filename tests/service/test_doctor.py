@@ -12,6 +12,8 @@ from epypes.cli import main
 from epypes.service.doctor import examine
 from epypes.transport import make_keys
 
+pytestmark = pytest.mark.slow
+
 
 def found(name, **given):
     return next(check for check in examine(**given) if check.name == name)

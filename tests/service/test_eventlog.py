@@ -15,6 +15,8 @@ from tests.service.processes import running
 from tests.service.served import TIMEOUT_S, peer_at, peer_of, serving, until
 from tests.store.postgres import server
 
+pytestmark = pytest.mark.slow
+
 
 def rows_of(path):
     with Store(path) as store:
@@ -117,7 +119,6 @@ def test_a_service_with_a_store_that_can_never_be_is_not_started(acting):
         Service(acting, store="nosuch://host/db")
 
 
-@pytest.mark.slow
 def test_a_service_of_the_command_line_stores_its_events(acting, tmp_path):
     from epypes.service.state import read_state
 
@@ -133,7 +134,6 @@ def test_a_service_of_the_command_line_stores_its_events(acting, tmp_path):
     assert row["outcome"] == "answered"
 
 
-@pytest.mark.slow
 def test_a_server_that_dies_and_comes_back_has_all_rows_and_no_answer_waited(acting, caplog):
     with server() as own:
         url = own.url()

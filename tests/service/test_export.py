@@ -29,6 +29,7 @@ def command_of(unit):
     return next(line for line in unit.splitlines() if line.startswith("ExecStart="))
 
 
+@pytest.mark.slow
 def test_a_unit_starts_the_service_as_the_user_and_says_how_it_is_used(bundle):
     unit = systemd_unit(bundle, ["--sub", "tcp://127.0.0.1:5555"], user="vision")
     assert "User=vision" in unit
@@ -116,6 +117,7 @@ def run(*arguments):
     return ended.value.code or 0
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_unit_and_refuses_options_that_serve_does_not_take(bundle, tmp_path, capsys):
     assert run("export", "systemd", bundle, "--user", "vision", "--", "--sub", "tcp://127.0.0.1:5555") == 0
     assert "--sub tcp://127.0.0.1:5555" in capsys.readouterr().out

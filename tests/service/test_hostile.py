@@ -107,6 +107,7 @@ def test_of_10000_messages_that_nobody_should_send_each_is_counted_and_the_good_
     assert counts["failed"] > MUTANTS / 3
 
 
+@pytest.mark.slow
 def test_a_message_beyond_the_limits_is_refused_before_it_is_kept_and_the_next_is_answered(edge_bundle, photograph):
     with serving(edge_bundle.path) as (service, peer, answers):
         peer.send_multipart([b"/", *[b""] * 5_000])

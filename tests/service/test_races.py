@@ -13,6 +13,8 @@ from epypes.service import asks, supervisor, tuning
 from tests.service.bundles import written_bundle
 from tests.service.served import SOURCE, TIMEOUT_S, acting_bundle, serving, until
 
+pytestmark = pytest.mark.slow
+
 TABLE = '''
     """A function with a table among its hyperparameters."""
 
@@ -43,7 +45,6 @@ def test_a_large_table_does_not_keep_a_new_worker_from_taking_the_parameters(tmp
         assert (answer.parts["out"], answer.revision) == (50, 1)
 
 
-@pytest.mark.slow
 def test_a_worker_that_refuses_the_parameters_of_the_last_one_is_not_used(tmp_path):
     once = tmp_path / "once"
     source = (

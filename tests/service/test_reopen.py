@@ -32,6 +32,7 @@ def bright_bundle(tmp_path_factory):
     return promoted(tmp_path_factory.mktemp("bundles"))
 
 
+@pytest.mark.slow
 def test_a_failure_opens_stopped_at_the_function_that_failed_and_goes_on_from_there(bright_bundle):
     failure = keep(bright_bundle, request(RAISES))
     runner = ep.load_failure(failure, bright_bundle)
@@ -71,6 +72,7 @@ def test_a_function_that_kills_or_hangs_is_not_called_in_the_notebook(bright_bun
     assert runner.rerun(by=40)["halved"].max() == (46 if kind == "killed" else 48) // 2
 
 
+@pytest.mark.slow
 def test_where_a_worker_was_killed_is_found_out_in_a_process_of_its_own(bright_bundle):
     failure = keep(bright_bundle, request(KILLS), kind="killed", function="", exception="SIGKILL", message="")
     runner = ep.load_failure(failure, bright_bundle)
@@ -78,6 +80,7 @@ def test_where_a_worker_was_killed_is_found_out_in_a_process_of_its_own(bright_b
     assert "checked" not in runner
 
 
+@pytest.mark.slow
 def test_a_worker_that_was_killed_by_somebody_else_leaves_a_runner_with_the_payload(bright_bundle):
     failure = keep(bright_bundle, request(FINE), kind="killed", function="", exception="SIGKILL", message="")
     with pytest.warns(UserWarning, match="not known in which function, so none was run"):
@@ -185,6 +188,7 @@ ENDINGS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("value", "ending", "exception", "message"), ENDINGS)
 def test_an_event_that_is_run_again_fails_is_fine_kills_or_hangs_and_the_caller_lives(
     bright_bundle, value, ending, exception, message
@@ -205,6 +209,7 @@ def test_an_event_that_is_run_again_fails_is_fine_kills_or_hangs_and_the_caller_
         )
 
 
+@pytest.mark.slow
 def test_a_bundle_whose_module_fails_is_no_reproduction(copy):
     with (copy / "pipeline.py").open("a") as file:
         file.write("\nraise RuntimeError('no')\n")
@@ -218,6 +223,7 @@ def byte_bundle(tmp_path_factory):
     return promoted(tmp_path_factory.mktemp("bundles"), with_f_in=True)
 
 
+@pytest.mark.slow
 def test_the_bundles_own_f_in_makes_the_payload_of_a_message_of_2019(byte_bundle):
     failure = keep(byte_bundle, picture(RAISES).tobytes())
     assert ep.load_failure(failure, byte_bundle)["bright"].max() == 95
@@ -225,6 +231,7 @@ def test_the_bundles_own_f_in_makes_the_payload_of_a_message_of_2019(byte_bundle
     assert (found.ending, found.function) == ("failed", "check")
 
 
+@pytest.mark.slow
 def test_an_f_in_that_hangs_is_not_called_in_the_notebook(byte_bundle):
     found = reproduce(FailureRecord(), b"hangs", byte_bundle, timeout_s=0.5)
     assert (found.ending, found.function) == ("stuck", "f_in")
@@ -242,6 +249,7 @@ def test_hyperparameters_that_the_bundle_has_no_more_are_said_to_be_gone(bright_
     assert dict(runner.hyperparameters) == {"by": 1, "most": 50}
 
 
+@pytest.mark.slow
 def test_a_failure_is_opened_from_a_running_service_by_its_url_or_connection(bright_bundle):
     requests = queue.SimpleQueue()
     with (

@@ -25,6 +25,8 @@ from tests.service.bundles import written_bundle
 from tests.service.processes import run_cli, running
 from tests.service.served import TIMEOUT_S, peer_of, serving, until
 
+pytestmark = pytest.mark.slow
+
 ANY = "tcp://127.0.0.1:*"
 
 IMAGES = '''
@@ -101,7 +103,6 @@ def local():
         lock.__exit__(None, None, None)
 
 
-@pytest.mark.slow
 def test_a_service_in_another_process_answers_with_what_the_notebook_computed(edge_bundle, photograph):
     expected = cv2.Canny(cv2.medianBlur(photograph, 5), 70, 200)
     with running(edge_bundle.path) as process:
@@ -162,7 +163,6 @@ def test_garbage_on_the_input_socket_is_counted_and_the_service_goes_on(edge_bun
         assert counts["answered"] == 1
 
 
-@pytest.mark.slow
 def test_a_port_in_use_is_named_and_nothing_is_left_behind(edge_bundle):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -177,7 +177,6 @@ def test_a_port_in_use_is_named_and_nothing_is_left_behind(edge_bundle):
         assert f"tcp://127.0.0.1:{port}" in process.ready
 
 
-@pytest.mark.slow
 def test_a_bundle_is_served_once(edge_bundle):
     with running(edge_bundle.path) as process:
         done = run_cli("serve", edge_bundle.path)
@@ -185,7 +184,6 @@ def test_a_bundle_is_served_once(edge_bundle):
         assert f"is being served already, by process {process.pid} at tcp://127.0.0.1:" in done.stderr
 
 
-@pytest.mark.slow
 def test_a_killed_service_is_not_taken_for_a_running_one(edge_bundle, photograph):
     with running(edge_bundle.path) as process:
         process.kill()
@@ -197,7 +195,6 @@ def test_a_killed_service_is_not_taken_for_a_running_one(edge_bundle, photograph
         assert call(edge_bundle.path, {"image": photograph}, timeout_s=TIMEOUT_S).tokens["edges"].any()
 
 
-@pytest.mark.slow
 def test_a_service_that_is_killed_while_it_works_is_told_to_the_caller(edge_bundle, photograph):
     with running(edge_bundle.path) as process, Client(edge_bundle.path, timeout_s=TIMEOUT_S) as client:
         client.call({"image": photograph})
@@ -207,7 +204,6 @@ def test_a_service_that_is_killed_while_it_works_is_told_to_the_caller(edge_bund
             client.call({"image": photograph})
 
 
-@pytest.mark.slow
 def test_a_stopped_service_makes_the_call_time_out(edge_bundle, photograph):
     with running(edge_bundle.path) as process, Client(edge_bundle.path, timeout_s=1.0) as client:
         client.call({"image": photograph})
@@ -219,7 +215,6 @@ def test_a_stopped_service_makes_the_call_time_out(edge_bundle, photograph):
             process.send_signal(signal.SIGCONT)
 
 
-@pytest.mark.slow
 def test_a_changed_bundle_is_not_served(edge_bundle, tmp_path):
     copy = tmp_path / "edges"
     shutil.copytree(edge_bundle.path, copy)

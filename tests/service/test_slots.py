@@ -11,6 +11,8 @@ from epypes.wire import Envelope, JustBytes
 from tests.service.bundles import written_bundle
 from tests.service.workers import ready_worker
 
+pytestmark = pytest.mark.slow
+
 OWN_PIPELINE = """
     import epypes as ep
     from epypes.wire import Envelope, JustBytes, parsed
@@ -312,7 +314,6 @@ def rss(process):
     return process.memory_info().rss
 
 
-@pytest.mark.slow
 def test_two_thousand_events_leave_nothing_behind(inverting, tmp_path):
     image, bad = np.full((500, 500), 14, np.uint8), np.full((500, 500), 13, np.uint8)
     with ready_worker(inverting, tmp_path) as front:
@@ -333,7 +334,6 @@ def test_two_thousand_events_leave_nothing_behind(inverting, tmp_path):
         assert process.num_fds() == files
 
 
-@pytest.mark.slow
 def test_a_worker_keeps_no_more_of_large_events_than_the_last_run_of_each_slot(inverting, tmp_path):
     with ready_worker(inverting, tmp_path) as front:
         process = psutil.Process(front.process.pid)
@@ -349,7 +349,6 @@ def test_a_worker_keeps_no_more_of_large_events_than_the_last_run_of_each_slot(i
         assert largest - rss(process) > 30_000_000
 
 
-@pytest.mark.slow
 def test_a_page_that_asks_all_the_time_has_each_picture_made_once_per_run(inverting, tmp_path):
     with ready_worker(inverting, tmp_path) as front:
         front.run(image=np.full((2000, 2000), 14, np.uint8))

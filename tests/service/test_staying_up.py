@@ -24,6 +24,8 @@ from epypes.service.packing import unpack
 from epypes.wire import decode
 from tests.service.served import SOURCE, TIMEOUT_S, acting_bundle, check_counts, peer_of, serving, until
 
+pytestmark = pytest.mark.slow
+
 
 def started(folder):
     until((folder / "started").exists)
@@ -66,7 +68,6 @@ def test_a_frame_that_kills_the_worker_is_put_aside_and_the_others_are_answered_
         assert service.info()["restarts"] == 2
 
 
-@pytest.mark.slow
 def test_a_worker_killed_from_outside_costs_no_event(acting):
     with serving(acting, mailbox_size=400) as (service, peer):
         for number in range(300):
@@ -82,7 +83,6 @@ def test_a_worker_killed_from_outside_costs_no_event(acting):
         assert service.info()["restarts"] == 3
 
 
-@pytest.mark.slow
 def test_with_three_slots_only_the_culprit_is_put_aside(acting):
     with serving(acting, threads=3, mailbox_size=100, retries=0) as (service, peer):
         for number in range(30):
@@ -93,7 +93,6 @@ def test_with_three_slots_only_the_culprit_is_put_aside(acting):
         assert service.counts()["dead_letters"] == 1
 
 
-@pytest.mark.slow
 def test_frames_that_kill_the_worker_one_after_another_are_put_aside_and_the_service_stays_up(acting):
     with serving(acting, mailbox_size=100, retries=0) as (service, peer):
         for number in range(7):
@@ -105,7 +104,6 @@ def test_frames_that_kill_the_worker_one_after_another_are_put_aside_and_the_ser
         assert service.counts()["dead_letters"] == 7
 
 
-@pytest.mark.slow
 def test_events_that_do_not_return_one_after_another_are_reported_and_the_service_stays_up(acting):
     with serving(acting, mailbox_size=100, job_timeout_s=0.1) as (service, peer):
         for number in range(6):
@@ -173,7 +171,6 @@ def test_a_function_that_does_not_return_is_named_and_the_worker_is_replaced(act
         assert not psutil.pid_exists(first)
 
 
-@pytest.mark.slow
 def test_a_worker_that_was_stopped_is_replaced(acting):
     with serving(acting, job_timeout_s=0.3) as (service, peer):
         os.kill(service.info()["worker_pid"], signal.SIGSTOP)
@@ -182,7 +179,6 @@ def test_a_worker_that_was_stopped_is_replaced(acting):
         assert peer.ask(number=3).parts["out"] == 6
 
 
-@pytest.mark.slow
 def test_what_runs_beside_a_stuck_event_is_tried_again(acting, tmp_path):
     with serving(acting, threads=2, job_timeout_s=0.5) as (service, peer):
         peer.send(f"hold:{tmp_path}", 1)
@@ -198,7 +194,6 @@ def test_what_runs_beside_a_stuck_event_is_tried_again(acting, tmp_path):
         assert service.counts()["retried"] == 1
 
 
-@pytest.mark.slow
 def test_an_event_that_waits_in_the_worker_for_a_change_has_its_time_from_when_it_is_begun(acting, tmp_path):
     with serving(acting, threads=2, job_timeout_s=1.0) as (service, peer):
         peer.send("sleep:0.8", 1)

@@ -24,6 +24,8 @@ from epypes.wire import Envelope, decode, encode
 from tests.service.bundles import written_bundle
 from tests.service.workers import TIMEOUT_S, ready_worker, worker_of
 
+pytestmark = pytest.mark.slow
+
 # What its function does is told by the event.
 SOURCE = '''
     """A graph whose functions do what they are told."""
@@ -531,7 +533,6 @@ def test_what_runs_is_told_while_a_function_computes(own):
         assert front.ask("running")[0]["running"] == []
 
 
-@pytest.mark.slow
 def test_too_many_questions_are_refused_and_none_is_left_without_answer(own):
     with own() as front:
         front.run(what="zeros")
@@ -644,7 +645,6 @@ def test_a_worker_that_is_told_what_it_does_not_know_ends_with_2(own, header):
         assert front.process.wait(TIMEOUT_S) == 2
 
 
-@pytest.mark.slow
 def test_a_worker_that_waits_costs_nothing(own):
     with own("--threads", "3") as front:
         front.run(what="a")

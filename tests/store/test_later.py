@@ -54,6 +54,7 @@ def test_what_can_not_be_written_at_all_holds_nothing_else_up(store, caplog):
     assert "Row '4' of events 'edges' can't be stored" in caplog.text
 
 
+@pytest.mark.slow
 def test_who_hands_over_rows_waits_for_nobody_and_what_does_not_fit_is_counted(tmp_path, monkeypatch):
     path = tmp_path / "results.sqlite"
     with Store(path) as store:
@@ -74,6 +75,7 @@ def test_who_hands_over_rows_waits_for_nobody_and_what_does_not_fit_is_counted(t
         assert sorted(row["n"] for row in series.rows()) == list(range(50))
 
 
+@pytest.mark.slow
 def test_rows_wait_for_a_server_that_is_away_which_is_told_once(caplog):
     caplog.set_level(logging.INFO, "epypes.store")
     with server() as own:

@@ -38,6 +38,7 @@ def alike(one, other):
     return repr(one) == repr(other)
 
 
+@pytest.mark.slow
 def test_a_row_comes_back_as_it_was(place):
     with Store(place) as store:
         store.series("map", "edges").append("odd", ODD)
@@ -114,6 +115,7 @@ def test_keys_that_are_no_texts_are_refused_before_one_takes_the_place_of_anothe
     assert len(series) == 0
 
 
+@pytest.mark.slow
 def test_a_row_of_many_megabytes_comes_back(store):
     series = store.series("map", "large")
     series.append("large", {"text": "é" * 5_000_000})
@@ -132,6 +134,7 @@ def test_a_key_is_there_once_and_the_last_one_stays_in_its_place(store):
     assert series.get("z") is None
 
 
+@pytest.mark.slow
 def test_rows_are_read_page_by_page_in_the_order_of_writing(store):
     series = store.series("map", "long")
     series.append_all((f"{number}", {"n": number}) for number in range(1_203))
@@ -201,6 +204,7 @@ with Store(place) as store:
 """
 
 
+@pytest.mark.slow
 def test_processes_write_to_a_new_database_at_once_and_nothing_is_lost_or_twice(place):
     # Started before there is a database: they make its tables all at once.
     told = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE}
@@ -217,6 +221,7 @@ def test_processes_write_to_a_new_database_at_once_and_nothing_is_lost_or_twice(
     assert len(found) == len(set(found)) == 850
 
 
+@pytest.mark.slow
 def test_threads_write_and_read_through_one_store(store):
     series = store.series("map", "edges")
 

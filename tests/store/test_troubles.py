@@ -48,6 +48,7 @@ def test_what_is_no_file_is_refused_before_it_is_opened(tmp_path):
         assert "is no file but a device or a pipe. Name a file" in refused(place)
 
 
+@pytest.mark.slow
 def test_a_store_that_was_closed_is_neither_read_nor_written(place):
     with Store(place) as store:
         series = store.series("map", "edges")
@@ -137,6 +138,7 @@ with Store(sys.argv[1]) as store:
 """
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_told_and_nothing_is_half_written(tmp_path):
     path = tmp_path / "results.sqlite"
     done = subprocess.run([sys.executable, "-c", _WITHOUT_ROOM, path], capture_output=True, text=True, timeout=60)
@@ -161,6 +163,7 @@ except StoreError as error:
 """
 
 
+@pytest.mark.slow
 def test_a_file_that_may_not_be_written_is_told(tmp_path_factory):
     import tempfile
     from pathlib import Path
@@ -180,6 +183,7 @@ def test_a_file_that_may_not_be_written_is_told(tmp_path_factory):
     assert "Check who may" in done.stdout
 
 
+@pytest.mark.slow
 def test_a_file_that_another_process_holds_is_waited_for_and_then_told(tmp_path, monkeypatch):
     monkeypatch.setattr("epypes.store.place._BUSY_S", 0.2)
     path = tmp_path / "results.sqlite"
@@ -235,6 +239,7 @@ def test_who_is_not_let_in_is_told_and_the_password_is_nowhere(postgres):
     assert "is not there" in refused(postgres.url().replace("/postgres?", "/nosuch?"))
 
 
+@pytest.mark.slow
 def test_a_server_that_dies_is_told_and_after_a_restart_the_same_store_works_again():
     with server() as own, Store(own.url()) as store:
         series = store.series("map", "edges")

@@ -134,6 +134,7 @@ def test_nothing_is_received_where_nothing_was_sent(opened):
     assert opened().receive(0) is None
 
 
+@pytest.mark.slow
 def test_each_message_of_a_queue_goes_to_one_receiver(opened):
     sender, first, second = opened(), opened(prefetch=3), opened(prefetch=100)
     for number in range(10):
@@ -234,6 +235,7 @@ def test_dead_letters_go_where_they_are_asked_for(opened, name):
     assert opened(f"{name}.aside").receive(WAIT_S).headers["epypes-reason"] == "no"
 
 
+@pytest.mark.slow
 def test_the_first_word_on_a_message_counts(opened, name):
     channel = opened()
     channel.send([b"x"])
@@ -273,6 +275,7 @@ def test_a_subscriber_that_may_not_receive_fails_at_its_start(opened, broker, na
     assert not subscriber.is_connected
 
 
+@pytest.mark.slow
 def test_what_is_sent_again_with_its_id_is_kept_once(opened):
     channel = opened()
     for _ in range(2):
@@ -323,6 +326,7 @@ def test_dead_letters_that_no_stream_keeps_are_an_error(opened, broker, name):
         opened(create=False)
 
 
+@pytest.mark.slow
 def test_a_server_without_jetstream_is_an_error_for_queues_alone(opened):
     with server(jetstream=False) as plain:
         with pytest.raises(BrokerError, match=r"JetStream is off there.*nats-server -js"):
@@ -337,6 +341,7 @@ def test_nobody_at_the_port_is_an_error():
         open_channel(f"nats://127.0.0.1:{port}/a", timeout_s=WAIT_S)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("greeting", "text"),
     [(b"HTTP/1.1 400 Bad Request\r\n\r\n", "is no NATS server"), (b"", "no NATS server has answered within 0.5 s")],
@@ -393,6 +398,7 @@ def test_a_broadcast_goes_to_all_who_listen_and_is_not_kept(opened):
         assert listener.receive(0) is None
 
 
+@pytest.mark.slow
 def test_every_receiver_of_a_log_gets_all_of_it_in_one_order(opened):
     first, second = opened(kind="log"), opened(kind="log")
     for number in range(600):
@@ -403,6 +409,7 @@ def test_every_receiver_of_a_log_gets_all_of_it_in_one_order(opened):
         assert channel.receive(0) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["send", "receive"])
 def test_a_server_that_is_killed_is_an_error_at_once_and_keeps_what_it_confirmed(opened, mortal, method):
     channel = opened("a", at=mortal)
@@ -458,6 +465,7 @@ def test_a_stream_that_is_deleted_meanwhile_is_an_error(opened, broker, name):
         sender.send([b"x"])
 
 
+@pytest.mark.slow
 def test_who_waits_for_a_message_hears_that_the_channel_was_closed(opened):
     channel = opened()
     threading.Timer(0.2, channel.close).start()
@@ -477,6 +485,7 @@ def test_a_closed_channel_leaves_no_thread(opened, name):
     assert not [thread for thread in threading.enumerate() if name in thread.name]
 
 
+@pytest.mark.slow
 def test_the_library_prints_and_logs_nothing(mortal):
     code = f"""
 import threading
@@ -540,6 +549,7 @@ def certificate(tmp_path_factory):
     return folder / "cert.pem", folder / "key.pem"
 
 
+@pytest.mark.slow
 def test_an_encrypted_server_is_checked_by_the_named_certificates(opened, certificate):
     with server(tls=certificate) as encrypted:
         channel = opened("a", at=encrypted, ca=certificate[0])

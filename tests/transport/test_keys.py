@@ -48,6 +48,7 @@ def test_a_subscriber_that_binds_hears_only_known_keys(tmp_path):
         assert into.empty()
 
 
+@pytest.mark.slow
 def test_a_peer_without_keys_and_one_that_takes_another_for_the_server_get_nothing(tmp_path):
     robot, known = make_keys(tmp_path / "robot"), make_keys(tmp_path / "known")
     out, nothing = queue.SimpleQueue(), queue.SimpleQueue()

@@ -40,6 +40,7 @@ def test_stop_works_before_start_and_twice_and_start_works_again(make):
     assert io_threads() == []
 
 
+@pytest.mark.slow
 def test_the_same_port_can_be_bound_at_once_after_a_stop():
     with ZMQPublisher(LOCAL, queue.Queue()) as pub:
         address = pub.address
@@ -48,6 +49,7 @@ def test_the_same_port_can_be_bound_at_once_after_a_stop():
             assert made.address == address
 
 
+@pytest.mark.slow
 def test_a_stop_takes_less_than_50_ms():
     durations = []
     for _ in range(10):
@@ -183,6 +185,7 @@ def test_stop_works_from_many_threads_at_once():
     assert io_threads() == []
 
 
+@pytest.mark.slow
 def test_a_queue_that_never_returns_is_named_and_the_port_is_free():
     let_go = threading.Event()
 
@@ -241,6 +244,7 @@ def test_commands_return_results_and_exceptions_to_the_thread_that_asked():
         io.call(lambda _: None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [ZMQPublisher, ZMQSubscriber])
 def test_one_that_is_forgotten_gives_a_warning_and_is_closed(make):
     made = make(LOCAL, queue.Queue(), bind=True).start()
@@ -270,6 +274,7 @@ assert sub.wait_joined(5)
 """
 
 
+@pytest.mark.slow
 def test_a_script_that_stops_nothing_ends_promptly_with_a_warning():
     before = time.perf_counter()
     done = run(START_BOTH, "-W", "always::ResourceWarning")
@@ -294,6 +299,7 @@ def test_an_idle_publisher_and_subscriber_take_less_than_1_percent_of_a_cpu():
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_a_forked_child_starts_an_io_thread_of_its_own():
     script = (
         START_BOTH

@@ -60,6 +60,7 @@ def test_what_was_put_before_the_start_comes_first_and_after_the_stop_it_is_kept
         assert again.sent == 1
 
 
+@pytest.mark.slow
 def test_many_threads_put_and_every_message_arrives_whole_and_in_the_order_of_its_thread():
     out, into = Mailbox("block", 1), queue.SimpleQueue()
     with ZMQPublisher(LOCAL, out, high_water_mark=10_000) as pub, ZMQSubscriber(pub.address, into) as sub:

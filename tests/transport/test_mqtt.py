@@ -19,6 +19,8 @@ from epypes.transport.channels import open_channel, place_of
 from tests.brokers import mosquitto as servers
 from tests.transport.peers import line_of, process, wait_until
 
+pytestmark = pytest.mark.slow
+
 WAIT_S = 10.0
 
 # Receives until it has COUNT, acknowledges none, prints how many it has, and waits.
@@ -299,7 +301,6 @@ def test_an_address_elsewhere_without_encryption_is_warned_of_once(caplog):
     assert "secret" not in caplog.text
 
 
-@pytest.mark.slow
 def test_an_idle_connection_stays_and_a_silent_broker_is_noticed(name):
     with servers.server() as server:
         address = server.address(name, create=True)

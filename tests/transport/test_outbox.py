@@ -113,6 +113,7 @@ class _Watched:
         self._lock.release()
 
 
+@pytest.mark.slow
 def test_what_the_outboxs_own_thread_has_meant_to_send_is_not_sent_again(address, monkeypatch):
     outbox = Outbox(place_of(address))
     outbox._turn = turn = _Watched()

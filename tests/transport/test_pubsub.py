@@ -30,6 +30,7 @@ def test_an_envelope_with_an_image_arrives_as_it_was():
     assert 0 < envelope.epoch < envelope.published_ns
 
 
+@pytest.mark.slow
 def test_fifty_starts_lose_no_first_messages_once_they_have_joined():
     for _ in range(50):
         out, into = queue.Queue(), queue.Queue()

@@ -99,6 +99,7 @@ FRAMES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frames", FRAMES.values(), ids=FRAMES)
 def test_what_is_sent_is_received(queue, opened, frames):
     sender, receiver = opened(queue), opened(queue)
@@ -142,6 +143,7 @@ def test_what_would_not_arrive_as_it_is_can_not_be_sent_and_the_next_goes_out(qu
     assert len(next_of(receiver).frames) == 1_026
 
 
+@pytest.mark.slow
 def test_whatever_the_reason_says_what_is_rejected_is_put_aside(queue, opened, name):
     opened(queue).send([b"a"])
     receiver = opened(queue)
@@ -151,6 +153,7 @@ def test_whatever_the_reason_says_what_is_rejected_is_put_aside(queue, opened, n
     assert receiver.receive(ABSENT_S) is None
 
 
+@pytest.mark.slow
 def test_a_message_without_id_and_headers_has_none(queue, opened):
     opened(queue).send([b"a"])
     received = next_of(opened(queue))
@@ -158,6 +161,7 @@ def test_a_message_without_id_and_headers_has_none(queue, opened):
     assert not received.headers
 
 
+@pytest.mark.slow
 def test_what_was_sent_before_anybody_listened_is_received_in_order(queue, opened):
     sender = opened(queue)
     for number in range(50):
@@ -171,6 +175,7 @@ def test_what_was_sent_before_anybody_listened_is_received_in_order(queue, opene
     assert came == list(range(50))
 
 
+@pytest.mark.slow
 def test_an_acknowledgement_is_final(queue, opened):
     opened(queue).send([b"a"])
     receiver = opened(queue)
@@ -190,6 +195,7 @@ def counted(peer, attempt):
     return 0 if peer.name == "mosquitto" else attempt
 
 
+@pytest.mark.slow
 def test_what_was_not_acknowledged_comes_again_to_another_and_is_counted(peer, queue, opened):
     opened(queue).send([b"a", b""], id="x", headers={"k": "v"})
     for attempt in (1, 2, 3):
@@ -200,6 +206,7 @@ def test_what_was_not_acknowledged_comes_again_to_another_and_is_counted(peer, q
         receiver.close()
 
 
+@pytest.mark.slow
 def test_what_was_received_and_never_read_comes_to_another(queue, opened):
     first = opened(queue, prefetch=10)
     assert first.receive(0.0) is None
@@ -212,6 +219,7 @@ def test_what_was_received_and_never_read_comes_to_another(queue, opened):
     assert sorted(came) == [[b"%d" % number] for number in range(10)]
 
 
+@pytest.mark.slow
 def test_what_is_rejected_is_put_aside_with_its_reason(peer, queue, opened, name):
     opened(queue).send([b"a", b"b"], id="x", headers={"k": "v"})
     receiver = opened(queue)
@@ -226,6 +234,7 @@ def test_what_is_rejected_is_put_aside_with_its_reason(peer, queue, opened, name
     assert opened(queue).receive(ABSENT_S) is None
 
 
+@pytest.mark.slow
 def test_no_more_come_than_asked_for_until_one_is_settled(queue, opened):
     sender, receiver = opened(queue), opened(queue, prefetch=3)
     for number in range(6):
@@ -239,6 +248,7 @@ def test_no_more_come_than_asked_for_until_one_is_settled(queue, opened):
     next_of(receiver)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("peer", ["within", "rabbitmq", "nats"], indirect=True)
 def test_more_may_be_in_hand_for_a_while(queue, opened):
     sender, receiver = opened(queue), opened(queue, prefetch=2)
@@ -258,6 +268,7 @@ def test_more_may_be_in_hand_for_a_while(queue, opened):
     assert sorted(number for received in held for number in bodies(received)) == [b"%d" % n for n in range(7)]
 
 
+@pytest.mark.slow
 def test_receivers_of_a_queue_share_it(queue, opened):
     sender, receivers = opened(queue), [opened(queue, prefetch=4) for _ in range(3)]
     for receiver in receivers:
@@ -278,6 +289,7 @@ def test_receivers_of_a_queue_share_it(queue, opened):
     assert all(share)
 
 
+@pytest.mark.slow
 def test_a_message_is_settled_from_any_thread(queue, opened):
     sender, receiver = opened(queue), opened(queue, prefetch=20)
     for _ in range(20):
@@ -292,6 +304,7 @@ def test_a_message_is_settled_from_any_thread(queue, opened):
     assert opened(queue).receive(ABSENT_S) is None
 
 
+@pytest.mark.slow
 def test_a_broadcast_reaches_all_who_listen_and_is_not_kept(peer, name, opened):
     address = peer.address(name, kind="broadcast", create=True)
     sender, listeners = opened(address), [opened(address) for _ in range(3)]
@@ -376,6 +389,7 @@ def test_a_broker_that_is_not_there_is_an_error(server, name):
     assert monotonic() - began_s < WAIT_S
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("says", [b"", b"HTTP/1.1 400 Bad Request\r\n\r\n", bytes(1000), b"\xff" * 1000])
 def test_a_port_of_another_program_is_an_error(server, name, says):
     scheme = place_of(server.address(name)).scheme
@@ -398,6 +412,7 @@ def test_a_port_of_another_program_is_an_error(server, name, says):
         assert not talking.is_alive()
 
 
+@pytest.mark.slow
 def test_what_is_larger_than_the_broker_takes_is_an_error_and_the_next_goes_out(server, queue_of, opened):
     address = queue_of(server)
     sender = opened(address)
@@ -482,6 +497,7 @@ def test_who_waits_in_receive_is_told_of_a_close(queue, opened):
         receiver.send([b"a"])
 
 
+@pytest.mark.slow
 def test_closed_channels_leave_no_thread_behind(queue):
     def use():
         channel = open_channel(queue, timeout_s=WAIT_S)

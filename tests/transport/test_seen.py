@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import tracemalloc
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -54,6 +55,7 @@ def test_long_ids_are_told_apart_and_take_no_more_memory_than_short_ones():
         tracemalloc.stop()
 
 
+@pytest.mark.slow
 def test_what_nobody_knows_any_more_is_not_in_hand():
     seen, thing = Seen(), Thing()
     seen.arrive("a", thing)

@@ -132,6 +132,7 @@ def test_a_caller_does_not_wait_for_ever_for_a_server_that_was_killed_and_is_ser
             assert answer == b"2"
 
 
+@pytest.mark.slow
 def test_an_output_buffer_that_is_used_again_at_once_does_not_tear_a_thousand_frames():
     buffer, out, into = np.zeros((300, 400), np.uint8), Mailbox(), queue.SimpleQueue()
     with (

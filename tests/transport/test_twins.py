@@ -121,6 +121,7 @@ def stalls(caplog):
     return [message for message in caplog.messages if "sends nothing more" in message]
 
 
+@pytest.mark.slow
 def test_who_acknowledges_nothing_is_told_once_why_nothing_more_comes(address, send, caplog, monkeypatch):
     monkeypatch.setattr(inhand, "LONG_S", 0.2)
     q = queue.SimpleQueue()
@@ -138,6 +139,7 @@ def test_who_acknowledges_nothing_is_told_once_why_nothing_more_comes(address, s
     assert "ack()" in told
 
 
+@pytest.mark.slow
 def test_what_is_in_hand_is_counted_anew_over_a_new_connection(address, broker, send, caplog, monkeypatch):
     monkeypatch.setattr(inhand, "LONG_S", 3600.0)
     q = queue.SimpleQueue()
@@ -156,6 +158,7 @@ def test_what_is_in_hand_is_counted_anew_over_a_new_connection(address, broker, 
     assert left(address) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options", [{"acknowledge": "received", "prefetch": 2}, {"prefetch": 4}, {"prefetch": 3, "exhausted": print}]
 )
@@ -286,6 +289,7 @@ def test_what_others_have_answered_is_a_duplicate_when_it_comes(address, send):
     assert left(address) == ["b"]
 
 
+@pytest.mark.slow
 def test_what_was_given_back_or_thrown_away_is_put_again_when_it_comes_again(broker, address, send):
     q = queue.Queue()
     send(id="a")
@@ -303,6 +307,7 @@ def test_what_was_given_back_or_thrown_away_is_put_again_when_it_comes_again(bro
 # Too often
 
 
+@pytest.mark.slow
 def test_what_nobody_could_answer_in_so_many_deliveries_is_a_dead_letter(broker, send, caplog):
     address, q = f"memory://{broker}/events?create=true&attempts=2", queue.Queue()
     send(id="a")
@@ -318,6 +323,7 @@ def test_what_nobody_could_answer_in_so_many_deliveries_is_a_dead_letter(broker,
         assert part in told
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("raises", [False, True])
 def test_who_wants_to_hear_of_what_was_delivered_too_often_rejects_it_himself(broker, send, raises, caplog):
     address, q, heard = f"memory://{broker}/events?create=true&attempts=1", queue.Queue(), queue.Queue()
@@ -343,6 +349,7 @@ def test_who_wants_to_hear_of_what_was_delivered_too_often_rejects_it_himself(br
 # A broker that goes away
 
 
+@pytest.mark.slow
 def test_a_subscriber_is_there_again_when_the_broker_is_and_what_is_in_hand_is_not_put_again(
     broker, address, send, caplog
 ):
@@ -366,6 +373,7 @@ def test_a_subscriber_is_there_again_when_the_broker_is_and_what_is_in_hand_is_n
     assert caplog.text.count("tried again until it is there") == 1
 
 
+@pytest.mark.slow
 def test_what_was_rejected_while_the_broker_was_away_is_a_dead_letter_all_the_same(broker, address, send):
     q = queue.Queue()
     with ep.Subscriber(address, q) as sub:
@@ -401,6 +409,7 @@ def test_a_broker_that_hangs_up_each_time_is_asked_less_and_less_often(address):
     assert pauses == [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0]
 
 
+@pytest.mark.slow
 def test_a_publisher_sends_what_it_has_when_the_broker_is_there_again(broker, address):
     out = queue.Queue()
     with ep.Publisher(address, out) as pub:
@@ -416,6 +425,7 @@ def test_a_publisher_sends_what_it_has_when_the_broker_is_there_again(broker, ad
     assert left(address) == list("abcd")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [ep.Publisher, ep.Subscriber])
 def test_a_twin_that_has_nothing_to_do_knows_that_the_broker_is_away_and_is_back(make, broker, address):
     twin, told = make(address, queue.Queue()), []
@@ -448,6 +458,7 @@ def test_a_put_into_a_mailbox_returns_when_the_broker_has_confirmed(broker, addr
         assert (putting.is_alive(), pub.sent) == (False, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [lambda: ep.Mailbox("block", 8), queue.Queue])
 def test_a_publisher_that_is_stopped_while_the_broker_is_away_says_what_it_has_not_sent(broker, address, make):
     out, raised = make(), []
@@ -504,6 +515,7 @@ def test_what_the_broker_will_never_take_is_told_and_the_next_one_is_sent(addres
         assert (pub.sent, pub.rejected, pub.reconnects) == (1, {"too large": 1}, 0)
 
 
+@pytest.mark.slow
 def test_a_message_that_no_channel_can_send_does_not_keep_the_others(address, monkeypatch):
     out = queue.Queue()
     with ep.Publisher(address, out) as pub:
@@ -521,6 +533,7 @@ def test_a_message_that_no_channel_can_send_does_not_keep_the_others(address, mo
         assert pub.rejected == {"TypeError": 1}
 
 
+@pytest.mark.slow
 def test_who_puts_while_a_publisher_starts_waits_for_the_confirmation(broker, address):
     class Queue(queue.Queue):
         def hand_to(self, publish):
@@ -640,6 +653,7 @@ def test_what_a_queue_does_not_take_because_it_has_ended_is_left_to_others(broke
     assert dead_letters(address) == []
 
 
+@pytest.mark.slow
 def test_a_subscriber_that_pauses_takes_nothing_and_what_is_in_hand_can_be_acknowledged(broker, address, send):
     q = queue.Queue()
     with ep.Subscriber(address, q) as sub:
@@ -713,6 +727,7 @@ def test_a_twin_is_stopped_before_it_was_started_and_twice_and_from_any_thread(m
     assert not twin.wait_connected(0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [ep.Publisher, ep.Subscriber])
 def test_a_twin_stops_in_time_though_the_broker_does_not_answer(make, broker, address, monkeypatch):
     is_asked, answers = threading.Event(), threading.Event()
@@ -781,6 +796,7 @@ def test_a_subscriber_whose_queue_does_not_return_says_so(address, send):
     wait_until(lambda: threads() == [])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [ep.Publisher, ep.Subscriber])
 @pytest.mark.parametrize("queues", [queue.Queue, lambda: ep.Mailbox("block", 8)])
 def test_a_twin_that_is_left_running_is_warned_of_and_ended(make, queues, address):
@@ -822,6 +838,7 @@ print("end", flush=True)
 """
 
 
+@pytest.mark.slow
 def test_the_interpreter_ends_with_twins_that_run():
     done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout) == (0, "end\n"), done.stderr
@@ -859,6 +876,7 @@ print("fine")
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
 def test_a_forked_child_has_no_running_twins_and_the_parents_go_on():
     command = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", FORKS]
@@ -875,6 +893,7 @@ def halves(x):
     return x / 2
 
 
+@pytest.mark.slow
 def test_every_event_is_answered_once_or_put_aside_though_the_broker_goes_away(broker):
     requests, answers = f"memory://{broker}/requests?create=true", f"memory://{broker}/answers?create=true"
     out, q_in, q_out, collected = queue.Queue(), queue.Queue(), ep.Mailbox("block", 8), queue.Queue()

@@ -122,6 +122,7 @@ def test_outside_of_a_notebook_a_runner_is_called_runner() -> None:
     assert name_of(object()) == "runner"
 
 
+@pytest.mark.slow
 def test_in_a_notebook_a_runner_is_found_among_what_its_cells_defined(tmp_path: Path) -> None:
     code = "from epypes_widgets.code import name_of; _hidden = edges = object(); assert name_of(edges) == 'edges'"
     command = [sys.executable, "-m", "IPython", "--no-banner", "-c", code]

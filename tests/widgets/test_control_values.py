@@ -107,6 +107,7 @@ def test_ranges_at_the_limits_of_numbers_make_controls_of_finite_numbers(value: 
             )
 
 
+@pytest.mark.slow
 @given(st.floats(-1e6, 1e6), st.lists(st.floats(-1e6, 1e6), max_size=5))
 def test_a_float_that_is_written_is_read_to_the_last_bit(first: float, written: list[float]) -> None:
     entry = made(first, ep.Param(-1e6, 1e6, soft=(-10.0, 10.0)))

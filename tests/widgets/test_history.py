@@ -194,6 +194,7 @@ def test_threads_that_commit_at_once_lose_nothing() -> None:
     assert numbers(history) == list(range(1, 801))
 
 
+@pytest.mark.slow
 def test_a_runner_keeps_its_history_and_takes_it_along_when_it_goes(runner: ep.CompGraphRunner) -> None:
     history_of(runner).commit({"gain": 1})
     assert len(history_of(runner)) == 1

@@ -37,6 +37,7 @@ def test_moving_a_control_runs_the_stale_functions_only(panel: Panel, screen: Fr
     np.testing.assert_array_equal(panel.result["mask"] == 255, panel.result["image_bright"] > 60)
 
 
+@pytest.mark.slow
 def test_the_front_end_moving_a_slider_does_the_same(panel: Panel, runner: ep.CompGraphRunner) -> None:
     panel._hand.control("threshold").widget.value = 61
     panel.wait(10)
@@ -148,6 +149,7 @@ def test_a_panel_made_again_goes_on_with_values_history_and_undo(panel: Panel, r
     again.close(10)
 
 
+@pytest.mark.slow
 def test_a_panel_whose_view_is_gone_computes_nothing_for_cells(
     panel: Panel, screen: FrontEnd, runner: ep.CompGraphRunner, calls: Any
 ) -> None:
@@ -306,6 +308,7 @@ def test_a_closed_panel_takes_no_values_and_its_controls_are_off(panel: Panel, c
     assert calls.counts == {}
 
 
+@pytest.mark.slow
 def test_two_panels_on_one_runner_both_work(runner: ep.CompGraphRunner) -> None:
     first, second = tune(runner), tune(runner)
     first["threshold"] = 60
@@ -317,6 +320,7 @@ def test_two_panels_on_one_runner_both_work(runner: ep.CompGraphRunner) -> None:
     second.close(10)
 
 
+@pytest.mark.slow
 def test_the_interpreter_ends_while_a_panel_is_open() -> None:
     code = (
         "import epypes as ep; from epypes_widgets import tune\n"
@@ -397,6 +401,7 @@ def test_a_panel_on_what_has_been_run_computes_nothing(runner: ep.CompGraphRunne
     panel.close(10)
 
 
+@pytest.mark.slow
 def test_two_panels_on_one_runner_add_no_rows_for_each_other(image: Any) -> None:
     cg = ep.CompGraph({"f": lambda image, k: image + np.uint8(k)}, {"f": (("image", "k"), "y")})
     runner = ep.CompGraphRunner(cg, {"k": 1})

@@ -89,6 +89,7 @@ def test_a_setting_that_fails_leaves_the_runner_as_it_was(
     assert "13 is not a threshold" in clicks.last("state")["text"]
 
 
+@pytest.mark.slow
 def test_an_open_panel_follows(panel: Panel, runner: ep.CompGraphRunner) -> None:
     picker = pick(ep.sweep(runner, {"gain": [1, 3], "threshold": [50, 60]}))
     picker.choose(3)
@@ -152,6 +153,7 @@ def test_a_closed_picker_follows_nothing_and_leaves_no_thread(
     assert not any(thread.name == "epypes-pick" for thread in threading.enumerate())
 
 
+@pytest.mark.slow
 def test_the_runner_keeps_no_picker_alive(result: ep.SweepResult) -> None:
     picker = pick(result)
     picker.widget.close()

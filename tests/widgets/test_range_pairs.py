@@ -120,6 +120,7 @@ HIGHS = st.sampled_from([ep.Param(0, 255), ep.Param(0, 80), ep.Param(1, 101, odd
 VALUES = st.one_of(st.integers(0, 255).map(lambda value: ("write", value)), PLACES.map(lambda places: ("move", places)))
 
 
+@pytest.mark.slow
 @given(LOWS, HIGHS, st.lists(VALUES, max_size=12), st.booleans())
 def test_whatever_is_moved_and_written_the_two_stay_in_order_and_range(
     low: ep.Param, high: ep.Param, events: list[Any], as_floats: bool

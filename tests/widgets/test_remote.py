@@ -17,6 +17,8 @@ from epypes_widgets import Panel, tune
 from tests.service.standing import Standing, standing
 from tests.widgets.frontend import FrontEnd
 
+pytestmark = pytest.mark.slow
+
 TIMEOUT_S = 20.0
 
 

@@ -56,6 +56,7 @@ def test_an_array_that_was_moved_to_one_of_the_same_shape_is_marked() -> None:
     assert "● changed<" in html
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "make",
     [lambda noise: noise, lambda noise: noise[:, :, 0] > 127, lambda noise: noise[:, :, 0].astype(np.float64) / 7,

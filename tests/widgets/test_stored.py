@@ -93,6 +93,7 @@ def test_a_database_that_is_held_up_holds_no_hand_up(tmp_path: Path) -> None:
     panel.close()
 
 
+@pytest.mark.slow
 def test_a_database_that_is_away_is_told_in_the_panel_and_one_that_can_never_be_at_once(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="SQLAlchemy knows no"):
         tune(runner_of(), store="nosuch://host/db")

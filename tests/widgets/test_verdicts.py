@@ -81,6 +81,7 @@ def test_a_new_view_is_told_which_images_pass_and_why_the_others_do_not(screen: 
     assert told["verdicts"][1]["text"].startswith("iou of mask: 0.")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["panel", "cell", "front end"])
 def test_verdicts_follow_what_is_committed(
     panel: Panel, runner: ep.CompGraphRunner, screen: FrontEnd, how: str
@@ -101,6 +102,7 @@ def test_verdicts_follow_what_is_committed(
     assert states(screen.last("cases")) == ["passed", "failed", "passed"]
 
 
+@pytest.mark.slow
 def test_nothing_is_checked_while_a_control_is_held(panel: Panel, screen: FrontEnd) -> None:
     before = len(screen.of("cases"))
     screen.tell("hold", names=["threshold"])

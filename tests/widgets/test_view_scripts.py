@@ -22,6 +22,7 @@ def _node(*arguments: str) -> str:
     return str(done.stdout)
 
 
+@pytest.mark.slow
 def test_the_pure_part_does_what_it_says() -> None:
     said = _node("--test", *(str(path) for path in sorted(_TESTS.glob("*.test.mjs"))))
     assert re.search(r"fail 0\b", said)

@@ -139,6 +139,7 @@ def names_of(tree: ast.AST):
             yield node.attr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
 def test_nothing_unpickles_and_numpy_is_told_not_to(path):
     tree = ast.parse(path.read_text())

@@ -195,6 +195,7 @@ def test_a_set_with_an_item_twice_or_a_list_in_it_is_refused():
         assert caught.value.reason == "bad key"
 
 
+@pytest.mark.slow
 def test_the_bytes_of_a_set_do_not_depend_on_the_seed_of_hashes():
     code = (
         "import sys; from epypes.wire import Envelope, encode; "

@@ -67,6 +67,7 @@ VALUES = st.recursive(
 QUICK = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
+@pytest.mark.slow
 @QUICK
 @given(value=VALUES, inline_below=st.sampled_from([0, 16, 8192]))
 def test_any_value_comes_back_as_it_was(value, inline_below):
@@ -75,6 +76,7 @@ def test_any_value_comes_back_as_it_was(value, inline_below):
     assert same(back, value)
 
 
+@pytest.mark.slow
 @QUICK
 @given(value=VALUES)
 def test_any_value_comes_back_from_a_sample(value, tmp_path_factory):

@@ -21,6 +21,8 @@ from epypes.transport.channels import memory, open_channel, place_of
 from epypes.wire import Envelope
 from tests.service.served import TIMEOUT_S, until
 
+pytestmark = pytest.mark.slow
+
 _numbers = itertools.count(1)
 
 
@@ -248,7 +250,6 @@ def test_a_bundle_that_nobody_knows_is_introduced(place):
         assert second.shown()[0] == 1
 
 
-@pytest.mark.slow
 def test_who_goes_on_knowing_less_is_told_again(place):
     # As with a log that keeps its newest entry alone, when that is another bundle's.
     first, second = group_of(place, 2)

@@ -68,6 +68,7 @@ def values(replicas):
     return [replica.parameters().entries["k"]["value"] for replica in replicas]
 
 
+@pytest.mark.slow
 def test_replicas_share_the_events_and_know_each_other(trio):
     line, replicas = trio
     sent = [line.send(number=number) for number in range(60)]
@@ -128,6 +129,7 @@ def test_any_replica_answers_for_all_over_http(trio, http):
     assert "epypes_group_ready 3.0" in metrics
 
 
+@pytest.mark.slow
 def test_listeners_hear_of_the_group_each_second(http):
     with http.stream("GET", "/v1/events", params={"for_s": 1.5}) as answer:
         told = [json.loads(each.data) for each in EventSource(answer).iter_sse() if each.event == "group"]
@@ -135,6 +137,7 @@ def test_listeners_hear_of_the_group_each_second(http):
     assert told[0]["replicas"] == 3
 
 
+@pytest.mark.slow
 def test_a_service_on_a_socket_is_a_group_of_its_own(acting):
     told = Service(acting).group()
     assert (told["is_shared"], told["replicas"], told["agree"]) == (False, 1, True)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -94,6 +95,7 @@ STEPS = st.lists(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(STEPS, st.lists(st.integers(1, 4), min_size=60, max_size=60))
 def test_any_interleaving_of_proposals_gives_the_same_everywhere(steps, counts):
@@ -156,6 +158,7 @@ class NewestOnly:
             self.send(owed)
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 2), st.sampled_from(["propose", "cut", "hear", "restate"])), max_size=40))
 def test_with_a_log_that_keeps_the_newest_alone_all_agree_in_the_end(steps):

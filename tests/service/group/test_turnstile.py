@@ -222,6 +222,7 @@ def test_every_event_goes_through_once_and_none_waits_too_long_whatever_dies(ste
     assert sorted(group.published) == list(range(first, first + count))
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(STEPS, st.integers(1, 30), st.sampled_from([1, 1, 57]))
 def test_the_order_is_kept_when_nothing_takes_longer_than_its_time(steps, count, first):

@@ -92,6 +92,7 @@ def test_another_state_of_the_same_bundle_is_nothing_odd():
     assert odds(OWN, peer(digest="d2", revision=7)) == []
 
 
+@pytest.mark.slow
 def test_a_foreign_bundle_and_another_order_are_told_to_both_sides(acting, tmp_path, caplog):
     foreign = acting_bundle(tmp_path / "foreign")
     caplog.set_level(logging.INFO, logger="epypes.service")

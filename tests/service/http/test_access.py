@@ -102,6 +102,7 @@ def test_an_address_that_others_can_reach_is_refused(address):
         listening(address)
 
 
+@pytest.mark.slow
 def test_a_port_in_use_is_named(service):
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
@@ -113,11 +114,13 @@ def test_a_port_in_use_is_named(service):
         server.stop()
 
 
+@pytest.mark.slow
 def test_who_says_insecure_may_be_called_by_any_name(service):
     with HttpServer(service, "0.0.0.0:*", insecure=True) as server:
         assert request(server.url, "GET /livez HTTP/1.1", "Host: line-3.example")[0] == 200
 
 
+@pytest.mark.slow
 def test_a_server_can_be_stopped_twice_and_before_it_was_started_and_its_port_is_free_then(service):
     server, before = HttpServer(service, "127.0.0.1:*"), set(threading.enumerate())
     server.stop()
@@ -131,6 +134,7 @@ def test_a_server_can_be_stopped_twice_and_before_it_was_started_and_its_port_is
     assert not [thread for thread in set(threading.enumerate()) - before if thread.name.startswith("epypes-http")]
 
 
+@pytest.mark.slow
 def test_the_token_stays_the_same_for_the_next_server(service):
     tokens = set()
     for _ in range(2):

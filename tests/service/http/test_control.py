@@ -21,6 +21,7 @@ from tests.service.http.raw import until
 from tests.service.served import acting_bundle, peer_of
 
 
+@pytest.mark.slow
 def test_info_says_what_is_served(client, service, edge_bundle):
     info = client.get("/v1/info").json()
     assert info == service.info()
@@ -149,6 +150,7 @@ def epypes(epypes, monkeypatch, http):
     return epypes
 
 
+@pytest.mark.slow
 def test_a_bundle_that_computes_something_else_does_not_take_over(changing, changed, epypes, http, edge_bundle):
     bad = changed("bad", "value = 200", "value = 20")
     answer = changing.post("/v1/deploy", json={"bundle": str(bad)})
@@ -174,6 +176,7 @@ def test_a_bundle_that_was_changed_since_its_promotion_is_none(changing, edge_bu
     assert "no folder" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_good_bundle_takes_over_and_a_rollback_brings_the_one_before(changing, changed, epypes, http, edge_bundle):
     good = changed("good", 'name = "edges"', 'name = "edges-2"')
     done = epypes("deploy", good, "--http", http.url)
@@ -231,6 +234,7 @@ def test_while_a_bundle_is_deployed_another_one_is_refused_and_all_else_is_answe
 # -- FAILURES 46 to 48 ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_bundle_that_does_not_compute_what_was_recorded_is_never_ready(tmp_path):
     bundle = acting_bundle(tmp_path / "wrong", expected=7)
     with Service(bundle) as service, HttpServer(service, "127.0.0.1:*") as http:
@@ -240,6 +244,7 @@ def test_a_bundle_that_does_not_compute_what_was_recorded_is_never_ready(tmp_pat
         assert "out" in answer.json()["reason"]
 
 
+@pytest.mark.slow
 def test_health_names_a_function_that_does_not_return_and_is_well_again(tmp_path, acting):
     with (
         Service(acting, job_timeout_s=0.5) as service,
@@ -262,6 +267,7 @@ def test_health_names_a_function_that_does_not_return_and_is_well_again(tmp_path
         assert failures[0]["kind"] == "stuck"
 
 
+@pytest.mark.slow
 def test_health_is_answered_while_a_function_holds_the_interpreter(acting):
     with (
         Service(acting, drain_timeout_s=0.3) as service,

@@ -39,6 +39,7 @@ def work(peer, photograph, count):
         peer.take()
 
 
+@pytest.mark.slow
 def test_a_listener_is_told_first_how_things_are(http, service):
     with listening(http.url) as told:
         first = [next(told) for _ in range(3)]
@@ -48,6 +49,7 @@ def test_a_listener_is_told_first_how_things_are(http, service):
     assert first[2][1] == service.counts()
 
 
+@pytest.mark.slow
 def test_counts_are_told_each_second(http):
     with listening(http.url, for_s=2.5) as told:
         kinds = Counter(kind for kind, _ in told)
@@ -89,6 +91,7 @@ def test_a_change_of_parameters_is_told_to_all(http, changing):
             )
 
 
+@pytest.mark.slow
 def test_fifty_listen_at_once_and_the_last_of_too_many_is_told_so(http, service, peer, photograph):
     with ExitStack() as all_of_them:
         told = [all_of_them.enter_context(listening(http.url)) for _ in range(50)]
@@ -111,6 +114,7 @@ def test_one_who_goes_away_is_forgotten(http):
     until(lambda: http.listeners == 0)
 
 
+@pytest.mark.slow
 def test_listeners_are_let_go_when_the_server_stops(service):
     server, before = HttpServer(service, "127.0.0.1:*"), set(threading.enumerate())
     with ExitStack() as all_of_them:

@@ -36,6 +36,7 @@ def is_well(http):
     return httpx.get(f"{http.url}/livez", trust_env=False).status_code == 200
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "path"), CHANGES)
 def test_a_change_without_the_token_is_refused_and_says_where_it_is(client, http, method, path):
     answer = client.request(method, path, json={})
@@ -259,6 +260,7 @@ def impatient(monkeypatch, service):
         yield server
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("begun", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: localhost\r\nX: "])
 def test_a_request_that_does_not_come_to_its_end_loses_its_connection(impatient, begun):
     with connection(impatient.url) as end:
@@ -266,6 +268,7 @@ def test_a_request_that_does_not_come_to_its_end_loses_its_connection(impatient,
         assert received(end) == b""
 
 
+@pytest.mark.slow
 def test_a_body_that_does_not_come_to_its_end_is_refused(impatient):
     head = f"Authorization: Bearer {impatient.token}", "Content-Type: application/json", "Content-Length: 100"
     status, said = request(impatient.url, "POST /v1/deploy HTTP/1.1", *head, body=b"{")
@@ -273,6 +276,7 @@ def test_a_body_that_does_not_come_to_its_end_is_refused(impatient):
     assert "at once" in said
 
 
+@pytest.mark.slow
 def test_who_takes_no_answers_loses_the_connection(impatient):
     with connection(impatient.url) as end:
         end.settimeout(0.5)
@@ -284,6 +288,7 @@ def test_who_takes_no_answers_loses_the_connection(impatient):
         until(lambda: len(impatient.connections) == 0)
 
 
+@pytest.mark.slow
 def test_idle_connections_keep_nobody_out(http):
     from contextlib import ExitStack
 

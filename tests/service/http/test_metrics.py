@@ -27,6 +27,7 @@ def value(families, name, **labels):
     return found
 
 
+@pytest.mark.slow
 def test_every_metric_is_ours_described_and_has_its_unit_in_its_name(families):
     for family in families.values():
         assert family.documentation.endswith(".")

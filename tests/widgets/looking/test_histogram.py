@@ -138,6 +138,7 @@ _SHAPES = st.tuples(st.integers(8, 20), st.integers(8, 20)) | st.tuples(
 _DTYPES = st.sampled_from(["?", "u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f2", "f4", "f8"])
 
 
+@pytest.mark.slow
 @given(_DTYPES.flatmap(lambda dtype: hnp.arrays(np.dtype(dtype), _SHAPES)))
 def test_every_pixel_of_any_image_is_counted_once(image: Any) -> None:
     said = counted(image)

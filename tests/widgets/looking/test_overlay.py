@@ -84,6 +84,7 @@ def test_a_long_contour_stays_within_bounds_and_short_ones_beside_it_stay_whole(
     assert lengths[-1] > 10_000
 
 
+@pytest.mark.slow
 @given(st.lists(st.integers(1, 3000), min_size=1, max_size=40), st.integers(1, 150))
 def test_whatever_the_contours_are_no_more_than_the_bound_is_drawn(lengths: list[int], repeats: int) -> None:
     contours = [np.full((length, 1, 2), 20, np.int32) for length in lengths] * repeats

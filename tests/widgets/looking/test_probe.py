@@ -144,6 +144,7 @@ _PLACE = st.floats(-5, 60)
 _IMAGES = _DTYPES.flatmap(lambda dtype: hnp.arrays(np.dtype(dtype), _SHAPES))
 
 
+@pytest.mark.slow
 @given(_IMAGES, _PLACE, _PLACE)
 def test_every_place_of_any_image_is_told(made: Any, x: float, y: float) -> None:
     told = texts({"image": made}, x, y)
