@@ -31,12 +31,18 @@ class Talk:
         Called on a thread of its own with what has come.
     pause
         Called on that thread when there is nothing more just now, with whether that was so for a moment.
+    first_s
+        How long that moment is before anything was heard, in seconds: a busy broker needs a while for the first.
     """
 
     def __init__(
-        self, place: Place, hear: Callable[[Received], object], pause: Callable[[bool], object] = lambda is_quiet: None
+        self,
+        place: Place,
+        hear: Callable[[Received], object],
+        pause: Callable[[bool], object] = lambda is_quiet: None,
+        first_s: float = TICK_S,
     ) -> None:
-        self.place = place
+        self.place, self._first_s = place, first_s
         self._hear, self._pause = hear, pause
         self._turn = threading.Lock()
         self._over = threading.Event()
@@ -90,7 +96,7 @@ class Talk:
             self._connection.end()
 
     def _listen(self, channel: Channel) -> None:
-        self._channel, wait_s = channel, TICK_S
+        self._channel, wait_s = channel, self._first_s
         while not self._over.is_set():
             try:
                 received = channel.receive(wait_s)
