@@ -421,3 +421,55 @@ def test_a_broker_that_is_killed_is_noticed_and_what_it_confirmed_is_there_when_
     attempts = {message.id: message.attempt for message in (received(again) for _ in range(20))}
     assert sorted(attempts, key=int) == [str(number) for number in range(20)]
     assert attempts["0"] == attempts["1"] == 2
+
+
+def interrupting(monkeypatch: pytest.MonkeyPatch, owner: object, name: str, *, after: bool) -> None:
+    """Have a method be interrupted once, before or after it has done its work, as by Ctrl-C."""
+    real, left = getattr(owner, name), [1]
+
+    def interrupted(*given: object, **more: object) -> object:
+        answer = real(*given, **more) if after or not left else None
+        if left:
+            left.clear()
+            raise KeyboardInterrupt
+        return answer
+
+    monkeypatch.setattr(owner, name, interrupted)
+
+
+def test_who_is_interrupted_in_the_midst_of_a_message_hears_at_once_that_the_connection_is_over(
+    server, name, opened, monkeypatch
+):
+    channel = opened(server.address(name, create=True))
+    channel.send([b"1"])
+    interrupting(monkeypatch, channel._connection.pika._transport, "_produce", after=False)
+    with pytest.raises(KeyboardInterrupt):
+        channel.send([b"2"])
+    assert "a signal came" in channel.trouble
+    begun_s = monotonic()
+    with pytest.raises(BrokerError, match="a signal came"):
+        channel.send([b"3"])
+    channel.close()
+    assert monotonic() - begun_s < WAIT_S / 2
+    again = opened(server.address(name))
+    again.send([b"4"])
+    assert bytes(again.receive(WAIT_S).frames[0]) == b"1"
+
+
+def test_who_is_interrupted_as_it_begins_to_receive_begins_anew_with_another_connection(
+    server, name, opened, monkeypatch
+):
+    address = server.address(name, create=True)
+    channel = opened(address, prefetch=5)
+    for number in (1, 2):
+        channel.send([b"%d" % number])
+    interrupting(monkeypatch, channel, "_consume", after=True)
+    with pytest.raises(KeyboardInterrupt):
+        channel.receive(WAIT_S)
+    with pytest.raises(BrokerError, match="could not begin to receive: KeyboardInterrupt"):
+        channel.receive(WAIT_S)
+    channel.close()
+    again = opened(address)
+    for _ in range(2):
+        again.receive(WAIT_S).ack()
+    assert again.receive(0.2) is None

@@ -318,3 +318,20 @@ def test_an_idle_connection_stays_and_a_silent_broker_is_noticed(name):
         for channel in (sender, receiver):
             channel.close()
         assert monotonic() - began_s < 20.0
+
+
+def test_what_comes_with_qos_0_while_nobody_receives_does_not_fill_the_memory(mosquitto, name, opened, foreign, caplog):
+    address = mosquitto.address(name, kind="broadcast")
+    channel = opened(address)
+    assert channel.receive(0.0) is None
+    sensor = foreign()
+    for _ in range(1_500):
+        sensor.publish(name, b"21.5 C", qos=0)
+    # What it sends with QoS 1 comes after, and always.
+    sensor.publish(name, b"the last", qos=1)
+    arrived = channel._receiving._arrived
+    wait_until(lambda: arrived and bytes(arrived[-1].payload) == b"the last")
+    assert 900 < len(arrived) <= 1_001
+    assert "what comes with QoS 0 is dropped" in caplog.text
+    received = [channel.receive(WAIT_S) for _ in range(len(arrived))]
+    assert bytes(received[-1].frames[0]) == b"the last"

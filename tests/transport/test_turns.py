@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -26,6 +27,7 @@ class Pipe:
         self.steps = self.flushed = self.closed = 0
         self.heard: list[str] = []
         self.strangers: set[int] = set()
+        self.is_waiting = False
         self.before: Callable[[], object] = nothing
 
     def step(self, timeout_s: float, aside: AbstractContextManager[object]) -> None:
@@ -260,9 +262,74 @@ def test_a_forked_child_leaves_the_connection_to_its_parent(turns, pipe):
     if not child:
         did: list[int] = []
         turns.run(lambda: did.append(1), always, 0.0)
+        begun_s = monotonic()
         turns.run(lambda: did.append(2), lambda: did, WAIT_S)
-        os._exit(len(did))
+        # Who led is not there.
+        turns.end(WAIT_S)
+        os._exit(len(did) + 2 * (monotonic() - begun_s > WAIT_S / 2))
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
     pipe.tell()
     waiting.join(WAIT_S)
     assert len(pipe.heard) == 1
+
+
+def test_a_connection_that_is_over_keeps_nobody_busy(turns, pipe, troubles):
+    def end() -> None:
+        raise ConnectionError("over")
+
+    begun_s, pipe.before = monotonic(), end
+    looks = len(troubles)
+    assert not turns.run(nothing, lambda: False, 0.0)
+    until_s = monotonic() + WAIT_S
+    while len(troubles) < looks + 3:
+        assert monotonic() < until_s
+    # Twice the keeper has looked, a quarter of a second after the other.
+    assert monotonic() - begun_s > 0.4
+
+
+@pytest.mark.parametrize("is_half_way", [True, False])
+def test_only_what_was_interrupted_half_way_is_told_as_broken(turns, pipe, troubles, is_half_way):
+    def interrupt() -> None:
+        pipe.before = nothing
+        pipe.is_waiting = not is_half_way
+        raise KeyboardInterrupt
+
+    pipe.before = interrupt
+    with pytest.raises(KeyboardInterrupt):
+        turns.run(nothing, lambda: False, WAIT_S)
+    assert [str(trouble) for trouble in troubles] == ["a signal came in the midst of a message"] * is_half_way
+
+
+def test_what_a_signals_handler_leaves_is_not_done_in_the_midst_of_what_it_has_come_between(turns, pipe):
+    did: list[str] = []
+    waiting = started(lambda: turns.run(nothing, lambda: pipe.heard, WAIT_S))
+    leading(turns, waiting)
+
+    def interrupted() -> None:
+        did.append("begun")
+        # As a handler does that is called just here.
+        turns.run(lambda: did.append("the handler's"), always, 0.0)
+        did.append("ended")
+
+    turns.run(interrupted, always, 0.0)
+    pipe.tell()
+    waiting.join(WAIT_S)
+    assert did == ["begun", "ended", "the handler's"]
+
+
+def test_what_a_signals_handler_leaves_is_done_at_once_though_its_own_thread_waits(turns):
+    did: list[float] = []
+    begun_s = monotonic()
+
+    def handle(*_: object) -> None:
+        turns.run(lambda: did.append(monotonic()), always, 0.0)
+
+    before = signal.signal(signal.SIGUSR1, handle)
+    try:
+        timer = threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGUSR1))
+        timer.start()
+        assert turns.run(nothing, lambda: did, WAIT_S)
+        timer.join(WAIT_S)
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+    assert did[0] - begun_s < WAIT_S / 2

@@ -23,7 +23,16 @@ _LONG_S: Final = 60.0
 
 
 class Loop(Protocol):
-    """What a client's connection is driven by."""
+    """What a client's connection is driven by.
+
+    Attributes
+    ----------
+    is_waiting
+        Set by a step while it only waits, also if that is ended by what a signal's handler raises: nothing has been
+        left half-way then.
+    """
+
+    is_waiting: bool
 
     def step(self, timeout_s: float, aside: AbstractContextManager[object]) -> None:
         """Do what is ready, and wait at most so long until there was something; with 0 see that what is said goes out.
@@ -89,7 +98,7 @@ class Turns:
         self._is_done: Callable[[], object] = always
         # How often somebody else than the keeper has led, and whether he shall, or shall no more.
         self._taken = 0
-        self._is_called = self._is_wanted = self._is_over = False
+        self._is_called = self._is_wanted = self._is_borrowed = self._is_over = False
         self._keeper = threading.Thread(target=self._keep, name=name, daemon=True)
         self._keeper.start()
         forget_in_child(self)
@@ -103,9 +112,9 @@ class Turns:
         self._aside = _Aside(self._hands)
 
     def forget(self) -> None:
-        """Do nothing more, in a forked child: the connection is the parent's."""
+        """Do nothing more, in a forked child: the connection is the parent's, and so is whoever leads."""
         self._make_locks()
-        self._is_over = True
+        self._leader, self._is_over = None, True
 
     def run(self, work: Callable[[], object], is_done: Callable[[], object], timeout_s: float) -> bool:
         """Have some work done on the connection, wait until ``is_done``, and return whether it is. From any thread.
@@ -114,14 +123,13 @@ class Turns:
         himself either: a signal's handler, or what the connection calls, may only leave work.
         """
         until_s = monotonic() + timeout_s
-        me = threading.get_ident()
         with self._changed:
             if self._is_over:
                 return bool(is_done())
             self._work.append(work)
             if self._leader is None:
                 self._drive(is_done, until_s)
-            is_left = self._leader not in (None, me) and not self._is_done_here(timeout_s)
+            is_left = self._leader is not None and not self._is_done_here(timeout_s)
         if is_left:
             # Without the lock, which who is woken takes first.
             self._loop.wake()
@@ -129,17 +137,32 @@ class Turns:
 
     def _is_done_here(self, timeout_s: float) -> bool:
         """Do what nobody waits for, if the leader only waits, and return whether it was done; called with the lock."""
-        if timeout_s > 0.0 or not self._hands.acquire(blocking=False):
+        is_mine = self._is_borrowed or self._leader == threading.get_ident()
+        # A signal's handler may come here in the midst of what its own thread does.
+        if is_mine or timeout_s > 0.0 or not self._hands.acquire(blocking=False):
             return False
+        self._is_borrowed = True
         try:
             self._do()
             self._loop.flush()
-        except Exception as error:  # as in a step
-            self._failed(error)
+        except BaseException as error:
+            self._broke(error, is_half_way=True)
         finally:
+            self._is_borrowed = False
             self._hands.release()
         self._changed.notify_all()
         return not self._is_done()
+
+    def _broke(self, error: BaseException, *, is_half_way: bool) -> None:
+        """Tell of what was raised; what a signal's handler raises goes on to whoever it hit."""
+        if isinstance(error, Exception):
+            # Whatever a library raises here must not end the thread of whoever waits.
+            self._failed(error)
+            return
+        if is_half_way:
+            self._failed(InterruptedError("a signal came in the midst of a message"))
+            self._loop.wake()
+        raise error
 
     def _waited(self, is_done: Callable[[], object], until_s: float) -> bool:
         me = threading.get_ident()
@@ -187,24 +210,27 @@ class Turns:
             self._changed.notify_all()
 
     def _turn(self, is_done: Callable[[], object], until_s: float) -> None:
-        while True:
-            self._step(is_done, until_s)
+        is_well = True
+        while is_well and (self._work or not (is_done() or self._is_over or monotonic() >= until_s)):
+            is_well = self._step(is_done, until_s)
             with self._changed:
                 self._changed.notify_all()
-            if not self._work and (is_done() or self._is_over or monotonic() >= until_s):
-                return
 
-    def _step(self, is_done: Callable[[], object], until_s: float) -> None:
+    def _step(self, is_done: Callable[[], object], until_s: float) -> bool:
+        """Return whether it went well: a connection that is over must not keep anybody busy."""
         self._hands.acquire()
+        self._loop.is_waiting = False
         try:
             self._do()
             self._loop.step(0.0 if is_done() else max(until_s - monotonic(), 0.0), self._aside)
-        except Exception as error:  # whatever a library raises here must not end the thread of whoever waits
-            self._failed(error)
+        except BaseException as error:
+            self._broke(error, is_half_way=not self._loop.is_waiting)
+            return False
         finally:
             # A signal may have come as it wanted them back.
             with suppress(RuntimeError):
                 self._hands.release()
+        return True
 
     def _do(self) -> None:
         while self._work:
@@ -230,8 +256,10 @@ class Turns:
                 self._called.notify()
                 if self._leader is None:
                     self._loop.close()
-            while self._leader not in (None, threading.get_ident()) and monotonic() < until_s:
+            while self._leader is not None:
                 self._loop.wake()
+                if self._leader == threading.get_ident() or monotonic() >= until_s:
+                    break
                 self._changed.wait(max(until_s - monotonic(), 0.0))
         if self._keeper is not threading.current_thread():
             self._keeper.join(max(until_s - monotonic(), 0.0))

@@ -60,7 +60,12 @@ class AmqpChannel:
         connection, arrived = self._connection, self._arrived
         connection.check()
         if self._incoming is None:
-            self._incoming = self._listen()
+            try:
+                self._incoming = self._listen()
+            except BaseException as error:
+                # By a signal, too: what has come meanwhile can't be acknowledged over another line.
+                connection.lose(f"it could not begin to receive: {str(error) or type(error).__name__}")
+                raise
         self._make_room(self._incoming)
         if not arrived:
             connection.turns.run(nothing, lambda: arrived or connection.trouble, timeout_s)

@@ -45,7 +45,7 @@ class PikaLoop:
     READ, WRITE, ERROR = READ, WRITE, 0
 
     def __init__(self) -> None:
-        self.is_eager = False
+        self.is_eager = self.is_waiting = False
         self._waiting = Waiting()
         self._handlers: dict[int, Handler] = {}
         # What is waited for at each, and which are to be written to before that is waited for.
@@ -61,8 +61,10 @@ class PikaLoop:
         """Take a step; see `turns.Loop.step`."""
         self.flush()
         patience_s = self._patience_s(timeout_s)
+        self.is_waiting = True
         with aside:
             ready = self._waiting.wait(patience_s)
+        self.is_waiting = False
         for fd, events in ready:
             handler = self._handlers.get(fd)
             if handler is not None:
@@ -77,10 +79,11 @@ class PikaLoop:
 
     def flush(self) -> None:
         """Write what can be written; see `turns.Loop.flush`."""
-        while self._unwritten:
-            fd = self._unwritten.pop()
+        for fd in tuple(self._unwritten):
+            # If all is written it asks for no more; if a signal's handler raises here, it is tried again.
             self._handlers[fd](fd, WRITE)
-            if self._events.get(fd, 0) & WRITE:
+            if fd in self._unwritten:
+                self._unwritten.discard(fd)
                 self._waiting.watch(fd, self._events[fd])
 
     def _call(self) -> None:
@@ -134,11 +137,12 @@ class PikaLoop:
 
     def update_handler(self, fd: int, events: int) -> None:
         """Have something else told."""
+        self._events[fd] = events
         if self.is_eager and events & WRITE:
             self._unwritten.add(fd)
         else:
+            self._unwritten.discard(fd)
             self._waiting.watch(fd, events)
-        self._events[fd] = events
 
     def remove_handler(self, fd: int) -> None:
         """Have nothing told any more."""

@@ -22,22 +22,26 @@ class _Sparing(OwnSelector):
     A message takes five rounds, and at each the interpreter's lock would be let go of.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, loop: OwnLoop) -> None:
         super().__init__()
-        self._spared = 0
+        self._loop, self._spared = loop, 0
 
     def select(self, timeout: float | None = None) -> list[tuple[SelectorKey, int]]:
         self._spared = self._spared + 1 if timeout == 0 else 0
         if self._spared % _ROUNDS_UNASKED:
             return []
-        return super().select(timeout)
+        self._loop.is_waiting = True
+        ready = super().select(timeout)
+        self._loop.is_waiting = False
+        return ready
 
 
 class OwnLoop(asyncio.SelectorEventLoop):
     """An event loop, as `turns.Loop`."""
 
     def __init__(self) -> None:
-        super().__init__(_Sparing())
+        self.is_waiting = False
+        super().__init__(_Sparing(self))
 
     def step(self, timeout_s: float, aside: AbstractContextManager[object]) -> None:
         """Take a step, aside never: a task may be anywhere; see `turns.Loop.step`."""

@@ -167,7 +167,7 @@ class MqttChannel:
         if receiving is not None:
             with self._lock:
                 self._session = ""
-            if session and receiving.is_lost:
+            if session and receiving.is_lost():
                 keep_for_later(self._place, session)
             receiving.close(with_notice=bool(session))
         self._sending.close()

@@ -32,6 +32,7 @@ _CLOSE_S: Final = 2.0
 # Somebody may come back for what is kept, but not for ever.
 _KEPT_S: Final = 7 * 24 * 3600
 _UNCONFIRMED: Final = 8
+_MOST_UNASKED: Final = 1_000
 _LARGEST: Final = 268_000_000
 _REFUSED: Final = 0x80
 _UNHEARD, _TOO_LARGE, _NO_ACCESS = 0x10, 0x95, (0x84, 0x85, 0x86, 0x87, 0x8C)
@@ -75,7 +76,7 @@ class Connection:
         self._prefetch = min(max(prefetch, 1), 65_535)
         self._greeting: tuple[ReasonCode, Properties | None] | None = None
         self._trouble = ""
-        self._is_too_large = False
+        self._is_too_large = self._is_dropping = False
         self.has_session = False
         self._client = client = self._made(session, notice)
         wish = _told(PacketTypes.CONNECT)
@@ -129,10 +130,15 @@ class Connection:
         self._answers[mid] = code
 
     def _arrive(self, message: paho.MQTTMessage) -> None:
-        self._arrived.append(message)
+        # For those with QoS 0 nobody waits, so nothing else keeps them from filling the memory.
+        if message.qos or len(self._arrived) < _MOST_UNASKED:
+            self._arrived.append(message)
+        elif not self._is_dropping:
+            self._is_dropping = True
+            log.warning("%s: %d messages wait, so what comes with QoS 0 is dropped", self._place, _MOST_UNASKED)
 
     def _broke(self, error: Exception) -> None:
-        self._break("the connection was closed" if isinstance(error, ConnectionError) else _no_mqtt(error))
+        self._break(str(error) if isinstance(error, OSError) else _no_mqtt(error))
 
     def _lose(self, code: ReasonCode) -> None:
         self._is_too_large = self._is_too_large or code.value == _TOO_LARGE
@@ -178,9 +184,9 @@ class Connection:
         """Why it is over; empty while it is not."""
         return self._trouble
 
-    @property
     def is_lost(self) -> bool:
-        """Whether it is over, by whomever."""
+        """Return whether it is over, by whomever, after a look: nobody may have had one for a moment."""
+        self._turns.run(nothing, always, 0.0)
         return bool(self._trouble)
 
     def publish(
@@ -289,7 +295,7 @@ class Connection:
         told = _told(PacketTypes.DISCONNECT)
         if with_session:
             told.SessionExpiryInterval = 0
-        was_over = self.is_lost
+        was_over = self.is_lost()
         self._break("it was closed")
         client, within_s = self._client, min(self._timeout_s, _CLOSE_S)
         if not was_over:

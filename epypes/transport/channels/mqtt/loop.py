@@ -24,7 +24,7 @@ class PahoLoop:
     """A client of paho that is connected, as `turns.Loop`."""
 
     def __init__(self, client: paho.Client) -> None:
-        self._client = client
+        self._client, self.is_waiting = client, False
         opened: Any = client.socket()
         self._socket, self._waiting = opened, Waiting()
 
@@ -33,8 +33,10 @@ class PahoLoop:
         self.flush()
         # What is encrypted may have come, and wait to be read, already.
         is_there = bool(getattr(self._socket, "pending", int)())
+        self.is_waiting = True
         with aside:
             ready = self._waiting.wait(0.0 if is_there else min(timeout_s, _LOOK_S))
+        self.is_waiting = False
         if is_there or any(events & READ for _, events in ready):
             self._client.loop_read()
         self._client.loop_misc()
@@ -45,7 +47,7 @@ class PahoLoop:
         if client.want_write():
             client.loop_write()
         if client.socket() is None:
-            raise ConnectionError("it is closed")
+            raise ConnectionError("the connection was closed")
         self._waiting.watch(self._socket, READ | (WRITE if client.want_write() else 0))
 
     def wake(self) -> None:
