@@ -26,8 +26,6 @@ from epypes.transport.channels import Place, Received
 
 _log = logging.getLogger("epypes.service")
 _POLL_S: Final = 0.5
-# Of a log of which nothing was heard for so long there is nothing.
-_FIRST_S: Final = 1.0
 # So long a replica must know less than others before they say again what holds: it may be reading just now.
 _LAG_S: Final = 3.0
 # How long each gives the one before it to say what holds.
@@ -91,7 +89,7 @@ class Agreement:
     ) -> None:
         self._tuned, self._timeout_s = tuned, timeout_s
         self._rank, self._changed = rank, changed
-        self._talk = Talk(place, self._hear, self._pause, _FIRST_S)
+        self._talk = Talk(place, self._hear, self._pause)
         self._revisions = Revisions()
         self._heard, self._own_turn = threading.Condition(), threading.Lock()
         self._verdicts: dict[str, Verdict] = {}

@@ -31,18 +31,12 @@ class Talk:
         Called on a thread of its own with what has come.
     pause
         Called on that thread when there is nothing more just now, with whether that was so for a moment.
-    first_s
-        How long that moment is before anything was heard, in seconds: a busy broker needs a while for the first.
     """
 
     def __init__(
-        self,
-        place: Place,
-        hear: Callable[[Received], object],
-        pause: Callable[[bool], object] = lambda is_quiet: None,
-        first_s: float = TICK_S,
+        self, place: Place, hear: Callable[[Received], object], pause: Callable[[bool], object] = lambda is_quiet: None
     ) -> None:
-        self.place, self._first_s = place, first_s
+        self.place = place
         self._hear, self._pause = hear, pause
         self._turn = threading.Lock()
         self._over = threading.Event()
@@ -96,7 +90,7 @@ class Talk:
             self._connection.end()
 
     def _listen(self, channel: Channel) -> None:
-        self._channel, wait_s = channel, self._first_s
+        self._channel, wait_s = channel, TICK_S
         while not self._over.is_set():
             try:
                 received = channel.receive(wait_s)

@@ -26,6 +26,10 @@ class _Sparing(OwnSelector):
         super().__init__()
         self._loop, self._spared = loop, 0
 
+    def ask_now(self) -> None:
+        """Have the kernel be asked at the next round."""
+        self._spared = -1
+
     def select(self, timeout: float | None = None) -> list[tuple[SelectorKey, int]]:
         self._spared = self._spared + 1 if timeout == 0 else 0
         if self._spared % _ROUNDS_UNASKED:
@@ -41,11 +45,13 @@ class OwnLoop(asyncio.SelectorEventLoop):
 
     def __init__(self) -> None:
         self.is_waiting = False
-        super().__init__(_Sparing(self))
+        self._sparing = _Sparing(self)
+        super().__init__(self._sparing)
 
     def step(self, timeout_s: float, aside: AbstractContextManager[object]) -> None:
         """Take a step, aside never: a task may be anywhere; see `turns.Loop.step`."""
         if timeout_s <= 0:
+            self._sparing.ask_now()
             for _ in range(_ROUNDS):
                 self.call_soon(self.stop)
                 self.run_forever()

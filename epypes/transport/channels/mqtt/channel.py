@@ -15,7 +15,8 @@ What is promised, and by whom (seen with mosquitto 2.0.11):
   disk (by default it writes each 30 minutes, see ``autosave_interval``); what is above ``max_queued_messages``, 1,000
   per session unless told otherwise, which it drops without a word; what is kept for a receiver that was killed while
   the broker was down, since its will went with it; what another program sent with QoS 0, unless it was the turn of
-  one who was connected; what nobody has come for within seven days.
+  one who was connected, or if 1,000 messages wait here that nobody has received yet; what nobody has come for within
+  seven days.
 - mosquitto 2.0.11 sends more than ``prefetch`` after an acknowledgement, up to all that it has for the session. They
   wait here, in memory, until as few are unacknowledged as was asked for.
 - Acknowledgements go out in the order of `Received.ack`, which mosquitto takes as it comes; a broker that insists on
