@@ -13,7 +13,7 @@ from typing import Any, Final
 from epypes.run import Run
 from epypes_widgets.frames import make_frame, picture
 from epypes_widgets.history import Entry, History, changed
-from epypes_widgets.looking.stages import Stage, stages, states
+from epypes_widgets.looking.stages import Stage, is_fresh, stages, states
 from epypes_widgets.picture import PictureView
 from epypes_widgets.plain import plain_values
 from epypes_widgets.session import Session
@@ -82,6 +82,9 @@ class Screen:
         self.is_closed = False
         self._reference: tuple[dict[str, Any], tuple[bytes, ...]] | None = None
         self._referred: tuple[object, tuple[Any, ...]] = (None, ())
+        self._seen_token: str | None = None
+        # Held while the history is told, so that what is told last is the newest.
+        self._telling = threading.Lock()
         self._told: set[int] = set()
         self.told = 0
         self._log: list[dict[str, str]] = []
@@ -127,6 +130,8 @@ class Screen:
             if self._waits:
                 self.note("")
             self.compute_ms = run.report.total_ns / 1e6
+        if is_fresh(run, shown.token):
+            self._seen_token = shown.token
         frame = make_frame(
             run,
             shown.token,
@@ -139,6 +144,11 @@ class Screen:
             stages=states(failed or run, self.stages),
         )
         self.view.frames.offer(frame)
+
+    def token_in(self, run: Run) -> str | None:
+        """Return the token that is seen in a run: the one before, while one chosen just now is not computed."""
+        token = self.shown.token
+        return token if token is None or is_fresh(run, token) else self._seen_token
 
     def fail(self, text: str, function: str = "", names: Sequence[str] = ()) -> None:
         """Say what failed, and where; the picture stays."""
@@ -207,7 +217,7 @@ class Screen:
 
     def tell_history(self) -> None:
         """Tell the last entries; a thumbnail goes to a view once, and is empty from then on."""
-        with self._lock:
+        with self._telling:
             entries, current = self._history.entries, self._history.current
             pairs = list(zip([None, *entries][: len(entries)], entries, strict=True))
             # The first one is where all came from.
@@ -217,8 +227,8 @@ class Screen:
             buffers = [b"" if entry.number in self._told else _thumbnail(entry) for _, entry in pairs]
             if self.view.frames.mounted:
                 self._told.update(entry.number for _, entry in pairs)
-        state = {"undo": self._history.can_undo, "redo": self._history.can_redo, "code": self._code()}
-        self.view.tell("history", {"entries": content, **state}, buffers)
+            state = {"undo": self._history.can_undo, "redo": self._history.can_redo, "code": self._code()}
+            self.view.tell("history", {"entries": content, **state}, buffers)
 
     def tell_verdicts(self, content: dict[str, Any]) -> None:
         """Tell which test images pass."""
@@ -240,7 +250,7 @@ class Screen:
     def ready(self) -> None:
         """Tell a view that has been mounted everything, its picture last."""
         self.view.frames.mount()
-        with self._lock:
+        with self._telling:
             self._told.clear()
         self.tell_setup()
         self.tell_history()

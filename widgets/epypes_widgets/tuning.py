@@ -12,7 +12,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final
 
-from epypes.display import Picture
 from epypes.errors import NotComputed, StillRunning
 from epypes.graph import CompGraph
 from epypes.run import Failure, Run
@@ -147,7 +146,7 @@ class Tuning:
         """Go to the entry of the history that is found after the present values were committed; False if none is."""
         run = self.session.result
         if run is not None and not self.session.is_wanting:
-            self._add(run, None)
+            self._add(run)
         entry = find()
         if entry is None:
             return False
@@ -334,17 +333,18 @@ class Tuning:
         run = self.session.result
         if run is None or self.session.wanted or (self.hand.is_holding and not is_final):
             return
-        self._add(run, thumbnail(run, self.screen.shown.token))
+        self._add(run)
         entries = self.history.entries
         if entries and entries[-1].number != self.screen.told:  # another panel may have added some
             self.screen.tell_history()
         self.worker.later("still", _STILL_S, self._settled)
 
-    def _add(self, run: Run, seen: Picture | None) -> None:
+    def _add(self, run: Run) -> None:
         current, image = self.history.current, self.session.image
         if not self.session.payloads and current is not None:
             image = current.image  # that of another panel on this runner
-        token, compute_ms = self.screen.shown.token, self.screen.compute_ms
+        token, compute_ms = self.screen.token_in(run), self.screen.compute_ms
+        seen = thumbnail(run, token)
         self.history.commit(run.hyperparameters, token=token, picture=seen, compute_ms=compute_ms, image=image)
 
     def _compare(self) -> None:

@@ -91,6 +91,11 @@ def states(looked_at: Run | Tunable, stages: Iterable[Stage]) -> dict[str, State
     return {stage.token: "absent" if run is None else _state(run, stage.token, outdated) for stage in stages}
 
 
+def is_fresh(run: Run, token: str) -> bool:
+    """Whether a run has a value of a token that belongs to its other values."""
+    return _state(run, token, frozenset()) == "fresh"
+
+
 def _state(run: Run, token: str, outdated: frozenset[str]) -> State:
     maker = run.cg.digraph.producer.get(token)
     if run.failure is not None and maker == run.failure.function:

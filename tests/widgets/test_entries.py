@@ -1,0 +1,89 @@
+"""Has every entry of a panel's history its picture, and has the screen the newest history?"""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import numpy as np
+import pytest
+
+import epypes as ep
+from epypes_widgets import Panel, tune
+from tests.widgets.frontend import FrontEnd
+
+
+@pytest.fixture
+def screen(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> FrontEnd:
+    return FrontEnd(panel, monkeypatch)
+
+
+def test_undo_before_the_hand_lets_go_adds_an_entry_with_its_picture(panel: Panel, screen: FrontEnd) -> None:
+    screen.tell("hold", names=["threshold"])
+    screen.tell("move", places={}, values={"threshold": 60})
+    screen.wait_for_values(10, threshold=60)
+    screen.tell("undo")
+    panel.wait(10)
+    assert [entry.values["threshold"] for entry in panel._history.entries] == [100, 60]
+    assert [entry.token for entry in panel._history.entries if entry.picture] == ["mask", "mask"]
+
+
+def test_an_entry_has_the_picture_of_the_stage_before_while_one_chosen_just_now_is_not_computed(
+    image: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entered, go_on = threading.Event(), threading.Event()
+
+    def brighten(image: Any, gain: int) -> Any:
+        if gain == 3:
+            entered.set()
+            assert go_on.wait(10)
+        return (image // 2 * gain).astype(np.uint8)
+
+    def above(bright: Any, threshold: int = 100) -> Any:
+        return np.where(bright > threshold, 255, 0).astype(np.uint8)
+
+    cg = ep.CompGraph(
+        {"brighten": brighten, "above": above},
+        {"brighten": (("image", "gain"), "bright"), "above": (("bright", "threshold"), "mask")},
+    )
+    runner = ep.CompGraphRunner(cg, {"gain": 1, "threshold": 100})
+    runner.run(image=image)
+    panel = tune(runner, token="bright")
+    FrontEnd(panel, monkeypatch)
+    panel.wait(10)
+    panel["gain"] = 3
+    assert entered.wait(10)
+    panel.token = "mask"
+    go_on.set()
+    panel.wait(10)
+    last = panel._history.entries[-1]
+    assert (last.values["gain"], last.token) == (3, "bright")
+    assert last.picture is not None
+    panel["threshold"] = 90
+    panel.wait(10)
+    last = panel._history.entries[-1]
+    assert last.token == "mask"
+    assert last.picture is not None
+    panel.close(10)
+
+
+def test_what_the_screen_is_told_last_is_the_newest_history(
+    panel: Panel, screen: FrontEnd, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    panel.wait(10)
+    told, code = [], panel._screen._code
+
+    def slow_code() -> str:
+        """While one thread has looked at the history and not told it yet, have another add an entry and tell it."""
+        if not told:
+            other = threading.Thread(target=panel._screen.tell_history)
+            told.append(other)
+            panel._history.commit({"gain": 2, "threshold": 61})
+            other.start()
+            other.join(0.2)
+        return code()
+
+    monkeypatch.setattr(panel._screen, "_code", slow_code)
+    panel._screen.tell_history()
+    told[0].join(10)
+    assert [entry["values"]["threshold"] for entry in screen.last("history")["entries"]] == [100, 61]
