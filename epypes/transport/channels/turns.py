@@ -139,7 +139,7 @@ class Turns:
         """Do what nobody waits for, if the leader only waits, and return whether it was done; called with the lock."""
         is_mine = self._is_borrowed or self._leader == threading.get_ident()
         # A signal's handler may come here in the midst of what its own thread does.
-        if is_mine or timeout_s > 0.0 or not self._hands.acquire(blocking=False):
+        if is_mine or timeout_s > 0.0 or not self._loop.suits() or not self._hands.acquire(blocking=False):
             return False
         self._is_borrowed = True
         try:

@@ -2,14 +2,16 @@
 
 Both sides do the same: an event is put into a work queue and confirmed; a replica, a process of its own, takes it,
 answers with what came, has the answer confirmed, and only then acknowledges the event; events and answers have an id.
-By hand that is one thread, or one event loop; ours is a pipeline between a subscriber and a publisher. ZeroMQ has no
+By hand that is one thread, or one event loop; our replica is a pipeline between a subscriber and a publisher. Who asks
+is a program of one thread on both sides, ours by the three methods of a channel; what it costs to ask through a
+publisher and a subscriber of one's own, whose queues take a switch of threads, is shown beside it. ZeroMQ has no
 broker: nobody keeps, confirms or shares, so its limit is a bare loop over two sockets, and no goal is set there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from time import perf_counter_ns
 
 import numpy as np
@@ -46,12 +48,20 @@ def rows(effort: Effort, present: Sequence[Venue] | None = None) -> list[Row]:
 def _pipelines(effort: Effort, venue: Venue, place: Place, count: int) -> list[Row]:
     """Measure pipelines in code: the same bytes as by hand, and envelopes with an array."""
     by_hand, own = place(f"bench{count}")
-    who, goal = f"{venue.name}, {_counted(count)}", _GOAL if venue.is_brokered else None
-    with _by_hand(venue, by_hand, count) as hand, replicas(ours, own, count), _asker(ours.Asker(own, count)) as asker:
-        found = list(_rows(effort, who, hand, asker, goal))
-        if count == 1:
-            asker.is_plain = False
-            found += [_trip(effort, f"{who}, an array of {size}", size, hand, asker, None) for size in _SIZES]
+    who = f"{venue.name}, {_counted(count)}"
+    with _by_hand(venue, by_hand, count) as hand, replicas(ours, own, count):
+        found: list[Row] = []
+        if venue.is_brokered:
+            with closing(ours.Asker(own, count)) as asker:
+                found += _rows(effort, who, hand, asker, _GOAL)
+            if count > 1:
+                return found
+            who += ", queues at both ends"
+        with closing(ours.TwinsAsker(own, count)) as asker:
+            found += _rows(effort, who, hand, asker, None)
+            if count == 1:
+                asker.is_plain = False
+                found += [_trip(effort, f"{who}, an array of {size}", size, hand, asker, None) for size in _SIZES]
     return found
 
 
@@ -59,7 +69,11 @@ def _services(effort: Effort, venue: Venue, place: Place, count: int) -> list[Ro
     """Measure `epypes serve`, which computes the half of an image, so that its answers are a quarter of the size."""
     by_hand, own = place("served")
     who = f"{venue.name}, {_counted(count)} of epypes serve"
-    with _by_hand(venue, by_hand, count) as hand, served.services(own, count), _asker(ours.Asker(own, count)) as asker:
+    with (
+        _by_hand(venue, by_hand, count) as hand,
+        served.services(own, count),
+        closing(ours.TwinsAsker(own, count)) as asker,
+    ):
         asker.is_plain = False
         return [
             _trip(effort, f"{who}, an array of 1 kB", "1 kB", hand, asker, None),
@@ -69,14 +83,6 @@ def _services(effort: Effort, venue: Venue, place: Place, count: int) -> list[Ro
 
 def _counted(count: int) -> str:
     return f"{count} replica{'s' * (count > 1)}"
-
-
-@contextmanager
-def _asker(made: ours.Asker) -> Iterator[ours.Asker]:
-    try:
-        yield made
-    finally:
-        made.close()
 
 
 @contextmanager

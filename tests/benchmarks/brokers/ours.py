@@ -1,4 +1,4 @@
-"""How does EPypes do it: a pipeline between a subscriber and a publisher, for any address?"""
+"""How does EPypes do it: a pipeline between a subscriber and a publisher, for any address, and who asks it?"""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 import epypes as ep
-from epypes.transport.channels import is_brokered
+from epypes.transport.channels import Channel, is_brokered, open_channel
 from epypes.wire import Envelope
+from epypes.wire.ids import new_id
 from tests.benchmarks.brokers.parties import DEADLINE_S, PREFETCH, Meeting, keep_busy
 from tests.benchmarks.work import passed
 
@@ -53,7 +54,41 @@ def _f_out(view: Any) -> Any:
 
 
 class Asker:
-    """Who asks: a subscriber that takes answers, and a publisher for each thread that sends.
+    """Who asks as one does by hand: a channel that takes answers, and one for each thread that sends."""
+
+    def __init__(self, meeting: Meeting, senders: int) -> None:
+        self._stack = ExitStack()
+        self._senders = [self._opened(meeting.events) for _ in range(senders)]
+        self._answers = self._opened(meeting.answers)
+
+    def _opened(self, address: str) -> Channel:
+        channel = open_channel(address, prefetch=PREFETCH)
+        self._stack.callback(channel.close)
+        return channel
+
+    def _receive(self) -> bytes | memoryview:
+        answer = self._answers.receive(DEADLINE_S)
+        if answer is None:
+            raise TimeoutError("No answer has come.")
+        answer.ack()
+        return answer.frames[0]
+
+    def ask(self, image: np.ndarray) -> np.ndarray:
+        self._senders[0].send([image.tobytes()], id=new_id())
+        return np.frombuffer(self._receive(), image.dtype).reshape(image.shape)
+
+    def ask_many(self, image: np.ndarray, count: int) -> None:
+        def sending(channel: Channel) -> Callable[[], object]:
+            return lambda: channel.send([image.tobytes()], id=new_id())
+
+        keep_busy([sending(channel) for channel in self._senders], self._receive, count)
+
+    def close(self) -> None:
+        self._stack.close()
+
+
+class TwinsAsker:
+    """Who asks from a program of threads and queues: a subscriber takes answers, a publisher sends for each thread.
 
     With `is_plain` false it sends envelopes with an array, else bytes, as is done by hand.
     """

@@ -48,6 +48,22 @@ class _Hearing:
             _log.debug("a message to %s was not understood", message.subject, exc_info=True)
 
 
+class _Client(Client):  # type: ignore[misc]  # the library has no types
+    """A client that writes what is said at once; the library wakes a task for it, which takes longer than to write."""
+
+    _pending: list[bytes]
+
+    async def _flush_pending(self, force_flush: bool = False) -> Any:
+        transport = self._transport
+        if transport is None or not self.is_connected:
+            return await super()._flush_pending(force_flush)
+        pending, self._pending, self._pending_data_size = self._pending, [], 0
+        if pending:
+            # Nor is waited until there is room again: who sends waits for the server's word, so little is on its way.
+            transport.writelines(pending)
+        return None
+
+
 class Link:
     """A connection, which never comes back once it is lost.
 
@@ -63,7 +79,7 @@ class Link:
 
     def __init__(self, place: Place, timeout_s: float, lost: Callable[[BrokerError], object]) -> None:
         self._place, self._timeout_s, self._lost = place, timeout_s, lost
-        self.client = Client()
+        self.client = _Client()
         self._why: str | None = None
         self._is_closing = self._is_over = False
         self._tasks: set[asyncio.Task[Any]] = set()
@@ -86,15 +102,15 @@ class Link:
     # --- for any thread ---
 
     def run(self, function: Callable[[], object], is_done: Callable[[], object], timeout_s: float) -> bool:
-        """Have a function called within the loop, wait until something is so, and return whether it is."""
-        return self._turns.run(partial(self._loop.call_soon, function), is_done, timeout_s)
+        """Have a function called by whose turn it is, wait until something is so, and return whether it is."""
+        return self._turns.run(function, is_done, timeout_s)
 
     def wait(self, is_done: Callable[[], object], timeout_s: float) -> bool:
         """Wait until something is so that `changed` tells of, and return whether it is."""
         return self._turns.run(nothing, is_done, timeout_s)
 
     def call(self, function: Callable[[], object]) -> None:
-        """Have a function called within the loop, without waiting; not at all if it is over."""
+        """Have a function called by whose turn it is, without waiting; not at all if it is over."""
         self.run(function, always, 0.0)
 
     def ask(self, question: Callable[[], Coroutine[Any, Any, Any]]) -> Any:
@@ -172,7 +188,7 @@ class Link:
 
     def spawn(self, work: Coroutine[Any, Any, Any], name: str | None = None) -> None:
         """Have a coroutine run beside the others."""
-        task = asyncio.get_running_loop().create_task(work, name=name)
+        task = self._loop.create_task(work, name=name)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 from contextlib import AbstractContextManager
 from selectors import SelectorKey
-from typing import Final
+from time import monotonic
+from typing import Any, Final
 
 from epypes.transport.channels.waking import OwnSelector
 
@@ -17,31 +19,66 @@ _ROUNDS_UNASKED: Final = 8
 
 
 class _Sparing(OwnSelector):
-    """A selector that does not ask the kernel at each round of a loop that has something else to do.
+    """A selector within which a loop never waits: one that has nothing to do is stopped, and waits outside.
 
-    A message takes five rounds, and at each the interpreter's lock would be let go of.
+    Nor is the kernel asked at each round of a loop that has something else to do: a message takes five rounds, and at
+    each the interpreter's lock would be let go of.
+
+    Attributes
+    ----------
+    is_idle
+        Whether the loop was stopped since it has nothing to do.
+    due_s
+        When it has, at the latest, by the monotonic clock.
+    waits_until_s
+        Until when somebody waits; 0 if nobody does.
+    changes
+        How often it was changed what is waited for.
     """
 
     def __init__(self, loop: OwnLoop) -> None:
         super().__init__()
         self._loop, self._spared = loop, 0
+        self._found: list[tuple[SelectorKey, int]] = []
+        self.is_idle = False
+        self.due_s = self.waits_until_s = 0.0
+        self.changes = 0
+
+    def wait(self, until_s: float) -> None:
+        """Wait until something has come, which the loop finds at its next round."""
+        self.waits_until_s = min(until_s, self.due_s)
+        try:
+            self._found = super().select(max(self.waits_until_s - monotonic(), 0.0))
+        finally:
+            self.waits_until_s = 0.0
 
     def ask_now(self) -> None:
         """Have the kernel be asked at the next round."""
         self._spared = -1
 
     def select(self, timeout: float | None = None) -> list[tuple[SelectorKey, int]]:
-        self._spared = self._spared + 1 if timeout == 0 else 0
-        if self._spared % _ROUNDS_UNASKED:
+        if self._found:
+            found, self._found = self._found, []
+            return found
+        if timeout is None or timeout > 0.0:
+            self.is_idle, self._spared = True, 0
+            self.due_s = math.inf if timeout is None else monotonic() + timeout
+            self._loop.stop()
             return []
-        self._loop.is_waiting = True
-        ready = super().select(timeout)
-        self._loop.is_waiting = False
-        return ready
+        self._spared += 1
+        return [] if self._spared % _ROUNDS_UNASKED or self.waits_until_s else super().select(0.0)
+
+    def register(self, fileobj: Any, events: int, data: Any = None) -> SelectorKey:
+        self.changes += 1
+        return super().register(fileobj, events, data)
+
+    def modify(self, fileobj: Any, events: int, data: Any = None) -> SelectorKey:
+        self.changes += 1
+        return super().modify(fileobj, events, data)
 
 
 class OwnLoop(asyncio.SelectorEventLoop):
-    """An event loop, as `turns.Loop`."""
+    """An event loop, as `turns.Loop`. While it waits it does not run, so that another thread may have it run."""
 
     def __init__(self) -> None:
         self.is_waiting = False
@@ -49,21 +86,35 @@ class OwnLoop(asyncio.SelectorEventLoop):
         super().__init__(self._sparing)
 
     def step(self, timeout_s: float, aside: AbstractContextManager[object]) -> None:
-        """Take a step, aside never: a task may be anywhere; see `turns.Loop.step`."""
-        if timeout_s <= 0:
+        """Take a step; see `turns.Loop.step`."""
+        if timeout_s <= 0.0:
             self._sparing.ask_now()
             for _ in range(_ROUNDS):
                 self.call_soon(self.stop)
                 self.run_forever()
             return
-        alarm = self.call_later(timeout_s, self.stop)
-        try:
-            self.run_forever()
-        finally:
-            alarm.cancel()
+        until_s = monotonic() + timeout_s
+        if self._is_idle():
+            self.is_waiting = True
+            with aside:
+                self._sparing.wait(until_s)
+            self.is_waiting = False
+            self._is_idle()
+
+    def _is_idle(self) -> bool:
+        """Run until there is nothing to do, and return True, or until somebody shall look whether it is done."""
+        self._sparing.is_idle = False
+        self.run_forever()
+        return self._sparing.is_idle
 
     def flush(self) -> None:
-        """Do nothing, since no step is aside; see `turns.Loop.flush`."""
+        """See that what is said goes out; see `turns.Loop.flush`."""
+        sparing = self._sparing
+        changes = sparing.changes
+        is_idle = any(self._is_idle() for _ in range(_ROUNDS))
+        # Who waits knows of nothing that was changed meanwhile.
+        if not is_idle or changes != sparing.changes or sparing.due_s < sparing.waits_until_s:
+            self.wake()
 
     def wake(self) -> None:
         """Have a step end soon; see `turns.Loop.wake`."""
