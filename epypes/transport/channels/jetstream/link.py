@@ -211,7 +211,7 @@ class Link:
     async def flush(self, timeout_s: float) -> None:
         """Return when the server has read all that was sent so far."""
         pause_s = 0.0
-        # The library's own question whether it has goes ahead of what still waits to be sent.
+        # Should the library let it wait once more, its own question whether it has would go ahead of it.
         while self.client.pending_data_size and self._why is None:
             await asyncio.sleep(pause_s)
             pause_s = 0.001

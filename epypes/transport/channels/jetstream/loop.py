@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from epypes.transport.channels.waking import OwnSelector
 
-# What is said goes out within so many rounds: to publish is to wake the library's own task, which writes.
+# Who does not wait gives what there is to do so many rounds, of which reading a message takes all.
 _ROUNDS: Final = 3
 _ROUNDS_UNASKED: Final = 8
 
@@ -32,8 +32,8 @@ class _Sparing(OwnSelector):
         When it has, at the latest, by the monotonic clock.
     waits_until_s
         Until when somebody waits; 0 if nobody does.
-    changes
-        How often it was changed what is waited for.
+    is_changed
+        Whether something else is to be waited for than what who waits knows of.
     """
 
     def __init__(self, loop: OwnLoop) -> None:
@@ -42,15 +42,19 @@ class _Sparing(OwnSelector):
         self._found: list[tuple[SelectorKey, int]] = []
         self.is_idle = False
         self.due_s = self.waits_until_s = 0.0
-        self.changes = 0
+        self.is_changed = False
 
-    def wait(self, until_s: float) -> None:
+    def wait_until(self, until_s: float) -> None:
+        """Take note of who is about to wait, until then at most."""
+        self.waits_until_s, self.is_changed = min(until_s, self.due_s), False
+
+    def wait(self) -> None:
         """Wait until something has come, which the loop finds at its next round."""
-        self.waits_until_s = min(until_s, self.due_s)
-        try:
-            self._found = super().select(max(self.waits_until_s - monotonic(), 0.0))
-        finally:
-            self.waits_until_s = 0.0
+        self._found = super().select(max(self.waits_until_s - monotonic(), 0.0))
+
+    def wait_no_more(self) -> None:
+        """Take note that nobody waits."""
+        self.waits_until_s = 0.0
 
     def ask_now(self) -> None:
         """Have the kernel be asked at the next round."""
@@ -69,12 +73,17 @@ class _Sparing(OwnSelector):
         return [] if self._spared % _ROUNDS_UNASKED or self.waits_until_s else super().select(0.0)
 
     def register(self, fileobj: Any, events: int, data: Any = None) -> SelectorKey:
-        self.changes += 1
+        self.is_changed = True
         return super().register(fileobj, events, data)
 
     def modify(self, fileobj: Any, events: int, data: Any = None) -> SelectorKey:
-        self.changes += 1
+        self.is_changed = True
         return super().modify(fileobj, events, data)
+
+    def unregister(self, fileobj: Any) -> SelectorKey:
+        # Who waits for a socket keeps it from being closed.
+        self.is_changed = True
+        return super().unregister(fileobj)
 
 
 class OwnLoop(asyncio.SelectorEventLoop):
@@ -95,10 +104,14 @@ class OwnLoop(asyncio.SelectorEventLoop):
             return
         until_s = monotonic() + timeout_s
         if self._is_idle():
-            self.is_waiting = True
-            with aside:
-                self._sparing.wait(until_s)
-            self.is_waiting = False
+            self._sparing.wait_until(until_s)
+            try:
+                self.is_waiting = True
+                with aside:
+                    self._sparing.wait()
+                self.is_waiting = False
+            finally:
+                self._sparing.wait_no_more()
             self._is_idle()
 
     def _is_idle(self) -> bool:
@@ -110,10 +123,9 @@ class OwnLoop(asyncio.SelectorEventLoop):
     def flush(self) -> None:
         """See that what is said goes out; see `turns.Loop.flush`."""
         sparing = self._sparing
-        changes = sparing.changes
         is_idle = any(self._is_idle() for _ in range(_ROUNDS))
-        # Who waits knows of nothing that was changed meanwhile.
-        if not is_idle or changes != sparing.changes or sparing.due_s < sparing.waits_until_s:
+        # Who waits knows of nothing that is otherwise since he began.
+        if not is_idle or sparing.is_changed or sparing.due_s < sparing.waits_until_s:
             self.wake()
 
     def wake(self) -> None:
