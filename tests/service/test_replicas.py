@@ -128,8 +128,14 @@ def test_a_change_of_hyperparameters_reaches_all_replicas_with_one_revision(bund
     with replicas(bundle, sub, pub) as members, Reader(pub) as reader, ep.Publisher(sub, outbox):
         controls = [control(member) for member in members]
         gains = {controls[0].parameters().revision: 2}
+
+        def is_answered() -> bool:
+            """Whether there is an answer of the last revision; others still wait to be answered."""
+            return reader.look() > 0 and max(gains) in {answer.revision for answer in reader.answers}
+
         for number in range(300):
             if number in (60, 120, 180):
+                until(is_answered, lambda: f"{reader.look()} answers")
                 gain = number // 10
                 gains[controls[number // 60 - 1].set(gain=gain).revision] = gain
             outbox.put(event(number))

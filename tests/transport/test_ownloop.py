@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from time import monotonic
 from typing import Self
 
@@ -74,6 +74,20 @@ class Leader:
         assert not self._thread.is_alive()
 
 
+def leave(turns: Turns, *works: Callable[[], object]) -> int | None:
+    """Leave work as a thread does that has not the main thread's signals; return which thread that was."""
+
+    def act() -> None:
+        for work in works:
+            turns.run(work, always, 0.0)
+
+    thread = threading.Thread(target=act)
+    thread.start()
+    thread.join(WAIT_S)
+    assert not thread.is_alive()
+    return thread.ident
+
+
 @pytest.fixture
 def leader(turns: Turns, loop: OwnLoop) -> Iterator[Leader]:
     with Leader(turns, loop) as made:
@@ -88,9 +102,8 @@ def test_what_nobody_waits_for_is_done_by_who_leaves_it_while_the_leader_waits(t
         ran.append(threading.get_ident())
 
     looks = leader.looks
-    for _ in range(50):
-        turns.run(lambda: loop.create_task(work()), always, 0.0)
-    assert ran == [threading.get_ident()] * 50
+    thread = leave(turns, *[lambda: loop.create_task(work())] * 50)
+    assert ran == [thread] * 50
     assert leader.is_waiting()
     # It was not woken.
     assert leader.looks == looks
@@ -98,7 +111,7 @@ def test_what_nobody_waits_for_is_done_by_who_leaves_it_while_the_leader_waits(t
 
 def test_a_timer_that_another_thread_sets_is_kept_by_who_waits(turns, loop, leader):
     rang = threading.Event()
-    turns.run(lambda: loop.call_later(0.05, rang.set), always, 0.0)
+    leave(turns, lambda: loop.call_later(0.05, rang.set))
     assert rang.wait(WAIT_S / 2)
 
 
@@ -115,13 +128,13 @@ def test_what_another_thread_could_not_write_at_once_is_written_by_who_waits(tur
     with theirs:
         assert turns.run(lambda: loop.create_task(connect()), lambda: opened, WAIT_S)
         leader.must_wait()
-        turns.run(lambda: opened[0].write(bytes(MANY_BYTES)), always, 0.0)
+        leave(turns, lambda: opened[0].write(bytes(MANY_BYTES)))
         theirs.settimeout(WAIT_S / 2)
         read = 0
         while read < MANY_BYTES:
             read += len(theirs.recv(65_536))
         leader.must_wait()
-        turns.run(lambda: opened[0].close(), always, 0.0)
+        leave(turns, opened[0].close)
         assert theirs.recv(1) == b""
 
 
@@ -137,7 +150,9 @@ def test_a_thread_that_runs_a_loop_of_its_own_leaves_it_to_the_leader(turns, loo
         turns.run(work, always, 0.0)
         assert done.wait(WAIT_S)
 
-    asyncio.run(cell())
+    thread = threading.Thread(target=lambda: asyncio.run(cell()))
+    thread.start()
+    thread.join(WAIT_S)
     assert ran == [leader.ident]
 
 
@@ -151,7 +166,7 @@ def test_what_is_more_than_a_few_rounds_is_gone_on_with_by_who_waits(turns, loop
             await asyncio.sleep(0)
         done.set()
 
-    turns.run(lambda: loop.create_task(work()), always, 0.0)
+    leave(turns, lambda: loop.create_task(work()))
     assert done.wait(WAIT_S)
 
 

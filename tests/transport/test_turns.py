@@ -132,20 +132,61 @@ def test_who_waits_does_the_work_that_others_wait_for(turns):
 
 def test_what_nobody_waits_for_is_done_by_who_asks_while_the_leader_only_waits(turns, pipe):
     did: list[str] = []
+
+    def leave() -> None:
+        turns.run(lambda: did.append(threading.current_thread().name), always, 0.0)
+
+    def act() -> None:
+        until_s = monotonic() + WAIT_S
+        # Until it has come to wait: before, what is left is its.
+        while (not did or did[-1] == "who waits") and monotonic() < until_s:
+            leave()
+        pipe.flushed, steps = 0, pipe.steps
+        leave()
+        flushed.append((pipe.flushed, pipe.steps - steps))
+
+    flushed: list[tuple[int, int]] = []
     waiting = started(lambda: turns.run(nothing, lambda: pipe.heard, WAIT_S), "who waits")
     leading(turns, waiting)
-    until_s = monotonic() + WAIT_S
-    while not did or did[-1] == "who waits":
-        # Until it has come to wait: before, what is left is its.
-        assert monotonic() < until_s
-        turns.run(lambda: did.append(threading.current_thread().name), always, 0.0)
-    assert pipe.flushed
-    steps = pipe.steps
-    turns.run(lambda: did.append(threading.current_thread().name), always, 0.0)
-    assert (did[-1], pipe.steps) == (threading.current_thread().name, steps)
+    started(act, "who asks").join(WAIT_S)
+    assert (did[-1], flushed) == ("who asks", [(1, 0)])
     pipe.tell()
     waiting.join(WAIT_S)
     assert pipe.heard == ["who waits"]
+
+
+def test_what_the_main_thread_leaves_is_done_by_the_leader_since_a_signal_may_come_in_the_midst_of_it(turns, pipe):
+    did: list[str] = []
+    waiting = started(lambda: turns.run(nothing, lambda: len(did) == 50, WAIT_S), "who waits")
+    leading(turns, waiting)
+    for _ in range(50):
+        turns.run(lambda: did.append(threading.current_thread().name), always, 0.0)
+    waiting.join(WAIT_S)
+    assert did == ["who waits"] * 50
+    assert pipe.flushed == 0
+
+
+def test_who_does_something_while_the_leader_waits_never_waits_for_himself(turns, pipe):
+    found: list[bool] = []
+
+    def work() -> None:
+        # As a handler of a client's log does that sends.
+        found.append(turns.run(nothing, lambda: False, WAIT_S))
+
+    def act() -> None:
+        until_s = monotonic() + WAIT_S
+        while not pipe.flushed and monotonic() < until_s:
+            turns.run(work, always, 0.0)
+
+    begun_s = monotonic()
+    waiting = started(lambda: turns.run(nothing, lambda: pipe.heard, WAIT_S))
+    leading(turns, waiting)
+    started(act).join(WAIT_S)
+    pipe.tell()
+    waiting.join(WAIT_S)
+    assert pipe.flushed
+    assert not any(found)
+    assert monotonic() - begun_s < WAIT_S / 2
 
 
 def test_a_leader_is_woken_when_what_another_did_is_what_it_waits_for(turns):

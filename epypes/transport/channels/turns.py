@@ -11,7 +11,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from time import monotonic
 from typing import Any, Final, Protocol
 
@@ -98,13 +98,16 @@ class Turns:
         self._is_done: Callable[[], object] = always
         # How often somebody else than the keeper has led, and whether he shall, or shall no more.
         self._taken = 0
-        self._is_called = self._is_wanted = self._is_borrowed = self._is_over = False
+        self._is_called = self._is_wanted = self._is_over = False
+        # Who does something while the leader waits.
+        self._guest: int | None = None
         self._keeper = threading.Thread(target=self._keep, name=name, daemon=True)
         self._keeper.start()
         forget_in_child(self)
 
     def _make_locks(self) -> None:
-        lock = threading.RLock()
+        # Taken by itself, not by way of a condition: there a signal may come when it is taken, and nobody knows it yet.
+        self._lock = lock = threading.RLock()
         # Two of one lock: whatever changes does not wake the keeper.
         self._changed, self._called = threading.Condition(lock), threading.Condition(lock)
         # Held by who uses the connection.
@@ -114,7 +117,7 @@ class Turns:
     def forget(self) -> None:
         """Do nothing more, in a forked child: the connection is the parent's, and so is whoever leads."""
         self._make_locks()
-        self._leader, self._is_over = None, True
+        self._leader, self._guest, self._is_over = None, None, True
 
     def run(self, work: Callable[[], object], is_done: Callable[[], object], timeout_s: float) -> bool:
         """Have some work done on the connection, wait until ``is_done``, and return whether it is. From any thread.
@@ -123,7 +126,7 @@ class Turns:
         himself either: a signal's handler, or what the connection calls, may only leave work.
         """
         until_s = monotonic() + timeout_s
-        with self._changed:
+        with self._lock:
             if self._is_over:
                 return bool(is_done())
             self._work.append(work)
@@ -136,19 +139,23 @@ class Turns:
         return bool(is_done()) if timeout_s <= 0.0 else self._waited(is_done, until_s)
 
     def _is_done_here(self, timeout_s: float) -> bool:
-        """Do what nobody waits for, if the leader only waits, and return whether it was done; called with the lock."""
-        is_mine = self._is_borrowed or self._leader == threading.get_ident()
-        # A signal's handler may come here in the midst of what its own thread does.
-        if is_mine or timeout_s > 0.0 or not self._loop.suits() or not self._hands.acquire(blocking=False):
+        """Do what nobody waits for, if the leader only waits, and return whether it was done; called with the lock.
+
+        Never in the main thread, where a signal's handler may come in the midst of it, and wait, or raise.
+        """
+        me = threading.get_ident()
+        if timeout_s > 0.0 or me in (self._leader, self._guest, threading.main_thread().ident):
             return False
-        self._is_borrowed = True
+        if not self._loop.suits() or not self._hands.acquire(blocking=False):
+            return False
+        self._guest = me
         try:
             self._do()
             self._loop.flush()
         except BaseException as error:
             self._broke(error, is_half_way=True)
         finally:
-            self._is_borrowed = False
+            self._guest = None
             self._hands.release()
         self._changed.notify_all()
         return not self._is_done()
@@ -166,8 +173,8 @@ class Turns:
 
     def _waited(self, is_done: Callable[[], object], until_s: float) -> bool:
         me = threading.get_ident()
-        with self._changed:
-            while not (is_done() or self._is_over or self._leader == me or monotonic() >= until_s):
+        with self._lock:
+            while not (is_done() or self._is_over or me in (self._leader, self._guest) or monotonic() >= until_s):
                 if self._leader is None:
                     self._drive(is_done, until_s)
                 else:
@@ -195,11 +202,11 @@ class Turns:
         """Take the turn; called with the lock, and held again afterwards."""
         self._leader, self._is_done = threading.get_ident(), is_done
         try:
-            self._changed.release()
+            self._lock.release()
             try:
                 self._turn(is_done, until_s)
             finally:
-                self._changed.acquire()
+                self._lock.acquire()
             while self._work:
                 # Who left it relied on us; under the lock nobody can leave more.
                 self._step(always, 0.0)
@@ -213,23 +220,27 @@ class Turns:
         is_well = True
         while is_well and (self._work or not (is_done() or self._is_over or monotonic() >= until_s)):
             is_well = self._step(is_done, until_s)
-            with self._changed:
+            with self._lock:
                 self._changed.notify_all()
 
     def _step(self, is_done: Callable[[], object], until_s: float) -> bool:
         """Return whether it went well: a connection that is over must not keep anybody busy."""
-        self._hands.acquire()
-        self._loop.is_waiting = False
+        # Nothing has begun.
+        self._loop.is_waiting = True
         try:
+            self._hands.acquire()
+            self._loop.is_waiting = False
             self._do()
             self._loop.step(0.0 if is_done() else max(until_s - monotonic(), 0.0), self._aside)
         except BaseException as error:
             self._broke(error, is_half_way=not self._loop.is_waiting)
             return False
         finally:
-            # A signal may have come as it wanted them back.
-            with suppress(RuntimeError):
+            # The first call, since a signal comes after one. It may have come as it wanted them, or wanted them back.
+            try:  # noqa: SIM105
                 self._hands.release()
+            except RuntimeError:
+                pass
         return True
 
     def _do(self) -> None:
@@ -237,7 +248,7 @@ class Turns:
             self._work.popleft()()
 
     def _keep(self) -> None:
-        with self._changed:
+        with self._lock:
             while not self._is_over:
                 taken = self._taken
                 if not self._is_called:
@@ -250,7 +261,7 @@ class Turns:
     def end(self, timeout_s: float) -> None:
         """Close the loop; work that comes later is not done. If a thread works on it that does so when it is done."""
         until_s = monotonic() + timeout_s
-        with self._changed:
+        with self._lock:
             if not self._is_over:
                 self._is_over = True
                 self._called.notify()

@@ -15,7 +15,7 @@ if sys.platform == "win32":
 else:
     from selectors import PollSelector as OwnSelector
 
-__all__ = ["READ", "WRITE", "OwnSelector", "Waiting"]
+__all__ = ["READ", "WRITE", "OwnSelector", "SocketLoop", "Waiting"]
 
 _MOST_WAKES: Final = 4_096
 
@@ -64,3 +64,23 @@ class Waiting:
         self._selector.close()
         self._waking.close()
         self._woken.close()
+
+
+class SocketLoop:
+    """What the `turns.Loop`s have in common that wait for sockets by a `Waiting`, in any thread."""
+
+    def __init__(self) -> None:
+        self.is_waiting = False
+        self._waiting = Waiting()
+
+    def wake(self) -> None:
+        """Have a step end soon; see `turns.Loop.wake`."""
+        self._waiting.wake()
+
+    def suits(self) -> bool:
+        """Return whether the calling thread may take steps; see `turns.Loop.suits`."""
+        return True
+
+    def close(self) -> None:
+        """Take no more steps; see `turns.Loop.close`."""
+        self._waiting.close()

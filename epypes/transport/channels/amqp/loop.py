@@ -16,7 +16,7 @@ from typing import Final
 
 import pika
 
-from epypes.transport.channels.waking import READ, WRITE, Waiting
+from epypes.transport.channels.waking import READ, WRITE, SocketLoop
 
 Handler = Callable[[int, int], object]
 
@@ -32,7 +32,7 @@ class JoiningConnection(pika.SelectConnection):  # type: ignore[misc]  # pika ha
         super()._output_marshaled_frames([b"".join(marshaled_frames)] if is_small else marshaled_frames)
 
 
-class PikaLoop:
+class PikaLoop(SocketLoop):
     """What pika asks of a loop, see `pika.adapters.utils.selector_ioloop_adapter`; and `turns.Loop`.
 
     Attributes
@@ -45,8 +45,8 @@ class PikaLoop:
     READ, WRITE, ERROR = READ, WRITE, 0
 
     def __init__(self) -> None:
-        self.is_eager = self.is_waiting = False
-        self._waiting = Waiting()
+        super().__init__()
+        self.is_eager = False
         self._handlers: dict[int, Handler] = {}
         # What is waited for at each, and which are to be written to before that is waited for.
         self._events: dict[int, int] = {}
@@ -93,18 +93,6 @@ class PikaLoop:
         while self._timers and self._timers[0][0] <= now_s:
             for callback in heapq.heappop(self._timers)[2]:
                 callback()
-
-    def wake(self) -> None:
-        """Have a step end soon; see `turns.Loop.wake`."""
-        self._waiting.wake()
-
-    def suits(self) -> bool:
-        """Return whether the calling thread may take steps; see `turns.Loop.suits`."""
-        return True
-
-    def close(self) -> None:
-        """Take no more steps; see `turns.Loop.close`."""
-        self._waiting.close()
 
     # --- what pika asks for ---
 

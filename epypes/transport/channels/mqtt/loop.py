@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import paho.mqtt.client as paho
 
-from epypes.transport.channels.waking import READ, WRITE, Waiting
+from epypes.transport.channels.waking import READ, WRITE, SocketLoop
 
 # So often paho looks after its heartbeats.
 _LOOK_S: Final = 0.5
@@ -20,13 +20,13 @@ class Client(paho.Client):
         return super()._packet_queue(command, memoryview(packet), *more)  # type: ignore[arg-type]  # it is cut and sent
 
 
-class PahoLoop:
+class PahoLoop(SocketLoop):
     """A client of paho that is connected, as `turns.Loop`."""
 
     def __init__(self, client: paho.Client) -> None:
-        self._client, self.is_waiting = client, False
-        opened: Any = client.socket()
-        self._socket, self._waiting = opened, Waiting()
+        super().__init__()
+        self._client = client
+        self._socket: Any = client.socket()
 
     def step(self, timeout_s: float, aside: AbstractContextManager[object]) -> None:
         """Take a step; see `turns.Loop.step`."""
@@ -49,15 +49,3 @@ class PahoLoop:
         if client.socket() is None:
             raise ConnectionError("the connection was closed")
         self._waiting.watch(self._socket, READ | (WRITE if client.want_write() else 0))
-
-    def wake(self) -> None:
-        """Have a step end soon; see `turns.Loop.wake`."""
-        self._waiting.wake()
-
-    def suits(self) -> bool:
-        """Return whether the calling thread may take steps; see `turns.Loop.suits`."""
-        return True
-
-    def close(self) -> None:
-        """Take no more steps; see `turns.Loop.close`."""
-        self._waiting.close()
