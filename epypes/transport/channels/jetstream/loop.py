@@ -103,7 +103,7 @@ class OwnLoop(asyncio.SelectorEventLoop):
                 self.run_forever()
             return
         until_s = monotonic() + timeout_s
-        if self._is_idle():
+        if self._run_on():
             self._sparing.wait_until(until_s)
             try:
                 self.is_waiting = True
@@ -112,9 +112,9 @@ class OwnLoop(asyncio.SelectorEventLoop):
                 self.is_waiting = False
             finally:
                 self._sparing.wait_no_more()
-            self._is_idle()
+            self._run_on()
 
-    def _is_idle(self) -> bool:
+    def _run_on(self) -> bool:
         """Run until there is nothing to do, and return True, or until somebody shall look whether it is done."""
         self._sparing.is_idle = False
         self.run_forever()
@@ -123,7 +123,7 @@ class OwnLoop(asyncio.SelectorEventLoop):
     def flush(self) -> None:
         """See that what is said goes out; see `turns.Loop.flush`."""
         sparing = self._sparing
-        is_idle = any(self._is_idle() for _ in range(_ROUNDS))
+        is_idle = any(self._run_on() for _ in range(_ROUNDS))
         # Who waits knows of nothing that is otherwise since he began.
         if not is_idle or sparing.is_changed or sparing.due_s < sparing.waits_until_s:
             self.wake()
