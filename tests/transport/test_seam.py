@@ -589,6 +589,22 @@ def test_an_address_that_is_written_wrongly_is_an_error_that_never_has_the_passw
     assert "secret" not in caught.value.address
 
 
+@pytest.mark.parametrize(
+    ("who", "option", "told"),
+    [
+        ("", "", "Write USER@ before the host, and the path of a file"),
+        ("", "?password_file={file}", "Write USER@ before the host; the password was read from {file}."),
+        ("robot:wrong@", "", "Mend the user or the password before the host"),
+        ("robot@", "?password_file={file}", "mend that file, or the user before the host"),
+    ],
+)
+def test_the_way_out_of_a_refusal_names_what_was_written(tmp_path, who, option, told):
+    file = tmp_path / "password"
+    file.write_text("wrong")
+    place = place_of(f"nats://{who}127.0.0.1/events{option.format(file=file)}")
+    assert told.format(file=file) in place.refused_way_out
+
+
 def test_an_address_may_have_a_number_sign_as_topics_and_passwords_have():
     place = place_of("mqtt://robot:a#b@host/line/#?kind=broadcast")
     assert (place.password, place.name, place.kind) == ("a#b", "line/#", "broadcast")

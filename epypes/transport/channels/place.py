@@ -108,8 +108,12 @@ class Place:
     @property
     def refused_way_out(self) -> str:
         """What helps when a broker refuses the user or the password: a sentence."""
+        if not self.user and self.password_file:
+            return f"Write USER@ before the host; the password was read from {self.password_file}."
         if self.password_file:
             return f"The password was read from {self.password_file}: mend that file, or the user before the host."
+        if self.user and self.password:
+            return "Mend the user or the password before the host; ?password_file=PATH keeps the latter out of sight."
         return "Write USER@ before the host, and the path of a file with the password at the end: ?password_file=PATH."
 
     def beside(self, ending: str, kind: Kind, *, create: bool | None = None) -> Place:
