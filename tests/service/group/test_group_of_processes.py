@@ -75,7 +75,9 @@ def test_a_group_finds_together_again_when_its_broker_was_away(bundle, nats):
             assert first.info()["state"] == "DEGRADED"
         finally:
             nats.start()
+        # Each finds back by itself, one later than the other.
         until(lambda: first.group()["replicas"] == 2 and not first.group()["trouble"], first.group)
+        until(lambda: second.group()["replicas"] == 2 and not second.group()["trouble"], second.group)
         assert second.set(gain=6).revision == 2
         until(lambda: first.parameters().revision == 2, first.group)
         assert first.parameters().entries["gain"]["value"] == 6
