@@ -49,6 +49,9 @@ class Server:
         The files of its certificate and of the key to it, for encrypted connections alone.
     """
 
+    # Whether the queues that it has outlive a kill; see the one of RabbitMQ.
+    has_written = True
+
     def __init__(
         self,
         folder: Path,

@@ -47,6 +47,8 @@ class Server:
     """
 
     name = "NATS"
+    # Whether the queues that it has outlive a kill; see the one of RabbitMQ.
+    has_written = True
 
     def __init__(
         self, folder: Path, host: str = "127.0.0.1", *, jetstream: bool = True, tls: tuple[Path, Path] | None = None

@@ -159,6 +159,18 @@ class Server:
                 process.wait(_DEADLINE_S)
         self._process = self._epmd = None
 
+    @property
+    def has_written(self) -> bool:
+        """Whether the queues that it has outlive a kill.
+
+        It writes down which quorum queues there are up to a second after they were made (names.dets of rabbitmq/ra). One
+        that it had not written down is made anew when it is back: empty, and by 3.10 without a leader, so that it
+        confirms nothing.
+        """
+        (kept,) = self._folder.glob("data/*/quorum/*/names.dets")
+        names = kept.read_bytes()
+        return all(config.parent.name.encode() in names for config in kept.parent.glob("*/config"))
+
     def pause(self) -> None:
         """Have it say nothing any more, as if the link to it were cut."""
         if self._process is not None:

@@ -8,7 +8,7 @@ import pytest
 
 import epypes as ep
 from tests.brokers.fleet import fleet
-from tests.brokers.traffic import KILLS, PLAIN, RAISES, Reader, dead_letters, event, left, until
+from tests.brokers.traffic import KILLS, PLAIN, RAISES, Reader, dead_letters, event, lasting, left, until
 
 pytestmark = pytest.mark.slow
 
@@ -72,8 +72,8 @@ def test_every_event_outlives_a_killed_pipeline_and_a_killed_broker(brokered):
         brokered.stop(at_once=True)
         brokered.start()
 
-    sub = brokered.address("pipelines.events", create=True, attempts=5)
-    outlived(brokered, sub, brokered.address("pipelines.answers", create=True), killed)
+    sub = lasting(brokered, "pipelines.events", attempts=5)
+    outlived(brokered, sub, lasting(brokered, "pipelines.answers"), killed)
 
 
 def test_every_event_outlives_a_killed_pipeline_over_mqtt_and_a_broker_that_ends_in_order(mosquitto):

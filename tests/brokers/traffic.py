@@ -30,6 +30,14 @@ def event(number, kind=PLAIN):
     return Envelope("frame", {"number": number, "kind": kind}, id=f"event-{number}", source="test")
 
 
+def lasting(broker, name, **options):
+    """Make a queue, and wait until it outlives a kill of its broker; return its address."""
+    address = broker.address(name, create=True, **options)
+    open_channel(address).close()
+    until(lambda: broker.has_written, f"{broker.name} to have written its queues")
+    return address
+
+
 class Reader:
     """Who gathers the answers of a place, each id once."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import epypes as ep
-from tests.brokers.traffic import KILLS, KILLS_PARENT, PLAIN, RAISES, Reader, dead_letters, event, left, until
+from tests.brokers.traffic import KILLS, KILLS_PARENT, PLAIN, RAISES, Reader, dead_letters, event, lasting, left, until
 from tests.service.replicated import control, promoted, replicas, stopped
 
 pytestmark = pytest.mark.slow
@@ -64,8 +64,8 @@ def ended_in_order(broker):
 
 
 def test_a_thousand_events_outlive_a_killed_replica_and_a_killed_broker(bundle, brokered):
-    sub = brokered.address("chaos.events", create=True, attempts=5)
-    outlived(bundle, brokered, sub, brokered.address("chaos.answers", create=True), killed)
+    sub = lasting(brokered, "chaos.events", attempts=5)
+    outlived(bundle, brokered, sub, lasting(brokered, "chaos.answers"), killed)
 
 
 def test_a_thousand_events_outlive_a_killed_replica_over_mqtt_and_a_broker_that_ends_in_order(bundle, mosquitto):

@@ -376,6 +376,27 @@ def test_a_broker_that_takes_no_messages_just_now_says_why(server, name, opened)
     assert "takes no messages just now: low on memory" in str(error)
 
 
+def test_a_queue_that_says_nothing_is_told_of_and_what_was_rejected_stays_until_it_is_put_aside(server, name, opened):
+    channel = opened(server.address(name, create=True), timeout_s=1.0)
+    channel.send([b"x"], id="spoilt")
+    queue = f"whereis('%2F_{name}.dead')"
+    server.control("eval", f"sys:suspend({queue}).")
+    try:
+        received(channel).reject("it is spoilt")
+        text = str(lost(lambda: channel.receive(0.1)))
+        with pytest.raises(BrokerError, match=f"did not answer within 1 s.*quorum_status '{name}.dead'"):
+            opened(server.address(f"{name}.dead"), timeout_s=1.0).receive(0.0)
+    finally:
+        server.control("eval", f"sys:resume({queue}).")
+    assert ".dead did not confirm a message within 1 s: it may have it or not. If" in text
+    assert text.endswith(f" see whether the queue has a leader: rabbitmq-queues quorum_status '{name}.dead'.")
+    channel.close()
+    again = received(opened(server.address(name)))
+    assert again.attempt == 2
+    again.reject("it is still spoilt")
+    assert received(opened(server.address(f"{name}.dead"))).id == "spoilt"
+
+
 def test_a_channel_that_nobody_uses_is_kept_alive(server, name, opened, monkeypatch):
     monkeypatch.setattr("epypes.transport.channels.amqp.connection._HEARTBEAT_S", 1)
     channel = opened(server.address(name, create=True))
@@ -408,6 +429,7 @@ def test_a_broker_that_is_killed_is_noticed_and_what_it_confirmed_is_there_when_
     for number in range(20):
         sender.send([b"x"], id=str(number))
     left = [received(receiver), received(receiver)]
+    until(lambda: server.has_written)
     server.stop(at_once=True)
     assert "is over" in str(lost(lambda: receiver.receive(0.1)))
     assert "is over" in str(lost(lambda: sender.send([b"nobody is there"])))

@@ -457,7 +457,7 @@ def test_a_broker_that_goes_away_is_an_error_in_time_and_keeps_what_it_has(peer,
         sent.append(number)
 
     ends = [ends_with(send), ends_with(lambda number: waiting.receive(60.0))]
-    wait_until(lambda: len(sent) > 20, WAIT_S)
+    wait_until(lambda: len(sent) > 20 and peer.has_written, WAIT_S)
     peer.stop(at_once=True)
     try:
         wait_until(lambda: all(ends), WAIT_S)

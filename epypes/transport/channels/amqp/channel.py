@@ -1,8 +1,9 @@
 """How are messages carried by RabbitMQ?
 
 ``amqp://USER:PASSWORD@HOST/QUEUE``, encrypted ``amqps://``. A queue is a quorum queue: what was confirmed is on the
-broker's disk (of most brokers of a cluster), and each message knows how often it was delivered. With a queue of
-another type that somebody else made, RabbitMQ tells only whether a message was delivered before: `Received.attempt`
+broker's disk (of most brokers of a cluster), and each message knows how often it was delivered. That there is the queue
+RabbitMQ writes down up to a second after it was made: if it is killed before, the queue comes back empty. With a queue
+of another type that somebody else made, RabbitMQ tells only whether a message was delivered before: `Received.attempt`
 is 1 or 2 then. What a replica had been handed in advance counts as delivered too when it dies.
 """
 

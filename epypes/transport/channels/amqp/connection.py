@@ -12,7 +12,7 @@ from pika.exceptions import AMQPError
 
 from epypes.errors import BrokerError
 from epypes.transport.channels.amqp.loop import JoiningConnection, PikaLoop
-from epypes.transport.channels.amqp.reasons import opening_reason, reason_of
+from epypes.transport.channels.amqp.reasons import leader_hint, opening_reason, reason_of
 from epypes.transport.channels.place import Place
 from epypes.transport.channels.turns import Turns, always, nothing
 
@@ -82,7 +82,8 @@ class Line:
         connection.turns.run(work, lambda: answers or self.is_over, connection.timeout_s)
         connection.check()
         if not answers and self.error is None:
-            raise connection.error(f"{connection.place} did not answer within {connection.timeout_s:g} s.")
+            text = f"{connection.place} did not answer within {connection.timeout_s:g} s."
+            raise connection.error(text + leader_hint(connection.place))
         return self.error
 
     def close(self) -> None:
@@ -158,7 +159,7 @@ class Connection:
     def check(self) -> None:
         """Raise BrokerError if it is over."""
         if self.trouble:
-            raise self.error(f"The connection to {self.place} is over: {self.trouble}.")
+            raise self.error(f"The connection to {self.place} is over: {self.trouble.removesuffix('.')}.")
 
     def _listen(self) -> None:
         """Notice a broker that says nothing any more: a link that was cut tells nobody."""

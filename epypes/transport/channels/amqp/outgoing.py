@@ -14,7 +14,7 @@ from pika.spec import Basic
 from epypes.errors import MessageError
 from epypes.transport.channels.amqp.connection import Connection, Line
 from epypes.transport.channels.amqp.places import missing
-from epypes.transport.channels.amqp.reasons import reason_of
+from epypes.transport.channels.amqp.reasons import leader_hint, reason_of
 from epypes.transport.channels.place import Place
 
 _PERSISTENT: Final = 2
@@ -79,7 +79,7 @@ class Outgoing:
         error = line.error
         if error is None:
             text = f"{place} did not confirm a message within {connection.timeout_s:g} s: it may have it or not."
-            raise connection.error(text)
+            raise connection.error(text + leader_hint(place))
         if isinstance(error, ChannelClosed) and error.reply_code == _PRECONDITION_FAILED and "size" in error.reply_text:
             raise MessageError(
                 "too large", f"A message of {size:,} bytes is too large for {place}: {reason_of(error)}."

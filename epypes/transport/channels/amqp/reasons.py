@@ -38,6 +38,16 @@ def reason_of(error: BaseException) -> str:
     return f"{type(error).__name__}: {str(error)[:_LONGEST]}"
 
 
+def leader_hint(place: Place) -> str:
+    """Return where to look when a broker is there and a place of it says nothing: a sentence after a space, or nothing.
+
+    A quorum queue without a leader takes and gives no message, and tells nobody.
+    """
+    if place.kind != "queue":
+        return ""
+    return f" If it goes on, see whether the queue has a leader: rabbitmq-queues quorum_status {place.name!r}."
+
+
 def innermost(error: BaseException | None) -> BaseException | None:
     """Return what pika has wrapped, some times."""
     while error is not None:
