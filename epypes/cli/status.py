@@ -133,7 +133,7 @@ def _group_lines(found: list[dict[str, Any]], *, is_one: bool) -> list[str]:
     # Whom the broker is away for hears nobody: who hears most is asked.
     asked = sorted((each for each in found if "group" in each), key=_hears, reverse=True)
     first = asked[0] if asked else found[0]
-    group = first.get("group", {"members": [], "trouble": ""})
+    group = first.get("group", {"members": [], "lost": [], "trouble": ""})
     lines = _head_lines(first, group) if asked else []
     if is_one:
         return lines
@@ -144,7 +144,8 @@ def _group_lines(found: list[dict[str, Any]], *, is_one: bool) -> list[str]:
     lines += [*_parameters_line(first), _addresses_line(first)]
     differ = {name: len({each[name] for each in group["members"] if name in each}) > 1 for name in _MAY_DIFFER}
     told = {_gist(group["trouble"])}
-    return [*lines, *(_member_line(member, differ, told) for member in _members(found, group))]
+    members = [*_members(found, group), *group["lost"]]
+    return [*lines, *(_member_line(member, differ, told) for member in members)]
 
 
 def _hears(found: dict[str, Any]) -> tuple[bool, int]:

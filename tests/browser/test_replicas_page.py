@@ -68,3 +68,23 @@ def test_the_page_shows_the_replicas_when_there_is_more_than_one(browser, replic
         assert errors == []
     finally:
         page.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_page_shows_who_has_gone_without_a_word(browser, replicas, scheme, monkeypatch):
+    _, first, second = replicas
+    page = browser.new_page(viewport={"width": 1400, "height": 1000}, color_scheme=scheme)
+    try:
+        page.goto(first.http)
+        with second:
+            page.wait_for_selector("#replicas tbody tr:nth-child(2) .badge.good:has-text('READY')")
+            assert first.group()["lost"] == []
+            # As if it were killed.
+            monkeypatch.setattr(second._peers._group._talk, "say", lambda data: None)
+        page.wait_for_selector("#replicas tbody tr:nth-child(2) .badge.error:has-text('LOST')")
+        assert "it was heard last" in rows(page)[1][1]
+        assert page.locator("#replicas tbody a").count() == 0, "nobody answers there"
+        assert unreadable(page, "#replicas-section") == []
+        page.locator("#replicas-section").screenshot(path=SCREENSHOTS / f"replicas-lost-{scheme}.png")
+    finally:
+        page.close()

@@ -105,6 +105,7 @@ class Standing:
     def group(self):
         return {
             "is_shared": False, "replicas": 1, "ready": 1, "agree": True, "counts": {}, "trouble": "", "rejected": 0, "members": [],
+            "lost": [],
         }  # fmt: skip
 
     def parameters(self):

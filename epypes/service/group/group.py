@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from epypes.errors import BrokerError, MessageError, ServiceError
 from epypes.service.group.agreement import Agreement, Tuned
-from epypes.service.group.membership import Member, Membership, Present, summary, told
+from epypes.service.group.membership import Heard, Member, Membership, summary, told, told_lost
 from epypes.service.group.notices import MOST_ID, MOST_IDS, Beat, Begun, Done, Left, Notice, read_notice, written
 from epypes.service.group.order import Order, place_in_stream
 from epypes.service.group.talk import Talk
@@ -133,7 +133,7 @@ class Group:
         """How many answers went on though an event before them was not known to be done."""
         return 0 if self._order is None else self._order.overtaken
 
-    def present(self) -> list[Present]:
+    def present(self) -> list[Heard]:
         """Return the replicas that live; this one is always among them."""
         member, now_s = self._member(), monotonic()
         with self._lock:
@@ -145,7 +145,9 @@ class Group:
         present = self.present()
         members = [told(each, is_self=each.member.id == self.id) for each in present]
         rejected = self.rejected + self.agreement.rejected
-        return {**summary(present), "trouble": self.trouble, "rejected": rejected, "members": members}
+        with self._lock:
+            lost = [told_lost(each) for each in self._watch.lost(monotonic())]
+        return {**summary(present), "trouble": self.trouble, "rejected": rejected, "members": members, "lost": lost}
 
     def _member(self) -> Member:
         return replace(self._about(self.id), agreed=self.agreement.agreed, trouble=self.agreement.trouble)
@@ -305,7 +307,7 @@ class Group:
         elif isinstance(notice, Left):
             with self._lock:
                 self._members.left(notice.member_id)
-            self._watch.left(notice.member_id)
+                self._watch.left(notice.member_id)
             self._look()
             self._changed()
         elif notice.member_id == self.id:
@@ -335,8 +337,10 @@ class Group:
         self._compare(member)
 
     def _look(self) -> None:
-        own = self._member()
-        for level, text in self._watch.look(own, self.present(), monotonic()):
+        own, present = self._member(), self.present()
+        with self._lock:
+            lines = self._watch.look(own, present, monotonic())
+        for level, text in lines:
             _log.log(level, "%s", text)
 
     def _compare(self, member: Member) -> None:

@@ -9,6 +9,8 @@ from typing import Any, Final
 
 # Three of its words may be lost before a replica counts as gone.
 LOST_S: Final = 3.5
+# The state of a replica that has gone without a word; none says it of itself.
+LOST: Final = "LOST"
 # Replicas come and go under names of their own; nobody runs as many at once.
 _MOST: Final = 1_000
 
@@ -58,8 +60,8 @@ class Member:
 
 
 @dataclass(frozen=True, slots=True)
-class Present:
-    """A replica that lives, and how many seconds ago it was heard."""
+class Heard:
+    """What a replica said last, and how many seconds ago it was heard."""
 
     member: Member
     heard_s: float
@@ -84,10 +86,10 @@ class Membership:
         """Note that a replica has said that it ends."""
         self._heard.pop(member_id, None)
 
-    def present(self, now_s: float) -> list[Present]:
+    def present(self, now_s: float) -> list[Heard]:
         """Return the replicas that live, in the order of their names."""
         self._forget(now_s)
-        found = [Present(member, max(now_s - at_s, 0.0)) for member, at_s in self._heard.values()]
+        found = [Heard(member, max(now_s - at_s, 0.0)) for member, at_s in self._heard.values()]
         return sorted(found, key=lambda each: (len(each.member.replica), each.member.replica, each.member.id))
 
     def _forget(self, now_s: float) -> None:
@@ -96,7 +98,7 @@ class Membership:
             del self._heard[key]
 
 
-def summary(present: list[Present]) -> dict[str, Any]:
+def summary(present: list[Heard]) -> dict[str, Any]:
     """Return what there is to say of all replicas together, JSON-ready.
 
     Returns
@@ -117,9 +119,19 @@ def summary(present: list[Present]) -> dict[str, Any]:
     }
 
 
-def told(present: Present, *, is_self: bool) -> dict[str, Any]:
+def told(heard: Heard, *, is_self: bool) -> dict[str, Any]:
     """Return what there is to say of one replica, JSON-ready."""
-    member = present.member
+    member = heard.member
     names = ("replica", "host", "pid", "state", "reason", "name", "digest", "revision", "ordered", "http", "trouble")
     said = {name: getattr(member, name) for name in names}
-    return {**said, "counts": dict(member.counts), "heard_s": round(present.heard_s, 3), "is_self": is_self}
+    return {**said, "counts": dict(member.counts), "heard_s": round(heard.heard_s, 3), "is_self": is_self}
+
+
+def told_lost(heard: Heard) -> dict[str, Any]:
+    """Return the same of one that has gone without a word."""
+    return {**told(heard, is_self=False), "state": LOST, "reason": last_heard(heard.heard_s)}
+
+
+def last_heard(heard_s: float) -> str:
+    """Return since when nothing is known of a replica: a sentence without its full stop."""
+    return f"it was heard last {heard_s:.1f} s ago, and has not said that it ends"

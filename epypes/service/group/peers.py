@@ -13,7 +13,7 @@ from epypes.service.desk import Desk
 from epypes.service.dispatch import Dispatcher
 from epypes.service.entrances import BrokerEntrance, SocketEntrance
 from epypes.service.group.group import Group
-from epypes.service.group.membership import Member, Present, summary, told
+from epypes.service.group.membership import Heard, Member, summary, told
 from epypes.service.ledger import Entry
 from epypes.service.options import Options, bare
 from epypes.service.parameters import Parameters
@@ -85,8 +85,8 @@ class Alone:
 
     def told(self) -> dict[str, Any]:
         """Return what there is to know of the group, of which this is the one member; JSON-ready."""
-        present = [Present(self._parts.member(), 0.0)]
-        heard = {"trouble": "", "rejected": 0, "members": [told(present[0], is_self=True)]}
+        present = [Heard(self._parts.member(), 0.0)]
+        heard = {"trouble": "", "rejected": 0, "members": [told(present[0], is_self=True)], "lost": []}
         return {"is_shared": False, **summary(present), **heard}
 
     def counts(self) -> dict[str, int]:

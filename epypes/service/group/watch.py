@@ -1,4 +1,4 @@
-"""What of the others is worth a line in a replica's log? Pure: times are given."""
+"""What of the others is worth a line in a replica's log, and who has gone without a word? Pure: times are given."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ from dataclasses import dataclass
 from math import inf
 from typing import Final
 
-from epypes.service.group.membership import LOST_S, Member, Present
+from epypes.service.group.membership import LOST_S, Heard, Member, last_heard
 
 # Who looks less often has not heard anybody meanwhile: the broker was away, or this replica was stopped.
 _DEAF_S: Final = 2.0
+# For so long, and of so many, is said that they have gone.
+_LOST_FOR_S: Final = 600.0
+_MOST_LOST: Final = 100
 _DIGITS: Final = 12
 
 Line = tuple[int, str]
@@ -31,6 +34,7 @@ class Watch:
     def __init__(self) -> None:
         self._known: dict[str, _Known] = {}
         self._left: set[str] = set()
+        self._lost: dict[str, _Known] = {}
         self._looked_s, self._sure_from_s = -inf, -inf
 
     def left(self, member_id: str) -> None:
@@ -38,7 +42,12 @@ class Watch:
         if member_id in self._known:
             self._left.add(member_id)
 
-    def look(self, own: Member, present: list[Present], now_s: float) -> list[Line]:
+    def lost(self, now_s: float) -> list[Heard]:
+        """Return who has gone without a word in the last ten minutes, and is not back, nor another of the same name."""
+        heard = [Heard(known.member, now_s - known.heard_at_s) for known in self._lost.values()]
+        return [each for each in heard if each.heard_s <= _LOST_FOR_S]
+
+    def look(self, own: Member, present: list[Heard], now_s: float) -> list[Line]:
         """Return levels and lines for a log: who has come, who has gone, and who does not go with this replica."""
         if now_s - self._looked_s > _DEAF_S:
             self._sure_from_s = now_s + LOST_S
@@ -47,9 +56,10 @@ class Watch:
         lines = self._gone(others, now_s)
         for each in others.values():
             lines += self._met(own, each, now_s)
+        self._found(others)
         return lines
 
-    def _gone(self, others: dict[str, Present], now_s: float) -> list[Line]:
+    def _gone(self, others: dict[str, Heard], now_s: float) -> list[Line]:
         lines: list[Line] = []
         for key in [key for key in self._known if key not in others]:
             known = self._known[key]
@@ -58,13 +68,14 @@ class Watch:
             elif now_s < self._sure_from_s:
                 continue
             else:
-                text = f"is gone: it was heard last {now_s - known.heard_at_s:.1f} s ago, and has not said that it ends"
+                text = f"is gone: {last_heard(now_s - known.heard_at_s)}"
                 lines.append((logging.WARNING, f"{_called(known.member)} {text}"))
+                self._lost[key] = known
             del self._known[key]
         self._left.clear()
         return lines
 
-    def _met(self, own: Member, other: Present, now_s: float) -> list[Line]:
+    def _met(self, own: Member, other: Heard, now_s: float) -> list[Line]:
         member, lines = other.member, list[Line]()
         known = self._known.get(member.id)
         if known is None:
@@ -74,6 +85,15 @@ class Watch:
         lines += [(logging.WARNING, f"{_called(member)} {text}") for text in odd if text not in known.odd]
         known.member, known.heard_at_s, known.odd = member, now_s - other.heard_s, odd
         return lines
+
+    def _found(self, others: dict[str, Heard]) -> None:
+        """Have nobody be lost who is back, or in whose place there is another one."""
+        places = {_place(each.member) for each in others.values()}
+        for key, known in list(self._lost.items()):
+            if key in others or _place(known.member) in places:
+                del self._lost[key]
+        for key in list(self._lost)[:-_MOST_LOST]:
+            del self._lost[key]
 
 
 def odds(own: Member, other: Member) -> list[str]:
@@ -93,6 +113,10 @@ def odds(own: Member, other: Member) -> list[str]:
 
 def _served(member: Member) -> str:
     return f"{member.name or 'without a name'} ({member.digest[:_DIGITS]})"
+
+
+def _place(member: Member) -> tuple[str, str]:
+    return member.replica, member.host
 
 
 def _called(member: Member) -> str:

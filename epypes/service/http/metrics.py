@@ -117,6 +117,8 @@ def _group(group: Mapping[str, Any]) -> Iterator[Metric]:
     if group["is_shared"]:
         yield GaugeMetricFamily("epypes_group_replicas", "Replicas that share the events.", group["replicas"])
         yield GaugeMetricFamily("epypes_group_ready", "Those of them that are ready.", group["ready"])
+        lost = "Those that have gone without a word in the last ten minutes, and are not back."
+        yield GaugeMetricFamily("epypes_group_lost", lost, len(group["lost"]))
         agree = "1 if all of them have the same bundle and revision of the parameters."
         yield GaugeMetricFamily("epypes_group_agrees", agree, float(group["agree"]))
 

@@ -121,6 +121,9 @@ class Group(BaseModel):
     trouble: str = Field(description="Why this one does not hear the others; empty if it does.")
     rejected: int = Field(description="How many messages among the replicas were none of theirs.")
     members: list[Member]
+    lost: list[Member] = Field(
+        description="Who has gone without a word in the last ten minutes and is not back, as heard last; state LOST."
+    )
 
 
 class Parameters(BaseModel):

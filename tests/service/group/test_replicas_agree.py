@@ -123,10 +123,12 @@ def test_any_replica_answers_for_all_over_http(trio, http):
     told = http.get("/v1/group").json()
     assert told["replicas"] == 3
     assert [each["pid"] for each in told["members"]] == [first.info()["pid"]] * 3
+    assert told["lost"] == []
     assert told["members"][0].keys() >= {"host", "state", "reason", "revision", "digest", "counts", "http", "heard_s"}
     metrics = http.get("/metrics").text
     assert "epypes_group_replicas 3.0" in metrics
     assert "epypes_group_ready 3.0" in metrics
+    assert "epypes_group_lost 0.0" in metrics
 
 
 @pytest.mark.slow

@@ -61,6 +61,60 @@ def test_who_is_not_heard_any_more_is_said_to_be_gone_with_the_time_since(log):
     assert log.take() == [(logging.INFO, "replica 2 at there is in the group")]
 
 
+def lost(log, at_s):
+    return [(each.member.id, round(each.heard_s, 1)) for each in log.watch.lost(at_s)]
+
+
+def gone(log, *others):
+    """Have some be heard for three seconds, and not for five."""
+    for at_s in range(9):
+        log.second(at_s, OWN, *(others if at_s < 4 else ()))
+
+
+def test_who_is_gone_without_a_word_is_lost_until_he_is_back(log):
+    gone(log, peer())
+    assert lost(log, 8.0) == [("other", 5.0)]
+    log.second(9, OWN, peer())
+    assert lost(log, 9.0) == []
+
+
+def test_who_says_that_it_ends_is_not_lost(log):
+    for at_s in range(4):
+        log.second(at_s, OWN, peer())
+    log.members.left("other")
+    log.watch.left("other")
+    for at_s in range(4, 9):
+        log.second(at_s, OWN)
+    assert lost(log, 9.0) == []
+
+
+@pytest.mark.parametrize("is_early", [True, False])
+def test_another_of_the_same_name_takes_the_place_of_a_lost_one_for_good(log, is_early):
+    gone(log, peer())
+    other = Member("third", "3", "there")
+    for at_s in range(9, 18):
+        log.second(at_s, OWN, *([Member("new", "2", "there"), other] if is_early or at_s > 12 else [other]))
+    assert lost(log, 18.0) == []
+    log.members.left("new")
+    log.watch.left("new")
+    for at_s in range(18, 24):
+        log.second(at_s, OWN)
+    assert lost(log, 24.0) == [("third", 7.0)]
+
+
+def test_another_of_the_same_name_elsewhere_is_another(log):
+    gone(log, peer())
+    log.second(9, OWN, Member("new", "2", "elsewhere"))
+    assert lost(log, 9.0) == [("other", 6.0)]
+
+
+def test_of_who_was_lost_long_ago_and_of_more_than_a_hundred_nothing_is_said(log):
+    gone(log, *(Member(f"{number}", f"{number}", "there") for number in range(120)))
+    assert [key for key, _ in lost(log, 9.0)] == [f"{number}" for number in range(20, 120)]
+    assert len(lost(log, 603.0)) == 100
+    assert lost(log, 603.1) == []
+
+
 def test_who_has_heard_nobody_says_of_nobody_that_he_is_gone(log):
     for at_s in range(6):
         log.second(at_s, OWN, peer())

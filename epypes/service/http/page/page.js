@@ -7,7 +7,7 @@ import { sawGroup } from "./replicas.js";
 import { ask, confirmed, hasToken, isTokenKnown, hear, keepToken, make, part, Refused, say, takeToken } from "./server.js";
 
 /** @type {Record<string, string>} */
-const TONES = { READY: "good", LOADING: "warn", PAUSED: "warn", DRAINING: "warn", DEGRADED: "error", FAULTED: "error" };
+const TONES = { READY: "good", LOADING: "warn", PAUSED: "warn", DRAINING: "warn", DEGRADED: "error", FAULTED: "error", LOST: "error" };
 const DIGITS = 12;
 
 let state = "";

@@ -6,7 +6,7 @@ const DIGITS = 12;
 /**
  * @typedef {{replica: string, host: string, pid: number, state: string, reason: string, digest: string, revision: number,
  *   counts: Record<string, number>, http: string, trouble: string, heard_s: number, is_self: boolean}} Member
- * @typedef {{replicas: number, ready: number, agree: boolean, counts: Record<string, number>, trouble: string, members: Member[]}} Group
+ * @typedef {{replicas: number, ready: number, agree: boolean, counts: Record<string, number>, trouble: string, members: Member[], lost: Member[]}} Group
  */
 
 /** @type {Map<string, {answered: number, at: number, rate: number | null}>} */
@@ -14,7 +14,7 @@ let seen = new Map();
 
 /** @param {Group} group @param {Record<string, string>} tones by state */
 export function sawGroup(group, tones) {
-  part("replicas-section").hidden = group.replicas < 2 && !group.trouble;
+  part("replicas-section").hidden = group.replicas < 2 && !group.trouble && !group.lost.length;
   const note = [`${group.ready} of ${group.replicas} are ready; together they have answered ${total(group)} events.`];
   if (!group.agree) note.push("They do not all serve the same bundle with the same parameters just now.");
   if (group.trouble) note.push(`The others are not heard: ${group.trouble}`);
@@ -24,6 +24,7 @@ export function sawGroup(group, tones) {
   const now = new Map();
   const here = group.members.find((member) => member.is_self)?.host;
   const rows = group.members.map((member) => row(member, rate(member, now), tones, isReached(member, here)));
+  rows.push(...group.lost.map((member) => row(member, null, tones, false)));
   seen = now;
   part("replicas").tBodies[0].replaceChildren(...rows);
 }
