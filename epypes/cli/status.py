@@ -21,6 +21,8 @@ _OF_BROKER = ("dead_letters", "redelivered", "duplicates", "given_back", "overta
 _DIGITS = 12
 _UNKNOWN = "RUNNING"
 _NO_HTTP = "no --http"
+# What the others say of a replica that has gone without a word.
+_LOST = "LOST"
 # In what replicas of one group should be alike.
 _MAY_DIFFER = ("name", "digest", "ordered")
 
@@ -144,8 +146,7 @@ def _group_lines(found: list[dict[str, Any]], *, is_one: bool) -> list[str]:
     lines += [*_parameters_line(first), _addresses_line(first)]
     differ = {name: len({each[name] for each in group["members"] if name in each}) > 1 for name in _MAY_DIFFER}
     told = {_gist(group["trouble"])}
-    members = [*_members(found, group), *group["lost"]]
-    return [*lines, *(_member_line(member, differ, told) for member in members)]
+    return [*lines, *(_member_line(member, differ, told) for member in _members(found, group))]
 
 
 def _hears(found: dict[str, Any]) -> tuple[bool, int]:
@@ -157,19 +158,21 @@ def _head_lines(found: dict[str, Any], group: dict[str, Any]) -> list[str]:
     if group["trouble"]:
         return [f"Group of {served}: the other replicas are not heard: {group['trouble']}"]
     agree = "all with" if group["agree"] else "not all with"
-    said = f"Group: replicas {group['replicas']}, ready {group['ready']}, {agree} the same bundle and parameters"
+    lost = f", lost {len(group['lost'])}" if group["lost"] else ""
+    said = f"Group: replicas {group['replicas']}, ready {group['ready']}{lost}, {agree} the same bundle and parameters"
     return [f"{said}: {served}."]
 
 
 def _members(found: list[dict[str, Any]], group: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the members of a group, and who runs here besides; what was seen here of a member beside its own words."""
+    """Return the members of a group, who runs here besides, and who is lost; with what was seen of them here."""
     here = {(each["replica"], each["pid"]): each for each in found}
     members = []
-    for member in group["members"]:
+    for member in (*group["members"], *group["lost"]):
         own = here.pop((member["replica"], member["pid"]), {}) if _is_here(member) else {}
         silent = own.get("reason", "") if own.get("state") == "SILENT" else ""
         members.append({**member, "silent": silent})
-    return [*members, *(_member_of(each) for each in here.values())]
+    lost = [member for member in members if member["state"] == _LOST]
+    return [*members[: len(group["members"])], *(_member_of(each) for each in here.values()), *lost]
 
 
 def _is_here(member: dict[str, Any]) -> bool:
@@ -187,7 +190,8 @@ def _member_line(member: dict[str, Any], differ: dict[str, bool], told: set[str]
     """Return what there is to say of a member, but for reasons that were told before: one broker is away for all."""
     reasons = []
     for text in filter(None, (member.get(name, "") for name in ("reason", "trouble", "silent"))):
-        if _gist(text) not in told:
+        # Whom the others have lost each is lost for himself.
+        if _gist(text) not in told or member["state"] == _LOST:
             reasons.append(text)
             told.add(_gist(text))
     why = f" ({' '.join(reasons)})" if reasons else ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 import shutil
@@ -75,13 +74,13 @@ def here(tmp_path, monkeypatch):
     """Start the server by the README's line, on a port of its own; what the addresses begin with then."""
     if not is_installed():
         pytest.skip("nats is not installed on this machine: sh .ci/brokers")
-    (line,) = (line for block in blocks("sh") for line in block.splitlines() if line.startswith("nats-server "))
+    (line,) = (line for block in blocks("sh") for line in block.splitlines() if " nats-server " in line)
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    name, *options = shlex.split(line)
     monkeypatch.chdir(tmp_path)
-    program = shutil.which(name, path=f"{os.environ['PATH']}:/usr/sbin:/usr/local/sbin")
-    with subprocess.Popen([program, *options, "--port", str(port)], stderr=subprocess.PIPE, text=True) as server:
+    # The shell becomes the server, which is ended then.
+    line = f"{line.replace('nats-server', 'exec nats-server', 1)} --port {port}"
+    with subprocess.Popen(["sh", "-c", line], stderr=subprocess.PIPE, text=True) as server:
         try:
             assert any("Server is ready" in said for said in server.stderr)
             yield f"{BROKER}:{port}"

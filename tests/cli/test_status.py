@@ -91,3 +91,18 @@ def test_where_failures_go_besides_is_said_where_somebody_asked_for_it(epypes, a
             assert known == service.service_state.failures
         assert (f"failures at {known}" in told) is bool(failures)
         assert ("failures at" in told) is bool(failures)
+
+
+def test_each_that_is_lost_is_one_line_with_its_reason(epypes, acting, monkeypatch):
+    with replicas("lost", a=(acting, {}), b=(acting, {}), c=(acting, {})) as (first, *others):
+        for other in others:
+            # It runs here, and the others hear nothing of it.
+            monkeypatch.setattr(other._peers._group._talk, "say", lambda data: None)
+        until(lambda: len(first.group()["lost"]) == 2)
+        told = epypes("status", acting).stdout
+    assert "Group: replicas 1, ready 1, lost 2, all with the same bundle and parameters" in told
+    assert [re.sub(r"[\d.]+ s ago", "x s ago", line).partition(", 0 answered")[0] for line in members(told)] == [
+        "- a: READY",
+        "- b: LOST (it was heard last x s ago, and has not said that it ends; its counts are of then)",
+        "- c: LOST (it was heard last x s ago, and has not said that it ends; its counts are of then)",
+    ]

@@ -19,6 +19,8 @@ from epypes.transport.channels import Channel, Received, open_channel, place_of
 from tests.brokers import rabbitmq
 
 pika = pytest.importorskip("pika")
+from epypes.transport.channels.amqp.reasons import leader_hint  # noqa: E402 - it needs pika
+
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(not rabbitmq.is_installed(), reason="RabbitMQ is not installed: rabbitmq-server"),
@@ -384,17 +386,23 @@ def test_a_queue_that_says_nothing_is_told_of_and_what_was_rejected_stays_until_
     try:
         received(channel).reject("it is spoilt")
         text = str(lost(lambda: channel.receive(0.1)))
-        with pytest.raises(BrokerError, match=f"did not answer within 1 s.*quorum_status '{name}.dead'"):
+        with pytest.raises(BrokerError, match=f"did not answer within 1 s.*quorum_status '{name}.dead' says"):
             opened(server.address(f"{name}.dead"), timeout_s=1.0).receive(0.0)
     finally:
         server.control("eval", f"sys:resume({queue}).")
     assert ".dead did not confirm a message within 1 s: it may have it or not. If" in text
-    assert text.endswith(f" see whether the queue has a leader: rabbitmq-queues quorum_status '{name}.dead'.")
+    assert text.endswith(f" rabbitmq-queues quorum_status '{name}.dead' says whether the queue has a leader.")
     channel.close()
     again = received(opened(server.address(name)))
     assert again.attempt == 2
     again.reject("it is still spoilt")
     assert received(opened(server.address(f"{name}.dead"))).id == "spoilt"
+
+
+def test_where_to_look_is_said_as_a_shell_takes_it():
+    assert " quorum_status robots says " in leader_hint(place_of("amqp://h/robots"))
+    assert " quorum_status --vhost 'cell 7' 'it'\"'\"'s' says " in leader_hint(place_of("amqp://h/it's?vhost=cell%207"))
+    assert leader_hint(place_of("amqp://h/robots?kind=broadcast")) == "", "an exchange has none"
 
 
 def test_a_channel_that_nobody_uses_is_kept_alive(server, name, opened, monkeypatch):

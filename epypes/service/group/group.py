@@ -14,7 +14,7 @@ from typing import Any, Final
 from epypes.errors import BrokerError, MessageError, ServiceError
 from epypes.service.group.agreement import Agreement, Tuned
 from epypes.service.group.membership import Heard, Member, Membership, summary, told, told_lost
-from epypes.service.group.notices import MOST_ID, MOST_IDS, Beat, Begun, Done, Left, Notice, read_notice, written
+from epypes.service.group.notices import MOST_ID, MOST_IDS, Beat, Begun, Done, Left, Lost, Notice, read_notice, written
 from epypes.service.group.order import Order, place_in_stream
 from epypes.service.group.talk import Talk
 from epypes.service.group.turnstile import Stream
@@ -25,6 +25,8 @@ from epypes.transport.channels import Place, Received
 _log = logging.getLogger("epypes.service")
 
 BEAT_S: Final = 1.0
+# With so many beats newcomers are told who is lost: at the first of them one may not listen yet.
+_TELLINGS: Final = 3
 # What is done is said together for so long; at once where others wait for it.
 _BATCH_S: Final = 0.1
 _STOP_S: Final = 2.0
@@ -88,6 +90,7 @@ class Group:
         self._to_acknowledge: list[Callable[[], object]] = []
         self._begun: list[tuple[Stream, int]] = []
         self._said_revision, self._is_beat_due = -1, False
+        self._tellings = 0
         self._is_over = False
         self._thread = threading.Thread(target=self._run, name="epypes group", daemon=True)
         self.rejected = 0
@@ -218,7 +221,7 @@ class Group:
         while not self._is_over:
             if monotonic() >= next_beat_s or self._is_beat_due:
                 next_beat_s, self._is_beat_due = monotonic() + BEAT_S, False
-                self._say([self._beat()])
+                self._say([self._beat(), *self._losses()])
                 self._changed()
             self._tell()
             self._wait(next_beat_s)
@@ -265,6 +268,14 @@ class Group:
             self._members.heard(member, monotonic(), is_self=True)
         return Beat(member, () if self._order is None else self._order.known())
 
+    def _losses(self) -> list[Notice]:
+        """Return who is lost, while somebody has come who can't know it."""
+        with self._lock:
+            if self._tellings == 0:
+                return []
+            self._tellings -= 1
+            return [Lost(each) for each in self._watch.lost(monotonic())]
+
     def _news(self) -> list[Notice]:
         if self._talk.trouble:
             return []
@@ -310,14 +321,11 @@ class Group:
                 self._watch.left(notice.member_id)
             self._look()
             self._changed()
-        elif notice.member_id == self.id:
-            return
-        elif isinstance(notice, Done):
-            self._seen(notice.ids)
-            if self._order is not None:
-                self._order.done(notice.numbers)
-        elif self._order is not None:
-            self._order.begun_elsewhere(notice.numbers)
+        elif isinstance(notice, Lost):
+            with self._lock:
+                self._watch.told_of(notice.heard, monotonic())
+        elif notice.member_id != self.id:
+            self._heard_of_events(notice)
 
     def _heard_beat(self, beat: Beat) -> None:
         member = beat.member
@@ -327,6 +335,8 @@ class Group:
             return
         with self._lock:
             is_new = self._members.heard(member, monotonic())
+            if is_new:
+                self._tellings = _TELLINGS
         if self._order is not None:
             self._order.told(beat.known)
         if is_new:
@@ -335,6 +345,14 @@ class Group:
             self._beat_soon()
             self._changed()
         self._compare(member)
+
+    def _heard_of_events(self, notice: Done | Begun) -> None:
+        if isinstance(notice, Done):
+            self._seen(notice.ids)
+            if self._order is not None:
+                self._order.done(notice.numbers)
+        elif self._order is not None:
+            self._order.begun_elsewhere(notice.numbers)
 
     def _look(self) -> None:
         own, present = self._member(), self.present()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -89,13 +89,17 @@ class Membership:
     def present(self, now_s: float) -> list[Heard]:
         """Return the replicas that live, in the order of their names."""
         self._forget(now_s)
-        found = [Heard(member, max(now_s - at_s, 0.0)) for member, at_s in self._heard.values()]
-        return sorted(found, key=lambda each: (len(each.member.replica), each.member.replica, each.member.id))
+        return by_name(Heard(member, max(now_s - at_s, 0.0)) for member, at_s in self._heard.values())
 
     def _forget(self, now_s: float) -> None:
         gone = [key for key, (_, at_s) in self._heard.items() if now_s - at_s > LOST_S]
         for key in gone:
             del self._heard[key]
+
+
+def by_name(heard: Iterable[Heard]) -> list[Heard]:
+    """Return replicas in the order of their names, as people count."""
+    return sorted(heard, key=lambda each: (len(each.member.replica), each.member.replica, each.member.id))
 
 
 def summary(present: list[Heard]) -> dict[str, Any]:
@@ -129,7 +133,11 @@ def told(heard: Heard, *, is_self: bool) -> dict[str, Any]:
 
 def told_lost(heard: Heard) -> dict[str, Any]:
     """Return the same of one that has gone without a word."""
-    return {**told(heard, is_self=False), "state": LOST, "reason": last_heard(heard.heard_s)}
+    return {
+        **told(heard, is_self=False),
+        "state": LOST,
+        "reason": f"{last_heard(heard.heard_s)}; its counts are of then",
+    }
 
 
 def last_heard(heard_s: float) -> str:

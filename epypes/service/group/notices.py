@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Final, TypeVar
 
 from epypes.errors import MessageError
-from epypes.service.group.membership import Member
+from epypes.service.group.membership import Heard, Member
 from epypes.service.group.revisions import Proposal
 from epypes.service.group.turnstile import Stream
 
@@ -70,7 +70,14 @@ class Begun:
     numbers: Sequence[tuple[Stream, int]]
 
 
-Notice = Beat | Left | Done | Begun
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """A replica has gone without a word; said to those who came later."""
+
+    heard: Heard
+
+
+Notice = Beat | Left | Done | Begun | Lost
 
 
 def written(notice: Notice | Proposal) -> bytes:
@@ -123,9 +130,17 @@ def _read(read: Callable[[], _T]) -> _T:
 # -- as they are written ----------------------------------------------------------------------------------------------
 
 
+def _written_member(member: Member) -> dict[str, Any]:
+    return {name: part[:_MOST_TEXT] if isinstance(part, str) else part for name, part in asdict(member).items()}
+
+
 def _written_beat(beat: Beat) -> dict[str, Any]:
-    told = {name: part[:_MOST_TEXT] if isinstance(part, str) else part for name, part in asdict(beat.member).items()}
-    return {"kind": "beat", "member": told, "known": [[*stream, at] for stream, at in beat.known]}
+    known = [[*stream, at] for stream, at in beat.known]
+    return {"kind": "beat", "member": _written_member(beat.member), "known": known}
+
+
+def _written_lost(lost: Lost) -> dict[str, Any]:
+    return {"kind": "lost", "member": _written_member(lost.heard.member), "heard_ms": round(lost.heard.heard_s * 1e3)}
 
 
 def _written_done(done: Done) -> dict[str, Any]:
@@ -143,6 +158,7 @@ _WRITERS: Final[Mapping[type, Callable[[Any], dict[str, Any]]]] = {
     Done: _written_done,
     Begun: _written_begun,
     Left: lambda left: {"kind": "left", "from": left.member_id},
+    Lost: _written_lost,
     Proposal: asdict,
 }
 
@@ -150,10 +166,12 @@ _WRITERS: Final[Mapping[type, Callable[[Any], dict[str, Any]]]] = {
 # -- as they are read -------------------------------------------------------------------------------------------------
 
 
+def _member(told: Mapping[str, Any]) -> Member:
+    return Member(**{field.name: _FIELDS[str(field.type)](told, field.name) for field in fields(Member)})
+
+
 def _beat(said: Mapping[str, Any]) -> Beat:
-    told = said["member"]
-    parts = {field.name: _FIELDS[str(field.type)](told, field.name) for field in fields(Member)}
-    return Beat(Member(**parts), [(_stream(row), _whole(row[2])) for row in _rows(said["known"])])
+    return Beat(_member(said["member"]), [(_stream(row), _whole(row[2])) for row in _rows(said["known"])])
 
 
 def _done(said: Mapping[str, Any]) -> Done:
@@ -178,6 +196,7 @@ _READERS: Final[Mapping[str, Callable[[Mapping[str, Any]], Notice]]] = {
     "done": _done,
     "begun": _begun,
     "left": lambda said: Left(_text(said, "from")),
+    "lost": lambda said: Lost(Heard(_member(said["member"]), _whole(said["heard_ms"]) / 1e3)),
 }
 
 

@@ -55,13 +55,15 @@ def test_one_address_tells_of_all_replicas_whoever_is_killed(bundle, nats):
         assert (lost["state"], lost["pid"], lost["counts"]["failed"]) == ("LOST", members[2].process.pid, 0)
         (line,) = (line for line in status(first.url).splitlines() if "LOST" in line)
         assert line.startswith("- 3: LOST (it was heard last ")
-        assert " s ago, and has not said that it ends), " in line
+        assert " s ago, and has not said that it ends; its counts are of then), " in line
+        assert "Group: replicas 2, ready 2, lost 1, all with" in status(first.url)
         with replicas(bundle, sub, pub, names=["again"]) as (newcomer,), control(newcomer) as last:
             # It is ready at once; its events wait until it has read the others' log.
             until(lambda: last.parameters().revision == 1, last.group)
             assert last.parameters().entries["gain"]["value"] == 5
             until(lambda: first.group()["replicas"] == last.group()["replicas"] == 3, last.group)
             assert last.group()["agree"] is True
+            until(lambda: [each["replica"] for each in last.group()["lost"]] == ["3"], last.group)
         # One of its name has come in its place, as a supervisor starts it, and the newcomer was killed.
         with replicas(bundle, sub, pub, names=["3"]):
             until(lambda: [each["replica"] for each in first.group()["lost"]] == ["again"], first.group)

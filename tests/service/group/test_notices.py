@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from epypes.errors import MessageError
-from epypes.service.group.membership import Member
-from epypes.service.group.notices import Beat, Begun, Done, Left, read_notice, read_proposal, written
+from epypes.service.group.membership import Heard, Member
+from epypes.service.group.notices import Beat, Begun, Done, Left, Lost, read_notice, read_proposal, written
 from epypes.service.group.order import place_in_stream
 from epypes.service.group.revisions import Proposal
 from epypes.wire import Envelope
@@ -16,6 +16,7 @@ NOTICES = [
     Left("a1"),
     Done("a1", ["e1", "e2"], [(("camera", 17), 3, False), (("camera", 17), 5, True)]),
     Begun("a1", [(("", 0), 7)]),
+    Lost(Heard(Member("a1", "1", "host", 7, counts={"answered": 5}), 12.345)),
 ]
 
 
@@ -44,6 +45,7 @@ def test_an_entry_of_the_log_is_understood():
         b'{"v":1,"kind":"done","from":"a","ids":[],"numbers":[["s",1]]}',
         b'{"v":1,"kind":"done","from":"a","ids":[],"numbers":[["s",1,-1,false]]}',
         b'{"v":1,"kind":"beat","member":{"id":"a"},"known":[]}',
+        b'{"v":1,"kind":"lost","member":{"id":"a"},"heard_ms":1}',
         b'{"v":1,"kind":"done","from":"a","ids":"abc","numbers":[]}',
         b'{"v":1,"kind":"done","from":"a","numbers":[],"ids":["a"' + b',"a"' * 1_000 + b"]}",
         b"[" * 100_000,

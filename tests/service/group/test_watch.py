@@ -4,7 +4,7 @@ import logging
 
 import pytest
 
-from epypes.service.group.membership import Member, Membership
+from epypes.service.group.membership import Heard, Member, Membership
 from epypes.service.group.watch import Watch, odds
 from tests.service.served import acting_bundle, until
 from tests.service.test_brokered import line_of, replica_of
@@ -88,13 +88,43 @@ def test_who_says_that_it_ends_is_not_lost(log):
     assert lost(log, 9.0) == []
 
 
+def test_after_an_outage_others_have_the_time_that_a_connection_takes_to_come_back(log):
+    for at_s in range(4):
+        log.second(at_s, OWN, peer())
+    # They try again each five seconds at most, and speak each second.
+    for at_s in range(20, 29):
+        log.second(at_s, OWN)
+    assert lost(log, 29.0) == []
+    log.second(29, OWN, peer())
+    assert log.take() == [(logging.INFO, "replica 2 at there is in the group")]
+
+
+def test_who_came_later_takes_the_word_of_others_for_who_is_lost(log):
+    log.watch.told_of(Heard(peer(), 5.0), 10.0)
+    assert lost(log, 12.0) == [("other", 7.0)]
+    log.watch.told_of(Heard(peer(), 9.0), 12.0)
+    assert lost(log, 12.0) == [("other", 7.0)], "the first word counts"
+    log.second(13, OWN, peer())
+    assert lost(log, 13.0) == []
+    log.watch.told_of(Heard(peer(), 5.0), 14.0)
+    assert lost(log, 14.0) == [], "it has heard him itself"
+    log.watch.told_of(Heard(Member("before", "1", "here"), 5.0), 15.0)
+    log.second(15, OWN)
+    assert lost(log, 15.0) == [], "this one is in his place"
+    assert log.take() == [(logging.INFO, "replica 2 at there is in the group")]
+
+
 @pytest.mark.parametrize("is_early", [True, False])
 def test_another_of_the_same_name_takes_the_place_of_a_lost_one_for_good(log, is_early):
-    gone(log, peer())
-    other = Member("third", "3", "there")
-    for at_s in range(9, 18):
-        log.second(at_s, OWN, *([Member("new", "2", "there"), other] if is_early or at_s > 12 else [other]))
+    other, new = Member("third", "3", "there"), Member("new", "2", "there")
+    for at_s in range(4):
+        log.second(at_s, OWN, peer(pid=7), other)
+    for at_s in range(4, 18):
+        log.second(at_s, OWN, *([new, other] if is_early or at_s > 12 else [other]))
     assert lost(log, 18.0) == []
+    again = "replica 2 at there has come again, in place of process 7, which has not said that it ends"
+    assert ((logging.INFO, again) in log.lines) is is_early
+    assert any("replica 2 at there is gone" in line for _, line in log.lines) is not is_early
     log.members.left("new")
     log.watch.left("new")
     for at_s in range(18, 24):
@@ -110,7 +140,7 @@ def test_another_of_the_same_name_elsewhere_is_another(log):
 
 def test_of_who_was_lost_long_ago_and_of_more_than_a_hundred_nothing_is_said(log):
     gone(log, *(Member(f"{number}", f"{number}", "there") for number in range(120)))
-    assert [key for key, _ in lost(log, 9.0)] == [f"{number}" for number in range(20, 120)]
+    assert sorted(map(int, (key for key, _ in lost(log, 9.0)))) == list(range(20, 120))
     assert len(lost(log, 603.0)) == 100
     assert lost(log, 603.1) == []
 
@@ -124,7 +154,7 @@ def test_who_has_heard_nobody_says_of_nobody_that_he_is_gone(log):
         log.second(at_s, OWN, peer())
     assert log.take() == []
     log.second(60, OWN)
-    for at_s in range(61, 70):
+    for at_s in range(61, 75):
         log.second(at_s, OWN)
     assert [text[:25] for _, text in log.take()] == ["replica 2 at there is gon"], "it has not come back"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import ssl
+from shlex import quote
 from typing import Final
 
 from pika.adapters.utils import connection_workflow as opening
@@ -45,7 +46,9 @@ def leader_hint(place: Place) -> str:
     """
     if place.kind != "queue":
         return ""
-    return f" If it goes on, see whether the queue has a leader: rabbitmq-queues quorum_status {place.name!r}."
+    where = "" if place.vhost == "/" else f"--vhost {quote(place.vhost)} "
+    command = f"rabbitmq-queues quorum_status {where}{quote(place.name)}"
+    return f" If it goes on, {command} says whether the queue has a leader."
 
 
 def innermost(error: BaseException | None) -> BaseException | None:
