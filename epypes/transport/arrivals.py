@@ -144,10 +144,12 @@ class Arrivals:
     def _say_again(self, word: Word, known_as: str, received: Received, connection: int) -> None:
         """Tell the broker what it was told of an event before.
 
-        A word that was said over a connection that broke may not have been heard. For an answered event nothing is
-        lost by that, but what was rejected would not be among the dead letters.
+        A word that was said over a connection that broke may not have been heard, nor one on what the same connection
+        delivers again. For an answered event nothing is lost by that, but what was rejected would not be among the dead
+        letters. One that is delivered for the first time was sent twice.
         """
-        if word.reason is None or word.connection == connection:
+        is_heard = word.connection == connection and received.attempt <= 1
+        if word.reason is None or is_heard:
             received.ack()
             return
         self.seen.finish(known_as, replace(word, connection=connection))

@@ -92,28 +92,44 @@ def left(address):
     return {"amqp": _left_in_rabbitmq, "nats": _left_in_nats, "mqtt": lambda place: 0}[place.scheme](place)
 
 
+def remove(address):
+    """Remove a queue with what it keeps, by the broker's own client."""
+    place = place_of(address)
+    if place.scheme == "amqp":
+        _in_rabbitmq(place, lambda channel: channel.queue_delete(place.name))
+    else:
+        _in_nats(place, lambda jetstream, stream: jetstream.delete_stream(stream))
+
+
 def _left_in_rabbitmq(place):
+    return _in_rabbitmq(place, lambda channel: channel.queue_declare(place.name, passive=True)).method.message_count
+
+
+def _in_rabbitmq(place, ask):
     import pika
 
     credentials = pika.PlainCredentials(place.user, place.password)
     parameters = pika.ConnectionParameters(place.host, place.port, place.vhost, credentials)
     with pika.BlockingConnection(parameters) as connection:
-        return connection.channel().queue_declare(place.name, passive=True).method.message_count
+        return ask(connection.channel())
 
 
 def _left_in_nats(place):
+    # Not what the stream keeps: a server that was killed may find messages again in its files that had been
+    # acknowledged; it knows that, and delivers them to nobody.
+    found = _in_nats(place, lambda jetstream, stream: jetstream.consumer_info(stream, place.group))
+    return found.num_pending + found.num_ack_pending
+
+
+def _in_nats(place, ask):
     import nats
 
-    async def ask():
+    async def asked():
         client = await nats.connect(f"nats://{place.host}:{place.port}", user=place.user, password=place.password)
         try:
             jetstream = client.jetstream()
-            stream = await jetstream.find_stream_name_by_subject(place.name)
-            # Not what the stream keeps: a server that was killed may find messages again in its files that had been
-            # acknowledged; it knows that, and delivers them to nobody.
-            found = await jetstream.consumer_info(stream, place.group)
-            return found.num_pending + found.num_ack_pending
+            return await ask(jetstream, await jetstream.find_stream_name_by_subject(place.name))
         finally:
             await client.close()
 
-    return apart(lambda: asyncio.run(ask()))
+    return apart(lambda: asyncio.run(asked()))

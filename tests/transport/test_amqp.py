@@ -155,17 +155,72 @@ def test_what_is_rejected_is_a_dead_letter_that_says_why(server, name, opened):
     assert channel.receive(0.2) is None
 
 
-def test_a_dead_letter_that_nobody_can_take_stays_where_it_was(server, name, opened, other):
-    channel = opened(server.address(name, create=True))
-    channel.send([b"keep me"])
+@pytest.fixture
+def soon(monkeypatch):
+    """What could not be put aside comes again soon."""
+    monkeypatch.setattr("epypes.transport.channels.amqp.channel._AGAIN_S", 0.2)
+
+
+@pytest.mark.parametrize("create", [True, False])
+def test_what_nobody_can_put_aside_comes_again_and_nothing_else_waits_for_it(
+    server, name, opened, other, soon, caplog, create
+):
+    opened(server.address(name, create=True))
+    channel = opened(server.address(name, create=create), prefetch=2)
+    channel.send([b"keep me"], id="spoilt")
     message = received(channel)
     other.queue_delete(f"{name}.dead")
     message.reject("no")
-    with pytest.raises(BrokerError, match=f"no queue '{name}.dead'"):
-        channel.receive(WAIT_S)
+    assert (
+        f"can't be put among the dead letters, and comes again in 0.2 s: There is no queue '{name}.dead'" in caplog.text
+    )
+    channel.send([b"other"], id="other")
+    came = {each.id: each for each in (received(channel), received(channel))}
+    assert (came["spoilt"].attempt, came["other"].attempt) == (2, 1)
+    came["other"].ack()
+    if not create:
+        came["spoilt"].reject("again no")
+        assert caplog.text.count("can't be put among the dead letters") == 2
+        other.queue_declare(f"{name}.dead", durable=True, arguments={"x-queue-type": "quorum"})
+        came["spoilt"] = received(channel)
+    came["spoilt"].reject("at last")
+    dead = received(opened(server.address(f"{name}.dead")))
+    assert (dead.id, dead.headers["epypes-reason"]) == ("spoilt", "at last")
+    assert channel.receive(0.5) is None
+
+
+def test_what_can_not_be_put_aside_while_the_queue_is_full_counts_for_nothing_else(server, name, opened, other, soon):
+    told = {"x-queue-type": "quorum", "x-max-length": 1, "x-overflow": "reject-publish"}
+    other.queue_declare(f"{name}.dead", durable=True, arguments=told)
+    channel = opened(server.address(name, create=True), prefetch=3)
+    dead = opened(server.address(f"{name}.dead"))
+    # A quorum queue takes some more than its length.
+    until(lambda: is_refused(dead))
+    for number in range(3):
+        channel.send([b"x"], id=str(number))
+    spoilt, held = received(channel), received(channel)
+    for _ in range(4):
+        spoilt.reject("no")
+        came = received(channel)
+        if came.id == "2":
+            came.ack()
+            came = received(channel)
+        assert came.id == "0"
+        spoilt = came
+    assert spoilt.attempt == 5
+    held.ack()
+    until(lambda: other.queue_declare(name, passive=True).method.message_count == 0)
     channel.close()
-    again = opened(server.address(name, create=True))
-    assert parts(received(again)) == [b"keep me"]
+    again = received(opened(server.address(name)))
+    assert (again.id, again.attempt) == ("0", 6), "the others were delivered once and are done"
+
+
+def is_refused(channel: Channel) -> bool:
+    try:
+        channel.send([b"x"])
+    except BrokerError:
+        return True
+    return False
 
 
 @pytest.mark.parametrize(
@@ -378,23 +433,22 @@ def test_a_broker_that_takes_no_messages_just_now_says_why(server, name, opened)
     assert "takes no messages just now: low on memory" in str(error)
 
 
-def test_a_queue_that_says_nothing_is_told_of_and_what_was_rejected_stays_until_it_is_put_aside(server, name, opened):
-    channel = opened(server.address(name, create=True), timeout_s=1.0)
+def test_a_queue_that_says_nothing_is_told_of_and_what_was_rejected_stays_until_it_is_put_aside(
+    server, name, opened, soon, caplog
+):
+    channel = opened(server.address(name, create=True), timeout_s=1.0, prefetch=2)
     channel.send([b"x"], id="spoilt")
     queue = f"whereis('%2F_{name}.dead')"
     server.control("eval", f"sys:suspend({queue}).")
     try:
         received(channel).reject("it is spoilt")
-        text = str(lost(lambda: channel.receive(0.1)))
         with pytest.raises(BrokerError, match=f"did not answer within 1 s.*quorum_status '{name}.dead' says"):
             opened(server.address(f"{name}.dead"), timeout_s=1.0).receive(0.0)
     finally:
         server.control("eval", f"sys:resume({queue}).")
-    assert ".dead did not confirm a message within 1 s: it may have it or not. If" in text
-    assert text.endswith(f" rabbitmq-queues quorum_status '{name}.dead' says whether the queue has a leader.")
-    channel.close()
-    again = received(opened(server.address(name)))
-    assert again.attempt == 2
+    assert ".dead did not confirm a message within 1 s: it may have it or not. If it goes on, rabbitmq" in caplog.text
+    again = received(channel)
+    assert (again.id, again.attempt) == ("spoilt", 2)
     again.reject("it is still spoilt")
     assert received(opened(server.address(f"{name}.dead"))).id == "spoilt"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import queue as queues
 import socket
 import threading
 import traceback
@@ -12,8 +13,10 @@ from uuid import uuid4
 
 import pytest
 
+import epypes as ep
 from epypes.errors import AddressError, BrokerError, MessageError
 from epypes.transport.channels import memory, open_channel, place_of
+from tests.brokers.traffic import remove
 from tests.transport.peers import wait_until
 
 WAIT_S = 10.0
@@ -23,7 +26,7 @@ ABSENT_S = 0.3
 class InThisProcess:
     """The double, as the servers are: it can be stopped and started."""
 
-    name, password = "memory", "secret"
+    name, password, has_written = "memory", "secret", True
 
     def __init__(self):
         self._host, self._away = uuid4().hex, None
@@ -173,6 +176,26 @@ def test_what_was_sent_before_anybody_listened_is_received_in_order(queue, opene
         came.append(int(bodies(received)[0]))
         received.ack()
     assert came == list(range(50))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("peer", ["rabbitmq", "nats"], indirect=True)
+def test_what_was_rejected_while_nobody_could_put_it_aside_is_a_dead_letter_in_the_end(peer, name, opened, monkeypatch):
+    """It comes again over the same connection, where it is no event that was sent twice."""
+    monkeypatch.setattr("epypes.transport.channels.amqp.channel._AGAIN_S", 0.2)
+    taken = queues.SimpleQueue()
+    opened(peer.address(name, create=True)).send([b"spoilt"], id="spoilt")
+    with ep.Subscriber(peer.address(name), taken) as subscriber:
+        item = taken.get(timeout=WAIT_S)
+        remove(peer.address(f"{name}.dead"))
+        item.reject("too dark")
+        wait_until(lambda: subscriber.duplicates == 1, WAIT_S)
+        # Which makes the place for dead letters again.
+        opened(peer.address(name, create=True)).send([b"next"], id="next")
+        taken.get(timeout=WAIT_S).ack()
+        letter = opened(peer.address(f"{name}.dead")).receive(WAIT_S)
+        assert (taken.empty(), subscriber.reconnects) == (True, 0)
+    assert (letter.id, letter.headers["epypes-reason"]) == ("spoilt", "too dark")
 
 
 @pytest.mark.slow

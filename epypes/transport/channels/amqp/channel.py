@@ -9,8 +9,9 @@ is 1 or 2 then. What a replica had been handed in advance counts as delivered to
 
 from __future__ import annotations
 
+import logging
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from epypes.errors import EpypesError
@@ -23,11 +24,15 @@ from epypes.transport.channels.place import Place
 from epypes.transport.channels.seam import Frames, Received
 from epypes.transport.channels.turns import always, nothing
 
+log = logging.getLogger("epypes.transport")
+
 # Quorum queues refuse more.
 _MOST_PREFETCH: Final = 2_000
 # Of what needs no acknowledgement so many are on their way at once.
 _AHEAD: Final = 100
 _LONGEST_REASON: Final = 4_000
+# After so long what could not be put aside comes again.
+_AGAIN_S: Final = 5.0
 _COUNT: Final = "x-delivery-count"
 # What the broker writes for its own use; a dead letter of ours must not tell of deliveries of the queue it was in.
 _OF_THE_BROKER: Final = ("x-delivery-count", "x-death", "x-first-death-", "x-last-death-", "x-stream-offset")
@@ -44,6 +49,8 @@ class AmqpChannel:
         # How much each consumer lets be in hand, by its tag: RabbitMQ leaves that as it was when a consumer began.
         self._consumers: dict[str, int] = {}
         self._arrived: deque[tuple[Any, Any, bytes]] = deque()
+        # Whether there is a place for dead letters, as far as is known.
+        self._can_put_aside = True
         try:
             make_sure(connection, place)
         except BaseException:
@@ -129,32 +136,43 @@ class AmqpChannel:
         attempt = _attempt(told.get(_COUNT), method.redelivered)
 
         def settle(reason: str | None) -> None:
-            if reason is not None and not self._put_aside(reason, body, message_id, headers, attempt):
-                return
-            self._ack(tag)
+            if reason is None or self._put_aside(reason, body, message_id, headers, attempt):
+                self._ack(tag)
+            else:
+                self._connection.later(_AGAIN_S, self._saying(lambda amqp: amqp.basic_nack(tag)))
 
         return Received(frames, message_id, attempt, shown, settle)
 
     def _ack(self, tag: int) -> None:
+        self._connection.turns.run(self._saying(lambda amqp: amqp.basic_ack(tag)), always, 0.0)
+
+    def _saying(self, say: Callable[[Any], object]) -> Callable[[], None]:
+        """Return what says something of what was delivered, if its line is open then."""
         line = self._incoming
 
-        def acknowledge() -> None:
+        def said() -> None:
             if line is not None and not line.is_over and line.amqp.is_open:
-                line.amqp.basic_ack(tag)
+                say(line.amqp)
 
-        self._connection.turns.run(acknowledge, always, 0.0)
+        return said
 
     def _put_aside(self, reason: str, body: bytes, id: str, headers: Mapping[str, str], attempt: int) -> bool:  # noqa: A002
-        """Send a message to the dead letters, and return whether it is there; else it stays where it was."""
+        """Send a message to the dead letters, and return whether it is there."""
         more = {REASON: reason[:_LONGEST_REASON], FROM: self._place.name, ATTEMPTS: str(attempt)}
         told = {**readable(body, headers), **more}
         if not fits(told):
             told = {name: value for name, value in told.items() if name in more or name == SIZES}
         try:
+            if not self._can_put_aside:
+                make_sure(self._connection, self._place)
             self._outgoing.send(aside(self._place), body, id, told)
         except EpypesError as error:
-            self._connection.lose(str(error))
+            self._can_put_aside = False
+            if not self._connection.trouble:
+                text = "A message of %s can't be put among the dead letters, and comes again in %g s: %s"
+                log.warning(text, self._place, _AGAIN_S, error)
             return False
+        self._can_put_aside = True
         return True
 
     def close(self) -> None:

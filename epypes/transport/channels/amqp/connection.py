@@ -152,6 +152,10 @@ class Connection:
         """Take it for broken; by the thread whose turn it is."""
         self.trouble = self.trouble or (error if isinstance(error, str) else reason_of(error))
 
+    def later(self, delay_s: float, work: Callable[[], object]) -> None:
+        """Have something done after so many seconds, unless it is over then."""
+        self.turns.run(lambda: self._loop.call_later(delay_s, work), always, 0.0)
+
     def error(self, text: str) -> BrokerError:
         """Return the error that says a text, and what the broker told of itself."""
         return BrokerError(str(self.place), text + self._blocked)
@@ -159,7 +163,7 @@ class Connection:
     def check(self) -> None:
         """Raise BrokerError if it is over."""
         if self.trouble:
-            raise self.error(f"The connection to {self.place} is over: {self.trouble.removesuffix('.')}.")
+            raise self.error(f"The connection to {self.place} is over: {self.trouble}.")
 
     def _listen(self) -> None:
         """Notice a broker that says nothing any more: a link that was cut tells nobody."""
