@@ -189,6 +189,21 @@ def test_what_nobody_can_put_aside_comes_again_and_nothing_else_waits_for_it(
     assert channel.receive(0.5) is None
 
 
+def test_while_one_waits_to_be_put_aside_there_is_room_for_as_many_as_before(server, name, opened, other):
+    channel = opened(server.address(name, create=True), prefetch=1)
+    for number in range(3):
+        channel.send([b"x"], id=str(number))
+    other.queue_delete(f"{name}.dead")
+    spoilt = received(channel)
+    assert channel.receive(0.2) is None
+    spoilt.reject("no")
+    second = received(channel, 2.0)
+    assert (spoilt.id, second.id) == ("0", "1")
+    assert channel.receive(0.2) is None, "one at a time"
+    second.ack()
+    assert received(channel, 2.0).id == "2"
+
+
 def test_what_can_not_be_put_aside_while_the_queue_is_full_counts_for_nothing_else(server, name, opened, other, soon):
     told = {"x-queue-type": "quorum", "x-max-length": 1, "x-overflow": "reject-publish"}
     other.queue_declare(f"{name}.dead", durable=True, arguments=told)

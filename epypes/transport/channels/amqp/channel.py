@@ -28,7 +28,7 @@ log = logging.getLogger("epypes.transport")
 
 # Quorum queues refuse more.
 _MOST_PREFETCH: Final = 2_000
-# Of what needs no acknowledgement so many are on their way at once.
+# Of what needs no acknowledgement so many are on their way at once; and so many make room that can't be put aside.
 _AHEAD: Final = 100
 _LONGEST_REASON: Final = 4_000
 # After so long what could not be put aside comes again.
@@ -49,8 +49,9 @@ class AmqpChannel:
         # How much each consumer lets be in hand, by its tag: RabbitMQ leaves that as it was when a consumer began.
         self._consumers: dict[str, int] = {}
         self._arrived: deque[tuple[Any, Any, bytes]] = deque()
-        # Whether there is a place for dead letters, as far as is known.
+        # Whether there is a place for dead letters, as far as is known; what waits for it, by delivery.
         self._can_put_aside = True
+        self._waiting: set[int] = set()
         try:
             make_sure(connection, place)
         except BaseException:
@@ -93,7 +94,11 @@ class AmqpChannel:
 
     @property
     def _room(self) -> int:
-        needed = self.prefetch if self._place.kind == "queue" else max(self.prefetch, _AHEAD)
+        if self._place.kind == "queue":
+            # Others come while something waits to be put aside.
+            needed = self.prefetch + min(len(self._waiting), _AHEAD)
+        else:
+            needed = max(self.prefetch, _AHEAD)
         return min(max(needed, 1), _MOST_PREFETCH)
 
     def _consume(self, line: Line, prefetch: int) -> None:
@@ -139,12 +144,17 @@ class AmqpChannel:
             if reason is None or self._put_aside(reason, body, message_id, headers, attempt):
                 self._ack(tag)
             else:
-                self._connection.later(_AGAIN_S, self._saying(lambda amqp: amqp.basic_nack(tag)))
+                self._waiting.add(tag)
+                self._connection.later(_AGAIN_S, self._saying(lambda amqp: self._give_back(amqp, tag)))
 
         return Received(frames, message_id, attempt, shown, settle)
 
     def _ack(self, tag: int) -> None:
         self._connection.turns.run(self._saying(lambda amqp: amqp.basic_ack(tag)), always, 0.0)
+
+    def _give_back(self, amqp: Any, tag: int) -> None:
+        self._waiting.discard(tag)
+        amqp.basic_nack(tag)
 
     def _saying(self, say: Callable[[Any], object]) -> Callable[[], None]:
         """Return what says something of what was delivered, if its line is open then."""
