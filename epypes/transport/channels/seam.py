@@ -81,6 +81,7 @@ class Received:
     def reject(self, reason: str) -> None:
         """Have the broker put it aside for good, among the dead letters. Otherwise as `ack`.
 
+        If they can't take it, which is logged, it is delivered again.
         The reason goes with it as one line of what can be printed: brokers end a connection for other text.
         """
         self._settle(_line(reason))

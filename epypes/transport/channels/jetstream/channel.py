@@ -225,7 +225,8 @@ class JetStreamChannel:
         self._held.pop(message.reply, None)
         if self._error is None:
             # Nobody says any more that it is being worked on, so it comes again.
-            _log.warning("A message of %s can't be put among the dead letters: %s", self._place, error)
+            text = "A message of %s can't be put among the dead letters, and comes again: %s"
+            _log.warning(text, self._place, error)
 
     def _acknowledge(self, message: Msg) -> None:
         del self._held[message.reply]
