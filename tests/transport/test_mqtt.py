@@ -16,6 +16,8 @@ from paho.mqtt.properties import Properties
 
 from epypes.errors import BrokerError, MessageError
 from epypes.transport.channels import open_channel, place_of
+from epypes.transport.channels.mqtt.connection import Connection
+from epypes.transport.channels.mqtt.sessions import join, keep_for_later, notices
 from tests.brokers import mosquitto as servers
 from tests.transport.peers import line_of, process, wait_until
 
@@ -335,3 +337,19 @@ def test_what_comes_with_qos_0_while_nobody_receives_does_not_fill_the_memory(mo
     assert "what comes with QoS 0 is dropped" in caplog.text
     received = [channel.receive(WAIT_S) for _ in range(len(arrived))]
     assert bytes(received[-1].frames[0]) == b"the last"
+
+
+def test_what_an_heir_has_left_who_came_too_early_is_no_event(mosquitto, queue, opened):
+    """It was connected as one who was gone, and had begun to hand on what is kept for him, when he came back."""
+    place = place_of(queue)
+    end = f"{notices(place, 'early')}/end"
+    join(place, "early", 1, WAIT_S).close(with_notice=True)
+    heir = Connection(place, WAIT_S, session="early", notice=notices(place, "early"))
+    heir.subscribe(end)
+    heir.publish(end, b"mark", {})
+    keep_for_later(place, "early")
+    receiver = opened(queue)
+    assert receiver.receive(1.0) is None
+    opened(queue).send([b"event"])
+    assert body(next_of(receiver)) == b"event"
+    heir.close()
