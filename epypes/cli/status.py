@@ -21,8 +21,6 @@ _OF_BROKER = ("dead_letters", "redelivered", "duplicates", "given_back", "overta
 _DIGITS = 12
 _UNKNOWN = "RUNNING"
 _NO_HTTP = "no --http"
-# What the others say of a replica that has gone without a word.
-_LOST = "LOST"
 # In what replicas of one group should be alike.
 _MAY_DIFFER = ("name", "digest", "ordered")
 
@@ -146,7 +144,10 @@ def _group_lines(found: list[dict[str, Any]], *, is_one: bool) -> list[str]:
     lines += [*_parameters_line(first), _addresses_line(first)]
     differ = {name: len({each[name] for each in group["members"] if name in each}) > 1 for name in _MAY_DIFFER}
     told = {_gist(group["trouble"])}
-    return [*lines, *(_member_line(member, differ, told) for member in _members(found, group))]
+    members, lost = _members(found, group)
+    lines += [_member_line(member, differ, told) for member in members]
+    # Each of them is lost for himself, though all may have been heard last at the same time.
+    return [*lines, *(_member_line(member, differ, set()) for member in lost)]
 
 
 def _hears(found: dict[str, Any]) -> tuple[bool, int]:
@@ -163,16 +164,16 @@ def _head_lines(found: dict[str, Any], group: dict[str, Any]) -> list[str]:
     return [f"{said}: {served}."]
 
 
-def _members(found: list[dict[str, Any]], group: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the members of a group, who runs here besides, and who is lost; with what was seen of them here."""
+def _members(found: list[dict[str, Any]], group: dict[str, Any]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return who is in a group or runs here besides, and who is lost; with what was seen of them here."""
     here = {(each["replica"], each["pid"]): each for each in found}
-    members = []
-    for member in (*group["members"], *group["lost"]):
+
+    def seen(member: dict[str, Any]) -> dict[str, Any]:
         own = here.pop((member["replica"], member["pid"]), {}) if _is_here(member) else {}
-        silent = own.get("reason", "") if own.get("state") == "SILENT" else ""
-        members.append({**member, "silent": silent})
-    lost = [member for member in members if member["state"] == _LOST]
-    return [*members[: len(group["members"])], *(_member_of(each) for each in here.values()), *lost]
+        return {**member, "silent": own.get("reason", "") if own.get("state") == "SILENT" else ""}
+
+    members, lost = [seen(each) for each in group["members"]], [seen(each) for each in group["lost"]]
+    return [*members, *(_member_of(each) for each in here.values())], lost
 
 
 def _is_here(member: dict[str, Any]) -> bool:
@@ -190,8 +191,7 @@ def _member_line(member: dict[str, Any], differ: dict[str, bool], told: set[str]
     """Return what there is to say of a member, but for reasons that were told before: one broker is away for all."""
     reasons = []
     for text in filter(None, (member.get(name, "") for name in ("reason", "trouble", "silent"))):
-        # Whom the others have lost each is lost for himself.
-        if _gist(text) not in told or member["state"] == _LOST:
+        if _gist(text) not in told:
             reasons.append(text)
             told.add(_gist(text))
     why = f" ({' '.join(reasons)})" if reasons else ""
