@@ -182,7 +182,8 @@ def test_what_was_sent_before_anybody_listened_is_received_in_order(queue, opene
 @pytest.mark.parametrize("peer", ["rabbitmq", "nats"], indirect=True)
 def test_what_was_rejected_while_nobody_could_put_it_aside_is_a_dead_letter_in_the_end(peer, name, opened, monkeypatch):
     """It comes again over the same connection, where it is no event that was sent twice."""
-    monkeypatch.setattr("epypes.transport.channels.amqp.channel._AGAIN_S", 0.2)
+    # Sooner than it would, and later than a busy machine may take to look.
+    monkeypatch.setattr("epypes.transport.channels.amqp.channel._AGAIN_S", 2.0)
     taken = queues.SimpleQueue()
     opened(peer.address(name, create=True)).send([b"spoilt"], id="spoilt")
     with ep.Subscriber(peer.address(name), taken) as subscriber:
