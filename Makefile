@@ -4,9 +4,14 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m uv pip install --quiet --python $(BIN)/python
+PIP := $(BIN)/python -m uv pip install --quiet --compile-bytecode --python $(BIN)/python
+PYTEST := $(BIN)/pytest -p nbval.plugin --nbval --nbval-sanitize-with tests/notebooks/sanitize.cfg --durations=40 \
+	tests epypes widgets/epypes_widgets notebooks
 
-.PHONY: demo test lab bench fix clean
+# Hundreds of interpreters are started by the tests: each would compile all that it imports.
+unexport PYTHONDONTWRITEBYTECODE
+
+.PHONY: demo test soak test-matrix lab bench fix clean
 
 demo: $(VENV)/.all
 	$(BIN)/epypes demo notebooks/01_edge_detection.ipynb --name runner --output edges --to demo-output
@@ -16,8 +21,15 @@ test: $(VENV)/.test chromium postgres brokers
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/pytest -m "" -n 2 -p nbval.plugin --nbval --nbval-sanitize-with tests/notebooks/sanitize.cfg \
-		tests epypes widgets/epypes_widgets notebooks
+	$(PYTEST) -m "not soak"
+
+# The long forms: every combination, long series, and far more examples for what searches at random. Takes hours.
+soak: $(VENV)/.test chromium postgres brokers
+	EPYPES_SOAK=1 $(PYTEST) -m "soak or fuzz" -o timeout=3600 -o faulthandler_timeout=3000
+
+# The default selection on every other Python that is found, and on the lowest versions that pyproject.toml admits.
+test-matrix: $(VENV)/.test
+	@sh .ci/matrix $(BIN)/python
 
 lab: $(VENV)/.all
 	$(BIN)/epypes lab notebooks
@@ -30,7 +42,7 @@ fix: $(VENV)/.test
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) demo-output test-output notebooks/edge_service notebooks/orb.* notebooks/*.toml notebooks/services notebooks/many_images services
+	rm -rf $(VENV) .matrix demo-output test-output notebooks/edge_service notebooks/orb.* notebooks/*.toml notebooks/services notebooks/many_images services
 
 # uv comes from the same registry as everything else and installs eight times faster than pip.
 $(BIN)/python:

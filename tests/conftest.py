@@ -1,4 +1,4 @@
-"""Which graphs and images do many tests share, and what are kernels and commands told that tests start?"""
+"""Graphs and images that many tests share, the environment of what they start, and how the tests are distributed."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import signal
 import subprocess
 
 import cv2
+import hypothesis
 import numpy as np
 import pytest
 from skimage import data
@@ -14,6 +15,7 @@ from xdist.scheduler import LoadFileScheduling
 
 import epypes as ep
 from epypes.cli import main
+from tests import hangs
 from tests.brokers.fixtures import broker, mosquitto, nats, rabbitmq
 from tests.brokers.nats import is_installed
 
@@ -23,6 +25,15 @@ __all__ = ["broker", "mosquitto", "nats", "rabbitmq"]
 os.environ.setdefault("EPYPES_REQUESTS", "20")
 # What is started in the background of a shell ignores Ctrl+C, and so would all that tests start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# `make soak` asks for far more examples; tests that search at random are marked "fuzz" and don't set their number.
+hypothesis.settings.register_profile("quick", max_examples=100, stateful_step_count=20, deadline=None)
+hypothesis.settings.register_profile("soak", parent=hypothesis.settings.get_profile("quick"), max_examples=10_000)
+hypothesis.settings.load_profile("soak" if "EPYPES_SOAK" in os.environ else "quick")
+
+
+def pytest_configure(config):
+    config.pluginmanager.register(hangs)
 
 
 class _Scheduling(LoadFileScheduling):
