@@ -55,11 +55,11 @@ $(VENV)/.all: pyproject.toml | $(BIN)/python
 	touch $@
 
 $(VENV)/.test: pyproject.toml | $(BIN)/python
-	$(PIP) --editable '.[all,test]'
+	$(PIP) --editable '.[all]' --group test
 	touch $@ $(VENV)/.all
 
 $(VENV)/.bench: pyproject.toml | $(BIN)/python
-	$(PIP) --editable '.[all,test,bench]'
+	$(PIP) --editable '.[all]' --group test --group bench
 	touch $@ $(VENV)/.test $(VENV)/.all
 
 .PHONY: chromium postgres brokers

@@ -18,17 +18,20 @@ from importlib import metadata
 from pathlib import Path
 from statistics import median
 from time import perf_counter_ns
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.bundle.seal import check_seal
 from epypes.errors import EpypesError
 from epypes.service.state import read_states
 
+if TYPE_CHECKING:
+    from packaging.requirements import Requirement
+
 Outcome = Literal["ok", "warning", "failed"]
 
 _OLDEST_PYTHON: Final = (3, 11)
 # What is not there is missed by a part of EPypes alone, which installing its extra brings.
-_EXTRAS: Final = ("notebook", "vision", "service", "scale", "rabbitmq", "nats", "mqtt")
+_EXTRAS: Final = ("notebook", "vision", "serve", "service", "scale", "store", "rabbitmq", "nats", "mqtt")
 _BROWSERS: Final = ("chromium", "chromium-browser", "google-chrome", "firefox", "safari", "microsoft-edge")
 _ROUND_TRIPS: Final = 100
 _ROUND_TRIP_TIMEOUT_S: Final = 5.0
@@ -122,13 +125,8 @@ def _epypes() -> Check:
 
 def _extra(extra: str) -> Check:
     """Look whether the packages of an extra are installed, at the versions that it asks for."""
-    from packaging.requirements import Requirement
-
-    wanted = [Requirement(text) for text in metadata.requires("epypes") or ()]
-    own = [one for one in wanted if one.marker and one.marker.evaluate({"extra": extra}) and one.name != "epypes"]
-    own = [one for one in own if not one.marker.evaluate({"extra": ""})]  # type: ignore[union-attr]
     missing, found = [], []
-    for one in own:
+    for one in _required(extra).values():
         try:
             version = metadata.version(one.name)
         except metadata.PackageNotFoundError:
@@ -142,6 +140,22 @@ def _extra(extra: str) -> Check:
         way_out = f"pip install 'epypes[{extra}]', if you need it."
         return Check(f"extra {extra}", "warning", f"missing: {', '.join(missing)}", way_out)
     return Check(f"extra {extra}", "ok", ", ".join(found))
+
+
+def _required(extra: str) -> dict[str, Requirement]:
+    """Return what an extra requires, by name; an extra that consists of others requires what they do."""
+    from packaging.requirements import Requirement
+
+    found: dict[str, Requirement] = {}
+    for one in map(Requirement, metadata.requires("epypes") or ()):
+        if one.marker is None or one.marker.evaluate({"extra": ""}) or not one.marker.evaluate({"extra": extra}):
+            continue
+        if one.name == "epypes":
+            for other in sorted(one.extras):
+                found |= _required(other)
+        else:
+            found[one.name] = one
+    return found
 
 
 def _opencv() -> Check:
