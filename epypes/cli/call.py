@@ -6,14 +6,16 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from epypes.cli.options import Allow, Keys
 from epypes.cli.terminal import out, print_answer
 from epypes.errors import ServiceError, UnknownName
-from epypes.images import Order
+
+if TYPE_CHECKING:
+    from epypes.images import Order
 
 
 def call(

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
-from rich.markup import escape
 
 from epypes.cli.terminal import out
 from epypes.errors import ScaleError
@@ -74,8 +73,7 @@ def check(
         out.print(f"{bundle}: {result}, {counted(len(result), 'check')} in all.")
 
 
-# A word in brackets would be taken for markup.
-check.__doc__ = f"{check.__doc__}\n\n{escape(_KEYS)}"
+check.__doc__ = f"{check.__doc__}\n\n{_KEYS}"
 
 
 def _fields(result: CheckResult) -> dict[str, Any]:

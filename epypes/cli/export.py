@@ -15,6 +15,7 @@ from epypes.errors import ServiceError
 export = typer.Typer(
     help="Write a systemd unit or a container file for a bundle. Options of epypes serve come behind a --.",
     no_args_is_help=True,
+    rich_markup_mode=None,
 )
 
 _Bundle = Annotated[Path, typer.Argument(help="The folder of the bundle.")]
@@ -60,7 +61,6 @@ def docker(
 
 def _check_serve_options(bundle: Path, options: Sequence[str]) -> None:
     """Refuse now what ``epypes serve`` would refuse at every boot, in the same words."""
-    from epypes.cli.app import app
+    from epypes.cli.app import command_named
 
-    serve = typer.main.get_command(app).commands["serve"]  # type: ignore[attr-defined]
-    serve.make_context("epypes serve", [str(bundle), *options])
+    command_named("serve").make_context("epypes serve", [str(bundle), *options])
