@@ -1,0 +1,509 @@
+"""Snapshots of mutable objects: the contents of everything that some values reach, to compare later and to put back.
+
+The objects are walked once, when the snapshot is taken. A comparison then goes through a flat list of records, each of
+which reads the contents of one object as a tuple and compares them with the saved ones by identity, and only where
+they differ by value. numpy and pandas are never imported here.
+
+What can't be seen into is left out: objects of C extensions that the garbage collector knows nothing about
+(``cv2.ORB``), open files, locks and the modules of installed packages.
+"""
+
+from __future__ import annotations
+
+import collections
+import functools
+import gc
+import itertools
+import operator
+import random
+import sys
+import types
+import warnings
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from datetime import date, time, timedelta, tzinfo
+from decimal import Decimal
+from enum import Enum
+from logging import Logger
+from pathlib import PurePath
+from typing import Any, Final
+
+from epypes.run.guard import is_array
+
+Contents = tuple[Any, ...]
+Found = Iterator[tuple[str, Any]]
+
+_ATOMS: Final = frozenset(
+    {int, float, complex, bool, str, bytes, type(None), type(...), type(NotImplemented), range, Decimal}
+)
+# Values of these kinds never change, although some of them fill caches of their own.
+_CONSTANT: Final = (Enum, PurePath, Logger, date, time, timedelta, tzinfo, types.CodeType, types.ModuleType)
+_CODE: Final = (type, types.FunctionType)
+_ATOMIC_ITERATORS: Final = (itertools.count, itertools.repeat)
+
+
+class _Record:
+    """One mutable object: how its contents are read and written, and what they were."""
+
+    __slots__ = ("name", "read", "saved", "value", "write")
+
+    def __init__(
+        self, name: str, value: Any, read: Callable[[Any], Contents], write: Callable[[Any, Contents], object]
+    ) -> None:
+        self.name, self.value, self.read, self.write = name, value, read, write
+        self.saved = read(value)
+
+    def differs(self) -> bool:
+        """Whether the contents are others than they were."""
+        try:
+            now = self.read(self.value)
+        except RuntimeError:  # another thread changes it at this moment
+            return True
+        saved = self.saved
+        if len(now) == len(saved) and all(map(operator.is_, now, saved)):
+            return False
+        return not self.accepts(now)
+
+    def accepts(self, now: Contents) -> bool:
+        """Whether contents that are not identical to the saved ones are equal to them."""
+        return _is_same(now, self.saved)
+
+    def restore(self) -> None:
+        """Put the saved contents back."""
+        self.write(self.value, self.saved)
+
+
+class _Attributes(_Record):
+    """The attributes of an object, as names followed by values.
+
+    A library's object may fill caches of its own: a private attribute that was absent or None.
+    """
+
+    __slots__ = ()
+
+    def accepts(self, now: Contents) -> bool:
+        before, after = _as_dict(self.saved), _as_dict(now)
+        library = not _is_own(type(self.value).__module__)
+        lazy = {name for name in after if _is_lazy(self.value, name)}
+        if library:
+            lazy |= {name for name, _ in after.items() if name[:1] == "_" and before.get(name) is None}
+        names = before.keys() | after.keys()
+        return all(_is_same(before.get(name, _ABSENT), after.get(name, _ABSENT)) for name in names - lazy)
+
+
+class _Table(_Record):
+    """A pandas object, compared by its own method."""
+
+    __slots__ = ()
+
+    def accepts(self, now: Contents) -> bool:
+        saved, after = self.saved[0], now[0]
+        axes = [axis for axis in ("index", "columns") if hasattr(saved, axis)]
+        same_axes = all(getattr(after, axis).identical(getattr(saved, axis)) for axis in axes)
+        return same_axes and bool(after.equals(saved))
+
+
+class Snapshot:
+    """The contents of all mutable objects that some values reach.
+
+    Parameters
+    ----------
+    roots
+        The values, by the names that :meth:`changed` reports.
+
+    Notes
+    -----
+    Lists, dicts with their order, sets, deques, bytearrays, arrays, the attributes and slots of objects, random
+    generators, iterators and pandas objects are compared; tuples, partials, bound methods and C containers are looked
+    through. Functions, classes and modules count as constants. Arrays count as changed when their bytes are.
+
+    A snapshot holds references to all that it compares, and a copy of every array that can be written to.
+
+    Examples
+    --------
+    >>> seen = {"a": [1, 2]}
+    >>> snapshot = Snapshot({"seen": seen})
+    >>> seen["a"].append(3)
+    >>> snapshot.changed()
+    'seen'
+    >>> snapshot.restore()
+    >>> seen, snapshot.changed()
+    ({'a': [1, 2]}, None)
+    """
+
+    def __init__(self, roots: Mapping[str, object]) -> None:
+        self.records: list[_Record] = []
+        # Held, so that no id is used again while the walk goes on.
+        self._seen: dict[int, object] = {}
+        waiting = [*roots.items()][::-1]
+        while waiting:
+            name, value = waiting.pop()
+            if type(value) in _ATOMS or id(value) in self._seen:
+                continue
+            self._seen[id(value)] = value
+            waiting.extend([*self.look_at(name, value)][::-1])
+        self._seen.clear()
+
+    def __bool__(self) -> bool:
+        """Whether there is anything that could change."""
+        return bool(self.records)
+
+    def changed(self) -> str | None:
+        """Return the first root that reaches an object whose contents have changed; None if there is none."""
+        for record in self.records:
+            if record.differs():
+                return record.name
+        return None
+
+    def restore(self) -> None:
+        """Put the contents of every object that has changed back.
+
+        An iterator can't be set back: it goes on counting as changed.
+        """
+        for record in self.records:
+            if record.differs():
+                record.restore()
+
+    def look_at(self, name: str, value: Any) -> Found:
+        """Record one object as far as it can change, and give what it refers to; the hook for subclasses."""
+        kind = type(value)
+        if issubclass(kind, _CONSTANT) or issubclass(kind, _CODE):
+            return
+        if is_array(value):
+            yield from self.look_at_array(name, value)
+        elif _is_pandas(kind):
+            self.records.append(_Table(name, value, _read_table, _write_table))
+            return
+        for base, read, write in _KINDS:
+            if issubclass(kind, base):
+                self.records.append(_Record(name, value, read, write))
+                break
+        state = _state_of(value)
+        if state is not None:
+            self.records.append(_Record(name, value, *state))
+            if state[1] is not _leave:
+                return
+        yield from ((name, part) for part in _parts(value))
+        yield from self._attributes(name, value)
+
+    def look_at_array(self, name: str, value: Any) -> Found:
+        """Record an array that can be written to."""
+        if value.flags.writeable:
+            self.records.append(_Record(name, value, _read_array, _write_array))
+        if value.base is not None:
+            yield name, value.base
+        if value.dtype.hasobject:
+            yield from ((name, part) for part in _items_of(value))
+
+    def _attributes(self, name: str, value: Any) -> Found:
+        if type(getattr(value, "__dict__", None)) is dict:
+            self.records.append(_Attributes(name, value, _read_attributes, _write_attributes))
+            yield from ((name, part) for part in vars(value).values())
+        slots = _slots(type(value))
+        if slots:
+            read, write = functools.partial(_read_slots, slots), functools.partial(_write_slots, slots)
+            found = _Attributes(name, value, read, write)
+            self.records.append(found)
+            yield from ((name, part) for part in found.saved[len(found.saved) // 2 :])
+
+
+# -- what is equal ------------------------------------------------------------------------------------------------
+
+_ABSENT: Final = object()
+
+
+def _is_same(now: Any, saved: Any) -> bool:
+    """Whether two values are one, or equal constants of one type, to the last bit."""
+    kind = type(now)
+    if now is saved or kind is not type(saved):
+        return now is saved
+    if kind in (float, complex):
+        return repr(now) == repr(saved)
+    if kind is tuple:
+        return len(now) == len(saved) and all(map(_is_same, now, saved))
+    if kind is frozenset:
+        return now == saved and sorted(map(_order, now)) == sorted(map(_order, saved))
+    if kind is types.MethodType:
+        return now.__self__ is saved.__self__ and now.__func__ is saved.__func__
+    return bool(now == saved) if kind in _ATOMS else _is_scalar(kind) and _bits(now) == _bits(saved)
+
+
+def _bits(scalar: Any) -> tuple[Any, bytes]:
+    return scalar.dtype, scalar.tobytes()
+
+
+def _order(value: Any) -> tuple[str, int]:
+    """Tell 1 from True, and two objects from each other, whatever their own methods say."""
+    return type(value).__name__, 0 if type(value) in _ATOMS else id(value)
+
+
+def _is_scalar(kind: type) -> bool:
+    numpy = sys.modules.get("numpy")
+    return numpy is not None and issubclass(kind, numpy.generic) and not issubclass(kind, numpy.object_ | numpy.void)
+
+
+def _as_dict(contents: Contents) -> dict[Any, Any]:
+    """Return names followed by values as a dict."""
+    half = len(contents) // 2
+    return dict(zip(contents[:half], contents[half:], strict=True))
+
+
+def _is_lazy(value: Any, name: str) -> bool:
+    """Whether an attribute is a cached property, which is computed when it is first read."""
+    return any(isinstance(vars(base).get(name), functools.cached_property) for base in type(value).__mro__)
+
+
+@functools.cache
+def _is_own(module: str) -> bool:
+    """Whether a module's code is the user's: of no installed package, not of Python's library nor of EPypes."""
+    if module.partition(".")[0] in {*sys.stdlib_module_names, *sys.builtin_module_names, "epypes", "epypes_widgets"}:
+        return module == "__main__"
+    file = getattr(sys.modules.get(module), "__file__", None) or ""
+    return not {"site-packages", "dist-packages"} & {*file.replace("\\", "/").split("/")}
+
+
+# -- how contents are read and written -----------------------------------------------------------------------------
+
+
+def _read_dict(value: dict[Any, Any]) -> Contents:
+    return *dict.keys(value), *dict.values(value)
+
+
+def _write_dict(value: dict[Any, Any], saved: Contents) -> None:
+    dict.clear(value)
+    dict.update(value, _as_dict(saved))
+
+
+def _read_ordered(value: collections.OrderedDict[Any, Any]) -> Contents:
+    # Those of dict don't see what move_to_end does.
+    return *collections.OrderedDict.keys(value), *collections.OrderedDict.values(value)
+
+
+def _write_ordered(value: collections.OrderedDict[Any, Any], saved: Contents) -> None:
+    collections.OrderedDict.clear(value)
+    collections.OrderedDict.update(value, _as_dict(saved))
+
+
+def _write_set(value: set[Any], saved: Contents) -> None:
+    set.clear(value)
+    set.update(value, saved[0])
+
+
+def _write_deque(value: collections.deque[Any], saved: Contents) -> None:
+    collections.deque.clear(value)
+    collections.deque.extend(value, saved)
+
+
+def _write_array_array(value: array[Any], saved: Contents) -> None:
+    value[:] = array(value.typecode, saved[0])
+
+
+_KINDS: Final[tuple[tuple[type, Callable[[Any], Contents], Callable[[Any, Contents], object]], ...]] = (
+    (list, lambda value: tuple(list.__iter__(value)), lambda value, saved: list.__setitem__(value, slice(None), saved)),
+    (collections.OrderedDict, _read_ordered, _write_ordered),
+    (dict, _read_dict, _write_dict),
+    (set, lambda value: (frozenset(set.__iter__(value)),), _write_set),
+    (collections.deque, lambda value: tuple(collections.deque.__iter__(value)), _write_deque),
+    (
+        bytearray,
+        lambda value: (bytes(value),),
+        lambda value, saved: bytearray.__setitem__(value, slice(None), saved[0]),
+    ),
+    (array, lambda value: (value.tobytes(),), _write_array_array),
+)
+
+
+def _items_of(value: Any) -> list[Any]:
+    """Return the objects in an array of objects, or the tuples of one whose fields are some."""
+    found: list[Any] = value.ravel().tolist()
+    return found
+
+
+def _read_array(value: Any) -> Contents:
+    data = tuple(_items_of(value)) if value.dtype.hasobject else value.tobytes()
+    return value.shape, value.dtype, value.flags.writeable, data
+
+
+def _write_array(value: Any, saved: Contents) -> None:
+    shape, dtype, writeable, data = saved
+    value.setflags(write=True)
+    if value.dtype != dtype:
+        value.dtype = dtype
+    if value.shape != shape:
+        value.shape = shape
+    if dtype.hasobject:
+        value.reshape(-1)[:] = data if dtype.names else [*data]
+    else:
+        value[...] = sys.modules["numpy"].frombuffer(data, dtype).reshape(shape)
+    value.setflags(write=writeable)
+
+
+def _read_attributes(value: Any) -> Contents:
+    found = vars(value)
+    return *found, *found.values()
+
+
+def _write_attributes(value: Any, saved: Contents) -> None:
+    found = vars(value)
+    found.clear()
+    found.update(_as_dict(saved))
+
+
+def _slots(kind: type) -> tuple[types.MemberDescriptorType, ...]:
+    """Return the slots of a class that Python code has made."""
+    return tuple(
+        slot
+        for base in kind.__mro__
+        if "__slots__" in vars(base)
+        for slot in vars(base).values()
+        if type(slot) is types.MemberDescriptorType
+    )
+
+
+def _read_slots(slots: tuple[types.MemberDescriptorType, ...], value: Any) -> Contents:
+    found = {}
+    for slot in slots:
+        try:
+            found[slot.__name__] = slot.__get__(value)
+        except AttributeError:
+            continue
+    return *found, *found.values()
+
+
+def _write_slots(slots: tuple[types.MemberDescriptorType, ...], value: Any, saved: Contents) -> None:
+    before = _as_dict(saved)
+    now = _as_dict(_read_slots(slots, value))
+    for slot in slots:
+        if slot.__name__ in before:
+            slot.__set__(value, before[slot.__name__])
+        elif slot.__name__ in now:
+            slot.__delete__(value)
+
+
+def _is_pandas(kind: type) -> bool:
+    pandas = sys.modules.get("pandas")
+    known = (getattr(pandas, name, None) for name in ("DataFrame", "Series", "Index"))
+    return any(isinstance(base, type) and issubclass(kind, base) for base in known)
+
+
+def _read_table(value: Any) -> Contents:
+    return (value.copy(deep=True),)
+
+
+def _write_table(value: Any, saved: Contents) -> None:
+    vars(value).clear()
+    vars(value).update(vars(saved[0].copy(deep=True)))
+
+
+# -- objects with a state of their own -----------------------------------------------------------------------------
+
+
+def _state_of(value: Any) -> tuple[Callable[[Any], Contents], Callable[[Any, Contents], object]] | None:
+    """Return how the state of a random generator, a buffer or an iterator is read and written."""
+    kind = type(value)
+    if issubclass(kind, random.Random):
+        return lambda value: (value.getstate(),), lambda value, saved: value.setstate(saved[0])
+    numbers = sys.modules.get("numpy.random")
+    if numbers is not None and issubclass(kind, numbers.BitGenerator):
+        return lambda value: (_flat(value.state), value.state)[:1], _restorer(value.state)
+    if hasattr(kind, "getvalue") and hasattr(kind, "__setstate__") and kind.__module__ == "_io":
+        return lambda value: value.__getstate__()[:2], lambda value, saved: value.__setstate__((*saved, None))
+    if issubclass(kind, types.GeneratorType | types.CoroutineType | types.AsyncGeneratorType):
+        return None if _frame(value) is None else (_read_generator, _leave)
+    if callable(getattr(kind, "__next__", None)) and kind.__module__ in ("builtins", "itertools", "collections"):
+        return _read_iterator, _leave
+    return None
+
+
+def _restorer(state: Any) -> Callable[[Any, Contents], object]:
+    def restore(value: Any, saved: Contents) -> None:
+        value.state = state
+
+    return restore
+
+
+def _flat(state: Any) -> Any:
+    """Return the state of a generator as something that can be compared."""
+    if isinstance(state, dict):
+        return tuple((name, _flat(part)) for name, part in state.items())
+    return state.tobytes() if is_array(state) else state
+
+
+def _leave(value: Any, saved: Contents) -> None:
+    """Leave an iterator as it is: none can be set back."""
+
+
+def _frame(value: Any) -> types.FrameType | None:
+    return next(
+        (frame for name in ("gi_frame", "cr_frame", "ag_frame") if (frame := getattr(value, name, None)) is not None),
+        None,
+    )
+
+
+def _read_generator(value: Any) -> Contents:
+    frame = _frame(value)
+    return () if frame is None else (frame.f_lasti, *_locals(value), *_locals(value).values())
+
+
+def _read_iterator(value: Any) -> Contents:
+    """Return how far an iterator has come, as far as it can be seen; nothing is taken from it."""
+    if type(value) in _ATOMIC_ITERATORS:
+        return (repr(value),) if type(value) is itertools.count else (operator.length_hint(value, -1),)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            made, *parts = value.__reduce__()
+    except TypeError:
+        return (operator.length_hint(value, -1),)
+    return made, *(_positions(part) for part in parts)
+
+
+def _positions(part: Any) -> Any:
+    """Return what of an iterator's ``__reduce__`` can be compared: its numbers, and the iterators in it."""
+    if type(part) is tuple:
+        return tuple(map(_positions, part))
+    if type(part) in _ATOMS:
+        return part
+    return len(part) if type(part) is list else type(part)
+
+
+# -- what an object refers to --------------------------------------------------------------------------------------
+
+
+def _parts(value: Any) -> Iterable[Any]:
+    """Return the objects that one refers to; its attributes are not among them."""
+    kind = type(value)
+    if issubclass(kind, dict):
+        return (*dict.keys(value), *dict.values(value))
+    if issubclass(kind, list | tuple | set | frozenset | collections.deque):
+        return [part for part in value if type(part) not in _ATOMS]
+    if kind is types.MappingProxyType:
+        return [*value.values()]
+    if kind is functools._lru_cache_wrapper:
+        return cached_values(value)
+    if kind is memoryview:
+        return (value.obj,)
+    if is_array(value):
+        return ()
+    # Of partials, bound methods, cells, iterators and the like the garbage collector knows what they hold.
+    own = getattr(value, "__dict__", None)
+    held = [part for part in gc.get_referents(value) if part is not own and part is not kind]
+    return [part for part in held if not isinstance(part, types.FrameType)] + [*_locals(value).values()]
+
+
+def cached_values(cached: Any) -> list[Any]:
+    """Return what the cache of ``functools.lru_cache`` holds, its keys among it where it is bounded."""
+    own = vars(cached)
+    found: list[Any] = []
+    for part in gc.get_referents(cached):
+        if type(part) is dict and part is not own:
+            found += part.values()
+        elif part is not own:
+            found.append(part)
+    return found
+
+
+def _locals(value: Any) -> Mapping[str, Any]:
+    """Return the local variables of a generator."""
+    frame = _frame(value)
+    return {} if frame is None else frame.f_locals
