@@ -4,7 +4,7 @@ pytest-timeout and faulthandler act inside the process, so a thread that never g
 garbage collection, in a call of a library) can hide from them. This pytest plugin starts a process beside each one that
 runs tests and writes to its standard input when a test begins (its name) and ends (an empty line). The watchdog prints
 the stacks of all threads by py-spy, native frames included, when a test has taken ``faulthandler_timeout``, and aborts
-the process 30 s after ``timeout``: the test counts as failed.
+the process a tenth later than ``timeout``: the test counts as failed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 
 import pytest
 
-_GRACE_S = 30
+_GRACE = 1.1
 _PR_SET_PTRACER = 0x59616D61
 _ANY_PROCESS = -1
 
@@ -33,7 +33,7 @@ def pytest_configure(config: pytest.Config) -> None:
         return
     # A process may be looked at by its child only if it says so.
     ctypes.CDLL(None).prctl(_PR_SET_PTRACER, ctypes.c_ulong(_ANY_PROCESS), 0, 0, 0)
-    limits = (float(config.getini("faulthandler_timeout")), float(config.getini("timeout")) + _GRACE_S)
+    limits = (float(config.getini("faulthandler_timeout")), float(config.getini("timeout")) * _GRACE)
     config.stash[_watchdog] = subprocess.Popen(
         [sys.executable, "-I", __file__, str(os.getpid()), *map(str, limits)],
         stdin=subprocess.PIPE,
@@ -70,7 +70,7 @@ def watch(pid: int, report_after_s: float, abort_after_s: float) -> None:
                 _report(pid, test, limit_s)
                 limit_s = abort_after_s - report_after_s
                 continue
-            print(f"\nAborting process {pid}: {test} has not ended", file=sys.stderr, flush=True)
+            sys.stderr.write(f"\nAborting process {pid}: {test} has not ended\n")
             os.kill(pid, signal.SIGABRT)
             return
         read = os.read(0, 1 << 16)
@@ -81,7 +81,8 @@ def watch(pid: int, report_after_s: float, abort_after_s: float) -> None:
 
 
 def _report(pid: int, test: str, after_s: float) -> None:
-    print(f"\n{test} has not ended after {after_s:g} s: the stacks of process {pid}", file=sys.stderr, flush=True)
+    sys.stderr.write(f"\n{test} has not ended after {after_s:g} s: the stacks of process {pid}\n")
+    sys.stderr.flush()
     spy = [str(Path(sys.executable).with_name("py-spy")), "dump", "--pid", str(pid)]
     # Native frames can't be had of every build of Python.
     if subprocess.run([*spy, "--native"], stdout=sys.stderr, check=False).returncode:
