@@ -9,6 +9,7 @@ Everything an error's text mentions is an attribute of it::
     |   +-- StaleToken          a token's value is out of date; .token
     +-- PayloadError            run() was given too little or the wrong tokens; .tokens
     +-- HyperparameterError     a token can't be set, frozen or unfrozen; .token
+    +-- IteratorRefused         a value can be read only once; .token, .function
     +-- PlaceholderNeeded       a function is still to be written; .functions
     +-- OutputArityError        a function returned another number of values; .function
     +-- ContractBroken          a value is not the image that an annotation says; .function, .token
@@ -150,6 +151,22 @@ class HyperparameterError(EpypesError, TypeError):
     def __init__(self, token: str, text: str) -> None:
         self.token = token
         super().__init__(text)
+
+
+class IteratorRefused(EpypesError, TypeError):
+    """A token's value is an iterator, which can be read only once; ``function`` made it, None if it was given."""
+
+    def __init__(self, token: str, function: str | None, value: object) -> None:
+        self.token, self.function = token, function
+        kind = type(value)
+        origin = f"made by function {function!r}" if function is not None else "which was given"
+        way_out = f"Make it a list: list({token})." if token.isidentifier() else "Make it a list."
+        if hasattr(kind, "read"):
+            way_out = f"{way_out} Of a file, give the path, or the content."
+        super().__init__(
+            f"Token {token!r}, {origin}, is an iterator ({kind.__name__}). An iterator can be read only once, "
+            f"but reruns and several functions read a token. {way_out}"
+        )
 
 
 class PlaceholderNeeded(EpypesError, NotImplementedError):

@@ -1,4 +1,4 @@
-"""How is one function called, with its inputs lent, its outputs kept and its time measured?"""
+"""One call of a function: its inputs lent, its outputs kept, its time measured."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def call(program: Program, step: Step, values: Sequence[Any]) -> tuple[Sequence[
         The function raised, or returned the wrong number of values, or a contract was broken.
     """
     # Unpacked at once: to look up one field of a named tuple takes as long.
-    place, _, function, inputs, outputs, single, _, _, switch, contracts, is_plain = step
+    place, _, function, inputs, outputs, single, _, switch, contracts, is_plain = step
     start_ns = 0
     try:
         if is_plain:
@@ -56,11 +56,11 @@ def call(program: Program, step: Step, values: Sequence[Any]) -> tuple[Sequence[
         duration_ns = perf_counter_ns() - start_ns
         made: Sequence[Any]
         if not single:
-            made = unpack(program, step, result)
+            made = unpack(program, step, result, values)
         elif type(result) in ARRAYLESS or not program.guard or switch is not None:
             made = (result,)
         else:
-            made = (keep(result, FRESH),)
+            made = (keep(result, FRESH, program, outputs[0], values),)
         if contracts is not None:
             _check(program, step, contracts[1], outputs, made)
     except BaseException as exception:
@@ -89,7 +89,7 @@ def _check(
             raise ContractBroken(step.name, program.tokens[slot], contract, found, made=slots is step.outputs)
 
 
-def unpack(program: Program, step: Step, result: Any) -> list[Any]:
+def unpack(program: Program, step: Step, result: Any, values: Sequence[Any]) -> list[Any]:
     """Return a result as one value per output token, guarded; a string or an array is not split.
 
     Raises
@@ -106,6 +106,10 @@ def unpack(program: Program, step: Step, result: Any) -> list[Any]:
             # The result, the list and the loop each hold a reference to an item; FRESH counts one of them. The items of
             # a result that the function goes on holding are not fresh, whatever their counts say.
             fresh_count = 0 if getrefcount(result) > FRESH else FRESH + 2
-            return [keep(item, fresh_count) for item in found] if program.guard else found
+            if not program.guard:
+                return found
+            # No zip(), which would hold a reference too.
+            slots = iter(step.outputs)
+            return [keep(item, fresh_count, program, next(slots), values) for item in found]
         got = f"{type(result).__name__} of {len(found)}"
     raise OutputArityError(step.name, [program.tokens[slot] for slot in step.outputs], got)

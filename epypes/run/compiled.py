@@ -1,4 +1,4 @@
-"""How is a run as fast as hand-written code?
+"""Runs that are repeated, each written out as one Python function and compiled.
 
 The engine's loop looks up, for every function, which slots it reads and how many values it makes. A run that is
 repeated is written out as one Python function instead, and compiled. Its source is made of slot and step numbers only:
@@ -8,10 +8,12 @@ the caches with an image, each costs some microseconds.
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from sys import getrefcount
 from time import perf_counter_ns
+from types import BuiltinFunctionType
 from typing import Any, Final, NoReturn
 
 from epypes.run.call import StepFailed, call, unpack
@@ -216,18 +218,21 @@ def _call(program: Program, step: Step, plain: Collection[int], locked: Collecti
         return
     args = []
     for place, slot in enumerate(step.inputs):
-        if not program.guard or slot in plain or (step.is_builtin and slot in locked):
+        if not program.guard or slot in plain:
             args.append(f"v[{slot}]")
             continue
         args.append(f"a{place}")
         yield f"a{place} = v[{slot}]"
-        yield from _lend(f"a{place}", is_locked=slot in locked)
+        if slot in locked and only_reads_arrays(step.function):
+            yield from _lend_all_but_arrays(f"a{place}")
+        else:
+            yield from _lend(f"a{place}", is_locked=slot in locked)
     yield "start = clock()"
     function = f"f{step.place}.func" if _is_direct(step) else f"f{step.place}"
     yield f"made = {function}({', '.join(args)})"
     yield "spent = clock() - start"
     if step.single and program.guard:
-        yield from _keep("made", is_read=bool(program.consumers[step.outputs[0]]))
+        yield from _keep("made", program, step.outputs[0])
     elif not step.single:
         yield from _unpack(program, step)
 
@@ -252,9 +257,9 @@ def _unpack(program: Program, step: Step) -> Iterator[str]:
     yield "    made = None"  # so that it does not count as one who knows the items
     for item, slot in zip(items, step.outputs, strict=True):
         if program.guard:
-            yield from (f"    {line}" for line in _keep(item, is_read=bool(program.consumers[slot])))
+            yield from (f"    {line}" for line in _keep(item, program, slot))
     yield f"    made = {', '.join(items)},"
-    yield f"else: made = unpack(program, steps[{step.place}], made)"
+    yield f"else: made = unpack(program, steps[{step.place}], made, v)"
 
 
 def _lend(name: str, is_locked: bool) -> Iterator[str]:
@@ -269,14 +274,38 @@ def _lend(name: str, is_locked: bool) -> Iterator[str]:
     yield f"        {name} = lend({name})"
 
 
-def _keep(name: str, is_read: bool) -> Iterator[str]:
+def _lend_all_but_arrays(name: str) -> Iterator[str]:
+    """Write out ``lend`` for a function that can be given a locked array as it is stored."""
+    yield f"k = kind({name})"
+    yield f"if k not in ARRAYLESS and k is not array and {_may_hold_arrays(name)}:"
+    yield f"    {name} = lend({name})"
+
+
+def only_reads_arrays(function: object) -> bool:
+    """Whether a function can change nothing about a locked array: those of OpenCV, and universal functions.
+
+    Other C functions can: setattr changes an array's shape.
+    """
+    numpy, cv2 = sys.modules.get("numpy"), sys.modules.get("cv2")
+    if numpy is not None and type(function) is numpy.ufunc:
+        return True
+    if cv2 is None or type(function) is not BuiltinFunctionType or function.__self__ is not None:
+        return False
+    name = function.__name__
+    if vars(cv2).get(name) is function:
+        return True
+    parts = [module for path, module in list(sys.modules.items()) if path.startswith("cv2.")]
+    return any(getattr(module, name, None) is function for module in parts)
+
+
+def _keep(name: str, program: Program, slot: int) -> Iterator[str]:
     """Write out ``keep``, for what it does to most values; an array that no function reads need not be locked."""
     yield f"k = kind({name})"
     yield "if k not in ARRAYLESS:"
     yield f"    if k is array and {name}.base is None and count({name}) <= FRESH_HERE:"
-    yield f"        {name}.setflags(False)" if is_read else "        pass"
+    yield f"        {name}.setflags(False)" if program.consumers[slot] else "        pass"
     yield f"    elif {_may_hold_arrays(name)}:"
-    yield f"        {name} = keep({name}, FRESH)"
+    yield f"        {name} = keep({name}, FRESH, program, {slot}, v)"
 
 
 def _may_hold_arrays(name: str) -> str:

@@ -1,16 +1,25 @@
-"""How is a function kept from spoiling another function's input?
+"""Values as functions and readers get them, and as runs store them, so that no function spoils another's input.
 
-Arrays travel as read-only views (rule 7 of the design). Writing in place raises at the line that did it.
-numpy is never imported here: an array can only turn up once somebody else has imported it.
+Arrays travel as read-only views (rule 7 of the design): writing in place raises at the line that did it. Lists, dicts
+and other mutable containers travel as shallow copies. An iterator can be read only once, so it is refused.
+Neither numpy nor pandas is imported here: their values can only turn up once another module has imported them.
 """
 
 from __future__ import annotations
 
+import copy
 import sys
 import threading
+from array import array as number_array
+from collections import deque
 from collections.abc import Callable, Sequence
 from sys import getrefcount
-from typing import Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from epypes.errors import IteratorRefused
+
+if TYPE_CHECKING:
+    from epypes.run.program import Program
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -70,6 +79,61 @@ def is_plain_array(value: Any) -> bool:
     return type(value) is array_type()
 
 
+# How to copy a value of a type that functions could change, by type; None if it is passed as it is. It holds each type
+# that was seen, so that a common one is found at a glance; iterators are never in it.
+COPIERS: Final[dict[type, Callable[[Any], Any] | None]] = {}
+_MOST_TYPES: Final = 1_000
+_MUTABLE: Final = (list, dict, set, deque, bytearray, number_array)
+
+
+def _learn(kind: type) -> Callable[[Any], Any] | None:
+    """Remember how values of a type are copied, and return it."""
+    if len(COPIERS) >= _MOST_TYPES:
+        COPIERS.clear()
+    pandas = sys.modules.get("pandas")
+    frames = tuple(getattr(pandas, name, ()) for name in ("DataFrame", "Series"))
+    if kind in _MUTABLE and kind is not number_array:
+        copier: Callable[[Any], Any] | None = kind.copy  # type: ignore[attr-defined]
+    elif issubclass(kind, _MUTABLE):
+        copier = copy.copy
+    else:
+        copier = _copy_of_frame if issubclass(kind, frames) else None
+    COPIERS[kind] = copier
+    return copier
+
+
+def _copy_of_frame(frame: Any) -> Any:
+    """Return a copy of a DataFrame or Series: of a pandas with copy-on-write, one that shares memory until a write."""
+    pandas = sys.modules["pandas"]
+    is_lazy = not pandas.__version__.startswith(("0.", "1.", "2.")) or pandas.options.mode.copy_on_write is True
+    return frame.copy(deep=not is_lazy)
+
+
+def _own_copy(value: Any) -> Any:
+    """Return a shallow copy of a mutable container; anything else as it is."""
+    copier = COPIERS.get(type(value), _learn)
+    if copier is _learn:
+        copier = _learn(type(value))
+    return value if copier is None else copier(value)
+
+
+def is_iterator(kind: type) -> bool:
+    """Whether values of a type are iterators: a generator, a zip, an open file."""
+    # Looked up in the classes, since a metaclass may answer for attributes that are not there.
+    return next((vars(base)["__next__"] for base in kind.__mro__ if "__next__" in vars(base)), None) is not None
+
+
+def require_reusable(value: Any, program: Program, slot: int) -> None:
+    """Raise IteratorRefused if the value for a slot can be read only once, and the program guards its values."""
+    kind = type(value)
+    if not program.guard or kind in COPIERS:
+        return
+    if is_iterator(kind):
+        token = program.tokens[slot]
+        raise IteratorRefused(token, program.cg.digraph.producer.get(token), value)
+    _learn(kind)
+
+
 def own_view(value: Any) -> Any:
     """Return an array as a view for the reader alone, whose shape may be changed; anything else as it is."""
     if not is_array(value):
@@ -78,10 +142,10 @@ def own_view(value: Any) -> Any:
 
 
 def lend(value: Any) -> Any:
-    """Return a value as a function or a reader gets it: arrays as read-only views of its own, lists as copies.
+    """Return a value as a function or a reader gets it: arrays as read-only views of its own, containers as copies.
 
-    Of tuples, named tuples and lists, the arrays in them count. A masked array is copied, since its mask can be
-    changed through any view.
+    The arrays in a tuple, named tuple, list, deque or dict count; what is deeper is shared. A masked array is copied,
+    since its mask can be changed through any view.
     """
     kind = type(value)
     if kind in ARRAYLESS:
@@ -92,65 +156,128 @@ def lend(value: Any) -> Any:
         return view
     if is_array(value):
         return _locked(own_view(value))
-    if _holds_arrays(value):
-        return _make(kind)(lend(item) if is_array(item) else item for item in value)
-    return value.copy() if kind is list else value
+    made = _own_copy(value)
+    return _with_items(made, lend) if _holds_arrays(made) else made
 
 
-def _locked(array: Any) -> Any:
-    array.flags.writeable = False
-    return array
+def _locked(value: Any) -> Any:
+    value.flags.writeable = False
+    return value
 
 
-def keep(value: Any, fresh_count: int) -> Any:
+def keep(value: Any, fresh_count: int, program: Program, slot: int, values: Sequence[Any]) -> Any:
     """Return what a function returned as it is stored: arrays locked, and copied where others could write to them.
 
     A function that goes on using the memory of its result would change a value that has been handed out. So an
     array to which somebody else holds a reference is copied; a new one, the usual case, is locked as it is. The same
-    goes for lists, and for the arrays in lists and tuples.
+    goes for mutable containers, and for the arrays in them and in tuples.
 
     Parameters
     ----------
     value
-        What was returned.
+        What was returned; or a hyperparameter's value.
     fresh_count
         The reference count, seen from here, of a value that nobody else knows.
+    program, slot
+        Where it is stored.
+    values
+        The values by slot, of which the function has read its inputs; empty for a hyperparameter.
+
+    Raises
+    ------
+    IteratorRefused
+        The value can be read only once.
     """
     kind = type(value)
     if kind in ARRAYLESS:
         return value
     is_known = getrefcount(value) > fresh_count
     if kind is (_ndarray or array_type()):
-        value = _own(value, is_known)
+        value = _own(value, is_known, program, slot, values)
         value.setflags(False)
         return value
     if is_array(value):
-        return _locked(own_view(value))
-    if _holds_arrays(value):
-        fresh_item = 0 if is_known else fresh_count + 1
-        return _make(kind)(keep(item, fresh_item) if is_array(item) else item for item in value)
-    return value.copy() if kind is list and is_known else value
+        return _locked(value.copy() if hasattr(value, "mask") else _own(value, is_known, program, slot, values))
+    if kind not in COPIERS:
+        require_reusable(value, program, slot)
+    copier = COPIERS.get(kind)
+    # A copy by pandas is made in any case: a new DataFrame may share its memory with others.
+    made = value if copier is None or not (is_known or copier is _copy_of_frame) else copier(value)
+    if not _holds_arrays(made):
+        return made
+    fresh_item = 0 if is_known else _FRESH_ITEM
+    return _with_items(made, lambda item: keep(item, fresh_item, program, slot, values))
 
 
-def _own(array: Any, is_known: bool) -> Any:
+def _with_items(value: Any, change: Callable[[Any], Any], which: Callable[[Any], bool] = is_array) -> Any:
+    """Return a tuple with its arrays changed; do that to a container in place, which is the caller's own."""
+    if issubclass(type(value), tuple):
+        return _make(type(value))(change(item) if which(item) else item for item in value)
+    for key in list(value) if issubclass(type(value), dict) else range(len(value)):
+        item = value[key]
+        if which(item):
+            value[key] = change(item)
+    return value
+
+
+def _own(array: Any, is_known: bool, program: Program, slot: int, values: Sequence[Any]) -> Any:
     """Return an array whose memory nobody else will write to, as far as can be seen."""
-    owner = array.base
-    if not array.flags.writeable:
-        return array
-    if is_known or (type(owner) is type(array) and getrefcount(owner) > _FRESH_OWNER):
+    is_writable, owner = array.flags.writeable, array.base
+    if is_known and is_writable:
+        return _copy(array)
+    while is_array(owner):
+        if getrefcount(owner) > _FRESH_OWNER and (is_writable or owner.flags.writeable):
+            is_input = not is_writable and _is_input(owner, program, slot, values)
+            return array if is_input else _copy(array)
+        owner = owner.base
+    # In memory of another library's object, it is unknown whether that is used again.
+    return array if owner is None or _is_constant(owner) else _copy(array)
+
+
+def _copy(array: Any) -> Any:
+    """Return a copy of an array; of one that was broadcast, what is repeated is copied once."""
+    if 0 not in array.strides or not array.size:
         return array.copy(order="K")
-    # In memory of another library's object, it is unknown whether that is used again; the object itself stays as it is.
-    return array if owner is None or type(owner) is type(array) else array.view()
+    once = array[tuple(slice(None) if stride else slice(1) for stride in array.strides)].copy(order="K")
+    return sys.modules["numpy"].broadcast_to(_locked(once), array.shape, subok=True)
+
+
+def _is_input(owner: Any, program: Program, slot: int, values: Sequence[Any]) -> bool:
+    """Whether memory is that of a value which the function of a slot has read: a payload's, which is not copied."""
+    for read in program.steps[program.makers[slot]].inputs if values else ():
+        value = values[read]
+        items = (value,) if is_array(value) else _items(value) if _holds_arrays(value) else ()
+        if any(is_array(item) and (item is owner or item.base is owner) for item in items):
+            return True
+    return False
+
+
+def _is_constant(owner: Any) -> bool:
+    """Whether the owner of memory lets nobody write to it: bytes, or a file mapped read-only."""
+    try:
+        with memoryview(owner) as view:
+            return view.readonly
+    except Exception:  # it is no buffer, or refuses to be looked at
+        return False
+
+
+def _items(value: Any) -> Any:
+    return value.values() if issubclass(type(value), dict) else value
 
 
 def _holds_arrays(value: Any) -> bool:
-    """Whether a tuple, named tuple or list has an array among its items."""
-    if type(value) is not tuple and type(value) is not list and not _is_named_tuple(value):
+    """Whether a tuple, named tuple, list, deque or dict has an array among its items."""
+    kind = type(value)
+    if kind is not tuple and not issubclass(kind, (list, dict, deque)) and not _is_named_tuple(value):
         return False
-    if len(value) < LONG or value[0] is None:
-        return any(map(is_array, value))
-    first = type(value[0])
-    if first not in HARMLESS and not is_array(value[0]):
+    items = _items(value)
+    if len(value) < LONG:
+        return any(map(is_array, items))
+    head = next(iter(items))
+    if head is None:
+        return any(map(is_array, items))
+    first = type(head)
+    if first not in HARMLESS and not is_array(head):
         HARMLESS.add(first)
     return first not in HARMLESS
 
@@ -164,7 +291,7 @@ def _is_named_tuple(value: Any) -> bool:
 
 
 def writable(value: Any) -> Any:
-    """Return a writable view of a guarded array, for an unguarded function; a copy where memory is read-only."""
+    """Return a value for an unguarded function: as ``lend`` does, but arrays writable, copied if memory is read-only."""
     if is_array(value):
         try:
             view = value.view()
@@ -172,9 +299,8 @@ def writable(value: Any) -> Any:
         except ValueError:
             view = _view_of_locked(value)
         return view
-    if _holds_arrays(value):
-        return _make(type(value))(writable(item) for item in value)
-    return value
+    made = _own_copy(value)
+    return _with_items(made, writable) if _holds_arrays(made) else made
 
 
 _unlocking = threading.Lock()
@@ -238,15 +364,17 @@ def _count(value: Any, unused: int) -> int:
     return getrefcount(value)
 
 
-def _measure_fresh() -> tuple[int, int, int]:
-    """Return the reference counts of an object that only its finder knows: seen by ``keep``, by its caller, as owner.
+def _measure_fresh() -> tuple[int, int, int, int]:
+    """Return the reference counts of an object that only its finder knows.
 
+    They are those seen by ``keep``, by its caller, of an array's owner, and by ``keep`` of an item of a new container.
     Measured, since interpreters differ in which references they count.
     """
     holder = _Holder(object())
     owner = holder.base
     result = object()
-    return _count(result, 0), getrefcount(result), getrefcount(owner)
+    (item,) = _with_items([object()], lambda item: _count(item, 0), lambda _: True)
+    return _count(result, 0), getrefcount(result), getrefcount(owner), item
 
 
-FRESH, FRESH_HERE, _FRESH_OWNER = _measure_fresh()
+FRESH, FRESH_HERE, _FRESH_OWNER, _FRESH_ITEM = _measure_fresh()

@@ -1,4 +1,4 @@
-"""Which tokens are frozen, to which values, and which free source tokens remain?"""
+"""The hyperparameters of a runner: which tokens are frozen, to which values, and which source tokens remain free."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import HyperparameterError
-from epypes.run.guard import ARRAYLESS, lend
+from epypes.run.guard import ARRAYLESS, keep, require_reusable
 from epypes.run.program import Program
 from epypes.run.refused import wrong_payload
 from epypes.run.tokens import NOT_COMPUTED, is_same_value
@@ -82,9 +82,11 @@ class Hyperparameters:
     def base(self) -> list[Any]:
         """The values by slot, with which a run begins."""
         if self._base is None:
-            self._base = [NOT_COMPUTED] * len(self.program.tokens)
+            base: list[Any] = [NOT_COMPUTED] * len(self.program.tokens)
             for token, entry in self.entries.items():
-                self._base[self.program.slots[token]] = entry[0]
+                base[self.program.slots[token]] = entry[0]
+            # Only when it is complete: other threads read it without a lock.
+            self._base = base
         return self._base
 
     def frozen(self, changes: Mapping[str, Any], *, also_new: bool = True) -> Hyperparameters:
@@ -103,6 +105,8 @@ class Hyperparameters:
             There is no such token, or a switch has no such branch.
         HyperparameterError
             A function makes the token, or it is not a hyperparameter.
+        IteratorRefused
+            A value can be read only once.
         """
         program, revision = self.program, self.revision
         entries, new, follows, plain = self.entries.copy(), {}, revision, self.plain
@@ -119,7 +123,8 @@ class Hyperparameters:
                 self.require_branches({token: value})
             if not is_count:
                 plain = plain if (type(value) in ARRAYLESS) == (token in plain) else plain ^ {token}
-                value = lend(value) if program.guard else value
+                # A copy of what others could write to: a change in place would not be noticed.
+                value = keep(value, 0, program, program.slots[token], ()) if program.guard else value
             new[token] = value
             entries[token] = (value, value if entry is None else entry[1])
         return Hyperparameters(program, entries, revision + 1, new, follows, plain) if new else self
@@ -137,6 +142,8 @@ class Hyperparameters:
         ------
         PayloadError, UnknownName
             A token is not a free source token, or a switch has no such branch.
+        IteratorRefused
+            A value can be read only once.
         """
         values, free = self.base.copy(), self.free_slots
         for token, value in payload.items():
@@ -144,6 +151,7 @@ class Hyperparameters:
             if slot is None:
                 raise wrong_payload(self.program.cg, token, free)
             values[slot] = value
+            require_reusable(value, self.program, slot)
         if self.program.selectors:
             self.require_branches(payload)
         return values

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
-from types import BuiltinFunctionType, FunctionType, ModuleType
+from types import FunctionType
 from typing import Any, Final, NamedTuple
 
 from epypes.graph import CompGraph, Switch, as_switch, layers
@@ -34,8 +34,6 @@ class Step(NamedTuple):
         Whether its value is one token as it is, not a sequence of tokens.
     unguarded
         Whether it gets its arrays writable.
-    is_builtin
-        Whether it is a C function of a module: it can write into an array, but neither change its shape nor keep it.
     switch
         The switch that it is, if it is one.
     contracts
@@ -51,7 +49,6 @@ class Step(NamedTuple):
     outputs: tuple[int, ...]
     single: bool
     unguarded: bool
-    is_builtin: bool
     switch: Switch | None
     contracts: Contracts | None
     is_plain: bool
@@ -160,7 +157,6 @@ def _steps(cg: CompGraph, slots: dict[str, int], guard: bool) -> Iterator[Step]:
             (slots[outputs[0]],) if len(outputs) == 1 else tuple(map(slot_of, outputs)),
             type(io[1]) is str,
             unguarded,
-            type(function) is BuiltinFunctionType and isinstance(function.__self__, ModuleType | None),
             switch,
             contract,
             guard and not unguarded and switch is None and contract is None,

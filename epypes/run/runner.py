@@ -1,4 +1,4 @@
-"""How is a graph run, tuned and run again?"""
+"""The runner of a graph: run, tune, run again."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from epypes.graph import CompGraph
 from epypes.run.attempt import AttemptsByKind, Outcome
 from epypes.run.call import StepFailed
 from epypes.run.draft import draft_after, tokens_now
-from epypes.run.guard import lend
+from epypes.run.guard import COPIERS, lend, require_reusable
 from epypes.run.hyperparameters import Hyperparameters
 from epypes.run.plan import Plan, plan
 from epypes.run.program import Program
@@ -40,7 +40,7 @@ class CompGraphRunner:
         How many functions may run at once, in threads. They run side by side where that is faster, which is tried; the
         results, the order of the report and the errors are those of one after another.
     guard
-        Whether functions get arrays as read-only views.
+        Whether functions get arrays as read-only views and containers as copies, and iterators are refused.
 
     Raises
     ------
@@ -108,6 +108,8 @@ class CompGraphRunner:
         ------
         PayloadError
             A free source token that is needed is missing, or a token is given that is not one.
+        IteratorRefused
+            A value that is given, or that a function returns, can be read only once.
         PlaceholderNeeded
             Functions that are needed are still to be written.
         UnknownName
@@ -131,7 +133,9 @@ class CompGraphRunner:
         values = base.copy()
         try:
             for token in payload:
-                values[slots[token]] = payload[token]
+                value = values[slots[token]] = payload[token]
+                if type(value) not in COPIERS:
+                    require_reusable(value, self._program, slots[token])
         except KeyError:
             return self._run_anyhow(payload, targets, start_ns, hparams)
         try:
