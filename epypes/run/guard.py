@@ -222,16 +222,20 @@ def _with_items(value: Any, change: Callable[[Any], Any], which: Callable[[Any],
 
 def _own(array: Any, is_known: bool, program: Program, slot: int, values: Sequence[Any]) -> Any:
     """Return an array whose memory nobody else will write to, as far as can be seen."""
-    is_writable, owner = array.flags.writeable, array.base
-    if is_known and is_writable:
+    owner = array.base
+    if is_known and array.flags.writeable:
         return _copy(array)
-    while is_array(owner):
-        if getrefcount(owner) > _FRESH_OWNER and (is_writable or owner.flags.writeable):
-            is_input = not is_writable and _is_input(owner, program, slot, values)
-            return array if is_input else _copy(array)
+    if owner is None:
+        return array
+    is_writable = array.flags.writeable
+    while type(owner) is _ndarray or is_array(owner):
+        if (is_writable or owner.flags.writeable) and getrefcount(owner) > _FRESH_OWNER:
+            return array if not is_writable and _is_input(owner, program, slot, values) else _copy(array)
         owner = owner.base
+        if owner is None:
+            return array
     # In memory of another library's object, it is unknown whether that is used again.
-    return array if owner is None or _is_constant(owner) else _copy(array)
+    return array if _is_constant(owner) else _copy(array)
 
 
 def _copy(array: Any) -> Any:
@@ -244,7 +248,12 @@ def _copy(array: Any) -> Any:
 
 def _is_input(owner: Any, program: Program, slot: int, values: Sequence[Any]) -> bool:
     """Whether memory is that of a value which the function of a slot has read: a payload's, which is not copied."""
-    for read in program.steps[program.makers[slot]].inputs if values else ():
+    inputs = program.steps[program.makers[slot]].inputs if values else ()
+    for read in inputs:
+        value = values[read]
+        if value is owner or (type(value) is _ndarray and value.base is owner):
+            return True
+    for read in inputs:
         value = values[read]
         items = (value,) if is_array(value) else _items(value) if _holds_arrays(value) else ()
         if any(is_array(item) and (item is owner or item.base is owner) for item in items):

@@ -1,4 +1,4 @@
-"""Which functions are being run at this moment, in whatever thread?
+"""The functions that are being run at this moment, in any thread.
 
 Runs don't keep account of that, which would cost something at every call: the frames of all threads are looked at,
 when somebody asks.
@@ -36,9 +36,11 @@ def locals_under_way(codes: Collection[CodeType]) -> list[dict[str, Any]]:
 
 def _frames() -> Iterator[FrameType]:
     """Give the frames of all threads, the innermost of each first."""
-    # The dictionary of frames gets no name: it holds the frame of this call, and would be a cycle with it.
-    for innermost in sys._current_frames().values():
-        frame: FrameType | None = innermost
+    # The frame of this call is among them. A local variable that still held it at the end would be a cycle, which
+    # keeps all that its callers hold alive: so what remains to be looked at is taken out of a list.
+    remaining = [*sys._current_frames().values()]
+    while remaining:
+        frame: FrameType | None = remaining.pop()
         while frame is not None:
             yield frame
             frame = frame.f_back
