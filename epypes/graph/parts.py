@@ -5,9 +5,10 @@ from __future__ import annotations
 import reprlib
 from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from epypes.errors import Finding
+from epypes.graph.redefined import is_same_default
 
 if TYPE_CHECKING:
     from epypes.graph.compgraph import CompGraph
@@ -76,25 +77,10 @@ def check_defaults(defaults: Iterable[Default]) -> Iterable[Finding]:
     first: dict[str, Default] = {}
     for default in defaults:
         other = first.setdefault(default.token, default)
-        if not _is_equal(other.value, default.value):
+        if not is_same_default(other.value, default.value):
             text = (
                 f"Token {default.token!r} has the default {reprlib.repr(other.value)} in {other.function!r} "
                 f"and {reprlib.repr(default.value)} in {default.function!r}. "
                 "Make them equal, or rename one of the tokens."
             )
             yield Finding("defaults", text, (default.token, other.function, default.function))
-
-
-_SIMPLE: Final = frozenset({int, bool, str, bytes})
-
-
-def _is_equal(left: Any, right: Any) -> bool:
-    """Whether two defaults are the same object or equal simple values; others are not asked, they may be arrays."""
-    kind = type(left)
-    if left is right or kind is not type(right):
-        return left is right
-    if kind is tuple:
-        return len(left) == len(right) and all(map(_is_equal, left, right))
-    if kind in (float, complex):  # NaN equals NaN here, and 0.0 is not -0.0
-        return repr(left) == repr(right)
-    return kind in _SIMPLE and bool(left == right)

@@ -1,4 +1,4 @@
-"""Which functions of a graph are no longer what their name says, since their cell was run again?"""
+"""Functions of a graph that are no longer what their name says, since their cell was run again."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
 # A wrapper may wrap itself by mistake; nobody wraps this deep on purpose.
 _DEEPEST: Final = 100
+_SAID_OF_PARAMETERS: Final = ("__defaults__", "__kwdefaults__", "__annotations__")
 
 
 def redefined(cg: CompGraph) -> tuple[str, ...]:
@@ -97,12 +98,33 @@ def have_one_name(left: object, right: object) -> bool:
 
 
 def is_defined_alike(old: Any, new: Any) -> bool:
-    """Whether two functions were defined in the same words and depend on nothing around them."""
+    """Whether two functions were defined in the same words, with the same defaults, and depend on nothing around them."""
     if old.__closure__ or new.__closure__:
         return False
-    if (old.__defaults__, old.__kwdefaults__) != (new.__defaults__, new.__kwdefaults__):
+    if not all(is_same_default(getattr(old, name), getattr(new, name)) for name in _SAID_OF_PARAMETERS):
         return False
     return old.__code__ == new.__code__ or _at_line_one(old.__code__) == _at_line_one(new.__code__)
+
+
+def is_same_default(left: Any, right: Any) -> bool:
+    """Whether two defaults or annotations are the same, to the last bit: 2 is not 2.0, nor 0.0 -0.0, nor 1 True."""
+    if left is right:
+        return True
+    if type(left) is not type(right):
+        return False
+    if type(left) in (tuple, list):
+        return len(left) == len(right) and all(map(is_same_default, left, right))
+    if type(left) is dict:
+        return len(left) == len(right) and all(map(is_same_default, left.items(), right.items()))
+    if hasattr(type(left), "tobytes") and hasattr(type(left), "dtype"):
+        # An array: NumPy is not imported here.
+        same = left.dtype == right.dtype and left.shape == right.shape and not left.dtype.hasobject
+        return bool(same and left.tobytes() == right.tobytes())
+    try:
+        # Objects that are equal may differ in what they hold, as a range from 1 and one from 1.0; NaN equals nothing.
+        return repr(left) == repr(right) and (bool(left == right) or bool(left != left))
+    except Exception:  # whatever an object's own comparison raises
+        return False
 
 
 def _at_line_one(code: CodeType) -> CodeType:

@@ -1,4 +1,4 @@
-"""How is a graph used as one node, with its times and attributes?"""
+"""A graph as one node, with its times and attributes."""
 
 from __future__ import annotations
 
@@ -71,8 +71,7 @@ class Pipeline(Node):
     @property
     def __epypes_revision__(self) -> tuple[Any, ...]:
         """Another value whenever a hyperparameter of this pipeline, or of one inside it, has changed."""
-        inner = (node.__epypes_revision__ for node in self.network.nodes.values() if isinstance(node, Pipeline))
-        return self.runner.revision, *inner
+        return self.runner.revision, *self.runner._program.revisions()
 
     @property
     def cg(self) -> CompGraph:

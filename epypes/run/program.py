@@ -1,16 +1,18 @@
-"""Which slots does each function read and write?
+"""A graph compiled for running: which slots each function reads and writes.
 
 A graph is compiled once: tokens become slot numbers, functions become steps in run order.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
-from types import FunctionType
+from types import BuiltinFunctionType, CodeType, FunctionType, MethodType
 from typing import Any, Final, NamedTuple
 
-from epypes.graph import CompGraph, Switch, as_switch, layers
+from epypes.graph import CompGraph, Switch, as_switch
+from epypes.graph.checks import distinct
 from epypes.images import Contracts
 from epypes.run.guard import is_unguarded
 
@@ -19,6 +21,8 @@ REVISION: Final = "__epypes_revision__"
 # What a function has that keeps account of its calls: where it is true, its ``func`` may be called in its place, if
 # ``count_call`` is called too.
 IS_ITS_FUNC: Final = "__epypes_is_its_func__"
+# More objects than any function refers to on purpose.
+_MOST_REACHED: Final = 1_000
 
 
 class Step(NamedTuple):
@@ -74,7 +78,8 @@ class Program:
     selectors
         By the selector's token, the switches that it selects for.
     revised
-        The steps whose function computes something else when it has got another revision: nested pipelines.
+        The steps whose function computes something else when what it is or reaches has got another revision: nested
+        pipelines.
     """
 
     def __init__(self, cg: CompGraph, guard: bool) -> None:
@@ -84,7 +89,10 @@ class Program:
         special = [step for step in steps if type(step.function) is not FunctionType]
         self.switches = tuple(step.place for step in special if step.switch is not None)
         self.placeholders = frozenset(step.place for step in special if step.name in cg.placeholders)
-        self.revised = tuple(step.place for step in special if _with_revision(step.function) is not None)
+        functions = {key: function for key, function in distinct(cg.functions).items() if not _is_alone(function)}
+        found = {key: objects for key, function in functions.items() if (objects := tuple(_with_revisions(function)))}
+        self.revised = tuple(step.place for step in steps if id(step.function) in found) if found else ()
+        self._with_revisions = tuple(found[id(steps[place].function)] for place in self.revised)
         self.selectors: dict[str, list[Switch]] = {}
         for place in self.switches:
             step = steps[place]
@@ -113,7 +121,7 @@ class Program:
 
     def revisions(self) -> tuple[Any, ...]:
         """Return the present revisions of the functions that have one."""
-        return tuple(getattr(_with_revision(self.steps[place].function), REVISION) for place in self.revised)
+        return tuple(tuple([getattr(found, REVISION) for found in objects]) for objects in self._with_revisions)
 
     def read_by(self, step: Step, values: Sequence[Any]) -> tuple[int, ...]:
         """Return the slots that a step reads with these values: of a switch, the selector and the chosen branch."""
@@ -138,9 +146,56 @@ class Program:
         return found
 
 
-def _with_revision(function: object) -> object | None:
-    """Return the function, or what it wraps, that has a revision; None if there is none."""
-    return next((layer for layer in layers(function) if hasattr(type(layer), REVISION)), None)
+def _is_alone(function: Any) -> bool:
+    """Whether a function refers to nothing by name, as can be seen at a glance: large graphs are compiled fast."""
+    if type(function) is not FunctionType or function.__closure__ or function.__defaults__ or function.__kwdefaults__:
+        return False
+    code = function.__code__
+    return not code.co_names and len(code.co_consts) <= 1 and not function.__dict__
+
+
+def _with_revisions(function: object) -> Iterator[object]:
+    """Give what has a revision among a function, what it wraps or is bound to, and what it refers to by name."""
+    pending, seen = [function], set[int]()
+    while pending and len(seen) < _MOST_REACHED:
+        reached = pending.pop()
+        if id(reached) in seen:
+            continue
+        seen.add(id(reached))
+        if hasattr(type(reached), REVISION):
+            yield reached
+        else:
+            with contextlib.suppress(Exception):  # whatever an object raises when it is looked at
+                pending.extend(_referred(reached))
+
+
+def _referred(function: Any) -> list[object]:
+    """Return the objects that can be called among those that a function, a method or a callable object refers to."""
+    kind = type(function)
+    if kind is MethodType:
+        return [function.__self__, function.__func__]
+    if kind is partial:
+        found = [function.func, *function.args, *function.keywords.values()]
+    elif kind is FunctionType:
+        found = [*(function.__defaults__ or ()), *(function.__kwdefaults__ or {}).values(), *vars(function).values()]
+        for cell in function.__closure__ or ():
+            with contextlib.suppress(ValueError):  # an empty cell
+                found.append(cell.cell_contents)
+        names = function.__globals__
+        for value in [names[name] for name in _names_in(function.__code__) if name in names]:
+            # Functions of other modules than the user's are not looked into.
+            if type(value) is not FunctionType or value.__globals__ is names:
+                found.append(value)
+    else:
+        found = list(vars(function).values())
+    return [value for value in found if callable(value) and not isinstance(value, type | BuiltinFunctionType)]
+
+
+def _names_in(code: CodeType) -> Iterator[str]:
+    yield from code.co_names
+    for constant in code.co_consts:
+        if type(constant) is CodeType:
+            yield from _names_in(constant)
 
 
 def _steps(cg: CompGraph, slots: dict[str, int], guard: bool) -> Iterator[Step]:

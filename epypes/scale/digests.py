@@ -181,8 +181,13 @@ def _is_numpy_scalar(value: Any) -> bool:
     return getattr(value, "shape", None) == () and hasattr(value, "dtype") and hasattr(value, "tobytes")
 
 
+# NumPy's long doubles have bytes that mean nothing.
+_PADDED: Final = "gG"
+
+
 def _of_scalar(value: Any) -> bytes:
-    return joined(_kind(value), repr(value.dtype.descr), value.tobytes())
+    content = repr(value) if value.dtype.char in _PADDED else value.tobytes()
+    return joined(_kind(value), repr(value.dtype.descr), content)
 
 
 def _of_array(array: Any) -> bytes:
@@ -190,7 +195,7 @@ def _of_array(array: Any) -> bytes:
 
     plain = np.asarray(array)
     described = _kind(array), repr(plain.dtype.descr), repr(plain.shape)
-    if plain.dtype.hasobject:
+    if plain.dtype.hasobject or plain.dtype.char in _PADDED:
         content: bytes | memoryview = _digest(plain.tolist())
     else:
         content = np.ascontiguousarray(plain).reshape(-1).view(np.uint8).data if plain.nbytes else b""

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import functools
+from typing import Annotated
 
+import numpy as np
 import pytest
 
 import epypes as ep
@@ -299,6 +301,51 @@ def test_a_function_whose_cell_was_run_again_is_the_same_one():
         left | ep.CompGraph({"f": one}, {"f": ("x", "z")})
     with pytest.raises(GraphError, match="with another callable or io. Rename one of them"):
         left | ep.CompGraph({"f": abs}, {"f": ("x", "y")})
+
+
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [
+        ("k=2", "k=2.0"),
+        ("k=0.0", "k=-0.0"),
+        ("k=1", "k=True"),
+        ("*, k=2", "*, k=2.0"),
+        ("k=(1, [2])", "k=(1, [2.0])"),
+        ("k={'a': 1}", "k={'a': True}"),
+        ("k=np.zeros(3)", "k=np.ones(3)"),
+        ("k=np.zeros(3)", "k=np.zeros(3, int)"),
+        ("k=np.zeros(3)", "k=-np.zeros(3)"),
+        ("k=(np.zeros(3),)", "k=(np.ones(3),)"),
+        ("k: int = 3", "k: float = 3"),
+        ("k: Annotated[int, ep.Param(1, 9)] = 3", "k: Annotated[int, ep.Param(1, 8)] = 3"),
+        ("k: Annotated[int, ep.Param(1, 9)] = 3", "k: Annotated[int, ep.Param(1.0, 9)] = 3"),
+    ],
+)
+def test_functions_that_differ_in_a_default_or_an_annotation_alone_are_two(left, right):
+    names = {"__name__": "__main__", "np": np, "ep": ep, "Annotated": Annotated}
+
+    def defined_with(parameter):
+        exec(f"def f(x, {parameter}):\n    return x", names)
+        return ep.CompGraph({"f": names["f"]}, {"f": ("x", "y")})
+
+    one, again, other = defined_with(left), defined_with(left), defined_with(right)
+    assert (one | again).functions["f"] is one.functions["f"]
+    assert ep.extend(one, {}, {}).functions["f"] is one.functions["f"]
+    for graphs in ((one, other), (other, one)):
+        with pytest.raises(GraphError, match="Two graphs have a function 'f', with another callable"):
+            ep.union(*graphs)
+
+
+def test_a_default_that_is_an_array_is_one_with_its_equal():
+    names = {"__name__": "__main__", "np": np}
+    graphs = []
+    for array in ("zeros", "zeros", "ones"):
+        exec(f"def f(x, k=np.{array}((9, 9))):\n    return k.sum() + x", names)
+        graphs.append(ep.CompGraph.from_functions(names["f"]))
+    one, again, other = graphs
+    assert ep.CompGraphRunner(one | again).run(x=1)["f"] == 1
+    with pytest.raises(GraphError, match="'k' has the default"):
+        one | other
 
 
 def test_suffixes_have_an_order():

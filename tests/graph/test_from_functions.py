@@ -3,6 +3,7 @@ from __future__ import annotations
 import functools
 import math
 
+import numpy as np
 import pytest
 
 import epypes as ep
@@ -98,9 +99,10 @@ def with_default(name, value):
 @pytest.mark.parametrize(
     ("one", "other", "agree"),
     [(1, 1, True), (1, 2, False), (1, True, False), (1, 1.0, False), (math.nan, math.nan, True), (0.0, -0.0, False),
-     ("a", "a", True), ((1, ("x",)), (1, ("x",)), True), ((1,), (1, 2), False), ([], [], False), (None, None, True)],
+     ("a", "a", True), ((1, ("x",)), (1, ("x",)), True), ((1,), (1, 2), False), ([], [], True), ([1], [1.0], False), ([], (), False),
+     (np.zeros(9), np.zeros(9), True), (np.zeros(9), np.ones(9), False), (object(), object(), False), (None, None, True)],
 )  # fmt: skip
-def test_two_defaults_of_one_token_must_be_equal_simple_values(one, other, agree):
+def test_two_defaults_of_one_token_must_be_equal_to_the_last_bit(one, other, agree):
     functions = with_default("f", one), with_default("g", other)
     if agree:
         assert list(ep.CompGraph.from_functions(*functions).defaults) == ["k"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 
 import pytest
@@ -242,6 +243,64 @@ def test_a_node_around_a_pipeline_shows_its_changes():
     inner["n"] = 5
     assert runner.stale == ("node",)
     assert runner.rerun()["b"] == 6
+
+
+class Stage:
+    def __init__(self, function):
+        self.function = function
+
+    def __call__(self, x):
+        return self.function(x)
+
+    def compute(self, x):
+        return self.function(x)
+
+
+def wrapped(pipe):
+    @functools.wraps(pipe)
+    def inner(*args):
+        return pipe(*args)
+
+    return inner
+
+
+def named(pipe, code="lambda a: p(a)"):
+    names = {"p": pipe, "helper": None}
+    exec("helper = lambda a: p(a)", names)
+    return eval(code, names)
+
+
+WRAPPERS = {
+    "partial": functools.partial,
+    "partial of a function": lambda pipe: functools.partial(lambda p, a: p(a), pipe),
+    "wraps": wrapped,
+    "lambda": lambda pipe: lambda a: pipe(a),
+    "default": lambda pipe: lambda a, p=pipe: p(a),
+    "call": lambda pipe: pipe.__call__,
+    "object": Stage,
+    "method": lambda pipe: Stage(pipe).compute,
+    "global": named,
+    "global in a comprehension": lambda pipe: named(pipe, "lambda a: [p(x) for x in (a,)][0]"),
+    "global in a helper": lambda pipe: named(pipe, "lambda a: helper(a)"),
+    "lambda around partial": lambda pipe: (lambda f: lambda a: f(a))(functools.partial(pipe)),
+}
+
+
+@pytest.mark.parametrize("how", WRAPPERS)
+def test_a_pipeline_behind_any_wrapper_shows_its_changes(how):
+    inner = ep.Pipeline("inner", ep.CompGraph({"f": lambda x, n: x + n}, {"f": (("x", "n"), "y")}), {"n": 1})
+    cg = ep.CompGraph({"before": abs, "f": WRAPPERS[how](inner)}, {"before": ("x", "a"), "f": (("a",), "b")})
+    whole = ep.Pipeline("whole", cg)
+    outer = ep.CompGraphRunner(ep.CompGraph({"whole": whole}, {"whole": ("a", "b")}))
+    for runner, function in ((ep.CompGraphRunner(cg), "f"), (outer, "whole")):
+        (token,) = runner.free_source_tokens
+        for n in range(RUNS):
+            inner["n"] = n
+            assert runner.run(**{token: 1})["b"] == 1 + n
+        for n in range(10, 10 + RUNS):
+            inner["n"] = n
+            assert runner.stale == (function,)
+            assert runner.rerun()["b"] == 1 + n
 
 
 def test_the_times_of_what_a_switch_left_out_are_not_those_of_an_earlier_call():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bisect
 import collections
+import contextlib
 import csv
 import heapq
 import io
@@ -54,12 +55,8 @@ def test_a_builtin_that_changes_its_input_changes_it_for_no_other_function(way, 
     cg = graph_of(make=(make, "n", "xs"), change=(change, inputs, "changed"), read=(read, "xs", "found"))
     runner = way.runner(cg, dict(zip(names, more, strict=True)))
     for _ in range(way.runs):
-        try:
-            found = runner.run(n=3)["found"]
-        except ValueError as error:
-            assert "read-only" in str(error)
-            found = read(runner["xs"])
-        assert found == expected
+        with contextlib.suppress(ValueError):  # of an array, which is read-only
+            assert runner.run(n=3)["found"] == expected
         assert read(runner["xs"]) == expected
 
 
@@ -188,7 +185,9 @@ def test_arrays_in_a_dict_are_guarded_as_those_in_a_list(way, container, count):
     for n in range(way.runs):
         with pytest.raises(ValueError, match="read-only"):
             runner.run(n=n)
-        assert [array.__array_interface__["data"][0] for array in runner["x"].values()] == addresses, "nothing is copied"
+        assert [array.__array_interface__["data"][0] for array in runner["x"].values()] == addresses, (
+            "nothing is copied"
+        )
         assert runner["x"][count - 1].tolist() == [n] * 3
 
 
