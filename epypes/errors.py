@@ -10,6 +10,7 @@ Everything an error's text mentions is an attribute of it::
     +-- PayloadError            run() was given too little or the wrong tokens; .tokens
     +-- HyperparameterError     a token can't be set, frozen or unfrozen; .token
     +-- IteratorRefused         a value can be read only once; .token, .function
+    +-- InputMutated            a function has changed its input in place; .function, .token
     +-- PlaceholderNeeded       a function is still to be written; .functions
     +-- OutputArityError        a function returned another number of values; .function
     +-- ContractBroken          a value is not the image that an annotation says; .function, .token
@@ -166,6 +167,17 @@ class IteratorRefused(EpypesError, TypeError):
         super().__init__(
             f"Token {token!r}, {origin}, is an iterator ({kind.__name__}). An iterator can be read only once, "
             f"but reruns and several functions read a token. {way_out}"
+        )
+
+
+class InputMutated(EpypesError, RuntimeError):
+    """A function has changed an object inside its input, which ``check_mutation`` has found and put back."""
+
+    def __init__(self, function: str, token: str) -> None:
+        self.function, self.token = function, token
+        super().__init__(
+            f"Function {function!r} has changed its input {token!r} in place, which other functions and reruns read. "
+            f"What it had changed was put back. Let it work on a copy, made with copy.deepcopy."
         )
 
 

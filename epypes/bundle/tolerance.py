@@ -17,7 +17,7 @@ from epypes.bundle.apart import apart
 from epypes.bundle.compare import Tolerance, Unlike, differences
 from epypes.bundle.kept import kept_by, what_changed
 from epypes.bundle.suspects import suspicion, way_out
-from epypes.errors import BundleError
+from epypes.errors import BundleError, InputMutated
 from epypes.graph import CompGraph, with_defaults
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
@@ -72,10 +72,10 @@ def learn(
     Raises
     ------
     BundleError
-        A function fails that did not fail before.
+        A function fails that did not fail before, or changes an object inside its input.
     """
     # Without its defaults, so that what was unfrozen is taken from the payload.
-    runner = CompGraphRunner(with_defaults(apart(cg), {}), hyperparameters)
+    runner = CompGraphRunner(with_defaults(apart(cg), {}), hyperparameters, check_mutation=True)
     tolerances: dict[str, Tolerance] = {}
     reasons: list[str] = []
     before = kept_by(cg.functions)
@@ -113,6 +113,8 @@ class _Seen:
         sample = self._sample
         try:
             run = self._runner.run(**{token: sample[token] for token in self._runner.free_source_tokens})
+        except InputMutated as error:
+            raise BundleError("", str(error)) from error
         except Exception as error:
             text = (
                 f"Run again on the same payload, {run_failed_in(error)} raised {type(error).__name__}: {error}. "

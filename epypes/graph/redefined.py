@@ -98,7 +98,7 @@ def have_one_name(left: object, right: object) -> bool:
 
 
 def is_defined_alike(old: Any, new: Any) -> bool:
-    """Whether two functions were defined in the same words, with the same defaults, and depend on nothing around them."""
+    """Whether two functions were defined in the same words, defaults included, and depend on nothing around them."""
     if old.__closure__ or new.__closure__:
         return False
     if not all(is_same_default(getattr(old, name), getattr(new, name)) for name in _SAID_OF_PARAMETERS):

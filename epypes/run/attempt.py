@@ -43,7 +43,9 @@ class Attempts:
     def __init__(self, program: Program, workers: int, plain: Iterable[str]) -> None:
         self._program, self._workers = program, workers
         self._compiled = CompiledRuns(program, plain)
-        self._gains = Gains(program, workers) if workers > 1 and has_independent_steps(program) else None
+        # Checked for changes to their inputs, functions that share one run one after another.
+        may_spread = workers > 1 and not program.check_mutation
+        self._gains = Gains(program, workers) if may_spread and has_independent_steps(program) else None
         self.short_way = self._compiled if self._gains is None else GuardedWay(self._compiled, self._gains)
         self.clean = Freshness(program, bytes(len(program.steps)), True)
 

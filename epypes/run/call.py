@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from sys import getrefcount
 from time import perf_counter_ns
 from typing import Any
 
-from epypes.errors import ContractBroken, OutputArityError
+from epypes.errors import ContractBroken, InputMutated, OutputArityError
 from epypes.images import Image
-from epypes.run.guard import ARRAYLESS, FRESH, keep, lend, writable
+from epypes.run.guard import ARRAYLESS, FRESH, is_array, keep, lend, writable
 from epypes.run.program import Program, Step
+from epypes.run.snapshot import Snapshot
 
 
 class StepFailed(BaseException):
@@ -51,6 +53,8 @@ def call(program: Program, step: Step, values: Sequence[Any]) -> tuple[Sequence[
                 args.append(value if type(value) in ARRAYLESS else lend(value))
         else:
             args = _args(program, step, values)
+            if program.check_mutation and switch is None:
+                function = partial(_call_checked, program, step, values)
         start_ns = perf_counter_ns()
         result = function(*args)
         duration_ns = perf_counter_ns() - start_ns
@@ -77,6 +81,25 @@ def _args(program: Program, step: Step, values: Sequence[Any]) -> list[Any]:
     if step.contracts is not None:
         _check(program, step, step.contracts[0], step.inputs, args)
     return args
+
+
+def _call_checked(program: Program, step: Step, values: Sequence[Any], *args: Any) -> Any:
+    """Call a step's function; put back what it has changed of its inputs, and raise InputMutated."""
+    given = {program.tokens[slot]: values[slot] for slot in step.inputs}
+    if step.unguarded:  # which can write into memory that is locked for others
+        views = zip(step.inputs, args, strict=True)
+        given.update((program.tokens[slot], view) for slot, view in views if is_array(view))
+    before = Snapshot(given)
+    try:
+        result = step.function(*args)
+    except BaseException:
+        before.restore()
+        raise
+    token = before.changed()
+    if token is not None:
+        before.restore()
+        raise InputMutated(step.name, token)
+    return result
 
 
 def _check(

@@ -191,7 +191,7 @@ def _body(program: Program, steps: list[Step], plain: Collection[int], changed: 
             given = _given(step, changed, known) if slot in checked else None
             lines += _store(slot, "made" if step.single else f"made[{place}]", given)
         lines.append(f"d{step.place} = spent")
-        if _is_direct(step):
+        if _is_direct(program, step):
             # As count_call does, which would be a call into cold code.
             lines += [f"f{step.place}.duration_ns = spent", f"f{step.place}.run_count = f{step.place}.next_count()"]
         if step.switch is None:
@@ -211,7 +211,7 @@ def _body(program: Program, steps: list[Step], plain: Collection[int], changed: 
 
 def _call(program: Program, step: Step, plain: Collection[int], locked: Collection[int]) -> Iterator[str]:
     """Write out the call of a step; the slots in ``locked`` hold what ``keep`` gave."""
-    if not _is_written_out(step):
+    if not _is_written_out(program, step):
         yield f"made, spent = call(program, steps[{step.place}], v)"
         if step.single:
             yield "made = made[0]"
@@ -228,7 +228,7 @@ def _call(program: Program, step: Step, plain: Collection[int], locked: Collecti
         else:
             yield from _lend(f"a{place}", is_locked=slot in locked)
     yield "start = clock()"
-    function = f"f{step.place}.func" if _is_direct(step) else f"f{step.place}"
+    function = f"f{step.place}.func" if _is_direct(program, step) else f"f{step.place}"
     yield f"made = {function}({', '.join(args)})"
     yield "spent = clock() - start"
     if step.single and program.guard:
@@ -237,13 +237,13 @@ def _call(program: Program, step: Step, plain: Collection[int], locked: Collecti
         yield from _unpack(program, step)
 
 
-def _is_written_out(step: Step) -> bool:
-    return step.switch is None and not step.unguarded and step.contracts is None
+def _is_written_out(program: Program, step: Step) -> bool:
+    return not program.check_mutation and step.switch is None and not step.unguarded and step.contracts is None
 
 
-def _is_direct(step: Step) -> bool:
+def _is_direct(program: Program, step: Step) -> bool:
     """Whether what a node stands for is called in its place."""
-    return _is_written_out(step) and is_its_func(step.function)
+    return _is_written_out(program, step) and is_its_func(step.function)
 
 
 def _unpack(program: Program, step: Step) -> Iterator[str]:

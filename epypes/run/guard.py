@@ -301,7 +301,7 @@ def _is_named_tuple(value: Any) -> bool:
 
 
 def writable(value: Any) -> Any:
-    """Return a value as an unguarded function gets it: arrays as writable views, as copies where memory is read-only."""
+    """Return a value as an unguarded function gets it: arrays as writable views, or copies of read-only memory."""
     if is_array(value):
         try:
             view = value.view()

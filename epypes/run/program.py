@@ -67,6 +67,8 @@ class Program:
         The graph.
     guard
         Whether functions get arrays as read-only views.
+    check_mutation
+        Whether each call is checked for changes to its inputs.
     tokens
         The tokens by slot.
     slots
@@ -82,10 +84,10 @@ class Program:
         pipelines.
     """
 
-    def __init__(self, cg: CompGraph, guard: bool) -> None:
-        self.cg, self.guard, self.tokens = cg, guard, cg.tokens
+    def __init__(self, cg: CompGraph, guard: bool, check_mutation: bool = False) -> None:
+        self.cg, self.guard, self.check_mutation, self.tokens = cg, guard, check_mutation, cg.tokens
         self.slots = slots = {token: slot for slot, token in enumerate(cg.tokens)}
-        self.steps = steps = tuple(_steps(cg, slots, guard))
+        self.steps = steps = tuple(_steps(cg, slots, guard and not check_mutation))
         special = [step for step in steps if type(step.function) is not FunctionType]
         self.switches = tuple(step.place for step in special if step.switch is not None)
         self.placeholders = frozenset(step.place for step in special if step.name in cg.placeholders)
@@ -198,7 +200,7 @@ def _names_in(code: CodeType) -> Iterator[str]:
             yield from _names_in(constant)
 
 
-def _steps(cg: CompGraph, slots: dict[str, int], guard: bool) -> Iterator[Step]:
+def _steps(cg: CompGraph, slots: dict[str, int], lends_only: bool) -> Iterator[Step]:
     contracts, slot_of = cg.contracts, slots.__getitem__
     switches = {name: as_switch(cg.functions[name]) for name in cg.switches}
     sides = zip(cg.digraph.inputs.values(), cg.digraph.outputs.values(), cg.func_io.values(), strict=True)
@@ -214,7 +216,7 @@ def _steps(cg: CompGraph, slots: dict[str, int], guard: bool) -> Iterator[Step]:
             unguarded,
             switch,
             contract,
-            guard and not unguarded and switch is None and contract is None,
+            lends_only and not unguarded and switch is None and contract is None,
         ))  # fmt: skip
 
 

@@ -41,6 +41,10 @@ class CompGraphRunner:
         results, the order of the report and the errors are those of one after another.
     guard
         Whether functions get arrays as read-only views and containers as copies, and iterators are refused.
+    check_mutation
+        Whether every call is checked for changes to what is deeper inside its inputs, such as a list in a list: they
+        are put back, and InputMutated is raised. It takes a look at all objects that the inputs reach, and runs one
+        function at a time; without it nothing is looked at.
 
     Raises
     ------
@@ -65,7 +69,13 @@ class CompGraphRunner:
     """
 
     def __init__(
-        self, cg: CompGraph, hparams: Mapping[str, Any] | None = None, *, workers: int = 1, guard: bool = True
+        self,
+        cg: CompGraph,
+        hparams: Mapping[str, Any] | None = None,
+        *,
+        workers: int = 1,
+        guard: bool = True,
+        check_mutation: bool = False,
     ) -> None:
         if not isinstance(cg, CompGraph):
             kind = type(cg).__name__
@@ -77,8 +87,9 @@ class CompGraphRunner:
         self.cg = cg
         self.workers = workers
         self.guard = guard
+        self.check_mutation = check_mutation
         self.reports = Reports()
-        self._program = Program(cg, guard)
+        self._program = Program(cg, guard, check_mutation)
         self._attempts = AttemptsByKind(self._program, workers)
         self._lock = threading.Lock()
         self._trials = Trials()
@@ -110,6 +121,8 @@ class CompGraphRunner:
             A free source token that is needed is missing, or a token is given that is not one.
         IteratorRefused
             A value that is given, or that a function returns, can be read only once.
+        InputMutated
+            With ``check_mutation``: a function has changed an object inside its input.
         PlaceholderNeeded
             Functions that are needed are still to be written.
         UnknownName

@@ -326,7 +326,8 @@ def _read_array(value: Any) -> Contents:
 
 def _write_array(value: Any, saved: Contents) -> None:
     shape, dtype, writeable, data = saved
-    value.setflags(write=True)
+    if not value.flags.writeable:
+        value.setflags(write=True)
     if value.dtype != dtype:
         value.dtype = dtype
     if value.shape != shape:
@@ -335,7 +336,8 @@ def _write_array(value: Any, saved: Contents) -> None:
         value.reshape(-1)[:] = data if dtype.names else [*data]
     else:
         value[...] = sys.modules["numpy"].frombuffer(data, dtype).reshape(shape)
-    value.setflags(write=writeable)
+    if not writeable:
+        value.setflags(write=False)
 
 
 def _read_attributes(value: Any) -> Contents:

@@ -39,7 +39,7 @@ class Sent:
         The runner's, as they travel.
     job
         What is to be done, as it travels.
-    workers, guard
+    workers, guard, check_mutation
         As the runner has them.
     """
 
@@ -49,6 +49,7 @@ class Sent:
     job: Job
     workers: int = 1
     guard: bool = True
+    check_mutation: bool = False
 
     def __dask_tokenize__(self) -> str:
         return self.id
@@ -76,7 +77,13 @@ class _Loaded:
         try:
             own = self._idle.get_nowait()
         except queue.Empty:
-            own = CompGraphRunner(self._bundle.cg, hyperparameters, workers=sent.workers, guard=sent.guard)
+            own = CompGraphRunner(
+                self._bundle.cg,
+                hyperparameters,
+                workers=sent.workers,
+                guard=sent.guard,
+                check_mutation=sent.check_mutation,
+            )
         try:
             own.set(**hyperparameters)
             return do(own, unpacked_job(sent.job, enums))
@@ -84,13 +91,13 @@ class _Loaded:
             self._idle.put(own)
 
 
-_LOADED: Final[OrderedDict[tuple[str, int, bool], _Loaded]] = OrderedDict()
+_LOADED: Final[OrderedDict[tuple[str, int, bool, bool], _Loaded]] = OrderedDict()
 _LOCK: Final = threading.Lock()
 
 
 def work(sent: Sent) -> list[Outcome] | Refusal:
     """Do a job in this process; called by whatever executor there is."""
-    key = sent.parcel.digest, sent.workers, sent.guard
+    key = sent.parcel.digest, sent.workers, sent.guard, sent.check_mutation
     with _LOCK:
         loaded = _LOADED.get(key)
         if loaded is None:

@@ -64,7 +64,9 @@ def own_runner(runner: CompGraphRunner) -> CompGraphRunner:
     """Return another runner of the same graph, with the same hyperparameters; the user's nodes see nothing of it."""
     hyperparameters = runner.hyperparameters
     cg = without_unfrozen(apart(runner.cg), hyperparameters)
-    return CompGraphRunner(cg, hyperparameters, workers=runner.workers, guard=runner.guard)
+    return CompGraphRunner(
+        cg, hyperparameters, workers=runner.workers, guard=runner.guard, check_mutation=runner.check_mutation
+    )
 
 
 class Threads:
@@ -141,7 +143,8 @@ class Bundles:
             here.set_result(do(own_runner(self._runner), job))
             return here
         runner = self._runner
-        sent = Sent("", self._parcel, self._hyperparameters, packed_job(job), runner.workers, runner.guard)
+        ways = runner.workers, runner.guard, runner.check_mutation
+        sent = Sent("", self._parcel, self._hyperparameters, packed_job(job), *ways)
         return self._send(sent if self._parcel.size <= _LIGHT else lighter(sent))
 
     def _proven(self, job: Job) -> Parcel | None:

@@ -44,4 +44,5 @@ def lasting_each(values: Iterable[Any]) -> Iterator[Any]:
 def settled_runner(runner: CompGraphRunner) -> CompGraphRunner:
     """Return a runner of one's own, which no longer changes when somebody sets, or writes into, hyperparameters."""
     own = {token: lasting(value) for token, value in runner.hyperparameters.items()}
-    return CompGraphRunner(without_unfrozen(runner.cg, own), own, workers=runner.workers, guard=runner.guard)
+    cg = without_unfrozen(runner.cg, own)
+    return CompGraphRunner(cg, own, workers=runner.workers, guard=runner.guard, check_mutation=runner.check_mutation)

@@ -165,7 +165,7 @@ def _complete(runner: CompGraphRunner) -> CompGraphRunner:
     if last is None:
         return runner
     # One function after another: what they print is told from other output by its thread.
-    own = CompGraphRunner(runner.cg, runner.hyperparameters, guard=runner.guard)
+    own = CompGraphRunner(runner.cg, runner.hyperparameters, guard=runner.guard, check_mutation=runner.check_mutation)
     own.run(**{token: last[token] for token in own.free_source_tokens})
     return own
 
