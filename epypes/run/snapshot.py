@@ -11,6 +11,7 @@ What can't be seen into is left out: objects of C extensions that the garbage co
 from __future__ import annotations
 
 import collections
+import contextlib
 import functools
 import gc
 import itertools
@@ -33,7 +34,7 @@ from epypes.run.guard import is_array
 Contents = tuple[Any, ...]
 Found = Iterator[tuple[str, Any]]
 
-_ATOMS: Final = frozenset(
+ATOMS: Final = frozenset(
     {int, float, complex, bool, str, bytes, type(None), type(...), type(NotImplemented), range, Decimal}
 )
 # Values of these kinds never change, although some of them fill caches of their own.
@@ -42,7 +43,7 @@ _CODE: Final = (type, types.FunctionType)
 _ATOMIC_ITERATORS: Final = (itertools.count, itertools.repeat)
 
 
-class _Record:
+class Record:
     """One mutable object: how its contents are read and written, and what they were."""
 
     __slots__ = ("name", "read", "saved", "value", "write")
@@ -73,25 +74,7 @@ class _Record:
         self.write(self.value, self.saved)
 
 
-class _Attributes(_Record):
-    """The attributes of an object, as names followed by values.
-
-    A library's object may fill caches of its own: a private attribute that was absent or None.
-    """
-
-    __slots__ = ()
-
-    def accepts(self, now: Contents) -> bool:
-        before, after = _as_dict(self.saved), _as_dict(now)
-        library = not _is_own(type(self.value).__module__)
-        lazy = {name for name in after if _is_lazy(self.value, name)}
-        if library:
-            lazy |= {name for name, _ in after.items() if name[:1] == "_" and before.get(name) is None}
-        names = before.keys() | after.keys()
-        return all(_is_same(before.get(name, _ABSENT), after.get(name, _ABSENT)) for name in names - lazy)
-
-
-class _Table(_Record):
+class _Table(Record):
     """A pandas object, compared by its own method."""
 
     __slots__ = ()
@@ -115,7 +98,7 @@ class Snapshot:
     -----
     Lists, dicts with their order, sets, deques, bytearrays, arrays, the attributes and slots of objects, random
     generators, iterators and pandas objects are compared; tuples, partials, bound methods and C containers are looked
-    through. Functions, classes and modules count as constants. Arrays count as changed when their bytes are.
+    through. Functions, classes and modules count as constants, and so do the private attributes of a library's objects.
 
     A snapshot holds references to all that it compares, and a copy of every array that can be written to.
 
@@ -132,13 +115,13 @@ class Snapshot:
     """
 
     def __init__(self, roots: Mapping[str, object]) -> None:
-        self.records: list[_Record] = []
+        self.records: list[Record] = []
         # Held, so that no id is used again while the walk goes on.
         self._seen: dict[int, object] = {}
         waiting = [*roots.items()][::-1]
         while waiting:
             name, value = waiting.pop()
-            if type(value) in _ATOMS or id(value) in self._seen:
+            if type(value) in ATOMS or id(value) in self._seen:
                 continue
             self._seen[id(value)] = value
             waiting.extend([*self.look_at(name, value)][::-1])
@@ -171,16 +154,18 @@ class Snapshot:
             return
         if is_array(value):
             yield from self.look_at_array(name, value)
-        elif _is_pandas(kind):
+            yield from self._attributes(name, value)
+            return
+        if _is_pandas(kind):
             self.records.append(_Table(name, value, _read_table, _write_table))
             return
         for base, read, write in _KINDS:
             if issubclass(kind, base):
-                self.records.append(_Record(name, value, read, write))
+                self.records.append(Record(name, value, read, write))
                 break
         state = _state_of(value)
         if state is not None:
-            self.records.append(_Record(name, value, *state))
+            self.records.append(Record(name, value, *state))
             if state[1] is not _leave:
                 return
         yield from ((name, part) for part in _parts(value))
@@ -189,27 +174,19 @@ class Snapshot:
     def look_at_array(self, name: str, value: Any) -> Found:
         """Record an array that can be written to."""
         if value.flags.writeable:
-            self.records.append(_Record(name, value, _read_array, _write_array))
-        if value.base is not None:
-            yield name, value.base
+            self.records.append(Record(name, value, _read_array, _write_array))
+        yield from ((name, part) for part in (value.base, vars(value).get("_mask") if hasattr(value, "mask") else None))
         if value.dtype.hasobject:
             yield from ((name, part) for part in _items_of(value))
 
     def _attributes(self, name: str, value: Any) -> Found:
-        if type(getattr(value, "__dict__", None)) is dict:
-            self.records.append(_Attributes(name, value, _read_attributes, _write_attributes))
-            yield from ((name, part) for part in vars(value).values())
-        slots = _slots(type(value))
-        if slots:
-            read, write = functools.partial(_read_slots, slots), functools.partial(_write_slots, slots)
-            found = _Attributes(name, value, read, write)
-            self.records.append(found)
-            yield from ((name, part) for part in found.saved[len(found.saved) // 2 :])
+        for read, write in _ways_to_attributes(value):
+            record = Record(name, value, read, write)
+            self.records.append(record)
+            yield from ((name, part) for part in record.saved[len(record.saved) // 2 :])
 
 
 # -- what is equal ------------------------------------------------------------------------------------------------
-
-_ABSENT: Final = object()
 
 
 def _is_same(now: Any, saved: Any) -> bool:
@@ -225,7 +202,7 @@ def _is_same(now: Any, saved: Any) -> bool:
         return now == saved and sorted(map(_order, now)) == sorted(map(_order, saved))
     if kind is types.MethodType:
         return now.__self__ is saved.__self__ and now.__func__ is saved.__func__
-    return bool(now == saved) if kind in _ATOMS else _is_scalar(kind) and _bits(now) == _bits(saved)
+    return bool(now == saved) if kind in ATOMS else _is_scalar(kind) and _bits(now) == _bits(saved)
 
 
 def _bits(scalar: Any) -> tuple[Any, bytes]:
@@ -234,7 +211,7 @@ def _bits(scalar: Any) -> tuple[Any, bytes]:
 
 def _order(value: Any) -> tuple[str, int]:
     """Tell 1 from True, and two objects from each other, whatever their own methods say."""
-    return type(value).__name__, 0 if type(value) in _ATOMS else id(value)
+    return type(value).__name__, 0 if type(value) in ATOMS else id(value)
 
 
 def _is_scalar(kind: type) -> bool:
@@ -242,19 +219,14 @@ def _is_scalar(kind: type) -> bool:
     return numpy is not None and issubclass(kind, numpy.generic) and not issubclass(kind, numpy.object_ | numpy.void)
 
 
-def _as_dict(contents: Contents) -> dict[Any, Any]:
+def as_dict(contents: Contents) -> dict[Any, Any]:
     """Return names followed by values as a dict."""
     half = len(contents) // 2
     return dict(zip(contents[:half], contents[half:], strict=True))
 
 
-def _is_lazy(value: Any, name: str) -> bool:
-    """Whether an attribute is a cached property, which is computed when it is first read."""
-    return any(isinstance(vars(base).get(name), functools.cached_property) for base in type(value).__mro__)
-
-
 @functools.cache
-def _is_own(module: str) -> bool:
+def is_own(module: str) -> bool:
     """Whether a module's code is the user's: of no installed package, not of Python's library nor of EPypes."""
     if module.partition(".")[0] in {*sys.stdlib_module_names, *sys.builtin_module_names, "epypes", "epypes_widgets"}:
         return module == "__main__"
@@ -271,7 +243,7 @@ def _read_dict(value: dict[Any, Any]) -> Contents:
 
 def _write_dict(value: dict[Any, Any], saved: Contents) -> None:
     dict.clear(value)
-    dict.update(value, _as_dict(saved))
+    dict.update(value, as_dict(saved))
 
 
 def _read_ordered(value: collections.OrderedDict[Any, Any]) -> Contents:
@@ -281,7 +253,7 @@ def _read_ordered(value: collections.OrderedDict[Any, Any]) -> Contents:
 
 def _write_ordered(value: collections.OrderedDict[Any, Any], saved: Contents) -> None:
     collections.OrderedDict.clear(value)
-    collections.OrderedDict.update(value, _as_dict(saved))
+    collections.OrderedDict.update(value, as_dict(saved))
 
 
 def _write_set(value: set[Any], saved: Contents) -> None:
@@ -340,46 +312,64 @@ def _write_array(value: Any, saved: Contents) -> None:
         value.setflags(write=False)
 
 
-def _read_attributes(value: Any) -> Contents:
-    found = vars(value)
-    return *found, *found.values()
+def cached_properties(kind: type) -> frozenset[str]:
+    """Return the attributes of a class that are computed when they are first read."""
+    found = {
+        name for base in kind.__mro__ for name in vars(base) if type(vars(base)[name]) is functools.cached_property
+    }
+    return frozenset(found)
 
 
-def _write_attributes(value: Any, saved: Contents) -> None:
-    found = vars(value)
-    found.clear()
-    found.update(_as_dict(saved))
-
-
-def _slots(kind: type) -> tuple[types.MemberDescriptorType, ...]:
+def _slots(kind: type) -> dict[str, types.MemberDescriptorType]:
     """Return the slots of a class that Python code has made."""
-    return tuple(
-        slot
-        for base in kind.__mro__
-        if "__slots__" in vars(base)
-        for slot in vars(base).values()
-        if type(slot) is types.MemberDescriptorType
-    )
+    bases = [vars(base) for base in kind.__mro__ if "__slots__" in vars(base)]
+    slots = (slot for base in bases for slot in base.values() if type(slot) is types.MemberDescriptorType)
+    return {slot.__name__: slot for slot in slots}
 
 
-def _read_slots(slots: tuple[types.MemberDescriptorType, ...], value: Any) -> Contents:
-    found = {}
-    for slot in slots:
-        try:
-            found[slot.__name__] = slot.__get__(value)
-        except AttributeError:
-            continue
-    return *found, *found.values()
+def _ways_to_attributes(value: Any) -> Iterator[tuple[Callable[[Any], Contents], Callable[[Any, Contents], object]]]:
+    """Give how the attributes and the slots of an object are read and written, as names followed by values.
 
+    Left out are cached properties, and the private attributes of objects of libraries, which are mostly caches.
+    """
+    kind = type(value)
+    own, lazy = is_own(str(kind.__module__)) or kind is types.SimpleNamespace, cached_properties(kind)
 
-def _write_slots(slots: tuple[types.MemberDescriptorType, ...], value: Any, saved: Contents) -> None:
-    before = _as_dict(saved)
-    now = _as_dict(_read_slots(slots, value))
-    for slot in slots:
-        if slot.__name__ in before:
-            slot.__set__(value, before[slot.__name__])
-        elif slot.__name__ in now:
-            slot.__delete__(value)
+    def counts(name: object) -> bool:
+        return name not in lazy and (own or not str(name).startswith("_"))
+
+    def read_attributes(value: Any) -> Contents:
+        found = vars(value) if own and not lazy else {name: part for name, part in vars(value).items() if counts(name)}
+        return *found, *found.values()
+
+    def write_attributes(value: Any, saved: Contents) -> None:
+        found, before = vars(value), as_dict(saved)
+        for name in [name for name in found if counts(name) and name not in before]:
+            del found[name]
+        found.update(before)
+
+    if type(getattr(value, "__dict__", None)) is dict:
+        yield read_attributes, write_attributes
+    slots = {name: slot for name, slot in _slots(kind).items() if counts(name)}
+
+    def read_slots(value: Any) -> Contents:
+        found = {}
+        for name, slot in slots.items():
+            with contextlib.suppress(AttributeError):
+                found[name] = slot.__get__(value)
+        return *found, *found.values()
+
+    def write_slots(value: Any, saved: Contents) -> None:
+        before = as_dict(saved)
+        for name, slot in slots.items():
+            if name in before:
+                slot.__set__(value, before[name])
+            else:
+                with contextlib.suppress(AttributeError):
+                    slot.__delete__(value)
+
+    if slots:
+        yield read_slots, write_slots
 
 
 def _is_pandas(kind: type) -> bool:
@@ -464,7 +454,7 @@ def _positions(part: Any) -> Any:
     """Return what of an iterator's ``__reduce__`` can be compared: its numbers, and the iterators in it."""
     if type(part) is tuple:
         return tuple(map(_positions, part))
-    if type(part) in _ATOMS:
+    if type(part) in ATOMS:
         return part
     return len(part) if type(part) is list else type(part)
 
@@ -478,7 +468,7 @@ def _parts(value: Any) -> Iterable[Any]:
     if issubclass(kind, dict):
         return (*dict.keys(value), *dict.values(value))
     if issubclass(kind, list | tuple | set | frozenset | collections.deque):
-        return [part for part in value if type(part) not in _ATOMS]
+        return [part for part in value if type(part) not in ATOMS]
     if kind is types.MappingProxyType:
         return [*value.values()]
     if kind is functools._lru_cache_wrapper:
@@ -487,10 +477,15 @@ def _parts(value: Any) -> Iterable[Any]:
         return (value.obj,)
     if is_array(value):
         return ()
-    # Of partials, bound methods, cells, iterators and the like the garbage collector knows what they hold.
+    # Of partials, bound methods, cells, iterators and the like the garbage collector knows what they hold. It names the
+    # attributes and slots too, or the dict in which they are.
     own = getattr(value, "__dict__", None)
-    held = [part for part in gc.get_referents(value) if part is not own and part is not kind]
-    return [part for part in held if not isinstance(part, types.FrameType)] + [*_locals(value).values()]
+    known = {id(kind), id(own), *map(id, own.values() if type(own) is dict else ())}
+    for slot in _slots(kind).values():
+        with contextlib.suppress(AttributeError):
+            known.add(id(slot.__get__(value)))
+    held = [part for part in gc.get_referents(value) if id(part) not in known and type(part) is not types.FrameType]
+    return [*held, *_locals(value).values()]
 
 
 def cached_values(cached: Any) -> list[Any]:

@@ -189,8 +189,9 @@ def test_what_an_array_that_is_locked_holds_is_not_copied():
 
 
 def test_caches_that_objects_fill_are_no_change():
-    path, plain = pathlib.PurePath("a/b"), Plain()
-    snapshot = Snapshot({"path": path, "plain": plain, "table": table})
+    path, plain, many = pathlib.PurePath("a/b"), Plain(), np.vectorize(lambda n: n + 1)
+    snapshot = Snapshot({"path": path, "plain": plain, "table": table, "many": many})
     assert (str(path), plain.length, table(77)) == ("a/b", 0, [77])
     assert hash(path)
+    assert many(3) == 4
     assert snapshot.changed() is None
