@@ -13,6 +13,7 @@ Everything an error's text mentions is an attribute of it::
     +-- InputMutated            a function has changed its input in place; .function, .token
     +-- PlaceholderNeeded       a function is still to be written; .functions
     +-- OutputArityError        a function returned another number of values; .function
+    +-- StateChanged            a bundle's function changed what outlives its call; .function, .changed
     +-- ContractBroken          a value is not the image that an annotation says; .function, .token
     +-- StillRunning            something did not stop in time; .name, .functions, .timeout_s
     +-- MailboxOverflow         a mailbox with policy "fault" is full; .size
@@ -206,6 +207,22 @@ class OutputArityError(EpypesError, ValueError):
         self.function, self.outputs, self.got = function, tuple(outputs), got
         wanted = f"{len(self.outputs)} value{'s' if len(self.outputs) != 1 else ''} ({', '.join(self.outputs)})"
         super().__init__(f"Function {function!r} must return a tuple or list of {wanted}, but it returned {got}.")
+
+
+class StateChanged(EpypesError, RuntimeError):
+    """A function of a bundle changed an object that outlives the call; ``changed`` names the object."""
+
+    def __init__(self, function: str, changed: str, is_restored: bool) -> None:
+        self.function, self.changed, self.is_restored = function, changed, is_restored
+        became = (
+            "It has been put back, so that no later event depends on it"
+            if is_restored
+            else "It can't be put back, so that every later event fails until the bundle is loaded again"
+        )
+        super().__init__(
+            f"Function {function!r} changed {changed!r}, which outlives the call. {became}. "
+            "Change a copy of it, or make it a token."
+        )
 
 
 class ContractBroken(EpypesError, ValueError):

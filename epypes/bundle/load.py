@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from epypes.bundle.mutable_state import MutableState, lock_cached_values
 from epypes.bundle.ports import answer_with, payload_of
 from epypes.bundle.seal import check_seal
 from epypes.bundle.settings import Settings, read_settings
@@ -87,8 +88,12 @@ def read_bundle(path: str | Path, *, sealed: bool = True) -> Bundle:
     try:
         enums = getattr(module, "enums", {}) if settings.has_members else {}
         settings = settings.with_enums(enums)
-        cg = _graph(module, settings)
         own = {name: getattr(module, name) for name in settings.own}
+        lock_cached_values(vars(module))
+        ports = {name: port for name, port in own.items() if name != MAKER}
+        state = MutableState({**module.func_dict, **ports})
+        cg = _graph(module, state.guarded(module.func_dict), settings)
+        own |= state.guarded(ports)
     except AttributeError as error:
         text = f"{folder / MODULE} defines no {error.name!r}. Promote the graph again."
         raise BundleError(folder, text) from error
@@ -98,8 +103,8 @@ def read_bundle(path: str | Path, *, sealed: bool = True) -> Bundle:
     return Bundle(folder, cg, settings, digest, own, enums)
 
 
-def _graph(module: Any, settings: Settings) -> CompGraph:
-    cg = CompGraph(module.func_dict, module.func_io, types=settings.types)
+def _graph(module: Any, functions: Mapping[str, Callable[..., Any]], settings: Settings) -> CompGraph:
+    cg = CompGraph(functions, module.func_io, types=settings.types)
     if settings.has_groups:
         for name, functions in module.func_groups.items():
             cg = group(cg, name, functions)

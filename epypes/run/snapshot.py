@@ -67,7 +67,7 @@ class Record:
 
     def accepts(self, now: Contents) -> bool:
         """Whether contents that are not identical to the saved ones are equal to them."""
-        return _is_same(now, self.saved)
+        return is_same(now, self.saved)
 
     def restore(self) -> None:
         """Put the saved contents back."""
@@ -174,7 +174,7 @@ class Snapshot:
     def look_at_array(self, name: str, value: Any) -> Found:
         """Record an array that can be written to."""
         if value.flags.writeable:
-            self.records.append(Record(name, value, _read_array, _write_array))
+            self.records.append(array_record(name, value))
         yield from ((name, part) for part in (value.base, vars(value).get("_mask") if hasattr(value, "mask") else None))
         if value.dtype.hasobject:
             yield from ((name, part) for part in _items_of(value))
@@ -189,7 +189,7 @@ class Snapshot:
 # -- what is equal ------------------------------------------------------------------------------------------------
 
 
-def _is_same(now: Any, saved: Any) -> bool:
+def is_same(now: Any, saved: Any) -> bool:
     """Whether two values are one, or equal constants of one type, to the last bit."""
     kind = type(now)
     if now is saved or kind is not type(saved):
@@ -197,7 +197,7 @@ def _is_same(now: Any, saved: Any) -> bool:
     if kind in (float, complex):
         return repr(now) == repr(saved)
     if kind is tuple:
-        return len(now) == len(saved) and all(map(_is_same, now, saved))
+        return len(now) == len(saved) and all(map(is_same, now, saved))
     if kind is frozenset:
         return now == saved and sorted(map(_order, now)) == sorted(map(_order, saved))
     if kind is types.MethodType:
@@ -294,6 +294,11 @@ def _items_of(value: Any) -> list[Any]:
 def _read_array(value: Any) -> Contents:
     data = tuple(_items_of(value)) if value.dtype.hasobject else value.tobytes()
     return value.shape, value.dtype, value.flags.writeable, data
+
+
+def array_record(name: str, value: Any) -> Record:
+    """Return the record of an array: its bytes, its shape and whether it can be written to."""
+    return Record(name, value, _read_array, _write_array)
 
 
 def _write_array(value: Any, saved: Contents) -> None:

@@ -1,0 +1,488 @@
+"""Mutable state that a bundle's functions reach: locked where it is an array, else compared after each call.
+
+No answer may depend on an earlier event. Promotion refuses functions that plainly write to what outlives their call;
+syntax can't show all of it. So each function of a loaded bundle that reaches a mutable object is wrapped: after its
+call, a snapshot of these objects is compared; if one has changed, it is put back and the call raises StateChanged. Such
+functions of one loaded bundle run one at a time, since a comparison could not tell the changes of two calls apart.
+Functions that reach only constants, which are most, are not wrapped.
+
+The cache of an ``lru_cache`` is no state: arrays in it are locked when they are computed, and a value that can still be
+changed does not stay in it after the call. The global generators of ``random`` and ``numpy.random`` are put back after
+each call of a function that names them, and count as no change.
+"""
+
+from __future__ import annotations
+
+import dis
+import functools
+import random
+import sys
+import threading
+import types
+from collections.abc import Callable, Iterator, Mapping
+from contextvars import ContextVar
+from enum import Enum
+from typing import Any, Final
+
+from epypes.errors import StateChanged
+from epypes.graph import as_switch, is_placeholder
+from epypes.pipeline import Node, Pipeline
+from epypes.run.guard import is_array, is_unguarded
+from epypes.run.snapshot import (
+    Found,
+    Record,
+    Snapshot,
+    array_record,
+    as_dict,
+    cached_properties,
+    cached_values,
+    is_own,
+    is_same,
+)
+
+_CACHED: Final = functools._lru_cache_wrapper
+# Code with one of these names can bind the names of its module; with one of the second set, the attributes of any
+# object; code that sets an attribute of the third, or calls setflags, can unlock or reshape an array.
+_BINDS: Final = frozenset({"globals", "exec", "eval", "vars", "__globals__", "__dict__", "modules", "f_globals"})
+_SETS: Final = _BINDS | {"setattr", "delattr", "__setattr__", "__delattr__", "__defaults__"}
+_UNLOCKS: Final = frozenset({"setflags", "=writeable", "=shape", "=dtype", "=strides", "=data"})
+# Python makes these itself when they are first asked for.
+_OF_PYTHON: Final = frozenset(
+    {"__builtins__", "__warningregistry__", "__dict__", "__weakref__", "__doc__", "__abstractmethods__", "_abc_impl"}
+    | {"__annotations__", "__annotations_cache__", "__annotate__", "__annotate_func__", "__static_attributes__"}
+)
+
+
+class CodeSnapshot(Snapshot):
+    """The mutable objects that functions reach, through names, closures, defaults, attributes, classes and caches.
+
+    Parameters
+    ----------
+    functions
+        The functions by name.
+    lock
+        Whether arrays are locked instead of compared.
+    compared
+        Arrays that are not locked in any case, by id.
+    caches
+        The checks of caches, by id, that snapshots of functions of one bundle share.
+    """
+
+    def __init__(
+        self,
+        functions: Mapping[str, object],
+        *,
+        lock: bool = True,
+        compared: Mapping[int, object] | None = None,
+        caches: dict[int, _CacheCheck] | None = None,
+    ) -> None:
+        self._lock, self._compared = lock, dict(compared or {})
+        self._caches = {} if caches is None else caches
+        self.arrays: dict[int, object] = {}
+        self._settlers: list[Callable[[], None]] = []
+        self._checks: list[_CacheCheck] = []
+        self._words: set[str] = set()
+        # What is only recorded if some of the code can change it.
+        self._bound: list[_Bindings] = []
+        self._set: list[_Bindings] = []
+        self._locked: list[tuple[str, Any]] = []
+        super().__init__(functions)
+        if self._words & _BINDS or "STORE_GLOBAL" in self._words:
+            self.records += self._bound
+        if self._words & _SETS or "STORE_ATTR" in self._words:
+            self.records += self._set
+        if self._words & _UNLOCKS:
+            for name, value in self._locked:
+                self.records.append(array_record(name, value))
+
+    def __bool__(self) -> bool:
+        return bool(self.records or self._settlers)
+
+    def settle(self) -> str | None:
+        """Put back what has changed, after a call; return the name of the first such object, None if there is none."""
+        for settle in self._settlers:
+            settle()
+        for record in self.records:
+            if record.differs():
+                name = record.changed_name() if isinstance(record, _Bindings) else record.name
+                self.restore()
+                # A call that is answered from a cache would not change it again.
+                for check in self._checks:
+                    check.clear()
+                return name
+        return None
+
+    # -- the walk ---------------------------------------------------------------------------------------------------
+
+    def look_at(self, name: str, value: Any) -> Found:
+        """Look into code too."""
+        kind = type(value)
+        if kind is types.FunctionType:
+            return self._look_at_function(value)
+        if issubclass(kind, type):
+            return self._look_at_class(value)
+        if kind is types.ModuleType:
+            return self._look_at_module(value)
+        if issubclass(kind, Node):
+            return self._look_at_node(name, value)
+        if kind is _CACHED:
+            return self._look_at_cache(value)
+        return self._look_at_object(name, value)
+
+    def _look_at_object(self, name: str, value: Any) -> Found:
+        kind = type(value)
+        if is_own(str(kind.__module__)):
+            yield kind.__name__, kind
+            lazy = cached_properties(kind)
+            if lazy:
+                self._settlers.append(functools.partial(_forget, value, lazy))
+        elif not is_array(value) and type(getattr(value, "__dict__", None)) is dict:
+            # A library's own code may not take read-only arrays.
+            self._compared.update((id(part), part) for part in vars(value).values() if is_array(part))
+        yield from super().look_at(name, value)
+
+    def look_at_array(self, name: str, value: Any) -> Found:
+        """Lock an array, instead of keeping a copy of it."""
+        self.arrays[id(value)] = value
+        if self._lock and id(value) not in self._compared:
+            value.setflags(write=False)
+            self._locked.append((name, value))
+        return super().look_at_array(name, value)
+
+    def _look_at_function(self, function: types.FunctionType) -> Found:
+        if not is_own(str(function.__globals__.get("__name__"))):
+            yield from _wrapped_by(function)
+            return
+        names, stored = self._read(function.__code__)
+        known = function.__globals__
+        self._bound.append(_Bindings("", known, _read_names, _write_names))
+        self._set.append(_Bindings(f"{function.__name__}.", function, _read_function, _write_function))
+        for name in names:
+            value = known.get(name, sys.modules.get(name))
+            if isinstance(value, types.ModuleType) and value.__name__ in ("numpy", "numpy.random", "random"):
+                self._look_at_global_generator(names, value)
+            yield name, value
+        for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
+            if name in stored:
+                self.records.append(Record(name, cell, _read_cell, _write_cell))
+            yield from ((name, value) for value in _read_cell(cell))
+        arguments = function.__code__.co_varnames[: function.__code__.co_argcount]
+        defaults = function.__defaults__ or ()
+        yield from zip(arguments[len(arguments) - len(defaults) :], defaults, strict=True)
+        yield from (function.__kwdefaults__ or {}).items()
+        yield from ((f"{function.__name__}.{name}", value) for name, value in function.__dict__.items())
+
+    def _read(self, code: types.CodeType) -> tuple[dict[str, None], set[str]]:
+        """Return the names that some code reads, and the variables of enclosing functions that it binds."""
+        names, stored = dict.fromkeys(code.co_names), set()
+        for instruction in dis.get_instructions(code):
+            if instruction.opname in ("STORE_DEREF", "DELETE_DEREF"):
+                stored.add(instruction.argval)
+            elif instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
+                self._words.add("STORE_GLOBAL")
+            elif instruction.opname in ("STORE_ATTR", "DELETE_ATTR"):
+                self._words |= {"STORE_ATTR", f"={instruction.argval}"}
+        self._words.update(code.co_names)
+        for constant in code.co_consts:
+            if isinstance(constant, types.CodeType):
+                inner, inner_stored = self._read(constant)
+                names |= inner
+                stored |= inner_stored
+        return names, stored
+
+    def _look_at_class(self, kind: type) -> Found:
+        if is_own(str(kind.__module__)):
+            self._set.append(_Bindings(f"{kind.__name__}.", kind, _read_class, _write_class))
+            found = as_dict(_read_class(kind))
+            yield from ((f"{kind.__name__}.{name}", value) for name, value in found.items())
+            yield from ((base.__name__, base) for base in kind.__bases__)
+
+    def _look_at_module(self, module: types.ModuleType) -> Found:
+        if is_own(module.__name__):
+            self._set.append(_Bindings(f"{module.__name__}.", vars(module), _read_names, _write_names))
+            yield from ((name, value) for name, value in vars(module).items() if name not in _OF_PYTHON)
+
+    def _look_at_node(self, name: str, node: Node) -> Found:
+        """Look into a node of a nested graph; what EPypes itself keeps in it is no state of the user's."""
+        if isinstance(node, Pipeline):
+            yield from node.cg.functions.items()
+            return
+        yield name, node.func
+        yield type(node).__name__, type(node)
+        if type(node) is not Node:
+            self.records.append(_Bindings(f"{name}.", node, _read_node, _write_node))
+            yield from ((f"{name}.{key}", value) for key, value in as_dict(_read_node(node)).items())
+
+    def _look_at_cache(self, cached: Any) -> Found:
+        """Look into the function behind an lru_cache, whose cache is emptied of what can be changed."""
+        if is_own(str(cached.__module__)):
+            cached.cache_clear()
+            check = self._caches.get(id(cached)) or self._caches.setdefault(id(cached), _CacheCheck(cached))
+            self._settlers.append(check.settle)
+            self._checks.append(check)
+        yield cached.__name__, cached.__wrapped__
+
+    def _look_at_global_generator(self, names: Mapping[str, None], module: types.ModuleType) -> None:
+        """Have a global random generator put back after each call, if the code names its module."""
+        if module.__name__ == "numpy" and "random" not in names:
+            return
+        hidden = random._inst if module.__name__ == "random" else sys.modules["numpy.random"].mtrand._rand
+        if id(hidden) not in self._seen:
+            self._seen[id(hidden)] = hidden
+            before = Snapshot({"": hidden})
+            self._settlers.append(before.restore)
+
+
+class _Bindings(Record):
+    """The names of a module, or the attributes of a class or a function, as names followed by values.
+
+    ``name`` is what stands before them in a report. Modules that are imported only when they are needed are no change.
+    """
+
+    __slots__ = ()
+
+    def accepts(self, now: tuple[Any, ...]) -> bool:
+        return not self._others(now)
+
+    def changed_name(self) -> str:
+        """Return what has another value."""
+        return f"{self.name}{self._others(self.read(self.value))[0]}"
+
+    def _others(self, now: tuple[Any, ...]) -> list[str]:
+        before, after = as_dict(self.saved), as_dict(now)
+        return [
+            name
+            for name in [*after, *(before.keys() - after.keys())]
+            if name not in _OF_PYTHON
+            and not is_same(after.get(name, self), before.get(name, self))
+            and not (isinstance(after.get(name), types.ModuleType) and before.get(name) is None)
+        ]
+
+
+class _CacheCheck:
+    """Empties an lru_cache whenever a call has left a value in it that can be changed."""
+
+    def __init__(self, cached: Any) -> None:
+        self._cached, self._misses = cached, 0
+        # The function and the like, of a cache that is empty.
+        self._ours = set(map(id, cached_values(cached)))
+
+    def settle(self) -> None:
+        """Look at the cache if a value has been added."""
+        misses = self._cached.cache_info().misses
+        if misses != self._misses:
+            self._misses = misses
+            values = tuple(value for value in cached_values(self._cached) if id(value) not in self._ours)
+            if CodeSnapshot({"": values}, lock=False):
+                self.clear()
+
+    def clear(self) -> None:
+        """Empty the cache."""
+        self._cached.cache_clear()
+        self._misses = 0
+
+
+def _forget(value: Any, lazy: frozenset[str]) -> None:
+    """Delete what cached properties have computed: it may be mutable, and is computed again."""
+    for name in lazy:
+        vars(value).pop(name, None)
+
+
+def _wrapped_by(function: types.FunctionType) -> Iterator[tuple[str, Any]]:
+    """Give the functions that one of a library holds: it may be a decorator's."""
+    held = [function.__dict__.get("__wrapped__"), *_registered(function)]
+    held += [value for cell in function.__closure__ or () for value in _read_cell(cell)]
+    yield from ((function.__name__, value) for value in held if callable(value) and not isinstance(value, type))
+
+
+def _registered(function: types.FunctionType) -> list[Any]:
+    registry = function.__dict__.get("registry")
+    return [*registry.values()] if isinstance(registry, types.MappingProxyType) else []
+
+
+# -- how bindings are read and written -----------------------------------------------------------------------------
+
+
+def _read_names(names: dict[str, Any]) -> tuple[Any, ...]:
+    return *names, *names.values()
+
+
+def _write_names(names: dict[str, Any], saved: tuple[Any, ...]) -> None:
+    before = as_dict(saved)
+    for name in [name for name in names if name not in before and not isinstance(names[name], types.ModuleType)]:
+        del names[name]
+    names.update(before)
+
+
+_OURS: Final = frozenset({*vars(Node("", len)), "compute"})
+
+
+def _read_node(node: Node) -> tuple[Any, ...]:
+    found = {name: value for name, value in vars(node).items() if name not in _OURS}
+    return *found, *found.values()
+
+
+def _write_node(node: Node, saved: tuple[Any, ...]) -> None:
+    for name in as_dict(_read_node(node)):
+        del vars(node)[name]
+    vars(node).update(as_dict(saved))
+
+
+def _read_class(kind: type) -> tuple[Any, ...]:
+    found = {name: value for name, value in vars(kind).items() if name not in _OF_PYTHON}
+    if issubclass(kind, Enum):
+        # It adds combinations of its members when they are asked for.
+        found.pop("_value2member_map_")
+    return *found, *found.values()
+
+
+def _write_class(kind: type, saved: tuple[Any, ...]) -> None:
+    before, now = as_dict(saved), as_dict(_read_class(kind))
+    for name in now.keys() - before.keys():
+        type.__delattr__(kind, name)
+    for name, value in before.items():
+        if name not in now or now[name] is not value:
+            type.__setattr__(kind, name, value)
+
+
+_PARTS_OF_A_FUNCTION: Final = ("__defaults__", "__kwdefaults__", "__code__")
+
+
+def _read_function(function: types.FunctionType) -> tuple[Any, ...]:
+    found = {**function.__dict__, **{name: getattr(function, name) for name in _PARTS_OF_A_FUNCTION}}
+    return *found, *found.values()
+
+
+def _write_function(function: types.FunctionType, saved: tuple[Any, ...]) -> None:
+    before = as_dict(saved)
+    for name in _PARTS_OF_A_FUNCTION:
+        setattr(function, name, before.pop(name))
+    function.__dict__.clear()
+    function.__dict__.update(before)
+
+
+def _read_cell(cell: types.CellType) -> tuple[Any, ...]:
+    return () if cell == types.CellType() else (cell.cell_contents,)
+
+
+def _write_cell(cell: types.CellType, saved: tuple[Any, ...]) -> None:
+    if saved:
+        cell.cell_contents = saved[0]
+    else:
+        del cell.cell_contents
+
+
+# -- what a bundle does with it ------------------------------------------------------------------------------------
+
+
+# The lock of the guarded call under way. What that calls, also in helper threads, is part of it.
+_under_way: ContextVar[object] = ContextVar("_under_way", default=None)
+
+
+class MutableState:
+    """Guards the functions of one loaded bundle.
+
+    Parameters
+    ----------
+    functions
+        All of them, by name; nested pipelines are looked through.
+    """
+
+    def __init__(self, functions: Mapping[str, Callable[..., Any]]) -> None:
+        self._turn = threading.RLock()
+        self._caches: dict[int, _CacheCheck] = {}
+        self._compared: dict[int, object] = {}
+        for name, function in _with_inner(functions):
+            if is_unguarded(function):
+                # It rejects read-only arrays.
+                self._compared |= CodeSnapshot({name: function}, lock=False).arrays
+
+    def guarded(self, functions: Mapping[str, Callable[..., Any]]) -> dict[str, Callable[..., Any]]:
+        """Return functions, each as it is or wrapped; nodes, and those of nested pipelines, are changed in place."""
+        return {name: self._guarded(name, function) for name, function in functions.items()}
+
+    def _guarded(self, name: str, function: Any) -> Any:
+        if is_placeholder(function) or as_switch(function) is not None:
+            return function
+        if isinstance(function, Pipeline):
+            self.guarded(function.network.nodes)
+            return function
+        snapshot = CodeSnapshot({name: function}, compared=self._compared, caches=self._caches)
+        if not snapshot:
+            return function
+        if not isinstance(function, Node):
+            return self._guarded_call(name, function, snapshot)
+        if type(function).compute is Node.compute:
+            function.func = self._guarded_call(name, function.func, snapshot)
+        else:
+            function.compute = self._guarded_call(name, function.compute, snapshot)  # type: ignore[method-assign]
+        return function
+
+    def _guarded_call(self, name: str, function: Callable[..., Any], snapshot: CodeSnapshot) -> Callable[..., Any]:
+        turn = self._turn
+
+        @functools.wraps(function)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            if _under_way.get() is turn:
+                return function(*args, **kwargs)
+            with turn:
+                token = _under_way.set(turn)
+                try:
+                    result = function(*args, **kwargs)
+                except BaseException:
+                    snapshot.settle()
+                    raise
+                finally:
+                    _under_way.reset(token)
+                changed = snapshot.settle()
+                if changed is None:
+                    return result
+                raise StateChanged(name, changed, snapshot.changed() is None)
+
+        return call
+
+
+def _with_inner(functions: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Give functions, and those of nested pipelines in their place."""
+    for name, function in functions.items():
+        if isinstance(function, Pipeline):
+            yield from _with_inner(function.cg.functions)
+        else:
+            yield name, function
+
+
+def lock_cached_values(names: dict[str, Any]) -> None:
+    """Have each lru_cache among the names of a module lock the arrays that its function returns."""
+    made: dict[int, Any] = {}
+    for name, value in [*names.items()]:
+        if type(value) is _CACHED and is_own(str(value.__module__)):
+            if id(value) not in made:
+                made[id(value)] = _with_locked_values(value)
+            names[name] = made[id(value)]
+    for value in [*names.values()]:
+        if type(value) is dict:
+            value.update({key: made[id(part)] for key, part in value.items() if id(part) in made})
+
+
+def _with_locked_values(cached: Any) -> Any:
+    function = cached.__wrapped__
+
+    def locked_result(*args: Any, **kwargs: Any) -> Any:
+        result = function(*args, **kwargs)
+        _lock_arrays(result)
+        return result
+
+    again = functools.lru_cache(**cached.cache_parameters())(locked_result)
+    return functools.update_wrapper(again, function)
+
+
+def _lock_arrays(value: Any) -> None:
+    if is_array(value):
+        value.setflags(write=False)
+        _lock_arrays(value.base)
+    elif type(value) in (tuple, list):
+        for part in value:
+            _lock_arrays(part)
+    elif type(value) is dict:
+        for part in value.values():
+            _lock_arrays(part)

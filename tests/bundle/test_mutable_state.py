@@ -1,0 +1,340 @@
+"""No answer of a bundle depends on an earlier event, whatever its functions keep that no sample has touched."""
+
+from __future__ import annotations
+
+import queue
+import textwrap
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+import epypes as ep
+from epypes.bundle.seal import seal
+from epypes.errors import StateChanged
+
+SETTINGS = '[bundle]\nformat = 1\nname = "b"\n[ports]\ninputs = ["x"]\noutputs = ["y"]\n'
+HEAD = (
+    "import functools\nimport itertools\nimport operator\nimport collections\nimport random\n\nimport numpy as np\n\n"
+)
+FOOT = '\nfunc_dict, func_io = {"f": f}, {"f": ("x", "y")}\n'
+
+
+def bundle(folder, source, settings=SETTINGS):
+    """Write a bundle by hand, as if the function's samples had all been small numbers."""
+    folder.mkdir(parents=True)
+    (folder / "pipeline.toml").write_text(settings)
+    (folder / "pipeline.py").write_text(HEAD + textwrap.dedent(source) + FOOT * ("func_dict" not in source))
+    seal(folder)
+    return folder
+
+
+def answer(runner, x):
+    try:
+        return repr(runner.run(x=x)["y"])
+    except Exception as error:
+        return type(error).__name__
+
+
+# By name: a module, and what the failure names. Each function answers with what it has kept; above 100 it keeps more.
+KEPT = {
+    "mutable default": ("def f(x, acc=[]):\n    if x > 100: acc.append(x)\n    return len(acc)", "acc"),
+    "keyword default": ("def f(x, *, acc={}):\n    if x > 100: acc[x] = 1\n    return len(acc)", "acc"),
+    "global": ("acc = []\ndef f(x):\n    if x > 100: acc.append(x)\n    return len(acc)", "acc"),
+    "global that is bound": ("n = 0\ndef f(x):\n    global n\n    if x > 100: n += 1\n    return n", "n"),
+    "globals()": ("n = 0\ndef f(x):\n    if x > 100: globals()['n'] = x\n    return n", "n"),
+    "alias": ("A, B = [], []\ndef f(x):\n    a, b = A, B\n    if x > 100: b.append(x)\n    return len(b)", "B"),
+    "helper that returns a global": (
+        "L = []\ndef kept():\n    return L\ndef f(x):\n    if x > 100: kept().append(x)\n    return len(L)", "L",
+    ),
+    "bound append": ("L = []\npush = L.append\ndef f(x):\n    if x > 100: push(x)\n    return push.__self__.count(x)", "push"),
+    "getattr": ("L = []\ndef f(x):\n    if x > 100: getattr(L, 'app' + 'end')(x)\n    return len(L)", "L"),
+    "map": ("L = []\ndef f(x):\n    if x > 100: list(map(L.append, [x]))\n    return len(L)", "L"),
+    "walrus": ("L = []\ndef f(x):\n    if x > 100: (l := L).append(x)\n    return len(L)", "L"),
+    "with ... as": (
+        "import contextlib\nL = []\ndef f(x):\n    with contextlib.nullcontext(L) as l:\n        if x > 100: l.append(x)\n    return len(L)",
+        "L",
+    ),
+    "keywords": ("L = []\ndef keep(**kw):\n    kw['l'].append(1)\ndef f(x):\n    if x > 100: keep(**{'l': L})\n    return len(L)", "L"),
+    "comprehension": ("L = []\ndef f(x):\n    [L.append(n) for n in [x] if n > 100]\n    return len(L)", "L"),
+    "inner function": ("L = []\ndef f(x):\n    def keep():\n        L.append(x)\n    if x > 100: keep()\n    return len(L)", "L"),
+    "lambda": ("L = []\nkeep = lambda x: L.append(x)\ndef f(x):\n    if x > 100: keep(x)\n    return len(L)", "L"),
+    "loop variable": ("L = [[]]\ndef f(x):\n    for part in L:\n        if x > 100: part.append(x)\n    return len(L[0])", "L"),
+    "defaultdict that is read": ("D = collections.defaultdict(list)\ndef f(x):\n    if x > 100: D[x]\n    return len(D)", "D"),
+    "setdefault": ("D = {}\ndef f(x):\n    if x > 100: D.setdefault(x, 1)\n    return len(D)", "D"),
+    "order of a dict": ("D = {'a': 1, 'b': 2}\ndef f(x):\n    if x > 100: D['a'] = D.pop('a')\n    return list(D)", "D"),
+    "operator": ("L = [1]\ndef f(x):\n    if x > 100: operator.iadd(L, [x])\n    return len(L)", "L"),
+    "deque": ("Q = collections.deque(maxlen=3)\ndef f(x):\n    if x > 100: Q.append(x)\n    return len(Q)", "Q"),
+    "bytearray": ("B = bytearray(b'a')\ndef f(x):\n    if x > 100: B[0] += 1\n    return bytes(B)", "B"),
+    "class attribute": ("class C:\n    n = 0\ndef f(x):\n    if x > 100: C.n += 1\n    return C.n", "C.n"),
+    "list of a class": ("class C:\n    items = []\ndef f(x):\n    if x > 100: C().items.append(x)\n    return len(C.items)", "C.items"),
+    "setattr": ("class C:\n    n = 0\ndef f(x):\n    if x > 100: setattr(C, 'n', x)\n    return C.n", "C.n"),
+    "instance": (
+        "class C:\n    def __init__(self): self.n = 0\n    def count(self): self.n += 1\nc = C()\n"
+        "def f(x):\n    if x > 100: c.count()\n    return c.n", "c",
+    ),
+    "instance with slots": (
+        "class C:\n    __slots__ = ('n',)\n    def __init__(self): self.n = 0\nc = C()\ndef f(x):\n    if x > 100: c.n += 1\n    return c.n", "c",
+    ),
+    "callable instance": (
+        "class C:\n    def __init__(self): self.n = 0\n    def __call__(self, x):\n        if x > 100: self.n += 1\n        return self.n\nf = C()",
+        "f",
+    ),
+    "bound method": (
+        "class C:\n    def __init__(self): self.n = 0\n    def m(self, x):\n        if x > 100: self.n += 1\n        return self.n\nf = C().m", "f",
+    ),
+    "function attribute": ("def f(x):\n    if x > 100: f.n = getattr(f, 'n', 0) + 1\n    return getattr(f, 'n', 0)", "f.n"),
+    "default that is replaced": ("def f(x, n=0):\n    if x > 100: f.__defaults__ = (x,)\n    return n", "f.__defaults__"),
+    "nonlocal": (
+        "def make():\n    n = 0\n    def f(x):\n        nonlocal n\n        if x > 100: n += 1\n        return n\n    return f\nf = make()", "n",
+    ),
+    "closure": ("def make():\n    acc = []\n    def f(x):\n        if x > 100: acc.append(x)\n        return len(acc)\n    return f\nf = make()", "acc"),
+    "decorator": (
+        "def counted(g):\n    calls = []\n    @functools.wraps(g)\n    def call(x):\n        if x > 100: calls.append(x)\n        return len(calls)\n    return call\n"
+        "@counted\ndef f(x):\n    return x", "calls",
+    ),
+    "partial": ("def g(acc, x):\n    if x > 100: acc.append(x)\n    return len(acc)\nf = functools.partial(g, [])", "f"),
+    "list of an lru_cached helper's argument": (
+        "L = []\n@functools.cache\ndef keep(x):\n    if x > 100: L.append(x)\n    return x\ndef f(x):\n    keep(x)\n    return len(L)", "L",
+    ),
+    "SimpleNamespace": ("import types\ns = types.SimpleNamespace(n=0)\ndef f(x):\n    if x > 100: s.n += 1\n    return s.n", "s"),
+    "random generator": ("rng = random.Random(0)\ndef f(x):\n    return rng.random() if x > 100 else rng.getstate()[1][:2]", "rng"),
+    "NumPy generator": ("rng = np.random.default_rng(0)\ndef f(x):\n    return rng.random() if x > 100 else str(rng.bit_generator.state)", "rng"),
+    "array in an unguarded function": (
+        "import epypes as ep\nW = np.zeros(2)\n@ep.unguarded\ndef f(x):\n    if x > 100: W[0] += 1\n    return W.tolist()", "W",
+    ),
+    "array that is unlocked": (
+        "W = np.zeros(2)\ndef f(x):\n    if x > 100:\n        W.setflags(write=True)\n        W[0] += 1\n    return W.tolist()", "W",
+    ),
+    "shape of an array": ("W = np.zeros((2, 3))\ndef f(x):\n    if x > 100: W.shape = (6,)\n    return W.shape", "W"),
+    "while it raises something else": (
+        "L = []\ndef f(x):\n    if x > 100:\n        L.append(x)\n        raise ValueError(x)\n    return len(L)", "",
+    ),
+}  # fmt: skip
+
+# Arrays are locked: NumPy itself refuses, at the line.
+LOCKED = {
+    "array": "W = np.zeros(2)\ndef f(x):\n    if x > 100: W[0] += 1\n    return W.tolist()",
+    "positional out": "W = np.zeros(2)\ndef f(x):\n    if x > 100: np.multiply(x, 2, W)\n    return W.tolist()",
+    "view": "W = np.zeros((2, 2))\nV = W[0]\ndef f(x):\n    if x > 100: V[0] += 1\n    return V.tolist()",
+    "base of a view": "W = np.zeros((2, 2))\nV = W[0]\ndef f(x):\n    if x > 100: V.base[0] += 1\n    return V.tolist()",
+    "mask": "W = np.ma.masked_array([1, 2], [False, True])\ndef f(x):\n    if x > 100: W.mask[0] = True\n    return W.sum()",
+    "in a dict": "D = {'w': np.zeros(2)}\ndef f(x):\n    if x > 100: D['w'][0] += 1\n    return D['w'].tolist()",
+    "of an lru_cached helper": (
+        "@functools.lru_cache\ndef kernel(n):\n    return np.zeros(n)\ndef f(x):\n    k = kernel(3)\n    if x > 100: k += 1\n    return k.tolist()"
+    ),
+    "of a method's cache": (
+        "class C:\n    @functools.lru_cache\n    def kernel(self, n):\n        return np.zeros(n)\nc = C()\n"
+        "def f(x):\n    k = c.kernel(3)\n    if x > 100: k += 1\n    return k.tolist()"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", KEPT)
+def test_a_call_that_changes_what_outlives_it_fails_and_is_undone(case, tmp_path):
+    source, changed = KEPT[case]
+    runner = ep.load(bundle(tmp_path / "b", source))
+    first = answer(runner, 1)
+    for _ in range(5):  # the fourth run is compiled
+        with pytest.raises((StateChanged, ValueError)) as error:
+            runner.run(x=200)
+        if changed:
+            assert str(error.value).startswith(f"Function 'f' changed {changed!r}, which outlives the call.")
+            assert (error.value.function, error.value.changed) == ("f", changed)
+            assert runner.last.failure.function == "f"
+        assert answer(runner, 1) == first
+
+
+@pytest.mark.parametrize("case", LOCKED)
+def test_arrays_are_locked_so_that_the_line_that_writes_fails(case, tmp_path):
+    runner = ep.load(bundle(tmp_path / "b", LOCKED[case]))
+    first = answer(runner, 1)
+    for _ in range(3):
+        if case != "of a method's cache":
+            with pytest.raises(ValueError, match="read-only"):
+                runner.run(x=200)
+        else:
+            answer(runner, 200)
+        assert answer(runner, 1) == first
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "counter = itertools.count()\ndef f(x):\n    return next(counter) if x > 100 else 0",
+        "numbers = iter([1, 2, 3])\ndef f(x):\n    return next(numbers) if x > 100 else 0",
+        "following = itertools.count().__next__\ndef f(x):\n    return following() if x > 100 else 0",
+        "def counting():\n    n = 0\n    while True:\n        yield (n := n + 1)\nnumbers = counting()\n"
+        "def f(x):\n    return next(numbers) if x > 100 else 0",
+    ],
+)
+def test_an_iterator_can_not_be_put_back_so_every_later_event_fails_and_says_so(source, tmp_path):
+    folder = bundle(tmp_path / "b", source)
+    runner = ep.load(folder)
+    assert runner.run(x=1)["y"] == 0
+    for x in (200, 1, 200):
+        with pytest.raises(StateChanged, match="can't be put back"):
+            runner.run(x=x)
+    assert ep.load(folder).run(x=1)["y"] == 0
+
+
+CONSTANT = {
+    "nothing": "def f(x):\n    return x",
+    "constants": "KEPT = [3, 1, 2]\nTABLE = {'a': 1}\nW = np.eye(2)\ndef f(x):\n    return sorted(KEPT), {**TABLE, 'b': x}, (W + x).tolist()",
+    "C objects": "import cv2\norb = cv2.ORB_create(5)\nclahe = cv2.createCLAHE()\ndef f(x):\n    return clahe.apply(np.full((9, 9), x % 255, np.uint8)).tolist()",
+    "lazy import": "_json = None\ndef f(x):\n    global _json\n    if _json is None: import json as _json\n    return _json.dumps(x)",
+    "lazy caches": "import pathlib, re, logging\nP, R, L = pathlib.PurePath('a/b'), re.compile('a'), logging.getLogger('l')\n"
+    "many = np.vectorize(lambda n: n + 1)\ndef f(x):\n    L.debug('%s', x)\n    return str(P), hash(P) and 1, R.findall('aa'), int(many(x))",
+    "cached property": "class C:\n    @functools.cached_property\n    def items(self): return []\nc = C()\n"
+    "def f(x):\n    c.items.append(x)\n    return len(c.items)",
+    "list of an lru_cached helper": "@functools.lru_cache\ndef items(n): return [n]\ndef f(x):\n    found = items(3)\n    found.append(x)\n    return len(found)",
+    "objects of the call": "class C:\n    def __init__(self): self.n = 0\n    def add(self, x): self.n += x\ndef f(x):\n    c = C()\n    c.add(x)\n    return c.n",
+    "a change that is undone": "L = [1]\ndef f(x):\n    L.append(x)\n    return L.pop()",
+    "the same again": "D = {'n': 1000}\ndef f(x):\n    D['n'] = int('1000')\n    return x",
+    "seeded global generators": "def f(x):\n    random.seed(3)\n    np.random.seed(3)\n    return random.random(), float(np.random.rand())",
+    "global generators": "def f(x):\n    return random.random(), float(np.random.rand())",
+    "dispatch": "@functools.singledispatch\ndef g(x): return x\n@g.register\ndef _(x: int): return x + 1\ndef f(x):\n    return g(x)",
+    "enumeration": "import enum\nclass E(enum.Flag):\n    A = 1\n    B = 2\ndef f(x):\n    return (E.A | E.B).value, E(x % 4).value",
+    "warning": "import warnings\nn = 0\ndef f(x):\n    global n\n    with warnings.catch_warnings(record=True):\n        warnings.warn('a')\n    return x + n",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CONSTANT)
+def test_constants_caches_and_what_a_call_makes_itself_are_no_state(case, tmp_path):
+    folder = bundle(tmp_path / "b", CONSTANT[case])
+    runner = ep.load(folder)
+    expected = {x: answer(runner, x) for x in (1, 200)}
+    assert not any("Changed" in text or "Error" in text for text in expected.values())
+    for x in (200, 1, 1, 200, 200):
+        assert answer(runner, x) == expected[x]
+
+
+def test_a_memo_keeps_its_arrays_and_its_numbers_warm(tmp_path):
+    source = """
+    calls = []
+    @functools.lru_cache
+    def kernel(n):
+        return np.ones(n), n
+    @functools.lru_cache(maxsize=None)
+    def fib(n):
+        return n if n < 2 else fib(n - 1) + fib(n - 2)
+    def f(x):
+        return kernel(3)[0].sum() + fib(30)
+    """
+    runner = ep.load(bundle(tmp_path / "b", source))
+    for x in range(9):
+        assert runner.run(x=x)["y"] == 832043
+    names = runner.cg.functions["f"].__wrapped__.__globals__
+    assert names["kernel"].cache_info()[:2] == (8, 1)
+    assert names["fib"].cache_info().misses == 31
+
+
+def test_reruns_and_trials_are_compared_too(tmp_path):
+    settings = f"{SETTINGS}\n[hyperparameters.k]\nvalue = 1\n"
+    source = """
+    L = []
+    def f(x, k):
+        if k > 100: L.append(k)
+        return len(L) + k
+    func_dict, func_io = {"f": f}, {"f": (("x", "k"), "y")}
+    """
+    runner = ep.load(bundle(tmp_path / "b", source, settings))
+    runner.run(x=1)
+    for _ in range(6):
+        with pytest.raises(StateChanged):
+            runner.rerun(k=200)
+        assert runner.rerun(k=2)["y"] == 2
+        assert isinstance(runner.trial({"k": 200}).failure.exception, StateChanged)
+        assert runner.trial({"k": 3})["y"] == 3
+
+
+NESTED = """
+import epypes as ep
+L = []
+def inner(x):
+    if x > 100: L.append(x)
+    return len(L)
+class Counting(ep.Node):
+    def compute(self, x):
+        if x > 100: self.n = getattr(self, "n", 0) + 1
+        return x + getattr(self, "n", 0)
+pipe = ep.Pipeline("pipe", ep.CompGraph({"inner": inner}, {"inner": ("x", "z")}))
+func_dict = {"pipe": pipe, "node": Counting("node", abs), "plain": ep.Node("plain", inner)}
+func_io = {"pipe": ("x", "z"), "node": ("z", "y"), "plain": ("x", "w")}
+"""
+
+
+def test_nested_pipelines_and_nodes_are_compared_too(tmp_path):
+    runner = ep.load(bundle(tmp_path / "b", NESTED))
+    for _ in range(5):
+        assert (runner.run(x=1)["y"], runner["w"]) == (0, 0)
+        with pytest.raises(StateChanged, match="Function 'inner' changed 'L'"):
+            runner.run(x=200)
+        with pytest.raises(StateChanged, match="Function 'plain' changed 'L'"):
+            runner.run("w", x=200)
+    with pytest.raises(StateChanged, match=r"Function 'node' changed 'node.n'"):
+        runner.cg.functions["node"](200)
+
+
+def test_events_of_a_pipeline_fail_and_the_next_ones_do_not_depend_on_them(tmp_path):
+    source = """
+    seen = []
+    def f(x):
+        return x
+    def f_in(event):
+        if event > 100: seen.append(event)
+        return {"x": event + len(seen)}
+    def f_out(view):
+        if view["y"] == 50: seen.append(50)
+        return view["y"] + len(seen)
+    """
+    settings = SETTINGS.replace("format = 1", "format = 2") + 'own = ["f_in", "f_out"]\n'
+    q_in, q_out, failures = queue.Queue(), queue.Queue(), queue.Queue()
+    pipeline = ep.load_pipeline(bundle(tmp_path / "b", source, settings), q_in, q_out)
+    pipeline.on_error = failures.put
+    with pipeline:
+        for event in (1, 200, 2, 50, 3):
+            q_in.put(event)
+        assert [q_out.get(timeout=60) for _ in range(3)] == [1, 2, 3]
+        found = [failures.get(timeout=60) for _ in range(2)]
+    assert [failure.function for failure in found] == ["f_in", "f_out"]
+    assert all(isinstance(failure.exception, StateChanged) for failure in found)
+
+
+def test_runs_in_threads_do_not_see_each_others_changes(tmp_path):
+    source = """
+    import time
+    L = []
+    def f(x):
+        if x > 100: L.append(x)
+        time.sleep(0.0005)
+        return len(L)
+    """
+    runner = ep.load(bundle(tmp_path / "b", source))
+    with ThreadPoolExecutor(8) as pool:
+        answers = [*pool.map(lambda x: answer(runner, x), [1, 200] * 40)]
+    assert answers == ["0", "StateChanged"] * 40
+
+
+def test_a_guarded_function_may_run_a_pipeline_of_the_bundle_in_threads(tmp_path):
+    source = """
+    import epypes as ep
+    L = [1]
+    def a(x): return x + len(L)
+    def b(x): return x + len(L)
+    def c(y, z): return y + z
+    cg = ep.CompGraph({"a": a, "b": b, "c": c}, {"a": ("x", "y"), "b": ("x", "z"), "c": (("y", "z"), "w")})
+    pipe = ep.Pipeline("pipe", cg, workers=2)
+    def f(x): return pipe(x) + len(L)
+    func_dict, func_io = {"f": f, "pipe": pipe}, {"f": ("x", "y"), "pipe": ("x", "w")}
+    """
+    runner = ep.load(bundle(tmp_path / "b", source))
+    done = threading.Event()
+
+    def work():
+        for x in range(20):
+            assert (runner.run(x=x)["y"], runner["w"]) == (2 * x + 3, 2 * x + 2)
+        done.set()
+
+    threading.Thread(target=work, daemon=True).start()
+    assert done.wait(60)
