@@ -2,7 +2,7 @@
 
 The rooms, from the bottom up; imports point downwards only (checked by ``lint-imports``):
 
-- ``errors``: every error EPypes raises
+- ``errors``: every error EPypes raises; ``optional``: which extra brings a package that is missing
 - ``annotations``: what a function's annotations say, once evaluated
 - ``hints``: which values a hyperparameter may take; ``images``: which arrays a function takes as images
 - ``graph``: what is connected to what
@@ -21,6 +21,8 @@ from __future__ import annotations
 
 import importlib
 from typing import TYPE_CHECKING, Any
+
+from epypes.optional import optional_import
 
 if TYPE_CHECKING:
     from epypes import errors
@@ -199,9 +201,9 @@ def __getattr__(name: str) -> Any:
     if home is None:
         way_out = ": from epypes_widgets import tune" if name == "tune" else ""
         raise AttributeError(f"module 'epypes' has no attribute {name!r}{way_out}")
-    value = (
-        importlib.import_module("epypes.errors") if name == "errors" else getattr(importlib.import_module(home), name)
-    )
+    with optional_import():
+        module = importlib.import_module("epypes.errors" if name == "errors" else home)
+    value = module if name == "errors" else getattr(module, name)
     globals()[name] = value
     return value
 

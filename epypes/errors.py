@@ -17,6 +17,7 @@ Everything an error's text mentions is an attribute of it::
     +-- ContractBroken          a value is not the image that an annotation says; .function, .token
     +-- StillRunning            something did not stop in time; .name, .functions, .timeout_s
     +-- MailboxOverflow         a mailbox with policy "fault" is full; .size
+    +-- MissingPackage          a package that an extra brings is not installed; .package, .extra
     +-- SourceRefused           a graph can't be written as one function; .reasons
     +-- LayoutUnavailable       no Graphviz engine answers; .tried
     +-- ImageFileError          an image file can't be read or written; .path
@@ -254,6 +255,14 @@ class MailboxOverflow(EpypesError):
         super().__init__(f"The mailbox is full ({size}) and its policy is 'fault'. Take faster, or drop.")
 
 
+class MissingPackage(EpypesError, ModuleNotFoundError):
+    """A package is not installed; ``extra`` names the extra of EPypes that brings it."""
+
+    def __init__(self, package: str, extra: str, module: str | None = None) -> None:
+        self.package, self.extra = package, extra
+        super().__init__(f"Package {package!r} is missing. Run: pip install 'epypes[{extra}]'", name=module)
+
+
 class SourceRefused(EpypesError):
     """A graph that can't be written as one Python function; ``reasons`` lists all of them."""
 
@@ -268,8 +277,8 @@ class LayoutUnavailable(EpypesError):
     def __init__(self, tried: Sequence[str]) -> None:
         self.tried = tuple(tried)
         super().__init__(
-            "No Graphviz engine answered, so the graph is shown as text. "
-            f"Run: pip install 'epypes[notebook]'. Tried: {'; '.join(self.tried)}."
+            "No Graphviz engine answered, so the graph is not drawn. "
+            f"Run: pip install 'epypes[graphviz]'. Tried: {'; '.join(self.tried)}."
         )
 
 

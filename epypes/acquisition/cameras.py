@@ -13,6 +13,7 @@ from epypes.acquisition.pace import Camera, paced, require_fps
 from epypes.acquisition.pictures import Sequence, Still, folder
 from epypes.acquisition.quiet import quiet
 from epypes.errors import ImageFileError
+from epypes.optional import optional_import
 from epypes.run.guard import is_array
 
 # Of sources that would give frames as fast as a processor can.
@@ -101,7 +102,8 @@ def _of_text(source: str | Path, fps: float | None, loop: bool) -> Camera:
 
 
 def _is_image(path: Path) -> bool:
-    import cv2
+    with optional_import():
+        import cv2
 
     # By its first bytes: reading the whole file as an image would load a film into the memory. What only is called like
     # an image would open as a film without a frame.

@@ -14,6 +14,7 @@ from typing import Any, Final
 from epypes.acquisition.pace import next_due_s
 from epypes.acquisition.quiet import quiet
 from epypes.errors import CameraUnavailable, ImageFileError
+from epypes.optional import optional_import
 
 # Reads in a row that give nothing, after which a device is opened again. That takes a second, so not after the first.
 _MISSES: Final = 3
@@ -208,7 +209,8 @@ def video_file(path: Path, loop: bool) -> tuple[Video, float]:
 
 def is_recorded(capture: Any) -> bool:
     """Whether a capture is of a file, which has an end and never runs ahead."""
-    import cv2
+    with optional_import():
+        import cv2
 
     return bool(capture.get(cv2.CAP_PROP_FRAME_COUNT) > 0)
 
@@ -220,7 +222,8 @@ def require_open(capture: Any) -> None:
 
 
 def _open(source: int | str) -> Any:
-    import cv2
+    with optional_import():
+        import cv2
 
     with quiet():
         return cv2.VideoCapture(source)
@@ -228,13 +231,15 @@ def _open(source: int | str) -> Any:
 
 def recorded_fps(capture: Any) -> float:
     """Return the frames per second that a video file says; 0 if it says nothing sensible."""
-    import cv2
+    with optional_import():
+        import cv2
 
     fps = float(capture.get(cv2.CAP_PROP_FPS))
     return fps if 0 < fps <= 1_000 else 0.0
 
 
 def _position() -> int:
-    import cv2
+    with optional_import():
+        import cv2
 
     return int(cv2.CAP_PROP_POS_FRAMES)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from epypes.acquisition.quiet import quiet
 from epypes.errors import ImageFileError
 from epypes.images import swapped
+from epypes.optional import optional_import
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,8 +27,9 @@ def read_image(path: str | Path, order: Order = "bgr") -> npt.NDArray[np.uint8 |
     ImageFileError
         There is no such file, or OpenCV does not know what is in it.
     """
-    import cv2
-    import numpy as np
+    with optional_import("vision"):
+        import cv2
+        import numpy as np
 
     file = Path(path)
     try:
@@ -61,8 +63,9 @@ def write_image(path: str | Path, image: npt.NDArray[Any], order: Order = "bgr")
     ImageFileError
         The array is no image that the format can hold, or the file can't be written.
     """
-    import cv2
-    import numpy as np
+    with optional_import("vision"):
+        import cv2
+        import numpy as np
 
     shown = image.astype(np.uint8) * 255 if image.dtype == np.bool_ else image
     if shown.dtype not in (np.uint8, np.uint16) or shown.ndim not in (2, 3):

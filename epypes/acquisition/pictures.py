@@ -12,6 +12,7 @@ from epypes.acquisition.files import read_image
 from epypes.acquisition.frames import lasting_copy
 from epypes.acquisition.quiet import quiet
 from epypes.errors import ImageFileError
+from epypes.optional import optional_import
 
 # Endings of what OpenCV reads. A folder may hold notes and tables too; but a file that says it is an image must be one.
 IMAGE_ENDINGS: Final = frozenset(
@@ -103,7 +104,8 @@ def folder(path: Path, loop: bool = True) -> Sequence:
     ImageFileError
         There are no images in it, or a file has the ending of an image and is none; that file is named.
     """
-    import cv2
+    with optional_import():
+        import cv2
 
     files = image_files(path)
     if not files:

@@ -6,6 +6,8 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from epypes.optional import optional_import
+
 _lock = threading.Lock()
 _users = 0
 _level_before = 0
@@ -17,7 +19,8 @@ def quiet() -> Iterator[None]:
 
     The level belongs to the whole process and cameras read side by side, so the last one to leave sets it back.
     """
-    import cv2
+    with optional_import():
+        import cv2
 
     global _users, _level_before
     with _lock:

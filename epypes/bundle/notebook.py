@@ -14,6 +14,7 @@ from typing import Any
 
 from epypes.bundle.promote import promote
 from epypes.errors import BundleError, EpypesError, PromotionRefused, UnknownName
+from epypes.optional import optional_import
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner
 
@@ -93,10 +94,11 @@ def _lines_of(pipe: Path, told: Told) -> Iterator[None]:
 
 
 def _execute(path: Path, last_cell: str, on_cell: Progress, scratch: Path) -> None:
-    import nbformat
-    from jupyter_client.manager import AsyncKernelManager
-    from nbclient import NotebookClient
-    from nbclient.exceptions import CellExecutionError, DeadKernelError
+    with optional_import():
+        import nbformat
+        from jupyter_client.manager import AsyncKernelManager
+        from nbclient import NotebookClient
+        from nbclient.exceptions import CellExecutionError, DeadKernelError
 
     try:
         document = nbformat.read(path, as_version=4)

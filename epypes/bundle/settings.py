@@ -17,6 +17,7 @@ from epypes.errors import BundleError
 from epypes.graph import CompGraph
 from epypes.hints import Param
 from epypes.images import Order
+from epypes.optional import optional_import
 
 FORMAT: Final = 1
 # Of a bundle with what the first one has not: ports or a pipeline of its own, groups, attributes, values of new kinds.
@@ -125,7 +126,8 @@ def writable_defaults(cg: CompGraph, hyperparameters: Mapping[str, Any]) -> dict
 
 def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
     """Write pipeline.toml, with a comment per section and the ranges that annotations and usual names give."""
-    import tomlkit
+    with optional_import():
+        import tomlkit
 
     document = tomlkit.document()
     document.add(
@@ -175,7 +177,8 @@ def _is_of_first_kind(value: Any) -> bool:
 
 
 def _ports(settings: Settings) -> Any:
-    import tomlkit
+    with optional_import():
+        import tomlkit
 
     ports = tomlkit.table()
     ports.add(tomlkit.comment("The tokens that an event brings, and those that its answer carries."))
@@ -225,7 +228,8 @@ def _takers(cg: CompGraph, token: str) -> str:
 
 
 def _table(entry: Mapping[str, Any], comment: str = "") -> Any:
-    import tomlkit
+    with optional_import():
+        import tomlkit
 
     table = tomlkit.table()
     if comment and comment.isprintable():
@@ -237,7 +241,8 @@ def _table(entry: Mapping[str, Any], comment: str = "") -> Any:
 
 def _item(part: Any) -> Any:
     """Return a value for TOML: rows of a matrix, and what is long, on lines of their own."""
-    import tomlkit
+    with optional_import():
+        import tomlkit
 
     if isinstance(part, dict):
         table = tomlkit.inline_table()

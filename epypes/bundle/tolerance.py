@@ -19,6 +19,7 @@ from epypes.bundle.kept import kept_by, what_changed
 from epypes.bundle.suspects import suspicion, way_out
 from epypes.errors import BundleError, InputMutated
 from epypes.graph import CompGraph, with_defaults
+from epypes.optional import optional_import
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
 
@@ -203,7 +204,8 @@ def _rounded_up(number: float) -> float:
 
 def add_tolerances(document: Any, tolerances: Mapping[str, Tolerance]) -> None:
     """Add the tolerances to the document of pipeline.toml, with a comment of what they mean."""
-    import tomlkit
+    with optional_import():
+        import tomlkit
 
     if not tolerances:
         return

@@ -23,6 +23,7 @@ from epypes.bundle.proof import prove
 from epypes.bundle.replay import REPLAY_TIMEOUT_S, outcome_of, run_isolated
 from epypes.bundle.seal import check_seal, digest
 from epypes.errors import BundleError, HyperparameterError, PromotionRefused, UnknownName
+from epypes.optional import optional_import
 from epypes.run import CompGraphRunner
 
 
@@ -103,7 +104,8 @@ def changed_settings(text: str, values: Mapping[str, Any]) -> str:
     HyperparameterError
         TOML can't hold a value.
     """
-    import tomlkit
+    with optional_import():
+        import tomlkit
 
     document = tomlkit.parse(text)
     entries: Any = document.get("hyperparameters", {})

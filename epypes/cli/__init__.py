@@ -9,13 +9,15 @@ def main(arguments: list[str] | None = None) -> None:
     """Run a command; what EPypes refuses is one line on standard error and exit status 1."""
     from epypes.cli.app import app
     from epypes.errors import EpypesError
+    from epypes.optional import missing_package
 
     try:
         app(args=arguments, prog_name="epypes")
     except EpypesError as error:
         sys.exit(f"epypes: {error}")
     except ModuleNotFoundError as error:
-        # Only what an extra brings: a module missing in our own packages is a bug and shows its traceback.
-        if error.name is None or error.name.partition(".")[0] in ("epypes", "epypes_widgets"):
+        # Only what an extra brings: another module that is missing is a bug and shows its traceback.
+        missing = missing_package(error)
+        if missing is None:
             raise
-        sys.exit(f"epypes: module {error.name!r} is missing. Run: pip install 'epypes[all]'")
+        sys.exit(f"epypes: {missing}")

@@ -54,7 +54,10 @@ def serve(
     allow: Allow = None,
     token_file: Annotated[Path | None, typer.Option(help="The token for HTTP; one is made without.")] = None,
     store: Annotated[
-        str | None, typer.Option(help="Where a row of each event is kept: a SQLite file, or a database's URL.")
+        str | None,
+        typer.Option(
+            help="Where a row of each event is kept: a SQLite file (extra store), or a database's URL (extra postgres)."
+        ),
     ] = None,
     replica: Annotated[
         str, typer.Option(help="What it is called among those that share a broker's queue; a number without.")

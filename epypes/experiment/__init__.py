@@ -8,6 +8,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from epypes.optional import optional_import
+
 if TYPE_CHECKING:
     from epypes.experiment.graph import orb_graph, orb_hyperparameters, stereo_pair
     from epypes.experiment.results import Results
@@ -27,7 +29,8 @@ _HOME = {
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found = getattr(importlib.import_module(f"epypes.experiment.{_HOME[name]}"), name)
+    with optional_import("experiment"):
+        found = getattr(importlib.import_module(f"epypes.experiment.{_HOME[name]}"), name)
     # So that the next look-up does not come here.
     globals()[name] = found
     return found

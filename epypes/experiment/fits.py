@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
+from epypes.optional import optional_import
+
 if TYPE_CHECKING:
     import numpy as np
     import pandas as pd
@@ -104,7 +106,8 @@ def answered(table: pd.DataFrame, *columns: str) -> np.ndarray:
     ValueError
         It is no table of an experiment, or lacks some of the columns that are needed.
     """
-    import pandas as pd
+    with optional_import("experiment"):
+        import pandas as pd
 
     if not isinstance(table, pd.DataFrame):
         kind = type(table).__name__
@@ -135,7 +138,8 @@ def summary(table: pd.DataFrame) -> pd.DataFrame:
         ``median_ms``, ``mode_ms`` of the log-normal distribution, the range from ``least_ms`` to ``most_ms``, and
         ``paper_mode_ms``, nan where the paper names none.
     """
-    import pandas as pd
+    with optional_import("experiment"):
+        import pandas as pd
 
     rows = table[answered(table)]
     times = [str(time) for time in rows.select_dtypes("number") if time not in _PLACES]

@@ -7,6 +7,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.graph import CompGraph, extend, union
+from epypes.optional import optional_import
 
 if TYPE_CHECKING:
     import numpy as np
@@ -47,7 +48,8 @@ def detect_and_describe_features(
     mask
         None, or uint8, (height, width): keypoints are looked for where it is not 0.
     """
-    import cv2
+    with optional_import():
+        import cv2
 
     orb = cv2.ORB.create(
         nfeatures=nfeatures,
@@ -64,7 +66,8 @@ def detect_and_describe_features(
 
 def match(descriptors_1: Any, descriptors_2: Any, normType: int, crossCheck: bool) -> list[Any]:
     """Return the matches of two images' descriptors, the nearest ones first."""
-    import cv2
+    with optional_import():
+        import cv2
 
     if descriptors_1 is None or descriptors_2 is None:
         return []
@@ -107,7 +110,8 @@ def orb_graph() -> CompGraph:
 
 def orb_hyperparameters() -> dict[str, Any]:
     """Return the values of the hyperparameters: OpenCV's own defaults, no masks, and matches that are mutual."""
-    import cv2
+    with optional_import():
+        import cv2
 
     values = (500, 1.2, 8, 31, 2, cv2.ORB_HARRIS_SCORE, 31, 20)
     return {
@@ -121,8 +125,9 @@ def orb_hyperparameters() -> dict[str, Any]:
 
 def stereo_pair() -> tuple[Array, Array]:
     """Return the stereo pair that comes with scikit-image (a motorcycle): two gray images, uint8, (500, 741)."""
-    import cv2
-    from skimage import data
+    with optional_import():
+        import cv2
+        from skimage import data
 
     left, right, _ = data.stereo_motorcycle()
     return cv2.cvtColor(left, cv2.COLOR_RGB2GRAY), cv2.cvtColor(right, cv2.COLOR_RGB2GRAY)

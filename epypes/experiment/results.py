@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.experiment.robot import Answer
+from epypes.optional import optional_import
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -54,7 +55,8 @@ class Results:
 
 def table_of(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Return rows as a table with the columns in their order, also of no rows."""
-    import pandas as pd
+    with optional_import("experiment"):
+        import pandas as pd
 
     return pd.DataFrame(list(rows), columns=list(COLUMNS)).astype(dict.fromkeys(_NUMBERS, float))
 

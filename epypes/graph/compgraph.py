@@ -27,6 +27,7 @@ from epypes.graph.redefined import is_redefined_inside, redefined
 from epypes.graph.switch import as_switch
 from epypes.graph.typecheck import check_types
 from epypes.images import Contracts
+from epypes.optional import optional_import
 from epypes.wording import counted
 
 if TYPE_CHECKING:
@@ -273,7 +274,8 @@ class CompGraph:
 
     def to_networkx(self) -> nx.DiGraph[tuple[str, str]]:
         """Return a networkx DiGraph; its vertices are ``("function", name)`` and ``("token", name)``."""
-        import networkx as nx
+        with optional_import():
+            import networkx as nx
 
         graph: nx.DiGraph[tuple[str, str]] = nx.DiGraph()
         for name, function in self._functions.items():

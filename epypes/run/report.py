@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, overload
 
+from epypes.optional import optional_import
 from epypes.run.program import Program, longest_path_ns
 from epypes.wording import counted
 
@@ -138,7 +139,8 @@ class RunReport:
 
         A function that failed has ``ran`` true as well, and the time until it raised.
         """
-        import pandas as pd
+        with optional_import():
+            import pandas as pd
 
         return pd.DataFrame(self._rows(), columns=list(_COLUMNS))
 
@@ -192,7 +194,8 @@ class Reports(Sequence[RunReport]):
 
     def to_frame(self) -> pd.DataFrame:
         """Return a table: run (0 is the oldest), function, ran, time_ms, share (of that run's total), failed."""
-        import pandas as pd
+        with optional_import():
+            import pandas as pd
 
         rows = [(place, *row) for place, report in enumerate(self) for row in report._rows()]
         return pd.DataFrame(rows, columns=["run", *_COLUMNS])

@@ -14,6 +14,7 @@ from statistics import NormalDist, fmean
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
+from epypes.optional import optional_import
 from epypes.run.report import RunReport
 from epypes.wording import counted
 
@@ -159,7 +160,8 @@ class TimingSummary:
         The last two rows are ``total`` and ``graph overhead``; p05 and p95 are quantiles of the fitted distribution,
         nan where fewer than 5 durations were fitted.
         """
-        import pandas as pd
+        with optional_import():
+            import pandas as pd
 
         rows = (*self.functions.items(), ("total", self.total), ("graph overhead", self.overhead))
         return pd.DataFrame([_row(name, fitted) for name, fitted in rows], columns=list(_COLUMNS))

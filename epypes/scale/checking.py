@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from epypes.bundle.entries import Member
 from epypes.errors import UnknownName
+from epypes.optional import optional_import
 from epypes.run import CompGraphRunner
 from epypes.scale.cases import Case, Check, cases_of, checks_of
 from epypes.scale.files import is_file
@@ -20,7 +21,6 @@ from epypes.scale.items import items_of
 from epypes.scale.job import Job
 from epypes.scale.lasting import settled_runner
 from epypes.scale.measuring import CheckOutcome, measured
-from epypes.scale.needed import needed
 from epypes.scale.progress import progress_bar
 from epypes.scale.spreading import spread
 from epypes.scale.table import none_as_it_is
@@ -220,7 +220,9 @@ class CheckResult:
             }
             for outcome in self.outcomes
         ]
-        frame: pd.DataFrame = needed("pandas").DataFrame(rows)
+        with optional_import():
+            import pandas as pd
+        frame = pd.DataFrame(rows)
         frame["failure"] = none_as_it_is([outcome.reason or None for outcome in self.outcomes])
         return frame
 

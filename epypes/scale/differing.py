@@ -8,6 +8,7 @@ from typing import Any, Final
 from epypes.display import is_image
 from epypes.display.previews.raster import THUMBNAIL_PX
 from epypes.graph import CompGraph, colour_order
+from epypes.optional import optional_import
 from epypes.scale.outcome import Thumbnail
 from epypes.scale.thumbnails import thumbnail_of_value
 
@@ -37,7 +38,8 @@ def pictures_of(value: Any, expected: Any, cg: CompGraph, token: str) -> dict[st
 def _difference(value: Any, expected: Any) -> Thumbnail | None:
     if not (is_image(value) and is_image(expected)):
         return None
-    import numpy as np
+    with optional_import("scale"):
+        import numpy as np
 
     got, wanted = np.asarray(value), np.asarray(expected)
     if got.shape != wanted.shape:
@@ -53,7 +55,8 @@ def _difference(value: Any, expected: Any) -> Thumbnail | None:
 
 
 def _is_mask(image: Any) -> bool:
-    import numpy as np
+    with optional_import("scale"):
+        import numpy as np
 
     if image.ndim != 2:
         return False
@@ -62,8 +65,9 @@ def _is_mask(image: Any) -> bool:
 
 def _three_colours(got: Any, wanted: Any) -> Thumbnail:
     """Return a PNG: as JPEG, a single pixel that differs would be grey, as if it did not."""
-    import numpy as np
-    from PIL import Image
+    with optional_import("scale"):
+        import numpy as np
+        from PIL import Image
 
     both, missing, extra = (_coarser(mask) for mask in (got & wanted, wanted & ~got, got & ~wanted))
     places = np.zeros(both.shape, np.uint8)
@@ -79,7 +83,8 @@ def _three_colours(got: Any, wanted: Any) -> Thumbnail:
 
 def _coarser(mask: Any) -> Any:
     """Return a mask of about the size of a thumbnail; what is in one pixel is in the coarse one around it."""
-    import numpy as np
+    with optional_import("scale"):
+        import numpy as np
 
     side = -(-max(mask.shape) // THUMBNAIL_PX)
     starts = [np.arange(0, length, side) for length in mask.shape]

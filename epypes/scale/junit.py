@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from epypes.errors import ScaleError
+from epypes.optional import optional_import
 from epypes.scale.measuring import CheckOutcome
-from epypes.scale.needed import needed
 
 # What XML 1.0 does not allow, in a name or in what an exception says, would make the whole file unreadable.
 _NOT_XML: Final = re.compile("[^\\t\\n\\r\\x20-\\ud7ff\\ue000-\\ufffd\\U00010000-\\U0010ffff]")
@@ -34,9 +34,12 @@ def write_junit(path: Path, outcomes: Sequence[CheckOutcome], name: str) -> Path
     Raises
     ------
     ScaleError
-        It can't be written, or junitparser is missing.
+        It can't be written.
+    MissingPackage
+        junitparser is missing.
     """
-    junit = needed("junitparser")
+    with optional_import():
+        import junitparser as junit
     suite = junit.TestSuite(_text(name))
     timed: set[int] = set()
     for outcome in outcomes:
@@ -57,7 +60,8 @@ def write_junit(path: Path, outcomes: Sequence[CheckOutcome], name: str) -> Path
 
 def check_place(path: Path) -> None:
     """Raise ScaleError if no JUnit XML can be written there, before what it is to tell of is run."""
-    needed("junitparser")
+    with optional_import():
+        import junitparser  # noqa: F401 - missing here, rather than after all cases have run
     if path.is_dir():
         raise ScaleError(f"{str(path)!r} is a folder. Name a file in it.")
     if not path.parent.is_dir():

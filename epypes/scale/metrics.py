@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+from epypes.optional import optional_import
 from epypes.scale.overlaps import BoxForm, boxes_iou, is_boxes, is_label_image, labels_iou
 
 if TYPE_CHECKING:
@@ -227,10 +228,8 @@ def psnr(value: Any, expected: Any, *, data_range: float | None = None) -> float
         raise ValueError(f"Of {got.dtype} images, psnr needs data_range.")
     if np.array_equal(got, wanted):
         return math.inf
-    try:
+    with optional_import():
         from skimage.metrics import peak_signal_noise_ratio
-    except ImportError as error:
-        raise ValueError("psnr needs scikit-image. Run: pip install 'epypes[vision]'.") from error
     return float(peak_signal_noise_ratio(wanted, got, data_range=data_range))
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from epypes.errors import ScaleError
-from epypes.scale.needed import needed
+from epypes.optional import optional_import
 from epypes.scale.ranging import Axis
 from epypes.scale.studying import Direction, Trial, importances
 from epypes.scale.table import none_as_it_is
@@ -117,8 +117,9 @@ class OptimizeResult:
         columns["state"] = ["failed" if trial.value is None else "complete" for trial in self.trials]
         columns["failure"] = none_as_it_is([trial.failure or None for trial in self.trials])
         columns["ms"] = [trial.total_ns / 1e6 for trial in self.trials]
-        frame: pd.DataFrame = needed("pandas").DataFrame(columns)
-        return frame
+        with optional_import():
+            import pandas as pd
+        return pd.DataFrame(columns)
 
     def history_plot(self) -> Figure:
         """Draw the value of each trial, and the best one so far, with Matplotlib."""

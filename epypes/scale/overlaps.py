@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final, Literal
 
+from epypes.optional import optional_import
+
 BoxForm = Literal["xywh", "xyxy"]
 
 # Each label of one side is compared with each of the other; so many pairs take 0.2 GB.
@@ -21,7 +23,7 @@ def paired_iou(pairs: Any) -> float:
 
     Raises
     ------
-    ValueError
+    MissingPackage
         scipy is missing.
     """
     most = max(pairs.shape)
@@ -29,10 +31,8 @@ def paired_iou(pairs: Any) -> float:
         return 1.0
     if not pairs.size:
         return 0.0
-    try:
+    with optional_import():
         from scipy.optimize import linear_sum_assignment
-    except ImportError as error:
-        raise ValueError("iou of boxes or labels needs scipy. Run: pip install 'epypes[scale]'.") from error
     rows, columns = linear_sum_assignment(pairs, maximize=True)
     return float(pairs[rows, columns].sum() / most)
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Final
 
-from epypes.errors import ScaleError
-from epypes.scale.needed import needed
+from epypes.errors import MissingPackage
+from epypes.optional import optional_import
 
 # Takes how many more are done, and how many of these have failed.
 Advance = Callable[[int, int], None]
@@ -33,8 +33,9 @@ def progress_bar(progress: bool | None, total: int | None, what: str, *, unit: s
         yield _tell_nobody
         return
     try:
-        tqdm = needed("tqdm").tqdm
-    except ScaleError:
+        with optional_import():
+            from tqdm import tqdm
+    except MissingPackage:
         if progress:
             raise
         yield _tell_nobody

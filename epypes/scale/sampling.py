@@ -10,7 +10,7 @@ from typing import Any
 
 from epypes.errors import ScaleError
 from epypes.hints import Param, odd_step
-from epypes.scale.needed import needed
+from epypes.optional import optional_import
 from epypes.scale.steps import at_place, last_place, odd_from
 
 
@@ -132,6 +132,7 @@ def shares(how: str, n: int, dimensions: int, seed: int) -> Sequence[Sequence[fl
     if how == "random":
         rows: Sequence[Sequence[float]] = generator.random((n, dimensions)).tolist()
         return rows
-    qmc = needed("scipy.stats").qmc
+    with optional_import():
+        from scipy.stats import qmc
     drawn: Sequence[Sequence[float]] = qmc.LatinHypercube(dimensions, seed=generator).random(n).tolist()
     return drawn

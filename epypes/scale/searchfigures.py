@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.scale.needed import needed
+from epypes.optional import optional_import
 from epypes.scale.optimized import best_so_far
 
 if TYPE_CHECKING:
@@ -63,9 +63,9 @@ def importance_figure(result: OptimizeResult) -> Figure:
 
 
 def _blank(width: float, height: float) -> tuple[Figure, Axes]:
-    figure: Figure = needed("matplotlib.figure", "vision").Figure(
-        figsize=(width, height), dpi=100, layout="constrained", facecolor="white"
-    )
+    with optional_import("scale"):
+        from matplotlib.figure import Figure
+    figure = Figure(figsize=(width, height), dpi=100, layout="constrained", facecolor="white")
     axes = figure.add_subplot()
     axes.spines[["top", "right"]].set_visible(False)
     return figure, axes

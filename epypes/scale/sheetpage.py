@@ -15,6 +15,7 @@ from typing import Final
 from epypes.display.limits import CHARACTERS, THUMBNAIL_CHARACTERS
 from epypes.display.markup import content, escape, fitted, size
 from epypes.display.previews.raster import encode_small
+from epypes.optional import optional_import
 from epypes.scale.outcome import Thumbnail
 from epypes.scale.sheet import Block, Sheet, Tile
 from epypes.wording import counted
@@ -155,7 +156,8 @@ def smaller(thumbnail: Thumbnail, most_bytes: int) -> Thumbnail | None:
         return thumbnail
     if most_bytes < _LEAST_BYTES or thumbnail.media_type == "image/svg+xml":
         return None
-    from PIL import Image
+    with optional_import("scale"):
+        from PIL import Image
 
     with Image.open(io.BytesIO(thumbnail.data)) as opened:
         opened.load()

@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 from epypes.errors import ScaleError
-from epypes.scale.needed import needed
+from epypes.optional import optional_import
 from epypes.scale.ranging import Axis, Choices, Span, setting_of, suggestion_of
 from epypes.scale.searched import changed_in
 from epypes.scale.steps import ends_on_step
@@ -103,7 +103,8 @@ class Search:
         name: str = "",
         about: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
-        found = needed("optuna")
+        with optional_import():
+            import optuna
         self.axes, self.direction = tuple(axes), direction
         self._present, self._about = dict(present), dict(about)
         self._distributions = {axis.token: _distribution(axis) for axis in axes}
@@ -112,8 +113,10 @@ class Search:
             self._written = None if url is None else self._opened(url, name)
             before = () if self._written is None else self._done_before(self._written, name)
             # Who goes on begins anew with chance: the same numbers again would be the same trials again.
-            sampler = found.samplers.TPESampler(seed=seed + len(before), constant_liar=at_once > 1)
-            self.study: optuna.Study = found.create_study(sampler=sampler, study_name=name or None, direction=direction)
+            sampler = optuna.samplers.TPESampler(seed=seed + len(before), constant_liar=at_once > 1)
+            self.study: optuna.Study = optuna.create_study(
+                sampler=sampler, study_name=name or None, direction=direction
+            )
         if before:
             self.study.add_trials(before)
         else:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.graph import CompGraph
-from epypes.scale.needed import needed
+from epypes.optional import optional_import
 from epypes.scale.outcome import Outcome
 
 if TYPE_CHECKING:
@@ -50,16 +50,19 @@ def frame_of(
     columns["total_ms"] = [outcome.total_ns / 1e6 for outcome in outcomes]
     for function in functions:
         columns[f"{function} ms"] = [_in_ms(outcome.times_ns.get(function)) for outcome in outcomes]
-    frame: pd.DataFrame = needed("pandas").DataFrame(columns)
-    return frame
+    with optional_import():
+        import pandas as pd
+    return pd.DataFrame(columns)
 
 
 def _column(values: list[Any]) -> Any:
     """Return values as a column; integers and truth values of which some are missing stay what they are."""
     kinds = {type(value) for value in values if value is not None}
     if None in values and len(kinds) == 1 and kinds <= {bool, int}:
+        with optional_import():
+            import pandas as pd
         try:
-            return needed("pandas").array(values, dtype="boolean" if bool in kinds else "Int64")
+            return pd.array(values, dtype="boolean" if bool in kinds else "Int64")
         except OverflowError:  # above 64 bits
             return values
     return values
@@ -68,7 +71,11 @@ def _column(values: list[Any]) -> Any:
 def none_as_it_is(values: Sequence[Any]) -> Any:
     """Return values as a column; where None is one of them it stays None, since NaN is another value."""
     has_none = any(value is None for value in values)
-    return needed("pandas").Series(list(values), dtype=object) if has_none else values
+    if not has_none:
+        return values
+    with optional_import():
+        import pandas as pd
+    return pd.Series(list(values), dtype=object)
 
 
 def _in_ms(duration_ns: int | None) -> float:

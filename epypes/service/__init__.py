@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from epypes.optional import optional_import
+
 if TYPE_CHECKING:
     from epypes.service.client import Answer, Client, call
     from epypes.service.parameters import Parameters
@@ -27,7 +29,8 @@ def __getattr__(name: str) -> Any:
     # A worker, which is in this room too, needs none of them.
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"epypes.service.{_HOME[name]}"), name)
+    with optional_import():
+        return getattr(importlib.import_module(f"epypes.service.{_HOME[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -217,8 +217,7 @@ def write_container(bundle: str | Path, to: str | Path, options: Sequence[str] =
         pinned = (folder / "requirements.txt").read_text(encoding="utf-8")
         kept = [line for line in pinned.splitlines() if not _is_epypes(line)]
         has_wheel = _add_wheel(target, epypes_source(pins(pinned.splitlines())))
-        extras = sorted({"service", *filter(None, map(extra_of, options))})
-        own = f"epypes[{','.join(extras)}]=={metadata.version('epypes')}"
+        own = f"epypes[{','.join(sorted(_extras(options)))}]=={metadata.version('epypes')}"
         (target / "requirements.txt").write_text("\n".join([*kept, own]) + "\n", encoding="utf-8")
         entrypoint = ["epypes", "serve", "/service/bundle", *options]
         text = _CONTAINERFILE.format(
@@ -236,6 +235,18 @@ def write_container(bundle: str | Path, to: str | Path, options: Sequence[str] =
             raise
         raise ServiceError(to, f"{to} can't be written: {error}. Name another folder.") from error
     return path
+
+
+def _extras(options: Sequence[str]) -> set[str]:
+    """Return the extras that a service with these options needs."""
+    found = {"serve"}
+    for before, option in pairwise(("", *options)):
+        name, _, value = option.partition("=") if option.startswith("--") else (before, "", option)
+        if name == "--store":
+            found.add("postgres" if value.startswith("postgres") else "store")
+        else:
+            found.add(extra_of(value))
+    return found - {""}
 
 
 def _is_epypes(line: str) -> bool:

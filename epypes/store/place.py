@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import unquote, urlsplit
 
 from epypes.errors import StoreError
+from epypes.optional import optional_import
 
 if TYPE_CHECKING:
     from sqlalchemy import URL
@@ -24,16 +25,15 @@ def url_of(given: str | Path) -> URL:
     ------
     StoreError
         There can be no such database.
+    MissingPackage
+        SQLAlchemy is missing.
     TypeError
         It is neither a path nor a URL.
     """
     if not isinstance(given, str | Path):
         raise TypeError(f"A store is a path or a URL, not {given!r:.80}. Name a file: 'results.sqlite'.")
-    try:
-        import sqlalchemy  # noqa: F401 - so that it is told by its own name
-    except ImportError:
-        text = "A store needs SQLAlchemy, which is not installed. Run: pip install 'epypes[scale]'"
-        raise StoreError("", text) from None
+    with optional_import():
+        import sqlalchemy  # noqa: F401 - missing here, rather than after the first run
     if isinstance(given, str) and "://" in given:
         return _parsed(given)
     if not str(given).strip() or str(given) == ":memory:":

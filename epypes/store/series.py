@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import StoreError
+from epypes.optional import optional_import
 from epypes.store.jsontext import from_text, from_word, to_text, to_word
 from epypes.store.onefile import file_of
 
@@ -205,7 +206,8 @@ class Series:
 
     def to_frame(self) -> pd.DataFrame:
         """Return the series as a pandas table: a row by key, a column by name; of dicts in it ``values.canny_lo``."""
-        import pandas as pd
+        with optional_import():
+            import pandas as pd
 
         found = list(self.items())
         index = pd.Index([key for key, _ in found], name="key", dtype="object")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from epypes.optional import optional_import
+
 if TYPE_CHECKING:
     from epypes.transport.addresses import check_bind, is_loopback, is_loopback_host
     from epypes.transport.keys import Keys, make_keys, read_keys
@@ -54,7 +56,8 @@ _HOME = {
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found = getattr(importlib.import_module(f"epypes.transport.{_HOME[name]}"), name)
+    with optional_import():
+        found = getattr(importlib.import_module(f"epypes.transport.{_HOME[name]}"), name)
     # So that the next look-up does not come here.
     globals()[name] = found
     return found

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from epypes.errors import KeysError
+from epypes.optional import optional_import
 
 _LINE = re.compile(r'^\s*(public|secret)-key\s*=\s*"([^"\n]*)"\s*$', re.MULTILINE)
 # Z85 of 32 bytes.
@@ -54,7 +55,8 @@ def make_keys(path: str | Path) -> Keys:
     KeysError
         If one of the files exists already, or can't be written.
     """
-    import zmq
+    with optional_import():
+        import zmq
 
     public, secret = (key.decode() for key in zmq.curve_keypair())
     stem = _stem(Path(path))
@@ -113,7 +115,8 @@ def _public(given: PublicKey) -> list[str]:
 
 def server_options(keys: Keys, domain: bytes) -> Options:
     """Return ZeroMQ's options for a socket that is bound with keys; a gate must know its domain."""
-    import zmq
+    with optional_import():
+        import zmq
 
     return [
         (zmq.CURVE_SERVER, 1),
@@ -126,7 +129,8 @@ def server_options(keys: Keys, domain: bytes) -> Options:
 
 def client_options(keys: Keys, server: str) -> Options:
     """Return ZeroMQ's options for a socket that connects to one with the public key ``server``."""
-    import zmq
+    with optional_import():
+        import zmq
 
     return [
         (zmq.CURVE_SERVERKEY, server.encode()),

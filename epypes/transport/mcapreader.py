@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from epypes.errors import RecordingError
+from epypes.optional import optional_import
 from epypes.transport.mcapformat import COUNTS, ENCODING, START, Counts, counts_of, unpacked
 
 _MAGIC_BYTES = 8
@@ -134,8 +135,9 @@ def _recorded(message: Any, channels: Mapping[int, str], path: Path) -> Recorded
 
 
 def _records(path: Path) -> Iterator[tuple[str, Any]]:
-    from mcap.exceptions import InvalidMagic
-    from mcap.stream_reader import StreamReader
+    with optional_import():
+        from mcap.exceptions import InvalidMagic
+        from mcap.stream_reader import StreamReader
 
     try:
         with path.open("rb") as file:

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from epypes.errors import RecordingError
+from epypes.optional import optional_import
 from epypes.transport.mcapformat import COUNTS, ENCODING, START, Counts, Frames, packed, topic_of
 
 _CHUNK_BYTES = 1024**2
@@ -43,7 +44,8 @@ class RecordingWriter:
     """
 
     def __init__(self, path: Path, about: Mapping[str, str], force: bool) -> None:
-        from mcap.writer import CompressionType, Writer
+        with optional_import():
+            from mcap.writer import CompressionType, Writer
 
         self.path, self.pending = path, 0
         self._count = self._bytes = 0

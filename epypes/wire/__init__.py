@@ -8,6 +8,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from epypes.optional import optional_import
+
 if TYPE_CHECKING:
     from epypes.wire.attribute_list import add_attribute, attributes
     from epypes.wire.complete import parsed, serialized
@@ -71,8 +73,8 @@ _HOME = {
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = importlib.import_module(f"epypes.wire.{_HOME.get(name, 'messages2019')}")
-    found = getattr(home, name)
+    with optional_import():
+        found = getattr(importlib.import_module(f"epypes.wire.{_HOME.get(name, 'messages2019')}"), name)
     # So that the next look-up does not come here.
     globals()[name] = found
     return found

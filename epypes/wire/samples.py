@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from epypes.errors import MessageError
+from epypes.optional import optional_import
 from epypes.wire.arrays import flat_bytes
 from epypes.wire.codecs import Payload, to_value
 from epypes.wire.limits import Limits
@@ -67,7 +68,8 @@ def save_sample(
     OSError
         If the file can't be written.
     """
-    from google.protobuf.json_format import MessageToDict
+    with optional_import():
+        from google.protobuf.json_format import MessageToDict
 
     entries: dict[str, AnyArray] = {}
     described: dict[str, Any] = {"format": FORMAT, "arrays": []}
@@ -124,7 +126,8 @@ def _read_entry(archive: zipfile.ZipFile, name: str) -> AnyArray:
 
 
 def _read_side(reader: Reader, entries: Any) -> Iterator[tuple[str, Any]]:
-    from google.protobuf.json_format import ParseDict, ParseError
+    with optional_import():
+        from google.protobuf.json_format import ParseDict, ParseError
 
     for name, value in entries:
         try:

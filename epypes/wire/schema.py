@@ -10,6 +10,8 @@ import threading
 from importlib import resources
 from typing import TYPE_CHECKING, Any
 
+from epypes.optional import optional_import
+
 if TYPE_CHECKING:
     from google.protobuf.descriptor_pool import DescriptorPool
 
@@ -25,8 +27,9 @@ def schema_bytes() -> bytes:
 
 
 def _filled_pool() -> DescriptorPool:
-    from google.protobuf.descriptor_pb2 import FileDescriptorSet
-    from google.protobuf.descriptor_pool import DescriptorPool
+    with optional_import():
+        from google.protobuf.descriptor_pb2 import FileDescriptorSet
+        from google.protobuf.descriptor_pool import DescriptorPool
 
     pool = DescriptorPool()
     for file in FileDescriptorSet.FromString(schema_bytes()).file:
@@ -55,7 +58,8 @@ def message_class(full_name: str) -> Any:
     known = _classes.get(full_name)
     if known is not None:
         return known
-    from google.protobuf.message_factory import GetMessageClass
+    with optional_import():
+        from google.protobuf.message_factory import GetMessageClass
 
     with _lock:
         if not _pools:

@@ -9,8 +9,10 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 import epypes
+from epypes.optional import EXTRAS
 
 ROOT = Path(__file__).parents[2]
 MODULES = sorted([*(ROOT / "epypes").rglob("*.py"), *(ROOT / "widgets").rglob("*.py")])
@@ -54,13 +56,13 @@ def test_the_version_is_the_packages():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(ROOT).as_posix())
-def test_every_module_says_first_which_question_it_answers_and_is_short(path):
+def test_every_module_begins_with_a_summary_and_is_short(path):
     text = path.read_text()
     docstring = ast.get_docstring(ast.parse(text))
     assert docstring
     first = docstring.splitlines()[0]
-    assert "?" in first or path.name in ("__init__.py", "errors.py") or first.startswith("``epypes ")
-    assert len(text.splitlines()) <= 400
+    assert first.endswith((".", "?")) or path.name in ("__init__.py", "errors.py") or first.startswith("``epypes ")
+    assert len(text.splitlines()) <= 500
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(ROOT).as_posix())
@@ -89,3 +91,48 @@ def test_architecture_names_every_room_and_stays_short():
     for room in (ROOT / "epypes").iterdir():
         if room.is_dir() and room.name != "__pycache__":
             assert f"`{room.name}/`" in text
+
+
+def imported(path):
+    """Return the packages that a module imports when it runs, at the top or later, without those for types alone."""
+    waiting: list[ast.AST] = [ast.parse(path.read_text())]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            continue
+        if isinstance(node, ast.Import):
+            yield from (alias.name.partition(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module.partition(".")[0]
+        waiting += ast.iter_child_nodes(node)
+
+
+def required(extra):
+    """Return the packages that an extra requires, those of the extras in it too."""
+    wanted = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"][extra]
+    found = set()
+    for one in map(Requirement, wanted):
+        found |= set().union(*map(required, one.extras)) if one.name == "epypes" else {one.name}
+    return found
+
+
+def test_every_package_that_is_imported_is_brought_by_an_extra_that_an_error_names():
+    own = {*sys.stdlib_module_names, "epypes", "epypes_widgets", "typer", "rich"}
+    assert {name for path in MODULES for name in imported(path)} - own <= EXTRAS.keys()
+    # What these bring by themselves: nothing asks for them by name.
+    within = {"ipython": "ipykernel", "traitlets": "ipywidgets", "jupyter-client": "nbclient", "jupyter-server": "jupyterlab",
+              "pydantic": "fastapi", "pydantic-core": "fastapi", "starlette": "fastapi"}  # fmt: skip
+    for package, extra in EXTRAS.values():
+        assert within.get(package, package) in required(extra)
+
+
+def test_opencv_is_brought_by_the_extra_of_its_own_alone():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert {extra for extra in extras if any("opencv" in name for name in required(extra))} == {"vision", "all"}
+
+
+def test_tools_of_development_are_no_extras():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert {"test", "bench"} <= project["dependency-groups"].keys()
+    assert not {"test", "bench"} & project["project"]["optional-dependencies"].keys()
+    assert not required("all") & {"pytest", "ruff", "mypy", "loman"}

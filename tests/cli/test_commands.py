@@ -147,7 +147,7 @@ def test_a_module_that_an_extra_brings_is_named():
     code = "import epypes.cli.app\n" + code
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 1
-    assert done.stderr.strip() == "epypes: module 'tomlkit' is missing. Run: pip install 'epypes[all]'"
+    assert done.stderr.strip() == "epypes: Package 'tomlkit' is missing. Run: pip install 'epypes[serve]'"
 
 
 def test_files_have_the_right_colours_whatever_the_order_of_the_tokens(epypes, tmp_path):

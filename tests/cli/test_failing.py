@@ -167,14 +167,20 @@ def test_an_option_that_there_is_not_exits_with_2(command, epypes):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("command", "module"),
-    [("promote", "nbclient"), ("promote", "nbformat"), ("demo", "nbclient"), ("lab", "jupyterlab"), ("serve", "zmq")],
+    ("command", "module", "package", "extra"),
+    [
+        ("promote", "nbclient", "nbclient", "service"),
+        ("promote", "nbformat", "nbformat", "service"),
+        ("demo", "nbclient", "nbclient", "service"),
+        ("lab", "jupyterlab", "jupyterlab", "notebook"),
+        ("serve", "zmq", "pyzmq", "serve"),
+    ],
 )
-def test_without_an_extra_a_command_says_what_to_install(command, module, places):
+def test_without_an_extra_a_command_says_what_to_install(command, module, package, extra, places):
     arguments = [argument.format(**places) for argument in FIRST[command]]
     code = f"import sys; sys.modules[{module!r}] = None; from epypes.cli import main; main({[command, *arguments]!r})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
-    assert f"module '{module}' is missing. Run: pip install 'epypes[all]'" in one_line(done)
+    assert f"Package {package!r} is missing. Run: pip install 'epypes[{extra}]'" in one_line(done)
 
 
 @pytest.mark.slow

@@ -120,7 +120,7 @@ def test_without_jupyterlab_it_says_what_to_install(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=DEADLINE_S)
     assert done.returncode == 1
-    assert done.stderr.strip() == "epypes: module 'jupyterlab' is missing. Run: pip install 'epypes[all]'"
+    assert done.stderr.strip() == "epypes: Package 'jupyterlab' is missing. Run: pip install 'epypes[notebook]'"
 
 
 class Server:

@@ -165,7 +165,7 @@ def test_without_any_engine_the_text_form_shows_with_a_way_out(
     assert set(bundle) == {"text/plain"}
     assert "canny(image_blurred, canny_lo, canny_hi) -> edges" in bundle["text/plain"]
     assert "canny_lo = 70" in bundle["text/plain"]
-    assert "pip install 'epypes[notebook]'" in bundle["text/plain"]
+    assert "pip install 'epypes[graphviz]'" in bundle["text/plain"]
 
 
 def test_a_pipeline_inside_a_graph_shows_that_it_is_one():

@@ -88,7 +88,7 @@ def test_a_container_is_built_from_the_bundle_and_what_it_requires(bundle, tmp_p
     assert "USER epypes" in text
     assert check_seal(path.parent / "bundle") == check_seal(bundle)
     lines = (path.parent / "requirements.txt").read_text(encoding="utf-8").splitlines()
-    assert [line for line in lines if line.startswith("epypes")] == [f"epypes[service]=={ep.__version__}"]
+    assert [line for line in lines if line.startswith("epypes")] == [f"epypes[serve]=={ep.__version__}"]
     assert any(line.startswith("opencv-python-headless==") for line in lines)
     (wheel,) = (path.parent / "wheels").iterdir()
     assert wheel.name == f"epypes-{ep.__version__}-py3-none-any.whl"

@@ -404,7 +404,7 @@ def test_a_store_without_sqlalchemy_says_what_to_install():
     code = (
         "import sys; sys.modules['sqlalchemy'] = None\n"
         "import epypes as ep\n"
-        "try:\n    ep.Store('x.sqlite')\nexcept ep.errors.StoreError as error:\n    print(error)"
+        "try:\n    ep.Store('x.sqlite')\nexcept ep.errors.MissingPackage as error:\n    print(error)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=os.sep)
-    assert done.stdout == "A store needs SQLAlchemy, which is not installed. Run: pip install 'epypes[scale]'\n"
+    assert done.stdout == "Package 'sqlalchemy' is missing. Run: pip install 'epypes[store]'\n"

@@ -47,8 +47,11 @@ What is looked at, and moved:
 
 from __future__ import annotations
 
-from epypes_widgets.making import tune
-from epypes_widgets.panel import Panel
-from epypes_widgets.picking import Picker, pick
+from epypes.optional import optional_import
+
+with optional_import():
+    from epypes_widgets.making import tune
+    from epypes_widgets.panel import Panel
+    from epypes_widgets.picking import Picker, pick
 
 __all__ = ["Panel", "Picker", "pick", "tune"]

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 from weakref import WeakKeyDictionary
 
 from epypes.display import Picture
+from epypes.optional import optional_import
 from epypes_widgets.looking.films import is_alike
 from epypes_widgets.places import Tunable
 from epypes_widgets.values import differing, said_change
@@ -198,7 +199,8 @@ class History:
         Its columns are the hyperparameters, then at, token, image, compute_ms, label and picture; if a hyperparameter
         is called like one of these, the latter has an underscore after its name.
         """
-        from epypes_widgets.historyframe import frame_of
+        with optional_import():
+            from epypes_widgets.historyframe import frame_of
 
         return frame_of(self._entries)
 

@@ -16,6 +16,7 @@ from epypes.bundle.entries import fits, plain, read, written
 from epypes.errors import SettingsError, UnknownName
 from epypes.graph import CompGraph, annotated_params
 from epypes.hints import Param
+from epypes.optional import optional_import
 from epypes_widgets.ranges import described
 
 FORMAT: Final = "epypes settings 1"
@@ -148,7 +149,8 @@ def _is_text(text: str) -> bool:
 
 
 def _document(values: Mapping[str, Any], params: Mapping[str, object]) -> str:
-    import tomlkit
+    with optional_import("widgets"):
+        import tomlkit
 
     document = tomlkit.document()
     document.add(tomlkit.comment(_ABOUT))
@@ -166,7 +168,8 @@ def _document(values: Mapping[str, Any], params: Mapping[str, object]) -> str:
 
 def _entry(value: Any) -> Any:
     """Return what stands behind the name: the value itself, or an inline table where its kind must be said."""
-    import tomlkit
+    with optional_import("widgets"):
+        import tomlkit
 
     entry = {"value": value.name, "kind": _MEMBER} if isinstance(value, enum.Enum) else written(plain(value))
     if entry.keys() == {"value"}:

@@ -9,6 +9,7 @@ import colorsys
 import functools
 from typing import TYPE_CHECKING, Any, Final
 
+from epypes.optional import optional_import
 from epypes.wording import counted
 
 if TYPE_CHECKING:
@@ -39,7 +40,9 @@ def palette() -> bytes:
 def label_picture(labels: Array, max_side_px: int | None) -> Image.Image:
     """Return a picture with a palette; made smaller by leaving out pixels, since labels have no mean."""
     import numpy as np
-    from PIL import Image
+
+    with optional_import():
+        from PIL import Image
 
     stride = 1 if max_side_px is None else -(-max(labels.shape) // max_side_px)
     kept = labels[::stride, ::stride]

@@ -15,6 +15,7 @@ from epypes.display.previews.charts import place_chart, spread
 from epypes.display.previews.imagekinds import image_kind, sampled
 from epypes.display.previews.raster import THUMBNAIL_PX, Picture, encode_image, encode_small, pillow_image
 from epypes.display.previews.shown import Backdrop, Chart, Marks, Most, Scene
+from epypes.optional import optional_import
 
 if TYPE_CHECKING:
     import numpy as np
@@ -187,7 +188,9 @@ def _drawn_over(backdrop: Backdrop, marks: Marks, side: int = THUMBNAIL_PX) -> I
 
 def _drawn_between(backdrops: tuple[Backdrop, Backdrop], pairs: Floats) -> Image.Image:
     import numpy as np
-    from PIL import Image
+
+    with optional_import():
+        from PIL import Image
 
     side = THUMBNAIL_PX * _OVERSAMPLED // 2
     (left, left_scale), (right, right_scale) = (_canvas(backdrop, side) for backdrop in backdrops)
@@ -207,7 +210,8 @@ def _drawn_between(backdrops: tuple[Backdrop, Backdrop], pairs: Floats) -> Image
 
 def _canvas(backdrop: Backdrop, side: int) -> tuple[Image.Image, float]:
     """Return an image to be drawn upon, a little darker, and how many of its pixels are one of the image."""
-    from PIL import Image
+    with optional_import():
+        from PIL import Image
 
     array, picture = backdrop.image, _picture(backdrop, side)
     scale = side / max(array.shape[:2])
@@ -226,7 +230,8 @@ class _Pen:
     """Draws upon a canvas, and nothing that is far off: Pillow would visit each pixel of a line, wherever it is."""
 
     def __init__(self, canvas: Image.Image) -> None:
-        from PIL import ImageDraw
+        with optional_import():
+            from PIL import ImageDraw
 
         self._draw = ImageDraw.Draw(canvas)
         self._low = -_MARGIN * canvas.width, -_MARGIN * canvas.height

@@ -11,6 +11,7 @@ from epypes.display.previews.charts import MOST_LINES, MOST_POINTS
 from epypes.display.previews.kinds import kind_name
 from epypes.display.previews.raster import THUMBNAIL_PX, Picture, encode_small
 from epypes.display.previews.shown import Chart
+from epypes.optional import optional_import
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -53,7 +54,8 @@ def checked_picture(picture: Any, most_bytes: int) -> Picture:
 
 
 def _opened(data: bytes, file_format: str) -> Image.Image:
-    from PIL import Image, UnidentifiedImageError
+    with optional_import():
+        from PIL import Image, UnidentifiedImageError
 
     try:
         opened = Image.open(io.BytesIO(data), formats=[file_format])

@@ -17,6 +17,7 @@ from epypes.display.previews.imagekinds import image_kind, is_image, is_mask, on
 from epypes.display.previews.labels import label_picture
 from epypes.display.previews.looking import silent_numpy
 from epypes.display.previews.ranges import Range, display_range
+from epypes.optional import optional_import
 
 if TYPE_CHECKING:
     import numpy as np
@@ -126,7 +127,8 @@ def encode_small(picture: Image.Image, most_bytes: int = THUMBNAIL_BYTES, *, has
 
 def _attempts(picture: Image.Image) -> Iterator[tuple[Image.Image, int]]:
     """Yield pictures of ever fewer bytes, with the quality of their JPEG."""
-    from PIL import Image
+    with optional_import():
+        from PIL import Image
 
     sharp = Image.Resampling.NEAREST if picture.mode in ("1", "P") else Image.Resampling.BOX
     if picture.mode in ("L", "RGB"):
@@ -166,7 +168,8 @@ def _as_bytes(image: Array, ends: Range) -> npt.NDArray[np.uint8]:
 
 
 def _pillow(image: npt.NDArray[np.uint8], order: Order) -> Image.Image:
-    from PIL import Image
+    with optional_import():
+        from PIL import Image
 
     size = (image.shape[1], image.shape[0])
     if image.ndim == 2:
@@ -179,7 +182,8 @@ def _pillow(image: npt.NDArray[np.uint8], order: Order) -> Image.Image:
 def _resized(picture: Image.Image, max_side_px: int | None) -> Image.Image:
     if max_side_px is None or max(picture.size) <= max_side_px:
         return picture
-    from PIL import Image
+    with optional_import():
+        from PIL import Image
 
     scale = max_side_px / max(picture.size)
     size = (max(1, round(picture.width * scale)), max(1, round(picture.height * scale)))
@@ -188,7 +192,8 @@ def _resized(picture: Image.Image, max_side_px: int | None) -> Image.Image:
 
 def _mask_thumbnail(mask: Array, max_side_px: int) -> Image.Image:
     """Shrink to twice the size by maximum, and from there by mean: thin lines stay, and stay thinner than areas."""
-    from PIL import Image
+    with optional_import():
+        from PIL import Image
 
     doubled = _mask_picture(mask, 2 * max_side_px).convert("L")
     indices = _resized(doubled, max_side_px).point(_BRIGHTER)
@@ -203,7 +208,8 @@ def _is_thumbnail(image: Array, max_side_px: int | None) -> bool:
 
 
 def _mask_picture(mask: Array, max_side_px: int | None) -> Image.Image:
-    from PIL import Image
+    with optional_import():
+        from PIL import Image
 
     return Image.fromarray(_mask_bits(mask, max_side_px)).convert("1")
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 from urllib.parse import parse_qs, urlsplit
 
 from epypes.errors import DeployRefused, MessageError, NotComputed, ParametersRefused, RevisionConflict, ServiceError
+from epypes.optional import optional_import
 from epypes.service.parameters import Parameters
 
 if TYPE_CHECKING:
@@ -42,7 +43,8 @@ class Control:
     """
 
     def __init__(self, url: str, token: str, timeout_s: float) -> None:
-        import httpx
+        with optional_import():
+            import httpx
 
         self.url, self.timeout_s, self.has_token = url, timeout_s, bool(token)
         headers = {"Authorization": f"Bearer {token}"} if token else {}
@@ -79,7 +81,8 @@ class Control:
     @contextmanager
     def events(self) -> Iterator[Stream]:
         """Open the stream of what the service tells of by itself."""
-        import httpx
+        with optional_import():
+            import httpx
 
         timeout = httpx.Timeout(self.timeout_s, read=SILENCE_S)
         headers = {"Accept": "text/event-stream", "Cache-Control": "no-store"}
@@ -93,7 +96,8 @@ class Control:
             self._fail(error)
 
     def _answered(self, method: str, path: str, **request: Any) -> httpx.Response:
-        import httpx
+        with optional_import():
+            import httpx
 
         try:
             answer = self._client.request(method, path, **request)
@@ -108,7 +112,8 @@ class Control:
         return answer
 
     def _fail(self, error: Exception) -> NoReturn:
-        import httpx
+        with optional_import():
+            import httpx
 
         if isinstance(error, httpx.TimeoutException):
             text = f"The service at {self.url} did not answer in time ({self.timeout_s:g} s). Is it stopped, or busy?"
@@ -154,7 +159,8 @@ class Stream:
 
     def __iter__(self) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield the name of each event and what it says."""
-        from httpx_sse import EventSource, SSEError
+        with optional_import():
+            from httpx_sse import EventSource, SSEError
 
         try:
             for event in EventSource(self._answer).iter_sse():

@@ -29,8 +29,8 @@ _SPOKEN: Final[Mapping[str, tuple[str, str]]] = {
     "tls": ("jetstream", "nats"),
     "mqtt": ("mqtt", "mqtt"),
     "mqtts": ("mqtt", "mqtt"),
-    "tcp": ("zeromq", "service"),
-    "ipc": ("zeromq", "service"),
+    "tcp": ("zeromq", "serve"),
+    "ipc": ("zeromq", "serve"),
     "memory": ("memory", ""),
 }
 # Control characters, lone surrogates, and what Unicode says is no character: brokers alter such, or end the connection.

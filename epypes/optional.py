@@ -1,0 +1,89 @@
+"""Optional imports: a package that is not installed is named, with the extra that brings it.
+
+Every package that EPypes imports, besides what the command line stands on, is in `EXTRAS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Final
+
+from epypes.errors import MissingPackage
+
+# By imported module: the package, and the smallest extra that brings it and is whole.
+EXTRAS: Final[Mapping[str, tuple[str, str]]] = {
+    "IPython": ("ipython", "widgets"),
+    "PIL": ("pillow", "widgets"),
+    "anywidget": ("anywidget", "widgets"),
+    "cv2": ("opencv-python-headless", "vision"),
+    "dask": ("dask", "cluster"),
+    "distributed": ("distributed", "cluster"),
+    "fastapi": ("fastapi", "serve"),
+    "google": ("protobuf", "serve"),
+    "graphviz": ("graphviz", "graphviz"),
+    "httpx": ("httpx", "serve"),
+    "httpx_sse": ("httpx-sse", "serve"),
+    "ipywidgets": ("ipywidgets", "widgets"),
+    "junitparser": ("junitparser", "scale"),
+    "jupyter_client": ("jupyter-client", "service"),
+    "jupyter_server": ("jupyter-server", "notebook"),
+    "jupyterlab": ("jupyterlab", "notebook"),
+    "matplotlib": ("matplotlib", "vision"),
+    "mcap": ("mcap", "record"),
+    "nats": ("nats-py", "nats"),
+    "nbclient": ("nbclient", "service"),
+    "nbformat": ("nbformat", "service"),
+    "networkx": ("networkx", "widgets"),
+    "numpy": ("numpy", "widgets"),
+    "optuna": ("optuna", "scale"),
+    "packaging": ("packaging", "serve"),
+    "paho": ("paho-mqtt", "mqtt"),
+    "pandas": ("pandas", "scale"),
+    "pika": ("pika", "rabbitmq"),
+    "prometheus_client": ("prometheus-client", "serve"),
+    "psycopg": ("psycopg", "postgres"),
+    "pydantic": ("pydantic", "serve"),
+    "pydantic_core": ("pydantic-core", "serve"),
+    "pygraphviz": ("pygraphviz", "graphviz"),
+    "scipy": ("scipy", "scale"),
+    "skimage": ("scikit-image", "scale"),
+    "sqlalchemy": ("sqlalchemy", "store"),
+    "starlette": ("starlette", "serve"),
+    "tomlkit": ("tomlkit", "serve"),
+    "tqdm": ("tqdm", "scale"),
+    "traitlets": ("traitlets", "widgets"),
+    "uvicorn": ("uvicorn", "serve"),
+    "zmq": ("pyzmq", "serve"),
+}
+
+
+@contextmanager
+def optional_import(extra: str = "") -> Iterator[None]:
+    """Import packages of an extra inside this block; a missing one is named with the way out.
+
+    Parameters
+    ----------
+    extra
+        The extra to name, where it is not the smallest one that brings the package.
+
+    Raises
+    ------
+    MissingPackage
+        A package is not installed. What else fails while a module is imported is raised as it is.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        missing = missing_package(error, extra)
+        if missing is None or missing is error:
+            raise
+        raise missing from error
+
+
+def missing_package(error: ModuleNotFoundError, extra: str = "") -> MissingPackage | None:
+    """Return which package is missing; None if it is none that an extra brings."""
+    if isinstance(error, MissingPackage):
+        return MissingPackage(error.package, extra, error.name) if extra else error
+    package, usual = EXTRAS.get((error.name or "").partition(".")[0], ("", ""))
+    return MissingPackage(package, extra or usual, error.name) if package else None

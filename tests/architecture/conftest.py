@@ -1,0 +1,58 @@
+"""The wheel of this checkout, built once, and environments that have it with some extras."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+UV = [sys.executable, "-m", "uv"]
+
+
+class Environment:
+    """A virtual environment with EPypes and some of its extras, and a folder to run things in."""
+
+    def __init__(self, home: Path, wheel: Path, extras: str) -> None:
+        self.bin, self.folder = home / "venv" / "bin", home / "empty"
+        self.folder.mkdir()
+        named = f"epypes[{extras}]" if extras else "epypes"
+        subprocess.run([*UV, "venv", "--quiet", "--python", sys.executable, str(home / "venv")], check=True)
+        install = [*UV, "pip", "install", "--quiet", "--python", str(self.bin / "python")]
+        subprocess.run([*install, f"{named} @ {wheel.as_uri()}"], check=True)
+
+    def has(self, *modules: str) -> list[str]:
+        """Return which of these modules are installed."""
+        code = "import sys, importlib.util as u; print(*[name for name in sys.argv[1:] if u.find_spec(name)])"
+        return self.python(code, *modules).split()
+
+    def python(self, code: str, *arguments: str) -> str:
+        """Return what a script prints; a script that fails fails the test."""
+        # A file, since processes that are started by what it does import it again.
+        (self.folder / "script.py").write_text(code, encoding="utf-8")
+        done = self._run([str(self.bin / "python"), "script.py", *arguments])
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    def epypes(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Run a command of EPypes."""
+        return self._run([str(self.bin / "epypes"), *arguments])
+
+    def _run(self, command: list[str]) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(command, cwd=self.folder, capture_output=True, text=True, check=False, timeout=240)
+
+
+@pytest.fixture(scope="session")
+def wheel(tmp_path_factory):
+    out = tmp_path_factory.mktemp("wheel")
+    subprocess.run([*UV, "build", "--quiet", "--wheel", "--out-dir", str(out), str(ROOT)], check=True)
+    (found,) = out.glob("*.whl")
+    return found
+
+
+@pytest.fixture
+def environment(wheel, tmp_path_factory):
+    """Make an environment with the extras that are named, as ``"serve"`` or ``"widgets,vision"``."""
+    return lambda extras: Environment(tmp_path_factory.mktemp("environment"), wheel, extras)
