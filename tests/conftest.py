@@ -18,6 +18,7 @@ from epypes.cli import main
 from tests import hangs
 from tests.brokers.fixtures import broker, mosquitto, nats, rabbitmq
 from tests.brokers.nats import is_installed
+from tests.browser.conftest import theme_of
 
 __all__ = ["broker", "mosquitto", "nats", "rabbitmq"]
 
@@ -37,11 +38,11 @@ def pytest_configure(config):
 
 
 class _Scheduling(LoadFileScheduling):
-    """Tests of one file share what they begin with; those of the browser share JupyterLab, and never run side by side."""
+    """Tests of one file share what they begin with; those of the browser share JupyterLab, in two groups of files."""
 
     def _split_scope(self, nodeid):
         file = super()._split_scope(nodeid)
-        return "tests/browser" if file.startswith("tests/browser/") else file
+        return f"tests/browser, {theme_of(file)}" if file.startswith("tests/browser/") else file
 
 
 def pytest_xdist_make_scheduler(config, log):

@@ -1,10 +1,11 @@
-"""How readable is every text of a page, on what is really behind it?
+"""The contrast of every text of a page to what is really behind it.
 
 Measured as WCAG 2.2 does (relative luminance): 4.5 to 1 is what ordinary text must have.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -83,6 +84,13 @@ class Reading:
 def readings(page: Any, within: str) -> list[Reading]:
     """Return the contrast of every visible text within the elements that a selector finds; hidden tables are not seen."""
     return [Reading(text, ratio) for text, ratio in page.evaluate(_MEASURE, within)]
+
+
+def schemes(page: Any) -> Iterator[str]:
+    """Show a page that follows the system's colours in light ones, then in dark ones."""
+    for scheme in ("light", "dark"):
+        page.emulate_media(color_scheme=scheme)
+        yield scheme
 
 
 def unreadable(page: Any, within: str = ".epypes-sheet") -> list[Reading]:

@@ -1,10 +1,13 @@
-"""How is a notebook opened, run and looked at as a user does?
+"""JupyterLab and Chromium: notebooks are opened, run and read as a user does it.
 
 ::
 
     with JupyterLab(folder, theme="dark") as lab, chromium() as browser:
-        notebook = Notebook(browser, lab, "x.ipynb")
+        notebook = Notebook(open_lab(browser, lab), "x.ipynb")
         notebook.run_all()
+
+The page of JupyterLab costs some 6 s of processor time, and a notebook that is opened in it 1 s. So tests open their
+notebooks one after the other in one page.
 
 Everything stays on loopback, in directories of its own, and only processes started here are ended here.
 """
@@ -28,10 +31,13 @@ from types import TracebackType
 from typing import Any, Self
 
 THEMES = {"light": "JupyterLab Light", "dark": "JupyterLab Dark"}
-START_TIMEOUT_S = 90
-STOP_TIMEOUT_S = 10
+# Every wait ends on a condition; these only matter when a test fails.
+TIMEOUT_MS = 90_000
 CELLS_TIMEOUT_MS = 180_000
-_BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+START_TIMEOUT_S = 90
+STOP_TIMEOUT_S = 60
+# The shell takes a third of the processor time of the whole browser to open a page.
+_BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
 _FLAGS = [
     "--no-sandbox",
     "--disable-gpu",
@@ -41,10 +47,7 @@ _FLAGS = [
     "--disable-component-update",
     "--disable-sync",
 ]
-_KERNEL = "jupyterapp.shell.currentWidget?.sessionContext?.session?.kernel"
-_SCROLLED = "document.querySelector('.jp-Notebook .jp-WindowedPanel-outer')"
-# More than JupyterLab's own bars take above and below a notebook.
-_LAB_PX = 300
+_KERNEL = "window.jupyterapp?.shell.currentWidget?.sessionContext?.session?.kernel"
 
 
 class JupyterLab:
@@ -90,9 +93,10 @@ class JupyterLab:
     ) -> None:
         self.stop()
 
-    def url(self, notebook: str) -> str:
-        """Return the address of a notebook, in a workspace of its own."""
-        return f"http://127.0.0.1:{self.port}/lab/tree/{notebook}?token={self.token}&reset"
+    @property
+    def url(self) -> str:
+        """The address of JupyterLab with no notebook open."""
+        return f"http://127.0.0.1:{self.port}/lab?token={self.token}&reset"
 
     def stop(self) -> None:
         """End the kernels, then the server; kill its process group if it does not end by itself."""
@@ -133,7 +137,7 @@ class JupyterLab:
             self.log.append(line)
             if f":{self.port}/lab" in line:
                 self._listening.set()
-        self._listening.set()  # it has ended; whoever waits looks at the process
+        self._listening.set()  # the process has ended, which the caller sees
 
     def _write_settings(self) -> None:
         folder = self.state / "settings" / "@jupyterlab" / "apputils-extension"
@@ -177,24 +181,37 @@ class JupyterLab:
 
 
 class Notebook:
-    """A notebook in a page of JupyterLab, with the file browser folded away."""
+    """A notebook in a page of JupyterLab; one at a time is open in a page.
+
+    Parameters
+    ----------
+    page
+        A page of ``open_lab``.
+    name
+        Of a file in the folder of the server.
+    width, height
+        Of the window, in pixels.
+    """
 
     # The kernel of the notebook that is open, in JavaScript.
     KERNEL = _KERNEL
 
-    def __init__(
-        self, browser: Any, lab: JupyterLab, name: str, width: int = 1280, height: int = 900, script: str = ""
-    ) -> None:
-        self.page = browser.new_context(viewport={"width": width, "height": height}).new_page()
-        if script:
-            self.page.add_init_script(script)
+    def __init__(self, page: Any, name: str, width: int = 1280, height: int = 900) -> None:
+        self.page, self.name = page, name
         self.page_errors: list[str] = []
-        self.page.on("pageerror", lambda error: self.page_errors.append(str(error)))
-        self.page.goto(lab.url(name))
-        self.page.wait_for_selector(".jp-Notebook .jp-Cell", timeout=CELLS_TIMEOUT_MS)
+        self.page.on("pageerror", self._keep_error)
+        self.page.set_viewport_size({"width": width, "height": height})
+        self._close_all()
+        self.page.evaluate(
+            """async path => {
+                const widget = await jupyterapp.commands.execute('docmanager:open', { path, factory: 'Notebook' });
+                await widget.context.ready;
+                await widget.revealed;
+            }""",
+            name,
+        )
+        self.page.wait_for_selector(".jp-Notebook .jp-Cell")
         self.wait_idle()
-        self.page.evaluate("() => jupyterapp.commands.execute('application:toggle-left-area')")
-        self.page.wait_for_selector("#jp-left-stack", state="hidden")
 
     def wait_idle(self) -> None:
         """Return when the kernel has nothing to do."""
@@ -204,6 +221,10 @@ class Notebook:
         """Run every cell; AssertionError with the traceback if one failed."""
         self.page.evaluate("() => jupyterapp.commands.execute('notebook:run-all-cells')")
         self.wait_idle()
+        self.check_outputs()
+
+    def check_outputs(self) -> None:
+        """Raise AssertionError with the traceback if a cell has failed."""
         failed = self.page.evaluate(
             """() => jupyterapp.shell.currentWidget.content.widgets
                 .flatMap(cell => cell.model.outputs?.toJSON() ?? [])
@@ -266,26 +287,75 @@ class Notebook:
         )
         return times
 
-    def screenshot(self, path: Path) -> None:
-        """Save the whole notebook: the window is made so high that all of it is rendered, then cut to it."""
-        size = self.page.viewport_size
+    def render_all(self) -> None:
+        """Scroll through the notebook: JupyterLab renders what comes into view."""
         for cell in self.page.locator(".jp-Notebook .jp-Cell").all():
-            cell.scroll_into_view_if_needed()  # JupyterLab renders what comes into view
-        high = self.page.evaluate(f"() => {_SCROLLED}.scrollHeight") + _LAB_PX
-        self.page.set_viewport_size({**size, "height": high})
-        self.page.evaluate(f"() => {{ document.activeElement?.blur(); {_SCROLLED}.scrollTop = 0; }}")
-        end = self.page.evaluate(
-            "() => Math.max(...[...document.querySelectorAll('.jp-Notebook .jp-Cell')]"
-            ".map(cell => cell.getBoundingClientRect().bottom))"
-        )
-        path.parent.mkdir(parents=True, exist_ok=True)
-        clip = {"x": 0, "y": 0, "width": size["width"], "height": min(high, round(end) + 24)}
-        self.page.screenshot(path=path, clip=clip)
-        self.page.set_viewport_size(size)
+            cell.scroll_into_view_if_needed()
+
+    def each_theme(self) -> Iterator[str]:
+        """Show JupyterLab in its light and in its dark theme, as its menu does; at the end in the one it had."""
+        before = self.page.evaluate("() => document.body.dataset.jpThemeName")
+        for theme in THEMES:
+            self._set_theme(THEMES[theme])
+            yield theme
+        self._set_theme(before)
 
     def close(self) -> None:
-        """Close the page."""
-        self.page.context.close()
+        """End the kernel and close the notebook; what was not saved is lost."""
+        self._close_all()
+        self.page.remove_listener("pageerror", self._keep_error)
+
+    def _close_all(self) -> None:
+        self.page.evaluate(
+            """async () => {
+                for (const widget of [...jupyterapp.shell.widgets('main')].filter(each => each.sessionContext)) {
+                    await widget.sessionContext.shutdown();
+                    widget.dispose();
+                }
+            }"""
+        )
+        self.page.wait_for_function("() => !document.querySelector('.jp-Notebook')")
+
+    def _set_theme(self, name: str) -> None:
+        self.page.evaluate("theme => jupyterapp.commands.execute('apputils:change-theme', { theme })", name)
+        self.page.wait_for_function("theme => document.body.dataset.jpThemeName === theme", arg=name)
+
+    def _keep_error(self, error: Any) -> None:
+        self.page_errors.append(str(error))
+
+
+def write_notebook(path: Path, *cells: str) -> None:
+    """Write a notebook with these cells of code, which names its kernel: JupyterLab would ask for one."""
+    import nbformat  # takes seconds
+
+    code = [nbformat.v4.new_code_cell(cell) for cell in cells]
+    metadata = {"kernelspec": {"name": "python3", "display_name": "Python 3"}}
+    nbformat.write(nbformat.v4.new_notebook(cells=code, metadata=metadata), path)
+
+
+def open_page(browser: Any, **options: Any) -> Any:
+    """Open a page in a context of its own, with the time-out of all waits and no transitions of colours.
+
+    Close it with ``page.context.close()``.
+    """
+    context = browser.new_context(reduced_motion="reduce", **options)
+    context.set_default_timeout(TIMEOUT_MS)
+    return context.new_page()
+
+
+def open_lab(browser: Any, lab: JupyterLab) -> Any:
+    """Open JupyterLab in a page, with the file browser folded away."""
+    page = open_page(browser)
+    page.goto(lab.url)
+    wait_for_lab(page)
+    page.evaluate("() => jupyterapp.commands.execute('application:toggle-left-area')")
+    page.wait_for_selector("#jp-left-stack", state="hidden")
+    return page
+
+
+def wait_for_lab(page: Any) -> None:
+    """Return when JupyterLab takes commands."""
+    page.wait_for_function("() => window.jupyterapp?.restored.then(() => true)")
 
 
 def browser_path() -> str:
@@ -293,7 +363,8 @@ def browser_path() -> str:
     path = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, _BROWSERS)), None)
     if path is None:
         raise RuntimeError(
-            "No Chromium was found. Install one (apt install chromium), or name it: CHROMIUM=/path/to/chromium."
+            "No Chromium was found. Install one (apt install chromium-headless-shell, or chromium), or name it: "
+            "CHROMIUM=/path/to/chromium."
         )
     return path
 

@@ -1,4 +1,4 @@
-"""How is a panel in JupyterLab moved and read by a test?"""
+"""A panel in JupyterLab, as tests move and read it."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import json
 from typing import Any
 
 from tests.browser.jupyter import Notebook
-
-TIMEOUT_MS = 20_000
 
 DIGEST = """async () => {
     const bytes = await (await fetch(document.querySelector('img.epypes-picture').src)).arrayBuffer();
@@ -21,9 +19,7 @@ class PanelOnScreen:
 
     def __init__(self, notebook: Notebook) -> None:
         self.notebook, self.page = notebook, notebook.page
-        self.page.wait_for_function(
-            "() => document.querySelector('img.epypes-picture')?.dataset.seq", timeout=TIMEOUT_MS
-        )
+        self.page.wait_for_function("() => document.querySelector('img.epypes-picture')?.dataset.seq")
 
     @property
     def seq(self) -> int:
@@ -55,7 +51,6 @@ class PanelOnScreen:
             "([name, value]) => JSON.parse("
             "document.querySelector('img.epypes-picture').dataset.values)[name] === value",
             arg=[name, value],
-            timeout=TIMEOUT_MS,
         )
 
     def row(self, name: str) -> Any:
@@ -85,7 +80,7 @@ class PanelOnScreen:
 
     def wait(self, condition: str, argument: Any = None) -> None:
         """Return when a condition in JavaScript holds."""
-        self.page.wait_for_function(condition, arg=argument, timeout=TIMEOUT_MS)
+        self.page.wait_for_function(condition, arg=argument)
 
     @property
     def history(self) -> int:
@@ -100,7 +95,7 @@ class PanelOnScreen:
 
     def settle(self) -> None:
         """Return when everything is computed, committed and on the screen; the panel is called that in the kernel."""
-        seq = int(self.notebook.execute("panel.wait(10); print(panel._screen.view.frames.newest.seq)"))
+        seq = int(self.notebook.execute("panel.wait(60); print(panel._screen.view.frames.newest.seq)"))
         self.wait("seq => document.querySelector('img.epypes-picture').dataset.seq >= seq", seq)
 
     def wait_for_status(self, text: str) -> None:
@@ -109,7 +104,6 @@ class PanelOnScreen:
             "text => { const said = document.querySelector('.epypes-status').textContent;"
             " return text ? said.includes(text) : said === ''; }",
             arg=text,
-            timeout=TIMEOUT_MS,
         )
 
     def choose(self, token: str) -> None:
@@ -118,7 +112,6 @@ class PanelOnScreen:
         self.page.wait_for_function(
             "token => document.querySelector('img.epypes-picture').alt.startsWith(token + ' ')",
             arg=token,
-            timeout=TIMEOUT_MS,
         )
 
     def _read(self, key: str) -> str:

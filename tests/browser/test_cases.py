@@ -1,4 +1,4 @@
-"""Do the test images of a panel in JupyterLab say whether they pass?"""
+"""The test images of a panel in JupyterLab say whether they pass."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ from typing import Any
 
 import pytest
 
-from tests.browser.conftest import SCREENSHOTS
 from tests.browser.contrast import unreadable
-from tests.browser.jupyter import JupyterLab, Notebook
+from tests.browser.jupyter import JupyterLab, Notebook, wait_for_lab, write_notebook
 from tests.browser.panel import PanelOnScreen
-from tests.browser.test_panel import written
 
 pytestmark = pytest.mark.browser
 
@@ -43,9 +41,9 @@ STATES = """() => [...document.querySelectorAll('.epypes-filmstrip .epypes-verdi
 
 
 @pytest.fixture(scope="module")
-def notebook(browser: Any, lab: JupyterLab) -> Iterator[Notebook]:
-    written(lab.root, "cases.ipynb", SET_UP.strip(), SHOW.strip())
-    notebook = Notebook(browser, lab, "cases.ipynb", height=1100)
+def notebook(lab_page: Any, lab: JupyterLab) -> Iterator[Notebook]:
+    write_notebook(lab.root / "cases.ipynb", SET_UP.strip(), SHOW.strip())
+    notebook = Notebook(lab_page, "cases.ipynb", height=1100)
     notebook.run_all()
     yield notebook
     notebook.close()
@@ -55,7 +53,7 @@ def notebook(browser: Any, lab: JupyterLab) -> Iterator[Notebook]:
 def panel(notebook: Notebook) -> PanelOnScreen:
     """The panel at its first values, with all cases checked."""
     panel = PanelOnScreen(notebook)
-    assert notebook.execute("panel.reset(); checked = panel.check(20)") == ""
+    assert notebook.execute("panel.reset(); checked = panel.check(60)") == ""
     panel.wait_for("threshold", 100)
     wait_for_states(panel, "passed", "failed", "failed")
     return panel
@@ -65,14 +63,14 @@ def wait_for_states(panel: PanelOnScreen, *states: str) -> None:
     panel.wait(f"wanted => JSON.stringify(({STATES})()) === JSON.stringify(wanted)", list(states))
 
 
-def test_every_test_image_says_whether_it_passes_and_why_not(panel: PanelOnScreen, theme: str) -> None:
+def test_every_test_image_says_whether_it_passes_and_why_not(notebook: Notebook, panel: PanelOnScreen) -> None:
     films = panel.page.locator(".epypes-filmstrip button")
     assert films.locator(".epypes-verdict").all_inner_texts() == ["✓ pass", "✗ fail", "✗ fail"]
     assert films.nth(0).get_attribute("aria-label") == "coins: passed, 1 check passed"
     assert "camera: failed, iou of above: 0." in films.nth(1).get_attribute("title")
     assert panel.page.locator(".epypes-tally").inner_text() == "1 of 3 cases pass"
-    panel.page.locator(".epypes-panel").screenshot(path=SCREENSHOTS / f"panel-cases-{theme}.png")
-    assert unreadable(panel.page, ".epypes-panel") == []
+    for colours in notebook.each_theme():
+        assert unreadable(panel.page, ".epypes-panel") == [], colours
 
 
 def test_verdicts_stay_while_the_hand_drags_and_follow_when_it_lets_go(panel: PanelOnScreen) -> None:
@@ -96,6 +94,7 @@ def test_a_click_on_a_case_that_fails_shows_it(notebook: Notebook, panel: PanelO
 
 def test_a_page_that_is_loaded_anew_has_the_verdicts(notebook: Notebook, panel: PanelOnScreen) -> None:
     panel.page.reload()
+    wait_for_lab(panel.page)
     panel.page.wait_for_selector(".jp-Notebook .jp-Cell")
     notebook.wait_idle()
     notebook.run_all()

@@ -1,4 +1,4 @@
-"""Can pictures be explored and read, on every kind of page they are shown on, in a real browser?"""
+"""Figures can be explored and read, on every kind of page that shows them, in a real browser."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from epypes.display import mimebundle, to_svg, view
 from epypes.display.paint.page import paint_figure, paint_graph, paint_page
 from epypes.display.paint.svg import paint_svg
 from tests.browser.contrast import ENOUGH, readings, unreadable
-from tests.browser.jupyter import Notebook
+from tests.browser.jupyter import open_page
 from tests.conftest import EDGE_FUNCTIONS, EDGE_HPARAMS, EDGE_IO
 
 pytestmark = pytest.mark.browser
@@ -100,12 +100,11 @@ class Sheet:
 @pytest.fixture
 def sheet(browser: Any) -> Iterator[Sheet]:
     """An empty page; whatever script of it fails, and whatever asks, fails the test."""
-    context = browser.new_context(viewport={"width": 1200, "height": 800}, reduced_motion="reduce")
-    page, wrong = context.new_page(), []
+    page, wrong = open_page(browser, viewport={"width": 1200, "height": 800}), []
     page.on("pageerror", lambda error: wrong.append(str(error)))
     page.on("dialog", lambda dialog: (wrong.append(dialog.message), dialog.dismiss()))
     yield Sheet(page)
-    context.close()
+    page.context.close()
     assert not wrong
 
 
@@ -550,14 +549,14 @@ def test_states_are_told_apart_without_colour(sheet: Sheet, states: str) -> None
 # -- where notebooks are read -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("colours", ["light", "dark"])
 def test_a_notebook_that_was_converted_to_html_can_be_explored_and_read(
-    sheet: Sheet, photo: np.ndarray, tmp_path: Path, theme: str
+    sheet: Sheet, photo: np.ndarray, tmp_path: Path, colours: str
 ) -> None:
     bundle = mimebundle(edge_runner().run(image=photo))
     output = nbformat.v4.new_output("display_data", dict(bundle))
     cell = nbformat.v4.new_code_cell("run", outputs=[output], execution_count=1)
-    html, _ = HTMLExporter(theme=theme).from_notebook_node(nbformat.v4.new_notebook(cells=[cell]))
+    html, _ = HTMLExporter(theme=colours).from_notebook_node(nbformat.v4.new_notebook(cells=[cell]))
     path = tmp_path / "notebook.html"
     path.write_text(html)
     sheet.page.route(re.compile("^https?://"), lambda route: route.abort())
@@ -568,24 +567,3 @@ def test_a_notebook_that_was_converted_to_html_can_be_explored_and_read(
     sheet.page.click("#function-blur")
     assert "def blur" in sheet.about
     assert unreadable(sheet.page) == []
-
-
-def test_in_jupyterlab_pictures_are_explored_and_read_and_its_shortcuts_stay_out(notebook: Notebook) -> None:
-    sheet = Sheet(notebook.page)
-    figure = notebook.page.locator("figure:has(#token-edges image)").first
-    figure.scroll_into_view_if_needed()
-    figure.locator("#token-edges").hover()
-    assert sheet.card[0] == "token edges"
-    cells = notebook.page.evaluate("jupyterapp.shell.currentWidget.content.model.cells.length")
-    figure.locator("#function-canny").click()
-    figure.locator("#function-canny").focus()
-    for key in ("d", "d", "b", "x"):
-        notebook.page.keyboard.press(key)
-    assert notebook.page.evaluate("jupyterapp.shell.currentWidget.content.model.cells.length") == cells
-    assert figure.locator(".epypes-about").inner_text().startswith("function canny")
-    for place in range(notebook.page.locator(".epypes-sheet").count()):
-        notebook.page.locator(".epypes-sheet").nth(place).evaluate(f"each => each.id = 'sheet-{place}'")
-        assert unreadable(notebook.page, f"#sheet-{place}") == []
-    notebook.page.keyboard.press("Escape")
-    assert figure.locator(".epypes-about").inner_text() == ""
-    assert not notebook.page_errors

@@ -1,4 +1,4 @@
-"""Is a setting picked in JupyterLab with the mouse and with the keyboard, and does the panel follow?"""
+"""A setting is picked in JupyterLab with the mouse and with the keyboard, and the panel follows."""
 
 from __future__ import annotations
 
@@ -6,15 +6,12 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
-import nbformat
 import pytest
 
-from tests.browser.conftest import SCREENSHOTS
-from tests.browser.jupyter import JupyterLab, Notebook
+from tests.browser.jupyter import JupyterLab, Notebook, write_notebook
 
 pytestmark = pytest.mark.browser
 
-TIMEOUT_MS = 20_000
 _CELLS = (
     """import cv2
 import epypes as ep
@@ -50,26 +47,23 @@ None""",
 
 
 @pytest.fixture(scope="module")
-def notebook(browser: Any, lab: JupyterLab) -> Iterator[Notebook]:
-    written = nbformat.v4.new_notebook()
-    written.cells = [nbformat.v4.new_code_cell(cell) for cell in _CELLS]
-    written.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
-    nbformat.write(written, lab.root / "pick.ipynb")
-    notebook = Notebook(browser, lab, "pick.ipynb", height=1800)
+def notebook(lab_page: Any, lab: JupyterLab) -> Iterator[Notebook]:
+    write_notebook(lab.root / "pick.ipynb", *_CELLS)
+    notebook = Notebook(lab_page, "pick.ipynb", height=1800)
     notebook.run_all()
-    notebook.page.wait_for_selector(".epypes-picker-tile img", timeout=TIMEOUT_MS)
+    notebook.page.wait_for_selector(".epypes-picker-tile img")
     yield notebook
     notebook.close()
 
 
 def hyperparameters(notebook: Notebook) -> dict[str, Any]:
-    printed = notebook.execute("import json; picker.wait(10); print(json.dumps(dict(runner.hyperparameters)))")
+    printed = notebook.execute("import json; picker.wait(60); print(json.dumps(dict(runner.hyperparameters)))")
     found: dict[str, Any] = json.loads(printed)
     return found
 
 
 def wait_for_chosen(notebook: Notebook, place: int) -> None:
-    notebook.page.wait_for_selector(f".epypes-picker-tile[data-place='{place}'][aria-pressed=true]", timeout=TIMEOUT_MS)
+    notebook.page.wait_for_selector(f".epypes-picker-tile[data-place='{place}'][aria-pressed=true]")
     assert notebook.page.locator(".epypes-picker-tile[aria-pressed=true]").count() == 1
 
 
@@ -80,11 +74,10 @@ def wait_for_panel(notebook: Notebook, **values: Any) -> None:
             return Object.entries(wanted).every(([name, value]) => shown[name] === value);
         }""",
         arg=values,
-        timeout=TIMEOUT_MS,
     )
 
 
-def test_the_sheet_has_a_tile_a_setting_and_marks_the_present_one(notebook: Notebook, theme: str) -> None:
+def test_the_sheet_has_a_tile_a_setting_and_marks_the_present_one(notebook: Notebook) -> None:
     page = notebook.page
     assert page.locator(".epypes-picker-tile").count() == 6
     assert page.locator(".epypes-picker-failed").count() == 1
@@ -92,7 +85,6 @@ def test_the_sheet_has_a_tile_a_setting_and_marks_the_present_one(notebook: Note
     # The static sheet is for a notebook without a kernel.
     assert page.locator(".epypes-contact").count() == 2
     assert page.locator(".epypes-contact:visible").count() == 1
-    notebook.screenshot(SCREENSHOTS / f"pick-{theme}.png")
 
 
 def test_a_click_sets_the_runner_and_the_panel_follows(notebook: Notebook) -> None:
@@ -119,23 +111,20 @@ def test_a_setting_that_fails_is_said_and_not_set(notebook: Notebook) -> None:
     notebook.page.locator(".epypes-picker-failed").click()
     notebook.page.wait_for_function(
         "() => document.querySelector('.epypes-picker-status').textContent.includes('canny_lo is 140')",
-        timeout=TIMEOUT_MS,
     )
     assert hyperparameters(notebook)["canny_lo"] == 30
     wait_for_chosen(notebook, 0)
 
 
 def test_the_mark_follows_the_hand_on_the_panel(notebook: Notebook) -> None:
-    notebook.execute("panel['canny_lo'] = 70; panel.wait(10)")
+    notebook.execute("panel['canny_lo'] = 70; panel.wait(60)")
     wait_for_chosen(notebook, 2)
 
 
 def test_another_token_is_shown(notebook: Notebook) -> None:
     page = notebook.page
     page.locator(".epypes-picker select").select_option("image_blurred")
-    page.wait_for_function(
-        "() => document.querySelector('.epypes-picker-tile').title.includes('uint8 400 x 600')", timeout=TIMEOUT_MS
-    )
+    page.wait_for_function("() => document.querySelector('.epypes-picker-tile').title.includes('uint8 400 x 600')")
     images = "() => new Set([...document.querySelectorAll('.epypes-picker-tile img')].map(one => one.src)).size"
-    page.wait_for_function(f"() => ({images})() === 1", timeout=TIMEOUT_MS)
+    page.wait_for_function(f"() => ({images})() === 1")
     assert not notebook.page_errors

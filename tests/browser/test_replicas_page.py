@@ -1,4 +1,4 @@
-"""Does the live page of one replica show them all?"""
+"""The live page of one replica shows them all."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import pytest
 
 from epypes.service import Service
 from epypes.service.http import HttpServer
-from tests.browser.conftest import SCREENSHOTS
-from tests.browser.contrast import unreadable
+from tests.browser.contrast import schemes, unreadable
+from tests.browser.jupyter import open_page
 from tests.service.served import acting_bundle, until
 from tests.service.test_brokered import line_of
 
@@ -37,10 +37,9 @@ def rows(page):
     return [row.inner_text().split("\t") for row in page.locator("#replicas tbody tr").all()]
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_the_page_shows_the_replicas_when_there_is_more_than_one(browser, replicas, scheme):
+def test_the_page_shows_the_replicas_when_there_is_more_than_one(browser, replicas):
     line, first, second = replicas
-    page = browser.new_page(viewport={"width": 1400, "height": 1000}, color_scheme=scheme)
+    page = open_page(browser, viewport={"width": 1400, "height": 1000})
     try:
         errors = []
         page.on("pageerror", lambda error: errors.append(str(error)))
@@ -58,22 +57,20 @@ def test_the_page_shows_the_replicas_when_there_is_more_than_one(browser, replic
             assert page.locator("#replicas tbody a").get_attribute("href") == second.http
             answered = sum(replica.counts()["answered"] for replica in (first, second))
             page.wait_for_selector(f"#replicas-note:has-text('answered {answered} events')")
-            assert unreadable(page, "#replicas-section") == []
-            SCREENSHOTS.mkdir(parents=True, exist_ok=True)
-            page.locator("#replicas-section").screenshot(path=SCREENSHOTS / f"replicas-{scheme}.png")
+            for scheme in schemes(page):
+                assert unreadable(page, "#replicas-section") == [], scheme
             second.pause()
             page.wait_for_selector("#replicas tbody tr:nth-child(2) .badge.warn:has-text('PAUSED')")
             second.resume()
         page.wait_for_selector("#replicas-section", state="hidden")
         assert errors == []
     finally:
-        page.close()
+        page.context.close()
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_the_page_shows_who_has_gone_without_a_word(browser, replicas, scheme, monkeypatch):
+def test_the_page_shows_who_has_gone_without_a_word(browser, replicas, monkeypatch):
     _, first, second = replicas
-    page = browser.new_page(viewport={"width": 1400, "height": 1000}, color_scheme=scheme)
+    page = open_page(browser, viewport={"width": 1400, "height": 1000})
     try:
         page.goto(first.http)
         with second:
@@ -84,7 +81,7 @@ def test_the_page_shows_who_has_gone_without_a_word(browser, replicas, scheme, m
         page.wait_for_selector("#replicas tbody tr:nth-child(2) .badge.error:has-text('LOST')")
         assert "ago, and has not said that it ends; its counts are of then" in rows(page)[1][1]
         assert page.locator("#replicas tbody a").count() == 0, "nobody answers there"
-        assert unreadable(page, "#replicas-section") == []
-        page.locator("#replicas-section").screenshot(path=SCREENSHOTS / f"replicas-lost-{scheme}.png")
+        for scheme in schemes(page):
+            assert unreadable(page, "#replicas-section") == [], scheme
     finally:
-        page.close()
+        page.context.close()

@@ -1,4 +1,4 @@
-"""Does the live page of a service show what happens, and do what it is asked?"""
+"""The live page of a service shows what happens, and does what the user asks for."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from epypes.bundle.seal import seal
 from epypes.service import Service
 from epypes.service.http import HttpServer
 from epypes.wire import Envelope
-from tests.browser.conftest import SCREENSHOTS
-from tests.browser.contrast import unreadable
+from tests.browser.contrast import schemes, unreadable
+from tests.browser.jupyter import open_page
 from tests.conftest import EDGE_HPARAMS
 from tests.service.bundles import written_bundle
 from tests.service.served import peer_of
@@ -108,10 +108,9 @@ def served(bundle, photograph, home):
 
 
 @contextmanager
-def page_of(browser, http, theme="light", width=1400, token=True):
+def page_of(browser, http, width=1400, token=True):
     """Open the page; whatever it complains of is a failure of the test."""
-    context = browser.new_context(viewport={"width": width, "height": 1000}, color_scheme=theme)
-    page = context.new_page()
+    page = open_page(browser, viewport={"width": width, "height": 1000})
     said = []
     page.on("pageerror", lambda error: said.append(str(error)))
     page.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
@@ -119,7 +118,7 @@ def page_of(browser, http, theme="light", width=1400, token=True):
     page.wait_for_selector("#graph svg")
     page.complaints = said
     yield page
-    context.close()
+    page.context.close()
 
 
 def change(http, **values):
@@ -133,11 +132,11 @@ def state_is(page, state):
     page.wait_for_function("state => document.getElementById('state').textContent === state", arg=state)
 
 
-def test_the_page_shows_the_running_service(browser, served, theme):
+def test_the_page_shows_the_running_service(browser, served):
     _, http, _ = served
-    with page_of(browser, http, theme) as page:
+    with page_of(browser, http) as page:
         state_is(page, "READY")
-        page.wait_for_function("() => parseFloat(document.getElementById('rate').textContent) > 1", timeout=20_000)
+        page.wait_for_function("() => parseFloat(document.getElementById('rate').textContent) > 1")
         page.wait_for_function("() => /ms|µs/.test(document.getElementById('p95').textContent)")
         assert page.locator("#name").text_content() == "edges"
         assert page.locator("#graph [id^=token-]").count() == 7
@@ -145,8 +144,8 @@ def test_the_page_shows_the_running_service(browser, served, theme):
         assert page.locator("#counts dd").first.text_content() != "0"
         assert "token=" not in page.url
         assert http.failures in page.locator("#facts").text_content()
-        page.screenshot(path=SCREENSHOTS / f"service-{theme}.png", full_page=True)
-        assert not unreadable(page, "body")
+        for scheme in schemes(page):
+            assert not unreadable(page, "body"), scheme
         assert not page.complaints
 
 
@@ -156,7 +155,6 @@ def test_a_narrow_page_needs_no_scrolling_sideways(browser, served):
     with page_of(browser, http, width=400) as page:
         page.wait_for_selector("#failures tbody tr")
         assert page.evaluate("() => document.documentElement.scrollWidth") <= 400
-        page.screenshot(path=SCREENSHOTS / "service-narrow.png", full_page=True)
 
 
 def test_the_picture_follows_the_runs_without_flicker(browser, served):
@@ -244,10 +242,10 @@ def test_a_number_that_is_whole_and_may_have_a_fraction_is_given_one(browser, bu
             assert page.locator("#parameter-canny_hi").get_attribute("step") == "any"
 
 
-def test_what_somebody_else_changed_is_shown_and_not_overwritten(browser, served, theme):
+def test_what_somebody_else_changed_is_shown_and_not_overwritten(browser, served):
     service, http, _ = served
     change(http, canny_lo=70, canny_hi=200)
-    with page_of(browser, http, theme) as page:
+    with page_of(browser, http) as page:
         page.wait_for_selector("#parameter-canny_lo")
         # What is told of a change arrives after this one was asked for.
         page.route("**/v1/parameters", lambda route: (change(http, canny_lo=33, canny_hi=150), route.continue_()))
@@ -262,15 +260,14 @@ def test_what_somebody_else_changed_is_shown_and_not_overwritten(browser, served
         assert page.locator("#parameter-canny_lo").input_value() == "90"
         assert page.locator("#parameter-canny_hi").input_value() == "150"
         assert "33 in the service" in page.locator("#parameter-canny_lo-note").text_content()
-        page.screenshot(path=SCREENSHOTS / f"service-conflict-{theme}.png", full_page=True)
         page.locator("#apply").click()
         page.wait_for_function("() => document.querySelectorAll('.field.changed').length === 0")
         assert service.parameters().entries["canny_lo"]["value"] == 90
 
 
-def test_a_failure_is_listed_with_what_opens_it_again(browser, served, theme):
+def test_a_failure_is_listed_with_what_opens_it_again(browser, served):
     _, http, line = served
-    with page_of(browser, http, theme) as page:
+    with page_of(browser, http) as page:
         rows = page.locator("#failures tbody tr").count()
         line.fail()
         page.wait_for_function("rows => document.querySelectorAll('#failures tbody tr').length > rows", arg=rows)
@@ -279,15 +276,14 @@ def test_a_failure_is_listed_with_what_opens_it_again(browser, served, theme):
         assert f"epypes replay {name} {http.url}" in row.text_content()
         assert f'ep.load_failure("{name}", "{http.url}")' in row.text_content()
         assert "grayscale" in row.text_content()
-        page.screenshot(path=SCREENSHOTS / f"service-failing-{theme}.png", full_page=True)
         page.context.grant_permissions(["clipboard-read", "clipboard-write"])
         row.locator("th a").click()
         page.wait_for_selector("#ask[open] pre")
         assert "in grayscale" in page.locator("#ask-title").text_content()
         assert "cvtColor" in page.locator("#ask pre").text_content()
         assert "canny_lo = " in page.locator("#ask .record").text_content()
-        page.screenshot(path=SCREENSHOTS / f"service-failure-{theme}.png")
-        assert not unreadable(page, "#ask")
+        for scheme in schemes(page):
+            assert not unreadable(page, "#ask"), scheme
         page.locator("#ask-no").click()
         row.locator("button").first.click()
         assert page.evaluate("() => navigator.clipboard.readText()") == f"epypes replay {name} {http.url}"
@@ -319,30 +315,27 @@ def test_values_are_written_back_after_their_difference_was_seen(browser, bundle
         change(http, canny_lo=64)
         with page_of(browser, http) as page:
             page.locator("#write-back:enabled").click()
-            page.wait_for_selector("#ask[open]", timeout=60_000)
+            page.wait_for_selector("#ask[open]")
             assert "+value = 64" in page.locator("#ask pre").text_content()
-            page.screenshot(path=SCREENSHOTS / "service-write-back.png")
             page.locator("#ask-yes").click()
-            page.wait_for_selector("#parameters-note:not([hidden])", timeout=60_000)
+            page.wait_for_selector("#parameters-note:not([hidden])")
             assert "Written" in page.locator("#parameters-note").text_content()
     assert "value = 64" in (folder / "pipeline.toml").read_text()
 
 
-def test_a_service_that_is_faulted_says_why_and_one_that_is_gone_is_asked_again(browser, bundle, home, tmp_path, theme):
+def test_a_service_that_is_faulted_says_why_and_one_that_is_gone_is_asked_again(browser, bundle, home, tmp_path):
     folder = shutil.copytree(bundle, tmp_path / "wrong")
     text = (folder / "pipeline.toml").read_text()
     (folder / "pipeline.toml").write_text(text.replace("value = 200", "value = 20"))
     seal(folder)
-    context = browser.new_context(viewport={"width": 1400, "height": 700}, color_scheme=theme)
-    page = context.new_page()
+    page = open_page(browser, viewport={"width": 1400, "height": 700})
     with Service(folder) as service, HttpServer(service, "127.0.0.1:*") as http:
         page.goto(http.url)
         state_is(page, "FAULTED")
         assert "edges" in page.locator("#reason").text_content()
-        page.screenshot(path=SCREENSHOTS / f"service-faulted-{theme}.png", full_page=True)
     page.wait_for_selector("#notice:not([hidden])")
     assert "can't be reached" in page.locator("#notice").text_content()
     with Service(bundle) as service, HttpServer(service, http.url):
         state_is(page, "READY")
         page.wait_for_selector("#notice", state="hidden")
-    context.close()
+    page.context.close()

@@ -1,4 +1,4 @@
-"""Have all tiles of a contact sheet one size, whatever their pictures are?"""
+"""All tiles of a contact sheet have one size, whatever their pictures are."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
+from tests.browser.jupyter import open_page
 
 pytestmark = pytest.mark.browser
 
@@ -23,9 +24,9 @@ def test_pictures_of_all_shapes_fill_squares_of_one_size(browser: Any) -> None:
     cg = ep.CompGraph({"over": over}, {"over": (("image", "threshold"), "bright")})
     runner = ep.CompGraphRunner(cg, {"threshold": 0})
     sheet = ep.sweep(runner, {"threshold": [0, 254]}, images).sheet("bright", columns="threshold")
-    page = browser.new_page()
+    page = open_page(browser)
     page.set_content(sheet._repr_mimebundle_()["text/html"])
     boxes = "query => [...document.querySelectorAll(query)].map(one => [one.offsetWidth, one.offsetHeight])"
     assert page.evaluate(boxes, ".epypes-contact img") == [[128, 128]] * 8
     assert {tuple(box) for box in page.evaluate(boxes, ".epypes-contact .cell")} == {(136, 136)}
-    page.close()
+    page.context.close()

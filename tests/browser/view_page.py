@@ -1,8 +1,9 @@
-"""How is the view driven without a kernel?
+"""The view of a panel in a page, driven without a kernel.
 
 ::
 
-    view = ViewPage(browser, theme="dark")
+    view = ViewPage(browser)
+    view.open(theme="dark")
     view.click(".epypes-chip[data-token=gray]")
     view.until("kernel.kinds('stage').length === 1")
 
@@ -20,11 +21,11 @@ import cv2
 from skimage import data
 
 from epypes_widgets.view.script import joined, styles
+from tests.browser.jupyter import open_page
 
 _HERE = Path(__file__).parents[1] / "widgets" / "view"
 _THEMES = Path(sys.prefix) / "share" / "jupyter" / "lab" / "themes" / "@jupyterlab"
 _ORIGIN = "http://panel.test/"
-_TIMEOUT_MS = 10_000
 # Counts the URLs of pictures that are made and not revoked.
 _COUNT_URLS = """
     window.urls = new Set();
@@ -41,14 +42,10 @@ class ViewPage:
     ----------
     browser
         Of Playwright.
-    theme
-        ``"light"`` or ``"dark"``.
-    width, height
-        Of the window, in pixels.
     """
 
-    def __init__(self, browser: Any, theme: str = "light", width: int = 1280, height: int = 1200) -> None:
-        self.page = browser.new_context(viewport={"width": width, "height": height}).new_page()
+    def __init__(self, browser: Any) -> None:
+        self.page = open_page(browser)
         self.errors: list[str] = []
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.add_init_script(_COUNT_URLS)
@@ -57,10 +54,16 @@ class ViewPage:
             "kernel.js": ("text/javascript", (_HERE / "kernel.js").read_text()),
             "view.js": ("text/javascript", joined()),
             "view.css": ("text/css", styles()),
-            "theme.css": ("text/css", (_THEMES / f"theme-{theme}-extension" / "index.css").read_text()),
             "photo.jpg": ("image/jpeg", _photo()),
         }
         self.page.route("**/*", self._serve)
+
+    def open(self, theme: str = "light", width: int = 1280, height: int = 1200) -> None:
+        """Load the page anew, in a theme, in a window of so many pixels, with the mouse at its corner."""
+        self.errors.clear()
+        self._files["theme.css"] = ("text/css", (_THEMES / f"theme-{theme}-extension" / "index.css").read_text())
+        self.page.set_viewport_size({"width": width, "height": height})
+        self.page.mouse.move(0, 0)
         self.page.goto(_ORIGIN)
         self.until("document.querySelector('img.epypes-picture')?.dataset.seq")
         self.until("document.querySelectorAll('.epypes-tail').length === 5")
@@ -76,7 +79,7 @@ class ViewPage:
 
     def until(self, condition: str) -> None:
         """Return when a condition holds in the page."""
-        self.page.wait_for_function(f"() => {{ {_WITH_KERNEL} return {condition}; }}", timeout=_TIMEOUT_MS)
+        self.page.wait_for_function(f"() => {{ {_WITH_KERNEL} return {condition}; }}")
 
     def sent(self, kind: str) -> list[dict[str, Any]]:
         """Return the messages of a kind that the view has sent."""
@@ -138,12 +141,10 @@ class ViewPage:
     def settle(self) -> None:
         """Return when the last frame is on the screen and what it says is written down."""
         self.js("kernel.painted()")
-        # A frame is acknowledged before it is decoded, which takes some milliseconds; one that can't be shown, never ends.
-        self.js(
-            "new Promise(done => { const end = performance.now() + 400; const look = () => {"
-            " const shown = [...document.querySelectorAll('.epypes-picture, .epypes-text')].some("
-            "  node => node.dataset.seq === String(kernel.seq));"
-            " shown || performance.now() > end ? done() : setTimeout(look, 5); }; look(); })"
+        # A frame is acknowledged before it is decoded, which takes some milliseconds.
+        self.until(
+            "[...document.querySelectorAll('.epypes-picture, .epypes-text')]"
+            ".some(node => node.dataset.seq === String(kernel.seq))"
         )
         self.js("new Promise(done => setTimeout(() => setTimeout(done)))")
 

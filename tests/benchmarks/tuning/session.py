@@ -13,7 +13,7 @@ from tests.benchmarks.timing import Effort
 from tests.benchmarks.tuning import cells
 from tests.benchmarks.tuning.hand import Slider, begin, echoes_ms
 from tests.benchmarks.tuning.latency import Seen
-from tests.browser.jupyter import JupyterLab, Notebook, chromium
+from tests.browser.jupyter import JupyterLab, Notebook, chromium, open_lab
 
 IMAGE = "ipywidgets.Image"
 MATPLOTLIB = "interact + matplotlib"
@@ -56,7 +56,7 @@ def measured(effort: Effort, *, plain: bool) -> Measured:
         notebooks.mkdir()
         cells.write_notebook(notebooks / "tuning.ipynb")
         with JupyterLab(notebooks, Path(folder) / "lab", plain=plain) as lab, chromium() as browser:
-            notebook = Notebook(browser, lab, "tuning.ipynb")
+            notebook = Notebook(open_lab(browser, lab), "tuning.ipynb")
             notebook.run_all()
             found = _moved(
                 notebook, _QUICK_ROUNDS if effort.quick else _ROUNDS, "jupyter lab" if plain else "epypes lab"
