@@ -16,11 +16,11 @@ from xdist.scheduler import LoadFileScheduling
 import epypes as ep
 from epypes.cli import main
 from tests import hangs
-from tests.brokers.fixtures import broker, mosquitto, nats, rabbitmq
+from tests.brokers.fixtures import broker, certificates, mosquitto, nats, rabbitmq
 from tests.brokers.nats import is_installed
 from tests.browser.conftest import theme_of
 
-__all__ = ["broker", "mosquitto", "nats", "rabbitmq"]
+__all__ = ["broker", "certificates", "mosquitto", "nats", "rabbitmq"]
 
 # They inherit it: the tutorial on the experiment asks so often where a reader asks 500 times.
 os.environ.setdefault("EPYPES_REQUESTS", "20")
@@ -37,11 +37,24 @@ def pytest_configure(config):
     config.pluginmanager.register(hangs)
 
 
+# One RabbitMQ for all of them: each start takes five seconds of processor time.
+_WITH_RABBITMQ = (
+    "tests/brokers/test_pipelines.py",
+    "tests/service/group/test_group_of_processes.py",
+    "tests/service/group/test_on_brokers.py",
+    "tests/service/test_replicas.py",
+    "tests/transport/test_amqp.py",
+    "tests/transport/test_seam.py",
+)
+
+
 class _Scheduling(LoadFileScheduling):
     """Tests of one file share what they begin with; those of the browser share JupyterLab, in two groups of files."""
 
     def _split_scope(self, nodeid):
         file = super()._split_scope(nodeid)
+        if file in _WITH_RABBITMQ:
+            return "tests with RabbitMQ"
         return f"tests/browser, {theme_of(file)}" if file.startswith("tests/browser/") else file
 
 

@@ -1,30 +1,52 @@
-"""How does a test get a broker? By naming it: tests/conftest.py knows these.
+"""Fixtures of the brokers: a test gets one by naming it.
 
-Each is started when it is first asked for and lives as long as the tests do. Who ends one has to start it again.
+Each broker is started when a test first needs it, and is shared by all tests of the process. A test that ends a broker
+starts it again.
 """
 
 from __future__ import annotations
 
 import importlib
+import subprocess
+import tempfile
+from pathlib import Path
 
 import pytest
 
 NAMES = ("rabbitmq", "nats", "mosquitto")
 
 
-def running(name):
+def running(name, **options):
     """Start a broker for the time of a fixture, or skip where it is not installed."""
     module = importlib.import_module(f"tests.brokers.{name}")
     if not module.is_installed():
         pytest.skip(f"{name} is not installed on this machine: sh .ci/brokers")
-    with module.server() as made:
+    with module.server(**options) as made:
         yield made
 
 
 @pytest.fixture(scope="session")
-def rabbitmq():
-    """A RabbitMQ server."""
-    yield from running("rabbitmq")
+def certificates():
+    """A folder with a certificate for 127.0.0.1 that is its own authority: ca.pem, cert.pem and key.pem."""
+    # Not in pytest's folder, which the accounts of the brokers may not enter.
+    with tempfile.TemporaryDirectory(prefix="epypes-certificates-") as made:
+        folder = Path(made)
+        folder.chmod(0o755)
+        command = (
+            "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 2 -subj /CN=127.0.0.1"
+        )
+        more = "-addext subjectAltName=IP:127.0.0.1 -keyout key.pem -out cert.pem"
+        subprocess.run([*command.split(), *more.split()], cwd=folder, check=True, capture_output=True, timeout=60)
+        (folder / "ca.pem").write_bytes((folder / "cert.pem").read_bytes())
+        for file in folder.iterdir():
+            file.chmod(0o644)
+        yield folder
+
+
+@pytest.fixture(scope="session")
+def rabbitmq(certificates):
+    """A RabbitMQ server, which also listens with encryption."""
+    yield from running("rabbitmq", certificates=certificates)
 
 
 @pytest.fixture(scope="session")

@@ -21,7 +21,7 @@ from tests.serving import account, with_parent
 # Both have what must be quoted in an address.
 USER, PASSWORD = "epypes", "pa@ss:wörd/1"
 _ACCOUNT = "mosquitto"
-_DEADLINE_S = 30.0
+_DEADLINE_S = 60.0
 _PACKET_BYTES = 8 * 1024 * 1024
 
 

@@ -19,7 +19,7 @@ from tests.serving import with_parent
 USER = "epypes"
 PASSWORD = "pa@ss:wörd/1"
 MAX_PAYLOAD = 8 * 1024**2
-_DEADLINE_S = 30.0
+_DEADLINE_S = 60.0
 
 
 def _binary() -> str | None:
@@ -124,6 +124,6 @@ def server(
         try:
             yield made
         finally:
-            made.stop()
+            made.stop(at_once=True)
     finally:
         shutil.rmtree(folder)

@@ -16,9 +16,9 @@ COUNT = 400
 REPLICA = ("-m", "tests.brokers.replica")
 
 
-@pytest.fixture(params=["rabbitmq", "nats"])
+@pytest.fixture
 def brokered(request):
-    """Each of the brokers that have work queues."""
+    """A broker that has work queues."""
     return request.getfixturevalue(request.param)
 
 
@@ -67,6 +67,7 @@ def check(reader, letters):
     assert all(int(answer.parts["result"][1]) == 2 * int(answer.correlation_id[6:]) for answer in reader.answers)
 
 
+@pytest.mark.parametrize("brokered", ["nats", pytest.param("rabbitmq", marks=pytest.mark.soak)], indirect=True)
 def test_every_event_outlives_a_killed_pipeline_and_a_killed_broker(brokered):
     def killed():
         brokered.stop(at_once=True)
@@ -76,6 +77,7 @@ def test_every_event_outlives_a_killed_pipeline_and_a_killed_broker(brokered):
     outlived(brokered, sub, lasting(brokered, "pipelines.answers"), killed)
 
 
+@pytest.mark.soak
 def test_every_event_outlives_a_killed_pipeline_over_mqtt_and_a_broker_that_ends_in_order(mosquitto):
     def stopped():
         mosquitto.stop()
@@ -85,6 +87,7 @@ def test_every_event_outlives_a_killed_pipeline_over_mqtt_and_a_broker_that_ends
     outlived(mosquitto, sub, mosquitto.address("pipelines/answers", create=True), stopped)
 
 
+@pytest.mark.parametrize("brokered", ["rabbitmq", pytest.param("nats", marks=pytest.mark.soak)], indirect=True)
 def test_an_event_that_kills_whoever_works_on_it_is_a_dead_letter(brokered):
     sub = brokered.address("poison.events", create=True, attempts=2)
     pub = brokered.address("poison.answers", create=True)

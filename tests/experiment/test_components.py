@@ -15,7 +15,7 @@ from epypes.run import Failure
 from epypes.wire import Event, add_attribute, attributes
 
 TIMES = ("t_react", "t_fin_start", "t_fin_end", "t_fout_start", "t_fout_end", "t_pub")
-TIMEOUT_S = 20.0
+TIMEOUT_S = 60.0
 
 
 def request(at: float, request_id: str = "abc") -> Request:

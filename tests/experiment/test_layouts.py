@@ -22,7 +22,7 @@ from epypes.experiment.station import described
 from epypes.pipeline import FullPipeline
 from epypes.transport import ZMQSubscriber, make_keys
 
-TIMEOUT_S = 20.0
+TIMEOUT_S = 60.0
 IN_CHILDREN = pytest.mark.slow
 
 

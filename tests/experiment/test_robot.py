@@ -17,7 +17,7 @@ from epypes.experiment.robot import Robot
 from epypes.run import Failure
 from epypes.wire import Envelope, JustBytes, add_attribute, attributes, failure_event
 
-TIMEOUT_S = 20.0
+TIMEOUT_S = 60.0
 KEYPOINTS = np.ones((20, 4), np.float32)
 
 

@@ -13,7 +13,7 @@ import pytest
 import epypes as ep
 from epypes.errors import HyperparameterError, PayloadError, UnknownName
 
-TIMEOUT_S = 10.0
+TIMEOUT_S = 60.0
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import pytest
 import epypes as ep
 from epypes.wire import decode, encode, failure_event
 
-TIMEOUT_S = 10.0
+TIMEOUT_S = 60.0
 
 
 class Unhashable(str):

@@ -13,7 +13,7 @@ import pytest
 import epypes as ep
 from epypes.errors import MailboxOverflow, PayloadError, StillRunning
 
-TIMEOUT_S = 10.0
+TIMEOUT_S = 60.0
 
 
 def square_graph() -> ep.CompGraph:

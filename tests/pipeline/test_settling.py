@@ -10,7 +10,7 @@ import pytest
 import epypes as ep
 from epypes.errors import BrokerError
 
-WAIT_S = 10.0
+WAIT_S = 60.0
 
 
 class Kept:

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import epypes as ep
 from epypes.wire.failures import failure_event
 
-TIMEOUT_S = 10.0
+TIMEOUT_S = 60.0
 
 
 def graph(function=lambda x: x + 1) -> ep.CompGraph:

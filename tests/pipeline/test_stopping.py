@@ -16,7 +16,7 @@ import pytest
 import epypes as ep
 from epypes.errors import StillRunning
 
-TIMEOUT_S = 10.0
+TIMEOUT_S = 60.0
 GRAPH = ep.CompGraph({"f": lambda x: x}, {"f": ("x", "y")})
 
 

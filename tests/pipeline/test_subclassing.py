@@ -10,7 +10,7 @@ import pytest
 import epypes as ep
 from epypes.errors import GraphError, StaleToken
 
-TIMEOUT_S = 10.0
+TIMEOUT_S = 60.0
 
 
 def add_graph(function=lambda x, n: x + n) -> ep.CompGraph:

@@ -12,7 +12,7 @@ from epypes.wire import Envelope
 from tests.service.bundles import written_bundle
 from tests.transport.peers import wait_until
 
-TIMEOUT_S = 30.0
+TIMEOUT_S = 60.0
 
 SOURCE = '''
     """A graph whose function does what it is told."""

@@ -21,7 +21,7 @@ from epypes.service.channel import MOST_HEADER_BYTES, Channel, channel_pair
 from epypes.service.packing import pack, table_of
 from tests.wire.mutants import mutate_bytes
 
-TIMEOUT_S = 20.0
+TIMEOUT_S = 60.0
 
 
 @pytest.fixture

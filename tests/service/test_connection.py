@@ -14,7 +14,7 @@ from epypes.service.state import StateLock
 from tests.conftest import EDGE_FUNCTIONS, EDGE_HPARAMS, EDGE_IO
 from tests.service.standing import Standing, standing
 
-TIMEOUT_S = 20.0
+TIMEOUT_S = 60.0
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from tests.service.bundles import written_bundle
 from tests.transport.peers import wait_until
 from tests.wire.mutants import mutate_bytes, mutate_description, mutate_frames
 
-WAIT_S = 30.0
+WAIT_S = 60.0
 MUTANTS = 10_000
 # Fewer than what a socket keeps, so that none is lost on the way.
 BATCH = 400

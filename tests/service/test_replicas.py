@@ -18,10 +18,16 @@ def bundle(tmp_path_factory):
     return promoted(tmp_path_factory.mktemp("replicated"))
 
 
-@pytest.fixture(params=["rabbitmq", "nats"])
+@pytest.fixture
 def brokered(request):
-    """Each of the brokers that have work queues."""
+    """A broker that has work queues."""
     return request.getfixturevalue(request.param)
+
+
+def on(name):
+    """Run a test on one of these brokers, and in `make soak` on the other."""
+    other = "nats" if name == "rabbitmq" else "rabbitmq"
+    return pytest.mark.parametrize("brokered", [name, pytest.param(other, marks=pytest.mark.soak)], indirect=True)
 
 
 def kind_of(number):
@@ -63,6 +69,7 @@ def ended_in_order(broker):
     broker.start()
 
 
+@on("rabbitmq")
 def test_a_thousand_events_outlive_a_killed_replica_and_a_killed_broker(bundle, brokered):
     sub = lasting(brokered, "chaos.events", attempts=5)
     outlived(bundle, brokered, sub, lasting(brokered, "chaos.answers"), killed)
@@ -101,6 +108,7 @@ def check_counts(counts):
     assert sum(counted["answered"] + counted["failed"] for counted in counts) >= COUNT // 2
 
 
+@on("nats")
 def test_an_event_that_takes_down_each_replica_is_a_dead_letter_that_can_be_opened(bundle, brokered):
     sub = brokered.address("deadly.events", create=True, attempts=2)
     pub = brokered.address("deadly.answers", create=True)
@@ -121,6 +129,7 @@ def test_an_event_that_takes_down_each_replica_is_a_dead_letter_that_can_be_open
     assert (opened["number"], opened["kind"]) == (0, KILLS_PARENT)
 
 
+@on("rabbitmq")
 def test_a_change_of_hyperparameters_reaches_all_replicas_with_one_revision(bundle, brokered):
     sub = brokered.address("tuned.events", create=True)
     pub = brokered.address("tuned.answers", create=True)
@@ -156,6 +165,7 @@ def test_a_change_of_hyperparameters_reaches_all_replicas_with_one_revision(bund
     assert {answer.revision for answer in reader.answers} == set(gains)
 
 
+@on("nats")
 def test_replicas_that_keep_order_answer_in_the_order_of_the_events(bundle, brokered):
     sub = brokered.address("ordered.events", create=True)
     pub = brokered.address("ordered.answers", create=True)

@@ -48,7 +48,7 @@ def said_across(host, bundle):
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
 
 
-@pytest.mark.parametrize("name", ["rabbitmq", "nats"])
+@pytest.mark.parametrize("name", ["nats", pytest.param("rabbitmq", marks=pytest.mark.soak)])
 def test_a_link_that_is_cut_for_ten_seconds_loses_nothing_that_was_acknowledged(hosts, tmp_path, name):
     near, far, cable = hosts
     bundle = promoted(tmp_path)

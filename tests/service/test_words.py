@@ -4,7 +4,7 @@ import os
 
 from epypes.service.words import Words
 
-TIMEOUT_S = 20.0
+TIMEOUT_S = 60.0
 
 
 def read_until(reader, end):

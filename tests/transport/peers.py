@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 LOCAL = "tcp://127.0.0.1:*"
-WAIT_S = 5.0
+WAIT_S = 60.0
 
 
 def wait_until(condition: Callable[[], object], timeout_s: float = WAIT_S) -> None:

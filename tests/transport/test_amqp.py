@@ -4,64 +4,37 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import shutil
 import socket
-import subprocess
 import threading
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from time import monotonic
 
 import pytest
 
 from epypes.errors import BrokerError, MessageError
 from epypes.transport.channels import Channel, Received, open_channel, place_of
-from tests.brokers import rabbitmq
+from tests.brokers.rabbitmq import MAX_MESSAGE_BYTES, Server, is_installed
 
 pika = pytest.importorskip("pika")
 from epypes.transport.channels.amqp.reasons import leader_hint  # noqa: E402 - it needs pika
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(not rabbitmq.is_installed(), reason="RabbitMQ is not installed: rabbitmq-server"),
+    pytest.mark.skipif(not is_installed(), reason="RabbitMQ is not installed: rabbitmq-server"),
 ]
 
-WAIT_S = 20.0
-LARGEST = 2_000_000
+WAIT_S = 60.0
 _numbers = itertools.count()
 
 
-def certificates(folder: Path) -> Path:
-    """Make a certificate for 127.0.0.1 that is its own authority."""
-    folder.chmod(0o755)
-    command = "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 2 -subj /CN=localhost"
-    told = ["-addext", "subjectAltName=IP:127.0.0.1", "-keyout", folder / "key.pem", "-out", folder / "cert.pem"]
-    subprocess.run([*command.split(), *told], check=True, capture_output=True)
-    shutil.copy(folder / "cert.pem", folder / "ca.pem")
-    for file in folder.iterdir():
-        file.chmod(0o644)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def keys() -> Iterator[Path]:
-    # Not in pytest's folder, which the broker's account may not enter.
-    folder = Path(subprocess.run(["mktemp", "-d"], check=True, capture_output=True, text=True).stdout.strip())
-    try:
-        yield certificates(folder)
-    finally:
-        shutil.rmtree(folder)
-
-
-@pytest.fixture(scope="module")
-def server(keys: Path) -> Iterator[rabbitmq.Server]:
-    with rabbitmq.server(settings={"max_message_size": LARGEST}, certificates=keys) as made:
-        yield made
+@pytest.fixture
+def server(rabbitmq: Server) -> Server:
+    return rabbitmq
 
 
 @pytest.fixture
 def name() -> str:
-    return f"events {next(_numbers)}"
+    return f"amqp events {next(_numbers)}"
 
 
 @pytest.fixture
@@ -77,7 +50,7 @@ def opened() -> Iterator[Callable[..., Channel]]:
 
 
 @pytest.fixture
-def other(server: rabbitmq.Server) -> Iterator[pika.adapters.blocking_connection.BlockingChannel]:
+def other(server: Server) -> Iterator[pika.adapters.blocking_connection.BlockingChannel]:
     """Another program's way to the broker."""
     who = pika.PlainCredentials(server.user, server.password)
     connection = pika.BlockingConnection(pika.ConnectionParameters("127.0.0.1", server.port, credentials=who))
@@ -297,11 +270,11 @@ def test_a_message_that_is_too_large_is_refused_and_the_next_one_is_sent(server,
     channel = opened(server.address(name, create=True))
     for _ in range(2):
         with pytest.raises(MessageError, match="too large") as caught:
-            channel.send([bytes(LARGEST + 1)])
+            channel.send([bytes(MAX_MESSAGE_BYTES + 1)])
         assert caught.value.reason == "too large"
     with pytest.raises(MessageError, match="longer than 255 bytes"):
         channel.send([b""], id="é" * 128)
-    channel.send([bytes(LARGEST)], id="largest")
+    channel.send([bytes(MAX_MESSAGE_BYTES)], id="largest")
     assert received(channel).id == "largest"
 
 
@@ -418,8 +391,8 @@ def test_who_is_not_there_is_said():
         open_channel("amqp://nobody.invalid/events")
 
 
-def test_an_encrypted_broker_is_checked_by_its_certificates(server, name, opened, keys):
-    channel = opened(server.address(name, scheme="amqps", create=True, ca=keys / "ca.pem"))
+def test_an_encrypted_broker_is_checked_by_its_certificates(server, name, opened, certificates):
+    channel = opened(server.address(name, scheme="amqps", create=True, ca=certificates / "ca.pem"))
     channel.send([b"secret"])
     assert parts(received(channel)) == [b"secret"]
     with pytest.raises(BrokerError, match=r"with encryption.*\?ca=FILE"):
@@ -439,11 +412,11 @@ def test_who_could_read_along_is_told_once_of_a_connection_to_elsewhere(server, 
 
 def test_a_broker_that_takes_no_messages_just_now_says_why(server, name, opened):
     channel = opened(server.address(name, create=True), timeout_s=1.0)
-    server.control("set_vm_memory_high_watermark", "0")
+    server.evaluate("vm_memory_monitor:set_vm_memory_high_watermark(0).")
     try:
         error = lost(lambda: channel.send([b"x"]))
     finally:
-        server.control("set_vm_memory_high_watermark", "0.8")
+        server.evaluate("vm_memory_monitor:set_vm_memory_high_watermark(0.8).")
     assert "did not confirm a message within 1 s" in str(error)
     assert "takes no messages just now: low on memory" in str(error)
 
@@ -454,13 +427,13 @@ def test_a_queue_that_says_nothing_is_told_of_and_what_was_rejected_stays_until_
     channel = opened(server.address(name, create=True), timeout_s=1.0, prefetch=2)
     channel.send([b"x"], id="spoilt")
     queue = f"whereis('%2F_{name}.dead')"
-    server.control("eval", f"sys:suspend({queue}).")
+    server.evaluate(f"sys:suspend({queue}).")
     try:
         received(channel).reject("it is spoilt")
         with pytest.raises(BrokerError, match=f"did not answer within 1 s.*quorum_status '{name}.dead' says"):
             opened(server.address(f"{name}.dead"), timeout_s=1.0).receive(0.0)
     finally:
-        server.control("eval", f"sys:resume({queue}).")
+        server.evaluate(f"sys:resume({queue}).")
     assert ".dead did not confirm a message within 1 s: it may have it or not. If it goes on, rabbitmq" in caplog.text
     again = received(channel)
     assert (again.id, again.attempt) == ("spoilt", 2)
@@ -500,6 +473,7 @@ def test_a_broker_that_says_nothing_any_more_is_given_up(server, name, opened, m
         server.resume()
 
 
+@pytest.mark.soak
 def test_a_broker_that_is_killed_is_noticed_and_what_it_confirmed_is_there_when_it_is_back(server, name, opened):
     receiver = opened(server.address(name, create=True), prefetch=2)
     sender = opened(server.address(name))

@@ -4,7 +4,6 @@ import asyncio
 import logging
 import queue
 import re
-import shutil
 import signal
 import socket
 import subprocess
@@ -19,6 +18,7 @@ import pytest
 import epypes as ep
 from epypes.errors import BrokerError, MessageError
 from epypes.transport.channels import open_channel, place_of
+from epypes.transport.channels.jetstream import places
 from epypes.transport.channels.jetstream.pulls import EXPIRES_S, Pulls
 from tests.apart import apart
 from tests.brokers.nats import MAX_PAYLOAD, PASSWORD, is_installed, server
@@ -26,7 +26,7 @@ from tests.brokers.nats import MAX_PAYLOAD, PASSWORD, is_installed, server
 pytestmark = pytest.mark.skipif(
     not is_installed(), reason="nats-server is not installed on this machine: sh .ci/brokers"
 )
-WAIT_S = 20.0
+WAIT_S = 60.0
 
 
 @pytest.fixture(scope="module")
@@ -148,23 +148,39 @@ def test_each_message_of_a_queue_goes_to_one_receiver(opened):
     assert {first.receive(0.1) or second.receive(WAIT_S)}
 
 
-def test_what_a_closed_receiver_held_comes_to_another_at_once(opened):
+def test_what_a_closed_receiver_held_comes_to_another_at_once(opened, monkeypatch):
+    # Longer than the test waits: the server does not wait for the acknowledgement of what was given back.
+    monkeypatch.setattr(places, "_SHARED", places._SHARED.evolve(ack_wait=10 * WAIT_S))
     sender, first, second = opened(), opened(prefetch=4), opened()
     for number in range(4):
         sender.send([b"%d" % number], id=str(number))
     until(lambda: first.receive(0.1))
-    begun_s = monotonic()
     first.close()
     items = []
     while len(items) < 4:
         items.append(second.receive(WAIT_S))
         items[-1].ack()
     assert {(item.id, item.attempt) for item in items} == {(str(number), 2) for number in range(4)}
-    assert monotonic() - begun_s < 4, "Not only once the server has waited for the acknowledgement in vain."
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    """Intervals of the connection that are shorter than a user's, so that the tests of them are."""
+    for name, value in (
+        ("places._SHARED", places._SHARED.evolve(ack_wait=1.0)),
+        ("pulls.EXPIRES_S", 1.0),
+        ("link._BEAT_S", 0.5),
+        ("link._SILENCE_S", 3.0),
+    ):
+        monkeypatch.setattr(f"epypes.transport.channels.jetstream.{name}", value)
 
 
 @pytest.mark.slow
-def test_what_a_killed_receiver_held_comes_again_soon(opened, broker, name):
+def test_what_a_killed_receiver_held_comes_again_soon(impatient, opened, broker, name):
+    # Receiving decides how long the server waits for an acknowledgement.
+    first = opened()
+    assert first.receive(0.0) is None
+    first.close()
     opened().send([b"x"], id="1")
     code = f"""
 import time
@@ -181,11 +197,11 @@ time.sleep(100)
 
 
 @pytest.mark.slow
-def test_what_is_worked_on_for_long_does_not_come_again(opened):
+def test_what_is_worked_on_for_long_does_not_come_again(impatient, opened):
     sender, worker, other = opened(), opened(), opened()
     sender.send([b"x"])
     item = worker.receive(WAIT_S)
-    assert other.receive(7.0) is None
+    assert other.receive(2.5) is None
     item.ack()
     assert worker.receive(0.2) is None
     sender.send([b"y"])
@@ -420,11 +436,9 @@ def test_a_server_that_is_killed_is_an_error_at_once_and_keeps_what_it_confirmed
         for number in range(1_000_000):
             channel.send([b"x"], id=f"more{number}") if method == "send" else channel.receive(WAIT_S)
 
-    begun_s = monotonic()
     threading.Timer(0.2, lambda: mortal.stop(at_once=True)).start()
     with pytest.raises(BrokerError, match="is over: the server has closed it, or has gone away"):
         use()
-    assert monotonic() - begun_s < 5
     with pytest.raises(BrokerError):
         channel.send([b"x"])
     with pytest.raises(BrokerError):
@@ -437,20 +451,17 @@ def test_a_server_that_is_killed_is_an_error_at_once_and_keeps_what_it_confirmed
 
 
 @pytest.mark.slow
-def test_a_server_that_says_nothing_is_noticed(opened, mortal):
+def test_a_server_that_says_nothing_is_noticed(impatient, opened, mortal):
     sender, receiver = opened("a", at=mortal, timeout_s=1.0), opened("a", at=mortal)
     receiver.receive(0)
     mortal.process.send_signal(signal.SIGSTOP)
     try:
-        begun_s = monotonic()
         with pytest.raises(BrokerError, match="has not confirmed a message within 1 s. It may have it"):
             sender.send([bytes(5_000_000)])
         with pytest.raises(BrokerError, match="nothing was heard of the server"):
-            receiver.receive(30)
-        assert monotonic() - begun_s < 10
+            receiver.receive(WAIT_S)
         sender.close()
         receiver.close()
-        assert monotonic() - begun_s < 15
     finally:
         mortal.process.send_signal(signal.SIGCONT)
 
@@ -537,22 +548,10 @@ def test_who_sends_to_elsewhere_unencrypted_is_told_once_who_can_read_it(caplog)
     assert [record.message.count("can read along") for record in caplog.records] == [1]
 
 
-@pytest.fixture(scope="module")
-def certificate(tmp_path_factory):
-    """The files of a certificate for 127.0.0.1 and of the key to it."""
-    if not shutil.which("openssl"):
-        pytest.skip("openssl is not installed on this machine")
-    folder = tmp_path_factory.mktemp("certificate")
-    command = "openssl req -x509 -newkey rsa:2048 -nodes -keyout key.pem -out cert.pem -days 2 -subj /CN=127.0.0.1"
-    extension = ["-addext", "subjectAltName=IP:127.0.0.1"]
-    subprocess.run([*command.split(), *extension], cwd=folder, check=True, capture_output=True)
-    return folder / "cert.pem", folder / "key.pem"
-
-
 @pytest.mark.slow
-def test_an_encrypted_server_is_checked_by_the_named_certificates(opened, certificate):
-    with server(tls=certificate) as encrypted:
-        channel = opened("a", at=encrypted, ca=certificate[0])
+def test_an_encrypted_server_is_checked_by_the_named_certificates(opened, certificates):
+    with server(tls=(certificates / "cert.pem", certificates / "key.pem")) as encrypted:
+        channel = opened("a", at=encrypted, ca=certificates / "ca.pem")
         channel.send([b"x" * 100_000], id="1")
         assert channel.receive(WAIT_S).id == "1"
         channel.close()
@@ -562,10 +561,10 @@ def test_an_encrypted_server_is_checked_by_the_named_certificates(opened, certif
             opened("a", at=encrypted, ca="/nowhere")
 
 
-def test_a_server_that_does_not_encrypt_gets_no_password(certificate):
+def test_a_server_that_does_not_encrypt_gets_no_password(certificates):
     info = b'INFO {"server_id":"x","version":"2.9.10","auth_required":true,"max_payload":1000}\r\n'
     with who_says(info) as (port, heard), pytest.raises(BrokerError, match="can't be trusted: it does not encrypt"):
-        open_channel(f"tls://epypes:secret@127.0.0.1:{port}/a?ca={certificate[0]}", timeout_s=5)
+        open_channel(f"tls://epypes:secret@127.0.0.1:{port}/a?ca={certificates / 'ca.pem'}", timeout_s=5)
     assert b"secret" not in b"".join(heard)
 
 
@@ -590,12 +589,12 @@ def test_who_holds_more_than_half_of_what_he_may_asks_for_the_rest_now_and_then(
 
 
 @pytest.mark.slow
-def test_who_waits_for_as_many_as_he_may_hold_gets_them_however_late_the_last_is_sent(opened):
+def test_who_waits_for_as_many_as_he_may_hold_gets_them_however_late_the_last_is_sent(impatient, opened):
     sender, receiver = opened(), opened(prefetch=4)
     for _ in range(3):
         sender.send([b"early"])
         assert receiver.receive(WAIT_S)
-    assert receiver.receive(EXPIRES_S + 2) is None
+    assert receiver.receive(3.0) is None
     sender.send([b"late"])
     assert frames_of(receiver.receive(WAIT_S)) == [b"late"]
 

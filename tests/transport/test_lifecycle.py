@@ -18,7 +18,7 @@ from epypes.transport import ZMQPublisher, ZMQSubscriber, io
 from tests.transport.peers import wait_until
 
 LOCAL = "tcp://127.0.0.1:*"
-WAIT_S = 5.0
+WAIT_S = 60.0
 
 
 def io_threads() -> list[threading.Thread]:

@@ -13,7 +13,7 @@ from epypes.transport.channels import memory, open_channel, place_of
 from epypes.transport.outbox import Outbox
 from tests.transport.peers import wait_until
 
-WAIT_S = 10.0
+WAIT_S = 60.0
 _numbers = itertools.count()
 
 

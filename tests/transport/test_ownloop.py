@@ -14,7 +14,7 @@ import pytest
 from epypes.transport.channels.jetstream.loop import OwnLoop
 from epypes.transport.channels.turns import Turns, always, nothing
 
-WAIT_S = 20.0
+WAIT_S = 60.0
 MANY_BYTES = 8_000_000
 
 

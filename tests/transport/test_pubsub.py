@@ -14,7 +14,7 @@ from epypes.wire import Envelope, JustBytes, encode
 from tests.transport.peers import wait_until
 
 LOCAL = "tcp://127.0.0.1:*"
-WAIT_S = 5.0
+WAIT_S = 60.0
 
 
 def test_an_envelope_with_an_image_arrives_as_it_was():

@@ -29,7 +29,7 @@ from tests.transport.peers import wait_until
 pytestmark = pytest.mark.slow  # files are written, cut off and played
 
 LOCAL = "tcp://127.0.0.1:*"
-WAIT_S = 5.0
+WAIT_S = 60.0
 HOUR_NS = 3_600 * 10**9
 
 
@@ -573,12 +573,13 @@ def test_a_file_cut_anywhere_gives_what_is_whole_and_one_error(tmp_path):
     assert len(frames_of(part)) == 10, "only the index at its end is missing, which a player does not need"
 
 
-def test_a_damaged_file_never_gives_anything_but_a_recording_error(tmp_path):
+@pytest.mark.parametrize("count", [400, pytest.param(20_000, marks=pytest.mark.soak)])
+def test_a_damaged_file_never_gives_anything_but_a_recording_error(tmp_path, count):
     path = tmp_path / "a.mcap"
     written(path, [(number, [b"t/", b"%d" % number]) for number in range(20)])
     content, refused = path.read_bytes(), 0
     rng = random.Random(2019)
-    for _ in range(2_000):
+    for _ in range(count):
         changed = bytearray(content)
         for _ in range(rng.randint(1, 3)):
             changed[rng.randrange(len(changed))] = rng.choice([0, 1, 0x7F, 0x80, 0xFF])
@@ -590,7 +591,7 @@ def test_a_damaged_file_never_gives_anything_but_a_recording_error(tmp_path):
             refused += 1
         else:
             assert len(frames) <= 20
-    assert refused > 500
+    assert refused > count // 4
 
 
 @pytest.mark.parametrize("options", [{"speed": -1}, {"speed": float("nan")}, {"speed": float("inf")}, {"loop": -1}])

@@ -14,7 +14,7 @@ import pytest
 from epypes.transport.channels.turns import Turns, always, nothing
 from epypes.transport.channels.waking import READ, Waiting
 
-WAIT_S = 20.0
+WAIT_S = 60.0
 
 
 class Pipe:

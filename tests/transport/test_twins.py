@@ -29,7 +29,7 @@ from epypes.transport.connection import Connection
 from epypes.wire import Envelope, encode
 from tests.transport.peers import wait_until
 
-WAIT_S = 10.0
+WAIT_S = 60.0
 _numbers = itertools.count()
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from epypes.transport.channels.waking import READ, WRITE, Waiting
 
-WAIT_S = 20.0
+WAIT_S = 60.0
 
 
 @pytest.fixture

@@ -94,8 +94,16 @@ def test_a_group_finds_together_again_when_its_broker_was_away(bundle, nats):
         assert first.parameters().entries["gain"]["value"] == 6
 
 
-@pytest.mark.parametrize("name", ["rabbitmq", "nats"])
-@pytest.mark.parametrize("before", [150, 600])
+@pytest.mark.parametrize(
+    ("name", "before"),
+    [
+        ("nats", 600),
+        *(
+            pytest.param(*more, marks=pytest.mark.soak)
+            for more in (("nats", 150), ("rabbitmq", 150), ("rabbitmq", 600))
+        ),
+    ],
+)
 def test_the_order_outlives_a_replica_that_is_killed(bundle, name, before, request):
     # While some of the events are sent, and while a long line of them waits. What the dead replica had comes again;
     # from NATS some seconds later, when the hands of the others have long been full of later ones.

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from time import monotonic, sleep
 from urllib.parse import urlsplit
 
-DEADLINE_S = 20.0
+DEADLINE_S = 60.0
 
 
 @contextmanager
