@@ -61,7 +61,7 @@ def mosquitto():
     yield from running("mosquitto")
 
 
-@pytest.fixture(params=NAMES)
+@pytest.fixture(params=[pytest.param(name, marks=pytest.mark.slow) for name in NAMES])
 def broker(request):
     """Each of them in turn."""
     return request.getfixturevalue(request.param)

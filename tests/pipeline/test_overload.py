@@ -99,7 +99,11 @@ def fails_often(x):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("function", [slow, fails_often], ids=["good frames", "bad frames too"])
+@pytest.mark.parametrize(
+    "function",
+    [pytest.param(slow, marks=pytest.mark.soak), fails_often],
+    ids=["good frames", "bad frames too"],
+)
 @pytest.mark.parametrize(("policy", "size"), [("latest", 1), ("drop_oldest", 8), ("block", 8)])
 def test_memory_stays_flat_over_as_many_frames_as_a_minute_of_overload_has(policy, size, function):
     overload(ep.Mailbox(policy, size), function, 100)

@@ -29,7 +29,6 @@ from tests.service.processes import running
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
-POISON = 250
 ENOUGH = 100_000
 WAIT_S = 60.0
 SOURCE = """
@@ -98,7 +97,8 @@ class Received:
         return sum(answer.failure is None for answer in self.answers)
 
 
-def test_nothing_is_lost_uncounted_and_order_is_kept(bundles):
+@pytest.mark.parametrize("poison", [1_000, pytest.param(250, marks=pytest.mark.soak)])
+def test_nothing_is_lost_uncounted_and_order_is_kept(bundles, poison):
     first, bad, good = bundles
     answers, failures = queue.SimpleQueue(), queue.SimpleQueue()
     options = ["--http", "http://127.0.0.1:0", "--threads", "2", "--mailbox-size", "64"]
@@ -114,7 +114,7 @@ def test_nothing_is_lost_uncounted_and_order_is_kept(bundles):
             reports.wait_joined(WAIT_S)
             received = Received(outlet, answers, failures)
             publisher = subprocess.Popen(
-                [sys.executable, "-m", "tests.service.chaos_publisher", state.sub, str(POISON), str(ENOUGH), "4"],
+                [sys.executable, "-m", "tests.service.chaos_publisher", state.sub, str(poison), str(ENOUGH), "4"],
                 cwd=ROOT,
                 stdout=subprocess.PIPE,
                 text=True,
@@ -164,7 +164,7 @@ def test_nothing_is_lost_uncounted_and_order_is_kept(bundles):
     assert counted["restarts"] >= 2
     check_counts(counts, sent, received)
     check_order(received)
-    check_poison(received, sent)
+    check_poison(received, sent, poison)
     check_revisions(received, gains, digest)
 
 
@@ -213,14 +213,14 @@ def check_order(received):
     assert numbers == sorted(numbers)
 
 
-def check_poison(received, sent):
+def check_poison(received, sent, poison):
     """Events that kill are dead letters, those that raise are failures with their own exception."""
     said = {answer.correlation_id: answer.failure for answer in received.answers}
     for number in range(sent):
         failure = said.get(f"event-{number}", "never received")
         if failure == "never received" or (failure is not None and failure.function == "mailbox"):
             continue
-        kind = kind_of(number, POISON)
+        kind = kind_of(number, poison)
         assert (failure is None) == (kind == 0), (number, failure)
         if kind == 2:
             assert failure.exception == "ValueError"

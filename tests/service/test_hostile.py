@@ -20,7 +20,6 @@ from tests.transport.peers import wait_until
 from tests.wire.mutants import mutate_bytes, mutate_description, mutate_frames
 
 WAIT_S = 60.0
-MUTANTS = 10_000
 # Fewer than what a socket keeps, so that none is lost on the way.
 BATCH = 400
 
@@ -76,8 +75,9 @@ def serving(bundle, **given):
 
 
 @pytest.mark.slow
-def test_of_10000_messages_that_nobody_should_send_each_is_counted_and_the_good_one_after_them_is_answered(
-    edge_bundle, caplog
+@pytest.mark.parametrize("count", [1_000, pytest.param(100_000, marks=pytest.mark.soak)])
+def test_each_message_that_nobody_should_send_is_counted_and_the_good_one_after_them_is_answered(
+    edge_bundle, caplog, count
 ):
     caplog.set_level("ERROR", "epypes.service")
     image = np.arange(24 * 32 * 3, dtype=np.uint8).reshape(24, 32, 3)
@@ -89,7 +89,7 @@ def test_of_10000_messages_that_nobody_should_send_each_is_counted_and_the_good_
             return counts["received"] + counts["rejected"] == sent and counts["waiting"] <= BATCH
 
         refused = 0
-        for number, frames in enumerate(mutants(image, MUTANTS), 1):
+        for number, frames in enumerate(mutants(image, count), 1):
             peer.send_multipart(frames)
             refused += is_refused(frames)
             if number % BATCH == 0:
@@ -102,9 +102,9 @@ def test_of_10000_messages_that_nobody_should_send_each_is_counted_and_the_good_
         counts = service.counts()
         assert service.state == "READY"
         assert service.info()["worker_pid"] == worker
-    assert counts["rejected"] == refused > MUTANTS / 5
-    assert counts["received"] == counts["answered"] + counts["failed"] == MUTANTS + 1 - refused
-    assert counts["failed"] > MUTANTS / 3
+    assert counts["rejected"] == refused > count / 5
+    assert counts["received"] == counts["answered"] + counts["failed"] == count + 1 - refused
+    assert counts["failed"] > count / 3
 
 
 @pytest.mark.slow
