@@ -77,7 +77,6 @@ def test_every_event_outlives_a_killed_pipeline_and_a_killed_broker(brokered):
     outlived(brokered, sub, lasting(brokered, "pipelines.answers"), killed)
 
 
-@pytest.mark.soak
 def test_every_event_outlives_a_killed_pipeline_over_mqtt_and_a_broker_that_ends_in_order(mosquitto):
     def stopped():
         mosquitto.stop()

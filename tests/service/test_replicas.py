@@ -75,6 +75,7 @@ def test_a_thousand_events_outlive_a_killed_replica_and_a_killed_broker(bundle, 
     outlived(bundle, brokered, sub, lasting(brokered, "chaos.answers"), killed)
 
 
+@pytest.mark.soak
 def test_a_thousand_events_outlive_a_killed_replica_over_mqtt_and_a_broker_that_ends_in_order(bundle, mosquitto):
     sub = mosquitto.address("chaos/events", create=True)
     outlived(bundle, mosquitto, sub, mosquitto.address("chaos/answers", create=True), ended_in_order)

@@ -141,6 +141,7 @@ def test_garbage_on_the_input_socket_is_counted_and_the_service_goes_on(edge_bun
     ]  # fmt: skip
     with serving(edge_bundle.path, mailbox_size=50) as (service, peer):
         context = zmq.Context()
+        context.linger = 0
         socket_ = context.socket(zmq.XPUB)
         try:
             socket_.connect(service.service_state.sub)

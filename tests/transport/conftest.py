@@ -12,6 +12,8 @@ from tests.transport.peers import WAIT_S
 def peer():
     """Makes raw sockets, as a peer without EPypes has them."""
     context = zmq.Context()
+    # Otherwise the garbage collector waits for ever for what was not sent when a test fails.
+    context.linger = 0
     made = []
 
     def make(kind: int, **options: int) -> zmq.Socket:

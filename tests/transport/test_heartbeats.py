@@ -103,6 +103,7 @@ def test_an_on_stale_that_raises_is_logged_and_the_input_goes_on(caplog):
 
 def test_a_peer_of_2019_sees_nothing_of_heartbeats():
     context = zmq.Context()
+    context.linger = 0
     out = queue.SimpleQueue()
     try:
         with ZMQPublisher(LOCAL, out) as pub:

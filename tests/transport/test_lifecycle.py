@@ -75,6 +75,7 @@ def test_what_is_queued_at_the_stop_is_still_sent():
 
 def test_what_was_sent_arrives_even_if_the_last_socket_is_closed_at_once():
     context = zmq.Context()
+    context.linger = 0
     peer = context.socket(zmq.SUB)
     peer.subscribe(b"")
     peer.rcvtimeo = int(WAIT_S * 1000)

@@ -26,6 +26,7 @@ BATCH = 500
 def poisoner():
     """A socket of a peer that sends what it likes to a subscriber, and the way to connect it."""
     context = zmq.Context()
+    context.linger = 0
     socket = context.socket(zmq.XPUB)
     socket.rcvtimeo = int(WAIT_S * 1000)
 
@@ -127,6 +128,8 @@ def test_false_answers_to_a_join_are_counted_if_they_are_none_and_bounded_if_the
     into = queue.SimpleQueue()
     with ZMQSubscriber("tcp://127.0.0.1:*", into, bind=True) as sub:
         context = zmq.Context()
+        # Otherwise the garbage collector waits for ever for what was not sent when this test fails.
+        context.linger = 0
         socket = context.socket(zmq.XPUB)
         socket.connect(sub.address)
         topics = [socket.recv()[1:] for _ in range(2)]
