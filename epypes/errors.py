@@ -30,6 +30,7 @@ Everything an error's text mentions is an attribute of it::
     +-- RecordingError          a recording of messages can't be written or read; .path
     +-- SettingsError           settings of hyperparameters can't be written or read; .path, .reasons
     +-- BundleError             a bundle is not what it says; .path
+    |   +-- BundleChanged       a bundle's files are not those of its manifest; .path
     |   +-- PromotionRefused    a graph can't become a bundle; .reasons
     |   +-- ReplayDiffers       a bundle computes something else; .report
     +-- ExperimentError         the paper's experiment can't begin or go on; .name
@@ -357,6 +358,10 @@ class BundleError(EpypesError):
     def __init__(self, path: object, text: str) -> None:
         self.path = str(path)
         super().__init__(text)
+
+
+class BundleChanged(BundleError):
+    """A bundle with files that are not those of its manifest; all of them are named."""
 
 
 class PromotionRefused(BundleError):

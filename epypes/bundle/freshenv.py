@@ -34,7 +34,7 @@ _REFRESHED: Final = ("--refresh-package", _OURS)
 _ADDRESSES: Final = re.compile(r"https?://\S+")
 
 
-def replay_in_fresh_environment(folder: Path, timeout_s: float) -> ReplayReport:
+def replay_in_fresh_environment(folder: Path, *, sealed: bool, timeout_s: float) -> ReplayReport:
     """Make an environment from requirements.txt, replay there, and remove it.
 
     Raises
@@ -48,7 +48,7 @@ def replay_in_fresh_environment(folder: Path, timeout_s: float) -> ReplayReport:
         until = time.monotonic() + INSTALL_TIMEOUT_S
         for what, command in steps:
             _step(folder, what, command, until - time.monotonic())
-        return replay_isolated(folder, sealed=True, timeout_s=timeout_s, python=str(home / "bin" / "python"))
+        return replay_isolated(folder, sealed=sealed, timeout_s=timeout_s, python=str(home / "bin" / "python"))
 
 
 def _wanted(folder: Path) -> list[str]:

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from epypes.bundle.mutable_state import MutableState, lock_cached_values
 from epypes.bundle.ports import answer_with, payload_of
-from epypes.bundle.seal import check_seal
+from epypes.bundle.seal import check_files, check_seal
 from epypes.bundle.settings import Settings, read_settings
 from epypes.errors import BundleError
 from epypes.graph import CompGraph, group, with_defaults
@@ -75,6 +75,8 @@ def read_bundle(path: str | Path, *, sealed: bool = True) -> Bundle:
     while True:
         before = _identity(folder)
         try:
+            if not sealed:
+                check_files(folder)
             digest = check_seal(folder) if sealed else ""
             settings, source = read_settings(folder / SETTINGS), (folder / MODULE).read_bytes()
         except (BundleError, OSError):

@@ -1,19 +1,27 @@
-"""Is every byte of a bundle the one that was promoted, and if not, which line was changed?
+"""The manifest of a bundle: a digest of every file, and the lines that were changed since.
 
 The manifest can be checked by ``sha256sum --check MANIFEST.sha256``, which passes over its comments. They say what the
-samples were recorded with, so that a replay that differs can be explained.
+samples were recorded with, so that a replay that differs can be explained. It is no signature: it shows accidents and
+careless changes, and anyone who can write the files can write the manifest anew.
+
+A bundle holds regular files only. A FIFO, a device or a link is refused before anything is read, since opening a FIFO
+blocks, a device has no end, and a link leads out of the folder.
 """
 
 from __future__ import annotations
 
 import difflib
+import errno
 import hashlib
+import io
+import os
+import stat
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
-from epypes.errors import BundleError
+from epypes.errors import BundleChanged, BundleError
 
 MANIFEST: Final = "MANIFEST.sha256"
 _TEXTS: Final = ("pipeline.py", "pipeline.toml", "requirements.txt")
@@ -23,6 +31,10 @@ _NEEDED: Final = frozenset({"pipeline.py", "pipeline.toml"})
 _FACT: Final = "# "
 _LINES: Final = "lines of "
 _WHOLE: Final = "recorded "
+# Bounds on what is read and hashed of a folder that may be anything. Samples and weights are large, text is not.
+MOST_BYTES: Final = 8 * 1024**3
+MOST_FILES: Final = 10_000
+_MOST_TEXT_BYTES: Final = 64 * 1024**2
 
 
 def seal(folder: Path, environment: Mapping[str, str] | None = None) -> str:
@@ -53,10 +65,12 @@ def check_seal(folder: Path) -> str:
 
     Raises
     ------
+    BundleChanged
+        A file was changed, is missing or was added; all of them are named.
     BundleError
-        There is no bundle, or a file was changed, is missing or was added; all of them are named.
+        There is no bundle, or something in it is not a regular file or is too large.
     """
-    if not (folder / MANIFEST).is_file():
+    if not os.path.lexists(folder / MANIFEST):
         raise BundleError(folder, _no_bundle(folder))
     recorded = _read_manifest(folder)
     present = set(_files(folder))
@@ -70,8 +84,19 @@ def check_seal(folder: Path) -> str:
     ]
     if findings:
         text = f"{folder} is not what was promoted: {'; '.join(findings)}. Restore it, or promote again."
-        raise BundleError(folder, text)
+        raise BundleChanged(folder, text)
     return digest(folder)
+
+
+def check_files(folder: Path) -> None:
+    """Check that a bundle whose manifest is not compared holds regular files only, within bounds.
+
+    Raises
+    ------
+    BundleError
+        Something else is named, or there is too much.
+    """
+    _files(folder)
 
 
 def why_no_bundle(folder: Path) -> str:
@@ -124,7 +149,7 @@ def _recorded(folder: Path, names: list[str]) -> dict[str, str]:
 
 def _sums(path: Path) -> str:
     """Return four hexadecimal digits for each line: enough to find the one that was changed."""
-    return " ".join(f"{zlib.crc32(line) & 0xFFFF:04x}" for line in path.read_bytes().splitlines())
+    return " ".join(f"{zlib.crc32(line) & 0xFFFF:04x}" for line in _read(path).splitlines())
 
 
 def _changed_line(folder: Path, name: str, facts: Mapping[str, str]) -> str:
@@ -137,7 +162,7 @@ def _changed_line(folder: Path, name: str, facts: Mapping[str, str]) -> str:
     what, first, _, at, _ = next((change for change in changes if change[0] != "equal"), ("", 0, 0, 0, 0))
     if what == "delete":
         return f", where line {first + 1} is missing"
-    text = [*path.read_text(encoding="utf-8", errors="replace").splitlines(), ""][at].strip()
+    text = [*_read(path).decode(errors="replace").splitlines(), ""][at].strip()
     return f" at line {at + 1}: {text:.80}" if what else ""
 
 
@@ -151,13 +176,13 @@ def _no_bundle(folder: Path) -> str:
 
 def _manifest_lines(folder: Path) -> list[str]:
     try:
-        return (folder / MANIFEST).read_text(encoding="utf-8").splitlines()
+        return _read(folder / MANIFEST).decode().splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise BundleError(folder, f"{folder / MANIFEST} can't be read: {error}. Promote again.") from error
 
 
 def _facts(folder: Path) -> dict[str, str]:
-    lines = _manifest_lines(folder) if (folder / MANIFEST).is_file() else []
+    lines = _manifest_lines(folder) if os.path.lexists(folder / MANIFEST) else []
     facts = (line.removeprefix(_FACT).partition(": ") for line in lines if line.startswith(_FACT))
     return {name: value for name, _, value in facts}
 
@@ -190,17 +215,61 @@ def _files(folder: Path, is_passed_over: Callable[[Path], bool] = _is_cached) ->
     Raises
     ------
     BundleError
-        There is a link, or something else that is neither a file nor a folder.
+        There is a link, something else that is neither a file nor a folder, or more than a bundle may hold.
     """
-    found = []
-    for path in sorted(folder.rglob("*")):
-        name = path.relative_to(folder).as_posix()
-        if path.is_symlink() or not (path.is_file() or path.is_dir()):
-            raise BundleError(folder, f"{folder} holds {name}, which is not a plain file. Remove it.")
-        if path.is_file() and name != MANIFEST and not is_passed_over(path.relative_to(folder)):
+    found, total_bytes = [], 0
+    for number, path in enumerate(folder.rglob("*"), 1):
+        if number > MOST_FILES:
+            raise BundleError(folder, f"{folder} holds more than {MOST_FILES:,} files. It is no bundle.")
+        status, name = path.lstat(), path.relative_to(folder)
+        if stat.S_ISDIR(status.st_mode):
+            continue
+        if not stat.S_ISREG(status.st_mode):
+            raise _not_regular(path, folder)
+        if name.as_posix() in _TEXTS:
+            _check_text(path, status.st_size)
+        total_bytes += status.st_size
+        if total_bytes > MOST_BYTES:
+            limit = f"{MOST_BYTES // 1024**3} GB"
+            raise BundleError(folder, f"{folder} holds more than {limit}, up to {name}. Keep large data elsewhere.")
+        if name.as_posix() != MANIFEST and not is_passed_over(name):
             found.append(name)
-    return found
+    return [name.as_posix() for name in sorted(found)]
+
+
+def _not_regular(path: Path, folder: Path) -> BundleError:
+    name = path.relative_to(folder).as_posix()
+    return BundleError(folder, f"{folder} holds {name}, which is not a plain file. Remove it.")
+
+
+def _opened(path: Path) -> io.BufferedReader:
+    """Open a regular file. Neither waits for the writer of a FIFO nor follows a link."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.ENXIO):
+            raise _not_regular(path, path.parent) from error
+        raise
+    file = os.fdopen(descriptor, "rb")
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        file.close()
+        raise _not_regular(path, path.parent)
+    return file
+
+
+def _read(path: Path) -> bytes:
+    """Return the bytes of a text."""
+    with _opened(path) as file:
+        _check_text(path, os.fstat(file.fileno()).st_size)
+        return file.read()
+
+
+def _check_text(path: Path, size: int) -> None:
+    if size > _MOST_TEXT_BYTES:
+        limit = f"{_MOST_TEXT_BYTES // 1024**2} MB"
+        raise BundleError(path.parent, f"{path} is larger than {limit}, which no text of a bundle is. Promote again.")
 
 
 def _hash(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    with _opened(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,4 +1,4 @@
-"""Does a bundle still compute what was recorded, and if not, what does that likely come from?"""
+"""The replay of a bundle's samples, compared with what was recorded, and the likely cause of a difference."""
 
 from __future__ import annotations
 
@@ -9,12 +9,17 @@ from epypes.bundle.causes import environment_notes, likely_causes
 from epypes.bundle.freshenv import replay_in_fresh_environment
 from epypes.bundle.replay import REPLAY_TIMEOUT_S, replay_isolated
 from epypes.bundle.report import ReplayReport
-from epypes.bundle.seal import MANIFEST, check_seal
-from epypes.errors import BundleError, ReplayDiffers
+from epypes.bundle.seal import check_seal
+from epypes.errors import BundleChanged, BundleError, ReplayDiffers
 
 
-def verify(path: str | Path, *, fresh_env: bool = False, timeout_s: float = REPLAY_TIMEOUT_S) -> ReplayReport:
+def verify(
+    path: str | Path, *, fresh_env: bool = False, timeout_s: float = REPLAY_TIMEOUT_S, run_anyway: bool = False
+) -> ReplayReport:
     """Replay a bundle's samples in a fresh isolated process.
+
+    A bundle is code, and is to be trusted like code: a replay runs it with the rights of the caller. The manifest is no
+    signature.
 
     Parameters
     ----------
@@ -24,6 +29,9 @@ def verify(path: str | Path, *, fresh_env: bool = False, timeout_s: float = REPL
         Whether to do so in a new environment, with what requirements.txt names and nothing else.
     timeout_s
         When the replay is ended.
+    run_anyway
+        Whether to replay a bundle whose files are not those of its manifest, to learn which token the change affects.
+        That runs the changed code. The bundle is refused all the same.
 
     Returns
     -------
@@ -32,36 +40,33 @@ def verify(path: str | Path, *, fresh_env: bool = False, timeout_s: float = REPL
 
     Raises
     ------
+    BundleChanged
+        A file was changed, is missing or was added. Nothing of the bundle was run, unless ``run_anyway``.
     ReplayDiffers
         A token is not what was recorded; token, first differing index, both values and the likely cause are named.
     BundleError
-        The folder is not the bundle that was promoted, its code fails, or no environment can be made.
+        The folder is no bundle, its code fails, or no environment can be made.
     """
     folder = Path(path)
+    change: BundleChanged | None = None
     try:
         check_seal(folder)
+    except BundleChanged as error:
+        if not run_anyway:
+            text = f"{error} Nothing of it was run; to run the changed code: epypes verify --run-anyway."
+            raise BundleChanged(folder, text) from None
+        change = error
+    replayed = replay_in_fresh_environment if fresh_env else replay_isolated
+    try:
+        report = replayed(folder, sealed=change is None, timeout_s=timeout_s)
     except BundleError as error:
-        raise _with_its_effect(folder, error, timeout_s) from None
-    if fresh_env:
-        report = replay_in_fresh_environment(folder, timeout_s)
-    else:
-        report = replay_isolated(folder, sealed=True, timeout_s=timeout_s)
+        if change is None:
+            raise
+        raise BundleChanged(folder, f"{change} It can't be replayed: {error}") from error
+    if change is not None:
+        if report.identical:
+            raise BundleChanged(folder, f"{change} It still computes what was recorded.")
+        raise ReplayDiffers(folder, replace(report, causes=(str(change),)))
     if report.identical:
         return replace(report, notes=(*report.notes, *report.outside, *environment_notes(folder, report)))
     raise ReplayDiffers(path, replace(report, causes=likely_causes(folder, report)))
-
-
-def _with_its_effect(folder: Path, broken: BundleError, timeout_s: float) -> BundleError:
-    """Return the error of a broken seal, with the token that is another because of it, if that can be found out.
-
-    The seal tells what was changed; it does not keep strangers out, who could write it anew.
-    """
-    if not (folder / MANIFEST).is_file():
-        return broken
-    try:
-        report = replay_isolated(folder, sealed=False, timeout_s=timeout_s)
-    except BundleError:
-        return broken
-    if report.identical:
-        return BundleError(folder, f"{broken} It still computes what was recorded.")
-    return ReplayDiffers(folder, replace(report, causes=(str(broken),)))

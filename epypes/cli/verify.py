@@ -21,13 +21,25 @@ def verify(
     fresh_env: Annotated[
         bool, typer.Option("--fresh-env", help="Replay in a new environment, made from requirements.txt alone.")
     ] = False,
+    run_anyway: Annotated[
+        bool,
+        typer.Option(
+            "--run-anyway",
+            help="Replay it even if its files were changed, which runs the changed code. It still exits non-zero.",
+        ),
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the whole report as JSON.")] = False,
 ) -> None:
-    """Replay a bundle's samples in a fresh isolated process; exit 0 only if every token is as it was recorded."""
+    """Replay a bundle's samples in a fresh isolated process; exit 0 only if every token is as it was recorded.
+
+    A bundle is code: trust it like code. The manifest shows changes, and is no signature.
+
+    If a file is not what the manifest says, nothing of the bundle is run.
+    """
     from epypes.bundle import verify as verify_bundle
 
     try:
-        report = verify_bundle(bundle, fresh_env=fresh_env)
+        report = verify_bundle(bundle, fresh_env=fresh_env, run_anyway=run_anyway)
     except BundleError as error:
         found = error.report if isinstance(error, ReplayDiffers) else None
         if as_json:

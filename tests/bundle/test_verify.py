@@ -68,7 +68,7 @@ def change(path, old, new):
 
 def refused(folder):
     with pytest.raises(BundleError) as caught:
-        verify(folder)
+        verify(folder, run_anyway=True)
     return str(caught.value)
 
 
@@ -87,6 +87,12 @@ def test_a_changed_constant_is_named_with_its_line_and_the_first_difference(fold
     )
     tokens = [difference.token for difference in caught.value.report.differences]
     assert tokens == ["marked", "points"], "and not the words, which do not depend on it"
+
+
+def test_a_sample_that_cannot_be_read_any_more_is_named_with_why(folder):
+    (folder / "samples" / "000.npz").write_bytes(b"broken")
+    assert "samples/000.npz was changed" in refused(folder)
+    assert "It can't be replayed" in refused(folder)
 
 
 def test_a_changed_comment_is_found_and_said_to_change_nothing(folder):
