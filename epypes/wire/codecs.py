@@ -1,4 +1,4 @@
-"""Which Value message is written for a Python value? `reading` has the way back.
+"""Writes Python values as Value messages; `reading` has the way back.
 
 Only exact types are taken: a subclass (a namedtuple, a masked array) would come back as something else.
 """
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 from epypes.errors import MessageError
 from epypes.wire.arrays import image_encoding
 from epypes.wire.instead import Path, no_codec, spoken
-from epypes.wire.limits import DEFAULT_LIMITS, Limits
+from epypes.wire.limits import DEFAULT_LIMITS, KeyCheck, Limits
 from epypes.wire.records import records_in, write_records
 from epypes.wire.schema import message_class
 from epypes.wire.tables import write_table
@@ -71,7 +71,8 @@ def to_value(
     Raises
     ------
     MessageError
-        Of reason ``"no codec"`` for another type, ``"too deep"``, ``"too many values"`` or ``"not utf-8"``.
+        Of reason ``"no codec"`` for another type, ``"too deep"``, ``"too many values"``, ``"too many keys"``,
+        ``"colliding keys"`` or ``"not utf-8"``.
     """
     writer = Writer(inline_below, limits, first_frame)
     message = message_class("epypes.v1.Value")()
@@ -91,6 +92,7 @@ class Writer:
     def __init__(self, inline_below: int, limits: Limits, first_frame: int = 0) -> None:
         self._inline_below, self._limits, self._first_frame = inline_below, limits, first_frame
         self._order, self._count = "bgr", 0
+        self._key_check = KeyCheck(limits)
         self.payloads: list[Payload] = []
 
     def write(self, message: Any, value: object, name: str, order: str) -> None:
@@ -150,7 +152,9 @@ class Writer:
     def _set(self, message: Any, value: Collection[object], path: Path) -> None:
         items = message.set if type(value) is set else message.frozen_set
         items.SetInParent()
+        check = self._key_check.for_container(path)
         for item in sorted(value, key=set_order):
+            check(item)
             self.fill(items.items.add(), item, (*path, item))
 
     def _list(self, message: Any, value: Sequence[object], path: Path) -> None:
@@ -164,7 +168,9 @@ class Writer:
 
     def _map(self, message: Any, value: dict[object, object], path: Path) -> None:
         message.map.SetInParent()
+        check = self._key_check.for_container(path)
         for key, item in value.items():
+            check(key)
             entry = message.map.entries.add()
             self.fill(entry.key, key, (*path, key))
             self.fill(entry.value, item, (*path, key))

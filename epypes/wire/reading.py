@@ -1,4 +1,4 @@
-"""Which Python value does a Value message stand for? Nothing in a message is believed before it is checked."""
+"""Reads Value messages into Python values. Nothing in a message is believed before it is checked."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from epypes.errors import MessageError
 from epypes.images import Order, swapped
 from epypes.wire.arrays import frozen, read_dtype, read_image, read_tensor
 from epypes.wire.instead import Path, spoken
-from epypes.wire.limits import DEFAULT_LIMITS, Limits
+from epypes.wire.limits import DEFAULT_LIMITS, KeyCheck, Limits
 from epypes.wire.records import read_records
 from epypes.wire.tables import read_table
 
@@ -43,6 +43,7 @@ class Reader:
     def __init__(self, frames: Sequence[memoryview], limits: Limits = DEFAULT_LIMITS) -> None:
         self._frames, self._limits = frames, limits
         self._count = 0
+        self._key_check = KeyCheck(limits)
         self._seen: set[int] = set()
         self.order: Order | None = None
         self.used: list[int] = []
@@ -95,10 +96,10 @@ class Reader:
 
     def _set(self, content: Any, path: Path) -> set[Any]:
         items = self._list(content, path)
-        try:
-            result = set(items)
-        except TypeError as error:
-            raise MessageError("bad key", f"{spoken(path)} is a set of what can't be in one: {error}.") from error
+        check = self._key_check.for_container(path)
+        for item in items:
+            check(item)
+        result = set(items)
         if len(result) < len(items):
             raise MessageError("bad key", f"{spoken(path)} is a set that has an item twice.")
         return result
@@ -108,13 +109,11 @@ class Reader:
 
     def _map(self, content: Any, path: Path) -> dict[Any, Any]:
         result: dict[Any, Any] = {}
+        check = self._key_check.for_container(path)
         for index, entry in enumerate(content.entries):
             key = self.read(entry.key, (*path, f"key {index}"))
-            try:
-                twice = key in result
-            except TypeError as error:
-                raise MessageError("bad key", f"{spoken(path)} has a key that can't be one: {error}.") from error
-            if twice:
+            check(key)
+            if key in result:
                 raise MessageError("bad key", f"{spoken(path)} has the key {str(key)[:40]!r} twice.")
             result[key] = self.read(entry.value, (*path, key))
         return result

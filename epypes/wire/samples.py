@@ -31,8 +31,8 @@ FORMAT = 1
 _DESCRIPTION = "description"
 # A zip entry carries a time; a fixed one makes the file depend on its values alone.
 _EPOCH = (1980, 1, 1, 0, 0, 0)
-# A sample is the user's own file, not a stranger's message: any number of arrays may be in it.
-_LIMITS = Limits(frames=2**31, parts=2**31)
+# A sample is the user's own file, not a stranger's message: any number of arrays and keys may be in it.
+_LIMITS = Limits(frames=2**31, parts=2**31, keys=2**31)
 # What zipfile and numpy raise for broken files; RuntimeError for encrypted or unknown compression.
 _BROKEN = (
     OSError,

@@ -251,12 +251,12 @@ def varint(number: int) -> bytes:
     return bytes([*out, number])
 
 
-@pytest.mark.slow
-def test_of_10000_broken_messages_none_raises_anything_but_a_message_error():
+@pytest.mark.parametrize("count", [300, pytest.param(10_000, marks=pytest.mark.soak)])
+def test_of_many_broken_messages_none_raises_anything_but_a_message_error(count):
     rng = random.Random(2019)
     frames = [bytes(frame) for frame in encode(full_envelope(), "cam1", inline_below=64)]
     reasons = []
-    for number in range(10_000):
+    for number in range(count):
         mutation = mutate_description if number % 3 == 0 else mutate_frames
         try:
             envelope = decode(mutation(frames, rng))
@@ -266,4 +266,4 @@ def test_of_10000_broken_messages_none_raises_anything_but_a_message_error():
             # What is accepted can be looked at in full.
             repr(dict(envelope.parts))
     assert all(reasons)
-    assert len(reasons) > 5_000
+    assert len(reasons) > count / 2
