@@ -112,7 +112,7 @@ def _copy_of_frame(frame: Any) -> Any:
 
 def _own_copy(value: Any) -> Any:
     """Return a shallow copy of a mutable container; anything else as it is."""
-    copier = COPIERS.get(type(value), _learn)
+    copier: Any = COPIERS.get(type(value), _learn)
     if copier is _learn:
         copier = _learn(type(value))
     return value if copier is None else copier(value)
