@@ -87,9 +87,9 @@ _MUTABLE: Final = (list, dict, set, deque, bytearray, number_array)
 
 
 def _learn(kind: type) -> Callable[[Any], Any] | None:
-    """Remember how values of a type are copied, and return it."""
-    if len(COPIERS) >= _MOST_TYPES:
-        COPIERS.clear()
+    """Return how values of a type are copied, and remember it; an iterator is passed as it is, where it may be."""
+    if is_iterator(kind):
+        return None
     pandas = sys.modules.get("pandas")
     frames = tuple(getattr(pandas, name, ()) for name in ("DataFrame", "Series"))
     copier: Callable[[Any], Any] | None = None
@@ -99,7 +99,8 @@ def _learn(kind: type) -> Callable[[Any], Any] | None:
         copier = copy.copy
     else:
         copier = _copy_of_frame if issubclass(kind, frames) else None
-    COPIERS[kind] = copier
+    if len(COPIERS) < _MOST_TYPES:
+        COPIERS[kind] = copier
     return copier
 
 
@@ -112,16 +113,16 @@ def _copy_of_frame(frame: Any) -> Any:
 
 def _own_copy(value: Any) -> Any:
     """Return a shallow copy of a mutable container; anything else as it is."""
-    copier: Any = COPIERS.get(type(value), _learn)
-    if copier is _learn:
-        copier = _learn(type(value))
+    kind = type(value)
+    copier = COPIERS[kind] if kind in COPIERS else _learn(kind)
     return value if copier is None else copier(value)
 
 
 def is_iterator(kind: type) -> bool:
     """Whether values of a type are iterators: a generator, a zip, an open file."""
     # Looked up in the classes, since a metaclass may answer for attributes that are not there.
-    return next((vars(base)["__next__"] for base in kind.__mro__ if "__next__" in vars(base)), None) is not None
+    found = [vars(base)["__next__"] for base in kind.__mro__ if "__next__" in vars(base)]
+    return bool(found) and found[0] is not None
 
 
 def require_reusable(value: Any, program: Program, slot: int) -> None:
@@ -201,7 +202,7 @@ def keep(value: Any, fresh_count: int, program: Program, slot: int, values: Sequ
         return _locked(value.copy() if hasattr(value, "mask") else _own(value, is_known, program, slot, values))
     if kind not in COPIERS:
         require_reusable(value, program, slot)
-    copier = COPIERS.get(kind)
+    copier = COPIERS[kind] if kind in COPIERS else _learn(kind)
     # A copy by pandas is made in any case: a new DataFrame may share its memory with others.
     made = value if copier is None or not (is_known or copier is _copy_of_frame) else copier(value)
     if not _holds_arrays(made):

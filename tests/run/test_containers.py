@@ -281,6 +281,7 @@ def test_a_memory_mapped_file_that_a_function_writes_again_changes_no_earlier_ru
     assert [numbers(run["a"]) for run in runs] == [{x} for x in range(way.runs)]
 
 
+@pytest.mark.slow
 def test_what_map_keeps_is_of_its_own_image():
     frame = pd.DataFrame({"a": [0, 0]})
 
@@ -393,11 +394,20 @@ def test_what_can_be_read_again_is_no_iterator(way):
 
 def test_without_the_guard_values_are_passed_as_they_are(way):
     seen = []
-    cg = graph_of(make=(lambda x: iter([x]), "x", "p"), use=(lambda p, q: (list(p), seen.append(q)), ("p", "q"), "y"))
+
+    def use(p, q):
+        seen.append(q)
+        return [1 // each for each in p]
+
+    cg = graph_of(make=(lambda x: iter([x]), "x", "p"), use=(use, ("p", "q"), "y"))
     runner, given = way.runner(cg, guard=False), {1: 2}
-    for x in range(way.runs):
-        assert runner.run(x=x, q=given)["y"] == ([x], None)
+    for x in range(1, way.runs):
+        assert runner.run(x=x, q=given)["y"] == [1 // x]
         assert seen[-1] is given
+    with pytest.raises(ZeroDivisionError):
+        runner.run(x=0, q=given)
+    with pytest.raises(IteratorRefused):
+        way.runner(cg).run(x=1, q=given)
 
 
 # -- hyperparameters ---------------------------------------------------------------------------------------------------
@@ -427,6 +437,7 @@ def test_a_hyperparameter_array_that_is_changed_in_place_changes_nothing(how):
     assert runner.rerun()["y"] == runner.run(x=1)["y"] == 1
 
 
+@pytest.mark.slow
 def test_values_are_never_seen_half_written_by_a_run_in_another_thread():
     """Four threads run while another sets: each run has all of the hyperparameters."""
     names = tuple(f"h{place}" for place in range(40))
