@@ -60,6 +60,7 @@ def test_a_builtin_that_changes_its_input_changes_it_for_no_other_function(way, 
         assert read(runner["xs"]) == expected
 
 
+@pytest.mark.filterwarnings("ignore:Setting the")
 @pytest.mark.parametrize("name", ["shape", "dtype"])
 def test_setattr_on_an_array_changes_it_for_no_other_function(way, name):
     value = {"shape": (2, 3), "dtype": np.dtype("int32")}[name]
