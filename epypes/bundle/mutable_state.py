@@ -2,13 +2,16 @@
 
 No answer may depend on an earlier event. Promotion refuses functions that plainly write to what outlives their call;
 syntax can't show all of it. So each function of a loaded bundle that reaches a mutable object is wrapped: after its
-call, a snapshot of these objects is compared; if one has changed, it is put back and the call raises StateChanged. Such
-functions of one loaded bundle run one at a time, since a comparison could not tell the changes of two calls apart.
+call, a snapshot of these objects is compared; if one has changed, it is put back and the call raises StateChanged.
 Functions that reach only constants, which are most, are not wrapped.
+
+Calls in several threads share the objects. Where a call finds a change and other calls ran meanwhile, any of them may
+have made it, or have read it: each of them is called again, alone, on objects that have been put back.
 
 The cache of an ``lru_cache`` is no state: arrays in it are locked when they are computed, and a value that can still be
 changed does not stay in it after the call. The global generators of ``random`` and ``numpy.random`` are put back after
-each call of a function that names them, and count as no change.
+each call of a function that names them, and count as no change; so are the attributes of a node of one's own class.
+What a pipeline of one's own class keeps in its attributes is not looked at.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ import sys
 import threading
 import types
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from contextvars import ContextVar
 from enum import Enum
 from typing import Any, Final
@@ -98,19 +102,33 @@ class CodeSnapshot(Snapshot):
     def __bool__(self) -> bool:
         return bool(self.records or self._settlers)
 
-    def settle(self) -> str | None:
-        """Put back what has changed, after a call; return the name of the first such object, None if there is none."""
-        for settle in self._settlers:
-            settle()
+    def changed(self) -> str | None:
+        """Return the first object that has changed, by the name that the code knows it by; None if there is none."""
         for record in self.records:
             if record.differs():
-                name = record.changed_name() if isinstance(record, _Bindings) else record.name
-                self.restore()
-                # A call that is answered from a cache would not change it again.
-                for check in self._checks:
-                    check.clear()
-                return name
+                return record.changed_name() if isinstance(record, _Bindings) else record.name
         return None
+
+    def settle(self) -> None:
+        """Put back what a call may change without a failure."""
+        for settle in self._settlers:
+            settle()
+
+    def restore(self) -> None:
+        """Put everything back; a call that is answered from a cache would not change it again."""
+        super().restore()
+        for check in self._checks:
+            check.clear()
+
+    def restored(self) -> bool:
+        """Put everything back, and return whether that was possible."""
+        self.restore()
+        return self.changed() is None
+
+    @property
+    def emptied(self) -> int:
+        """How often caches have been emptied, since a value in them could be changed."""
+        return sum(check.emptied for check in self._checks)
 
     # -- the walk ---------------------------------------------------------------------------------------------------
 
@@ -210,7 +228,8 @@ class CodeSnapshot(Snapshot):
         yield name, node.func
         yield type(node).__name__, type(node)
         if type(node) is not Node:
-            self.records.append(_Bindings(f"{name}.", node, _read_node, _write_node))
+            # A component may count its calls. It is put back without a failure: no answer depends on it.
+            self._settlers.append(_Bindings(f"{name}.", node, _read_node, _write_node).settle)
             yield from ((f"{name}.{key}", value) for key, value in as_dict(_read_node(node)).items())
 
     def _look_at_cache(self, cached: Any) -> Found:
@@ -248,6 +267,11 @@ class _Bindings(Record):
         """Return what has another value."""
         return f"{self.name}{self._others(self.read(self.value))[0]}"
 
+    def settle(self) -> None:
+        """Put back what is bound otherwise."""
+        if self.differs():
+            self.restore()
+
     def _others(self, now: tuple[Any, ...]) -> list[str]:
         before, after = as_dict(self.saved), as_dict(now)
         return [
@@ -263,7 +287,7 @@ class _CacheCheck:
     """Empties an lru_cache whenever a call has left a value in it that can be changed."""
 
     def __init__(self, cached: Any) -> None:
-        self._cached, self._misses = cached, 0
+        self._cached, self._misses, self.emptied = cached, 0, 0
         # The function and the like, of a cache that is empty.
         self._ours = set(map(id, cached_values(cached)))
 
@@ -280,6 +304,7 @@ class _CacheCheck:
         """Empty the cache."""
         self._cached.cache_clear()
         self._misses = 0
+        self.emptied += 1
 
 
 def _forget(value: Any, lazy: frozenset[str]) -> None:
@@ -375,7 +400,7 @@ def _write_cell(cell: types.CellType, saved: tuple[Any, ...]) -> None:
 # -- what a bundle does with it ------------------------------------------------------------------------------------
 
 
-# The lock of the guarded call under way. What that calls, also in helper threads, is part of it.
+# The turns of the guarded call under way. What that calls, also in helper threads, is part of it.
 _under_way: ContextVar[object] = ContextVar("_under_way", default=None)
 
 
@@ -389,7 +414,7 @@ class MutableState:
     """
 
     def __init__(self, functions: Mapping[str, Callable[..., Any]]) -> None:
-        self._turn = threading.RLock()
+        self._turns = _Turns()
         self._caches: dict[int, _CacheCheck] = {}
         self._compared: dict[int, object] = {}
         for name, function in _with_inner(functions):
@@ -419,27 +444,91 @@ class MutableState:
         return function
 
     def _guarded_call(self, name: str, function: Callable[..., Any], snapshot: CodeSnapshot) -> Callable[..., Any]:
-        turn = self._turn
+        turns = self._turns
+
+        def attempt(args: Any, kwargs: Any) -> tuple[Any, BaseException | None]:
+            token = _under_way.set(turns)
+            try:
+                return function(*args, **kwargs), None
+            except BaseException as error:
+                return None, error
+            finally:
+                _under_way.reset(token)
+                snapshot.settle()
 
         @functools.wraps(function)
         def call(*args: Any, **kwargs: Any) -> Any:
-            if _under_way.get() is turn:
+            if _under_way.get() is turns:
                 return function(*args, **kwargs)
-            with turn:
-                token = _under_way.set(turn)
-                try:
-                    result = function(*args, **kwargs)
-                except BaseException:
-                    snapshot.settle()
-                    raise
-                finally:
-                    _under_way.reset(token)
-                changed = snapshot.settle()
-                if changed is None:
-                    return result
-                raise StateChanged(name, changed, snapshot.changed() is None)
+            emptied, entered, is_restored = snapshot.emptied, turns.enter(), True
+            result, error = attempt(args, kwargs)
+            changed = snapshot.changed()
+            with turns.changed:
+                is_alone = turns.was_alone(entered)
+                if changed is not None and is_alone:
+                    is_restored = snapshot.restored()
+                turns.leave()
+            if not is_alone and (changed is not None or snapshot.emptied != emptied):
+                with turns.alone():
+                    snapshot.restore()
+                    result, error = attempt(args, kwargs)
+                    changed = snapshot.changed()
+                    is_restored = changed is None or snapshot.restored()
+            try:
+                if error is not None:
+                    raise error
+                if changed is not None:
+                    raise StateChanged(name, changed, is_restored)
+                return result
+            finally:
+                # The exception keeps this frame, which would keep the exception, and with it the images of the call.
+                del error, result
 
         return call
+
+
+class _Turns:
+    """Tells a call whether others ran meanwhile, and lets one run alone."""
+
+    def __init__(self) -> None:
+        self.changed = threading.Condition()
+        self._running = self._entered = 0
+        self._is_taken = False
+
+    def enter(self) -> int:
+        """Begin a call; return its number, or 0 if others are running."""
+        with self.changed:
+            while self._is_taken:
+                self.changed.wait()
+            self._running += 1
+            self._entered += 1
+            return self._entered if self._running == 1 else 0
+
+    def was_alone(self, entered: int) -> bool:
+        """Whether no other call ran since this one has begun; to be asked with ``changed`` held."""
+        return entered == self._entered
+
+    def leave(self) -> None:
+        """End a call, with ``changed`` held."""
+        self._running -= 1
+        if self._is_taken:
+            self.changed.notify_all()
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Wait for the others to end, and let none begin until the block ends."""
+        with self.changed:
+            while self._is_taken:
+                self.changed.wait()
+            self._is_taken = True
+            while self._running:
+                self.changed.wait()
+        try:
+            yield
+        finally:
+            with self.changed:
+                self._is_taken = False
+                self.changed.notify_all()
 
 
 def _with_inner(functions: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
