@@ -12,6 +12,7 @@ from tests.benchmarks import (
     case,
     engine,
     imports,
+    mutable_state,
     peers,
     picture,
     pipeline,
@@ -25,6 +26,10 @@ from tests.benchmarks.table import as_table, write_json
 from tests.benchmarks.timing import Effort
 
 _WIDTH = 170
+_MODULES = (
+    *(imports, engine, pipeline, mutable_state, picture, sockets, brokers, service, scale_map, scale_sweep, case),
+    tuning,
+)
 
 
 def main() -> None:
@@ -34,7 +39,7 @@ def main() -> None:
     console = Console()
     console = console if console.is_terminal else Console(width=_WIDTH)
     rows = []
-    for module in (imports, engine, pipeline, picture, sockets, brokers, service, scale_map, scale_sweep, case, tuning):
+    for module in _MODULES:
         console.print(module.__doc__, style="dim")
         rows += module.rows(effort)
     console.print(as_table(rows))

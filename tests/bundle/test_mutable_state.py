@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import gc
 import queue
 import textwrap
 import threading
-import weakref
 from concurrent.futures import ThreadPoolExecutor
 
-import numpy as np
 import pytest
 
 import epypes as ep
@@ -352,24 +349,6 @@ def test_a_call_that_saw_the_change_of_another_is_made_again(tmp_path):
     runner = ep.load(bundle(tmp_path / "b", source))
     with ThreadPoolExecutor(2) as pool:
         assert [*pool.map(lambda x: answer(runner, x), [1, 200])] == ["0", "StateChanged"]
-
-
-def test_a_failure_that_is_dropped_frees_its_inputs_at_once(tmp_path):
-    source = "L = []\ndef f(x):\n    if x[0, 0] > 100: L.append(1)\n    raise ValueError('no')"
-    runner = ep.load(bundle(tmp_path / "b", source))
-    gc.collect()
-    gc.disable()
-    try:
-        for value in (0, 200):
-            image = np.full((9, 9), value)
-            gone = weakref.ref(image)
-            with pytest.raises(ValueError, match="no"):
-                runner.run(x=image)
-            del image
-            runner.last = None
-            assert gone() is None
-    finally:
-        gc.enable()
 
 
 def test_a_guarded_function_may_run_a_pipeline_of_the_bundle_in_threads(tmp_path):

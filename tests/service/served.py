@@ -93,7 +93,10 @@ class Peer:
         self.sent = []
 
     def send(self, what="plain", number=1):
-        request = event(what, number)
+        return self.send_parts(what=what, number=number)
+
+    def send_parts(self, **parts):
+        request = Envelope(type="x", parts=parts)
         self.sent.append(request.id)
         self.requests.put(request)
         return request.id
