@@ -14,6 +14,7 @@ from epypes.bundle.values import expression
 from epypes.bundle.words import word_of
 from epypes.graph import CompGraph, Switch, as_switch, is_placeholder
 from epypes.pipeline import Node, Pipeline
+from epypes.run.guard import as_written
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,7 +237,7 @@ class Graphs:
 def bare(function: Any) -> Any:
     """Return the function of a node that does nothing else than call it; anything else as it is."""
     while type(function) is Node:
-        function = function.func
+        function = as_written(function.func)
     return function
 
 

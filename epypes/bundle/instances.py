@@ -17,7 +17,7 @@ from epypes.bundle.literal import is_data, is_same_data
 from epypes.bundle.source import Refused
 from epypes.bundle.text import nested_codes
 from epypes.pipeline import Node, Pipeline
-from epypes.run.guard import is_plain_array
+from epypes.run.guard import as_written, is_plain_array
 
 _GIVEN: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
@@ -80,7 +80,7 @@ def _kept(made: Node, name: str) -> Any:
         }[name]
     for attribute in (name, f"_{name}"):
         if attribute in vars(made):
-            return vars(made)[attribute]
+            return as_written(vars(made)[attribute])
     return _MISSING
 
 
@@ -105,6 +105,7 @@ def _check_made_again(made: Node, given: Mapping[str, Any], what: str) -> None:
         raise Refused(f"{text} Keep every argument of __init__ as an attribute of its name.") from error
     ours = vars(again).keys() & {*vars(Node("node", len)), *_PIPELINES, "__wrapped__"}
     by_runs = set(_set_by_runs(kind, _called_by(made)))
+    by_runs |= {name for name, value in vars(made).items() if as_written(value) is not value}
     for name in sorted((vars(made).keys() | vars(again).keys()) - ours - by_runs):
         one, other = vars(made).get(name, _MISSING), vars(again).get(name, _MISSING)
         if not _is_alike(one, other):

@@ -17,6 +17,7 @@ from epypes.errors import BundleError
 from epypes.graph import CompGraph, group, with_defaults
 from epypes.pipeline import FullPipeline
 from epypes.run import CompGraphRunner
+from epypes.run.guard import called_for
 
 MODULE: Final = "pipeline.py"
 SETTINGS: Final = "pipeline.toml"
@@ -95,7 +96,7 @@ def read_bundle(path: str | Path, *, sealed: bool = True) -> Bundle:
         ports = {name: port for name, port in own.items() if name != MAKER}
         state = MutableState({**module.func_dict, **ports})
         cg = _graph(module, state.guarded(module.func_dict), settings)
-        own |= state.guarded(ports)
+        own |= {name: called_for(name, port) for name, port in state.guarded(ports).items()}
     except AttributeError as error:
         text = f"{folder / MODULE} defines no {error.name!r}. Promote the graph again."
         raise BundleError(folder, text) from error

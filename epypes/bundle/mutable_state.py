@@ -31,7 +31,7 @@ from typing import Any, Final
 from epypes.errors import StateChanged
 from epypes.graph import as_switch, is_placeholder
 from epypes.pipeline import Node, Pipeline
-from epypes.run.guard import is_array, is_unguarded
+from epypes.run.guard import WATCH, WRITTEN, is_array, is_unguarded
 from epypes.run.snapshot import (
     Found,
     Record,
@@ -188,7 +188,8 @@ class CodeSnapshot(Snapshot):
         defaults = function.__defaults__ or ()
         yield from zip(arguments[len(arguments) - len(defaults) :], defaults, strict=True)
         yield from (function.__kwdefaults__ or {}).items()
-        yield from ((f"{function.__name__}.{name}", value) for name, value in function.__dict__.items())
+        attributes = function.__dict__.items()
+        yield from ((f"{function.__name__}.{name}", value) for name, value in attributes if name != WATCH)
 
     def _read(self, code: types.CodeType) -> tuple[dict[str, None], set[str]]:
         """Return the names that some code reads, and the variables of enclosing functions that it binds."""
@@ -374,7 +375,8 @@ _PARTS_OF_A_FUNCTION: Final = ("__defaults__", "__kwdefaults__", "__code__")
 
 
 def _read_function(function: types.FunctionType) -> tuple[Any, ...]:
-    found = {**function.__dict__, **{name: getattr(function, name) for name in _PARTS_OF_A_FUNCTION}}
+    found = {name: value for name, value in function.__dict__.items() if not name.startswith("__epypes_")}
+    found |= {name: getattr(function, name) for name in _PARTS_OF_A_FUNCTION}
     return *found, *found.values()
 
 
@@ -382,7 +384,8 @@ def _write_function(function: types.FunctionType, saved: tuple[Any, ...]) -> Non
     before = as_dict(saved)
     for name in _PARTS_OF_A_FUNCTION:
         setattr(function, name, before.pop(name))
-    function.__dict__.clear()
+    for name in [name for name in function.__dict__ if name not in before and not name.startswith("__epypes_")]:
+        del function.__dict__[name]
     function.__dict__.update(before)
 
 
@@ -423,7 +426,10 @@ class MutableState:
                 self._compared |= CodeSnapshot({name: function}, lock=False).arrays
 
     def guarded(self, functions: Mapping[str, Callable[..., Any]]) -> dict[str, Callable[..., Any]]:
-        """Return functions, each as it is or wrapped; nodes, and those of nested pipelines, are changed in place."""
+        """Have runners and nodes call what watches over these functions; return them, those of odd kinds wrapped.
+
+        Nodes, and those of nested pipelines, are changed in place.
+        """
         return {name: self._guarded(name, function) for name, function in functions.items()}
 
     def _guarded(self, name: str, function: Any) -> Any:
@@ -434,6 +440,10 @@ class MutableState:
             return function
         snapshot = CodeSnapshot({name: function}, compared=self._compared, caches=self._caches)
         if not snapshot:
+            return function
+        if type(function) in (types.FunctionType, functools.partial, _CACHED):
+            # It stays what the module defines, so that it can be promoted again.
+            setattr(function, WATCH, functools.partial(self._guarded_call, function=function, snapshot=snapshot))
             return function
         if not isinstance(function, Node):
             return self._guarded_call(name, function, snapshot)
@@ -484,6 +494,8 @@ class MutableState:
                 # The exception keeps this frame, which would keep the exception, and with it the images of the call.
                 del error, result
 
+        vars(call).pop(WATCH, None)
+        setattr(call, WRITTEN, function)
         return call
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, Final, TypeGuard
 
 from epypes.pipeline import Node, Pipeline
+from epypes.run.guard import as_written
 
 # A node may be made to wrap itself; nobody wraps this deep on purpose.
 _DEEPEST: Final = 100
@@ -18,7 +19,7 @@ def called_by(function: Any) -> Any:
             break
         if kind.compute is not Node.compute or kind.__call__ is not Node.__call__:
             break
-        function = function.func
+        function = as_written(function.func)
     return function
 
 

@@ -30,6 +30,7 @@ from epypes.bundle.state import check_asked, check_state
 from epypes.bundle.text import renamed
 from epypes.bundle.uses import global_names, replaced, submodules
 from epypes.bundle.values import expression
+from epypes.run.guard import WATCH
 
 _CONSTANT_CHARACTERS: Final = 400
 RESERVED: Final = frozenset({"func_dict", "func_io"})
@@ -148,7 +149,7 @@ class Slice:
         if owner is not None:
             of, method = owner
             return f"{of if isinstance(of, str) else self.reference(of, what)}.{method}"
-        if type(function) is partial and not function.__dict__:
+        if type(function) is partial and not function.__dict__.keys() - {WATCH}:
             return self._add_partial(function, what, wanted)
         source = "" if isinstance(function, types.FunctionType) else expression(self, function, what)
         return source or self._add_definition(function, what, wanted).name

@@ -17,6 +17,7 @@ from epypes.bundle.values import expression
 from epypes.graph import CompGraph, with_defaults
 from epypes.pipeline import FullPipeline, Pipeline, SinkPipeline, SourcePipeline
 from epypes.run import CompGraphRunner
+from epypes.run.guard import as_written
 
 # What the maker is given, and hands on to the class.
 _GIVEN: Final = ("cg", "q_in", "q_out", "f_in", "f_out", "hparams")
@@ -83,7 +84,7 @@ def subject_of(given: object, f_in: Any, f_out: Any) -> Subject:
 
 def _ports(own: Mapping[str, Any], f_in: Any, f_out: Any) -> dict[str, Callable[..., Any]]:
     found = {**own, **{name: port for name, port in (("f_in", f_in), ("f_out", f_out)) if port is not None}}
-    return {name: port for name, port in found.items() if port is not None and not is_usual(port)}
+    return {name: as_written(port) for name, port in found.items() if port is not None and not is_usual(port)}
 
 
 def _is_port(pipeline: Pipeline, name: str) -> bool:

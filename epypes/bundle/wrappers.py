@@ -14,6 +14,7 @@ from epypes.bundle.literal import is_data
 from epypes.bundle.remade import is_same_value, makers, pure_value, unlike, with_inner
 from epypes.bundle.source import evaluated, importable
 from epypes.bundle.text import definition_of, first_line
+from epypes.run.guard import WATCH
 
 # Objects of libraries hold much that is no function of the notebook.
 _MOST: Final = 500
@@ -36,7 +37,7 @@ def own_state(
     names
         The names of the notebook.
     """
-    hung = [name for name in wrapper.__dict__.keys() - wrapped.__dict__.keys() if name != "__wrapped__"]
+    hung = [name for name in wrapper.__dict__.keys() - wrapped.__dict__.keys() if name not in ("__wrapped__", WATCH)]
     if hung:
         return f"which hangs {min(hung)!r} on it, where it may keep something from call to call"
     _, node = definition_of(made_by.__code__)

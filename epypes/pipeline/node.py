@@ -9,6 +9,7 @@ from time import perf_counter_ns
 from types import CodeType
 from typing import Any, Final, TypeVar
 
+from epypes.run.guard import WATCH, called_for
 from epypes.run.underway import functions_under_way, locals_under_way
 
 M = TypeVar("M", bound=Callable[..., Any])
@@ -61,7 +62,7 @@ class Node:
         if not callable(func):
             raise TypeError(f"Node {name!r:.40} needs a function to call, not {type(func).__name__!r}.")
         self.name = name
-        self.func = func
+        self.func = called_for(name, func)
         self.duration_ns = 0
         self.run_count = 0
         # Whole in every thread, which counting up is not.
@@ -69,7 +70,9 @@ class Node:
         # Gives the node its function's signature, so that a graph of nodes is checked like one of functions.
         functools.update_wrapper(self, func, updated=())
         # Marks go along; whatever else a callable object or another node keeps must not take the place of our own.
-        marks = {key: mark for key, mark in getattr(func, "__dict__", {}).items() if not hasattr(self, key)}
+        marks = {
+            key: mark for key, mark in getattr(func, "__dict__", {}).items() if not hasattr(self, key) and key != WATCH
+        }
         self.__dict__.update(marks)
 
     @is_a_call

@@ -8,12 +8,14 @@ Neither numpy nor pandas is imported here: their values can only turn up once an
 from __future__ import annotations
 
 import copy
+import functools
 import sys
 import threading
 from array import array as number_array
 from collections import deque
 from collections.abc import Callable, Sequence
 from sys import getrefcount
+from types import FunctionType
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from epypes.errors import IteratorRefused
@@ -24,6 +26,11 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound=Callable[..., Any])
 
 _MARK = "__epypes_unguarded__"
+# What a bundle's function has that reaches what can be changed: given its name in a graph, it makes the function
+# that is called in its place. That one has the second.
+WATCH: Final = "__epypes_watch__"
+WRITTEN: Final = "__epypes_written__"
+_WATCHED: Final = frozenset({FunctionType, functools.partial, functools._lru_cache_wrapper})
 # What holds no array, known at a glance: most values of a graph are looked at several times per run.
 ARRAYLESS: Final = frozenset({int, float, bool, str, bytes, complex, type(None)})
 # Of a long tuple or list the first item tells whether it holds arrays: to look at each of 500 keypoints would take
@@ -53,6 +60,17 @@ def unguarded(function: F) -> F:
 def is_unguarded(function: object) -> bool:
     """Whether a function, or the function that it wraps, is marked as unguarded."""
     return bool(getattr(function, _MARK, False))
+
+
+def called_for(name: str, function: Any) -> Any:
+    """Return what is called for a function of a graph: in a loaded bundle, what watches over its calls."""
+    make = getattr(function, WATCH, None) if type(function) in _WATCHED else None
+    return function if make is None else make(name)
+
+
+def as_written(function: Any) -> Any:
+    """Return the function that a bundle's module defines, of one that watches over its calls."""
+    return getattr(function, WRITTEN, function) if type(function) is FunctionType else function
 
 
 # numpy's array type as soon as it has been seen: looking it up costs as much as a view.

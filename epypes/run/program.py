@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 from epypes.graph import CompGraph, Switch, as_switch
 from epypes.graph.checks import distinct
 from epypes.images import Contracts
-from epypes.run.guard import is_unguarded
+from epypes.run.guard import called_for, is_unguarded
 
 # What a function has that keeps hyperparameters of its own: a value that is another one whenever they have changed.
 REVISION: Final = "__epypes_revision__"
@@ -205,6 +205,7 @@ def _steps(cg: CompGraph, slots: dict[str, int], lends_only: bool) -> Iterator[S
     switches = {name: as_switch(cg.functions[name]) for name in cg.switches}
     sides = zip(cg.digraph.inputs.values(), cg.digraph.outputs.values(), cg.func_io.values(), strict=True)
     for place, ((name, function), (inputs, outputs, io)) in enumerate(zip(cg.functions.items(), sides, strict=True)):
+        function = called_for(name, function)
         unguarded, switch, contract = is_unguarded(function), switches.get(name), contracts.get(name)
         yield _new_step((
             place,

@@ -224,7 +224,7 @@ def test_a_memo_keeps_its_arrays_and_its_numbers_warm(tmp_path):
     runner = ep.load(bundle(tmp_path / "b", source))
     for x in range(9):
         assert runner.run(x=x)["y"] == 832043
-    names = runner.cg.functions["f"].__wrapped__.__globals__
+    names = runner.cg.functions["f"].__globals__
     assert names["kernel"].cache_info()[:2] == (8, 1)
     assert names["fib"].cache_info().misses == 31
 
@@ -373,3 +373,65 @@ def test_a_guarded_function_may_run_a_pipeline_of_the_bundle_in_threads(tmp_path
 
     threading.Thread(target=work, daemon=True).start()
     assert done.wait(60)
+
+
+REPROMOTED = """
+import epypes as ep
+LEVELS = [3, 1, 2]
+
+
+def levelled(g):
+    @functools.wraps(g)
+    def call(x):
+        return g(x) + len(LEVELS)
+    return call
+
+
+@levelled
+def decorated(x):
+    return x + LEVELS[0]
+
+
+@functools.lru_cache
+def kernel(n):
+    return np.ones(n)
+
+
+def plain(x):
+    return x + sum(LEVELS) + int(kernel(2).sum())
+
+
+def scaled(k, x):
+    return k * x + LEVELS[0]
+
+
+class Adding(ep.Node):
+    def compute(self, x):
+        return self.func(x) + LEVELS[0]
+
+
+pipe = ep.Pipeline("pipe", ep.CompGraph({"inner": plain}, {"inner": ("x", "z")}))
+functions = {
+    "decorated": decorated, "plain": plain, "partial": functools.partial(scaled, 3), "pipe": pipe,
+    "adding": Adding("adding", plain), "node": ep.Node("node", plain),
+}
+func_dict, func_io = functions, {name: ("x", f"y_{name}") for name in functions}
+"""
+
+
+@pytest.mark.slow
+def test_a_bundle_of_watched_functions_is_promoted_again(tmp_path):
+    outputs = [f"y_{name}" for name in ("decorated", "plain", "partial", "pipe", "adding", "node")]
+    settings = SETTINGS.replace('["y"]', str(outputs).replace("'", '"'))
+    loaded = ep.load(bundle(tmp_path / "first", REPROMOTED, settings))
+    loaded.run(x=2)
+    second = ep.promote(loaded, tmp_path / "second")
+    again = ep.load(second.path)
+    assert dict(again.run(x=5)) == dict(ep.load(tmp_path / "first").run(x=5))
+    third = ep.promote(again, tmp_path / "third")
+    assert (third.path / "pipeline.py").read_text().replace("third", "second") == (
+        second.path / "pipeline.py"
+    ).read_text()
+    namespace: dict = {}
+    exec(ep.to_source(loaded), namespace)
+    assert namespace["run_graph"](2) == tuple(loaded.last[token] for token in loaded.cg.sink_tokens)
