@@ -27,6 +27,8 @@ DARK = frozenset(
         "test_panel.py",
         "test_remote_panel.py",
         "test_search.py",
+        "test_service_page.py",
+        "test_view.py",
     }
 )
 
