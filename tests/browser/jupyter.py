@@ -201,6 +201,7 @@ class Notebook:
         self.page_errors: list[str] = []
         self.page.on("pageerror", self._keep_error)
         self.page.set_viewport_size({"width": width, "height": height})
+        self.page.mouse.move(0, 0)  # what is under the mouse would show its card
         self._close_all()
         self.page.evaluate(
             """async path => {
