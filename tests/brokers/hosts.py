@@ -14,7 +14,7 @@ _PATH = f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin"
 
 def _ip(*words):
     return subprocess.run(
-        [shutil.which("ip", path=_PATH) or "ip", *words], capture_output=True, text=True, check=True, timeout=30
+        [shutil.which("ip", path=_PATH) or "ip", *words], capture_output=True, text=True, check=True, timeout=60
     ).stdout
 
 

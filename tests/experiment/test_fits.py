@@ -34,6 +34,7 @@ def test_it_is_what_scipy_fits_with_the_place_held_at_zero(seed):
     assert np.allclose(fitted.pdf(times), stats.lognorm.pdf(times, sigma, 0, scale), rtol=1e-4)
 
 
+@pytest.mark.fuzz
 @given(
     st.lists(st.floats(1e-9, 1e3), min_size=1, max_size=30),
     st.permutations([0.0, -1e-6, math.nan, math.inf, -math.inf]),
@@ -45,6 +46,7 @@ def test_what_is_no_positive_number_is_counted_and_changes_nothing_else(values, 
     assert (alone.count, alone.left_out) == (len(values), 0)
 
 
+@pytest.mark.fuzz
 @given(st.floats(1e-9, 1e3), st.integers(1, 50))
 def test_values_that_are_equal_have_their_mode_there_and_no_curve(value, count):
     fitted = lognormal_fit([value] * count)

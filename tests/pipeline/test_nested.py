@@ -193,7 +193,7 @@ def test_a_pipeline_with_workers_runs_independent_functions_at_once(monkeypatch)
     barrier = threading.Barrier(2)
 
     def meet(x):
-        barrier.wait(10)  # passes only if two are in it at once
+        barrier.wait(60)  # passes only if two are in it at once
         return x
 
     cg = ep.CompGraph({"f": meet, "g": meet}, {"f": ("x", "a"), "g": ("x", "b")})

@@ -286,7 +286,7 @@ def test_a_pipeline_left_running_warns_and_the_interpreter_exits():
         "ep.SinkPipeline('left', cg, queue.Queue(), lambda e: {'x': e}).listen()\n"
     )
     done = subprocess.run(
-        [sys.executable, "-W", "always", "-c", code], capture_output=True, text=True, timeout=30, check=False
+        [sys.executable, "-W", "always", "-c", code], capture_output=True, text=True, timeout=60, check=False
     )
     assert done.returncode == 0
     assert "ResourceWarning: 'left' was left running" in done.stderr

@@ -6,6 +6,8 @@ import queue
 import time
 from types import SimpleNamespace
 
+import pytest
+
 import epypes as ep
 from epypes.wire.failures import failure_event
 
@@ -94,6 +96,7 @@ def test_failures_of_one_event_are_counted_by_its_id_and_say_whose_they_are():
     assert (sent.failure.function, sent.failure.tokens, sent.failure.exception) == ("f", ("x", "y"), "TypeError")
 
 
+@pytest.mark.slow
 def test_the_ids_of_failed_events_are_not_kept_for_ever():
     attempts = []
     pipe = ep.SinkPipeline("p", graph(), queue.Queue(), lambda event: {})

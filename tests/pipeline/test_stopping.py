@@ -193,7 +193,7 @@ def endless(x):
     threading.Event().wait()
 cg = ep.CompGraph({'endless': endless}, {'endless': ('x', None)})
 pipe = ep.SinkPipeline('stuck', cg, queue.Queue(), lambda event: {'x': event})
-pipe.q_in.put(1); pipe.listen(); inside.wait(20)
+pipe.q_in.put(1); pipe.listen(); inside.wait(60)
 for stop in (pipe.stop, pipe.listen):
     try:
         stop(timeout_s=0.05)

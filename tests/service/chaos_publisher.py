@@ -25,7 +25,7 @@ def main(address: str, poison: int, count: int, pace_ms: int) -> None:
     signal.signal(signal.SIGTERM, lambda *_: ended.set())
     items: queue.SimpleQueue = queue.SimpleQueue()
     with ep.ZMQPublisher(address, items, bind=False) as publisher:
-        publisher.wait_for_subscriber(30)
+        publisher.wait_for_subscriber(60)
         print("JOINED", flush=True)  # noqa: T201
         sent = 0
         while sent < count and not ended.wait(pace_ms / 1000):

@@ -32,7 +32,7 @@ def running(bundle, *options):
         watchdog.cancel()
         if process.poll() is None:
             process.send_signal(signal.SIGTERM)
-        process.communicate(timeout=30)
+        process.communicate(timeout=60)
 
 
 def run_cli(*arguments, timeout_s=90, **options):

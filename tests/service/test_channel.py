@@ -13,7 +13,7 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from epypes.errors import MessageError
@@ -58,7 +58,7 @@ def in_thread(function, *arguments):
     return result
 
 
-@settings(max_examples=50, deadline=None)
+@pytest.mark.fuzz
 @given(
     st.dictionaries(st.text(max_size=9), st.none() | st.integers() | st.text(max_size=9) | st.floats(allow_nan=False)),
     st.lists(st.binary(max_size=300), max_size=6),
@@ -91,6 +91,7 @@ def test_messages_larger_than_all_buffers_arrive_whole_in_both_directions_at_onc
         assert all(frame.readonly for frame in got)
 
 
+@pytest.mark.slow
 def test_more_frames_than_the_system_takes_at_once_arrive_whole(ends):
     frames = [bytes([number % 256]) * (number % 7) for number in range(5_000)]
     send = in_thread(ends[0].send, {}, frames)
@@ -122,6 +123,7 @@ def test_what_was_sent_may_be_written_to_again(ends):
     assert np.frombuffer(receive()[1][0], np.uint8).max() == 1
 
 
+@pytest.mark.slow
 def test_threads_that_send_at_once_do_not_mix_their_messages(ends):
     ours, other = ends
     senders = [

@@ -80,6 +80,7 @@ def test_systemd_takes_the_unit(bundle, tmp_path):
     assert "kill mode" in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.packaging
 def test_a_container_is_built_from_the_bundle_and_what_it_requires(bundle, tmp_path):
     path = write_container(bundle, tmp_path / "image", ["--threads", "2"])
@@ -127,6 +128,7 @@ def test_the_command_writes_a_unit_and_refuses_options_that_serve_does_not_take(
     assert "--sob" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.packaging
 def test_the_command_writes_a_container(bundle, tmp_path, capsys):
     assert run("export", "docker", bundle, "--to", tmp_path / "image") == 0

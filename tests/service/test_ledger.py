@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
@@ -278,5 +277,4 @@ class Everything(RuleBasedStateMachine):
         assert sorted([event for event, _ in self.out] + self.dropped) == self.accepted
 
 
-TestEverything = Everything.TestCase
-TestEverything.settings = settings(max_examples=120, stateful_step_count=50, deadline=None)
+TestEverything = pytest.mark.slow(pytest.mark.fuzz(Everything.TestCase))

@@ -17,6 +17,7 @@ from tests.wire.mutants import mutate_bytes
 HEAD = struct.Struct("<4sI")
 
 
+@pytest.mark.fuzz
 @given(st.lists(st.binary(max_size=200), max_size=20))
 def test_what_was_packed_is_unpacked_frame_by_frame(frames):
     unpacked = unpack(pack(frames))
@@ -24,6 +25,7 @@ def test_what_was_packed_is_unpacked_frame_by_frame(frames):
     assert all(frame.readonly for frame in unpacked)
 
 
+@pytest.mark.fuzz
 @given(st.lists(st.binary(max_size=50), max_size=5), st.binary(min_size=1, max_size=9), st.integers(1, 60))
 def test_bytes_too_many_or_too_few_are_refused(frames, more, fewer):
     block = pack(frames)

@@ -274,6 +274,7 @@ def test_a_failure_is_opened_from_a_running_service_by_its_url_or_connection(bri
         connection.close()
 
 
+@pytest.mark.slow
 @pytest.mark.notebook
 def test_in_a_notebook_a_failure_shows_itself_and_the_next_cell_goes_on_from_it(bright_bundle):
     failure = keep(bright_bundle, request(RAISES))

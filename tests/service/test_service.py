@@ -25,8 +25,6 @@ from tests.service.bundles import written_bundle
 from tests.service.processes import run_cli, running
 from tests.service.served import TIMEOUT_S, peer_of, serving, until
 
-pytestmark = pytest.mark.slow
-
 ANY = "tcp://127.0.0.1:*"
 
 IMAGES = '''
@@ -103,6 +101,7 @@ def local():
         lock.__exit__(None, None, None)
 
 
+@pytest.mark.slow
 def test_a_service_in_another_process_answers_with_what_the_notebook_computed(edge_bundle, photograph):
     expected = cv2.Canny(cv2.medianBlur(photograph, 5), 70, 200)
     with running(edge_bundle.path) as process:
@@ -120,6 +119,7 @@ def test_a_service_in_another_process_answers_with_what_the_notebook_computed(ed
     assert read_state(edge_bundle.path) is None
 
 
+@pytest.mark.slow
 def test_a_function_that_fails_is_told_to_the_caller_and_the_service_goes_on(local, edge_bundle, photograph):
     service = local(edge_bundle.path)
     with pytest.raises(RemoteFailure, match="Function 'smooth' failed in the service: error") as error:
@@ -132,6 +132,7 @@ def test_a_function_that_fails_is_told_to_the_caller_and_the_service_goes_on(loc
             call(edge_bundle.path, parts, timeout_s=TIMEOUT_S)
 
 
+@pytest.mark.slow
 def test_garbage_on_the_input_socket_is_counted_and_the_service_goes_on(edge_bundle, photograph):
     header = bytes(encode(Envelope(type="x", parts={"image": photograph}))[1])
     garbage = [
@@ -164,6 +165,7 @@ def test_garbage_on_the_input_socket_is_counted_and_the_service_goes_on(edge_bun
         assert counts["answered"] == 1
 
 
+@pytest.mark.slow
 def test_a_port_in_use_is_named_and_nothing_is_left_behind(edge_bundle):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -178,6 +180,7 @@ def test_a_port_in_use_is_named_and_nothing_is_left_behind(edge_bundle):
         assert f"tcp://127.0.0.1:{port}" in process.ready
 
 
+@pytest.mark.slow
 def test_a_bundle_is_served_once(edge_bundle):
     with running(edge_bundle.path) as process:
         done = run_cli("serve", edge_bundle.path)
@@ -185,6 +188,7 @@ def test_a_bundle_is_served_once(edge_bundle):
         assert f"is being served already, by process {process.pid} at tcp://127.0.0.1:" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_killed_service_is_not_taken_for_a_running_one(edge_bundle, photograph):
     with running(edge_bundle.path) as process:
         process.kill()
@@ -196,6 +200,7 @@ def test_a_killed_service_is_not_taken_for_a_running_one(edge_bundle, photograph
         assert call(edge_bundle.path, {"image": photograph}, timeout_s=TIMEOUT_S).tokens["edges"].any()
 
 
+@pytest.mark.slow
 def test_a_service_that_is_killed_while_it_works_is_told_to_the_caller(edge_bundle, photograph):
     with running(edge_bundle.path) as process, Client(edge_bundle.path, timeout_s=TIMEOUT_S) as client:
         client.call({"image": photograph})
@@ -205,6 +210,7 @@ def test_a_service_that_is_killed_while_it_works_is_told_to_the_caller(edge_bund
             client.call({"image": photograph})
 
 
+@pytest.mark.slow
 def test_a_stopped_service_makes_the_call_time_out(edge_bundle, photograph):
     with running(edge_bundle.path) as process, Client(edge_bundle.path, timeout_s=1.0) as client:
         client.call({"image": photograph})
@@ -216,6 +222,7 @@ def test_a_stopped_service_makes_the_call_time_out(edge_bundle, photograph):
             process.send_signal(signal.SIGCONT)
 
 
+@pytest.mark.slow
 def test_a_changed_bundle_is_not_served(edge_bundle, tmp_path):
     copy = tmp_path / "edges"
     shutil.copytree(edge_bundle.path, copy)
@@ -235,6 +242,7 @@ def test_an_address_that_others_can_reach_is_refused(edge_bundle):
         Service(edge_bundle.path, "tcp://0.0.0.0:5999", ANY)
 
 
+@pytest.mark.slow
 def test_a_service_can_connect_instead_of_bind(local, edge_bundle, photograph):
     requests, answers = queue.Queue(), queue.Queue()
     with ep.ZMQPublisher(ANY, requests) as publisher, ep.ZMQSubscriber(ANY, answers, bind=True) as subscriber:
@@ -248,6 +256,7 @@ def test_a_service_can_connect_instead_of_bind(local, edge_bundle, photograph):
         service.stop()
 
 
+@pytest.mark.slow
 def test_a_service_stops_twice_and_before_it_was_started(acting):
     service = Service(acting)
     assert service.state == "STOPPED"
@@ -273,6 +282,7 @@ def test_load_pipeline_gives_the_pipeline_that_serve_runs(edge_bundle, photograp
     assert np.array_equal(answer.parts["edges"], cv2.Canny(cv2.medianBlur(photograph, 5), 70, 200))
 
 
+@pytest.mark.slow
 def test_a_function_that_uses_its_buffer_again_does_not_change_answers_on_their_way(local, image_bundle):
     local(image_bundle)
 
@@ -285,6 +295,7 @@ def test_a_function_that_uses_its_buffer_again_does_not_change_answers_on_their_
         assert all(pool.map(calls, range(4)))
 
 
+@pytest.mark.slow
 def test_threads_that_share_a_client_each_get_their_own_answer(local, image_bundle):
     local(image_bundle)
     with Client(image_bundle, timeout_s=TIMEOUT_S) as client, ThreadPoolExecutor(4) as pool:
@@ -296,6 +307,7 @@ def test_threads_that_share_a_client_each_get_their_own_answer(local, image_bund
         assert (client.call({"image": images[0]}).tokens["out"] == 1).all(), "it spoils no later one"
 
 
+@pytest.mark.slow
 def test_whatever_a_function_raises_or_returns_is_answered_and_the_service_goes_on(local, failing_bundle):
     service = local(failing_bundle)
     failures = {
@@ -314,6 +326,7 @@ def test_whatever_a_function_raises_or_returns_is_answered_and_the_service_goes_
     assert (counts["failed"], counts["answered"], service.info()["restarts"]) == (len(failures), 1, 0)
 
 
+@pytest.mark.slow
 def test_every_event_is_answered_dropped_ones_and_those_that_wait_at_the_stop_too(acting, tmp_path):
     count, size = 30, 8
     with serving(acting, mailbox_size=size) as (service, peer):
@@ -338,6 +351,7 @@ def test_every_event_is_answered_dropped_ones_and_those_that_wait_at_the_stop_to
     assert {name: service.counts()[name] for name in expected} == expected
 
 
+@pytest.mark.slow
 def test_what_can_not_be_finished_in_time_is_answered_at_the_stop_with_the_function_that_it_is_in(acting, tmp_path):
     with serving(acting) as (service, peer):
         peer.send(f"hold:{tmp_path}", 0)
@@ -370,6 +384,7 @@ def test_a_service_is_found_by_where_it_answers_over_http(acting, edge_bundle):
     assert running_at("http://127.0.0.1:8642") is None, "it does not run any more"
 
 
+@pytest.mark.slow
 def test_the_colours_of_rgb_tokens_survive_the_way_through_a_service(local, tmp_path):
     runner, image = red_runner(), red_image(200)
     runner.run(image=image)

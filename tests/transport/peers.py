@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from time import monotonic
 
 LOCAL = "tcp://127.0.0.1:*"
 WAIT_S = 60.0
@@ -14,12 +15,11 @@ WAIT_S = 60.0
 
 def wait_until(condition: Callable[[], object], timeout_s: float = WAIT_S) -> None:
     """Wait on an event that nobody sets, a little at a time, until a counter of another thread is right."""
-    never = threading.Event()
-    for _ in range(int(timeout_s / 0.005)):
-        if condition():
-            return
+    never, end_s = threading.Event(), monotonic() + timeout_s
+    while not condition():
+        if monotonic() > end_s:
+            raise AssertionError(f"the condition did not come true within {timeout_s:g} s")
         never.wait(0.005)
-    raise AssertionError("the condition did not come true in time")
 
 
 @contextmanager

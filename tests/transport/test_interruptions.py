@@ -46,7 +46,7 @@ with ZMQPublisher("tcp://127.0.0.1:*", out) as pub:
     before = pub.sent
     other = threading.Thread(target=out.put, args=(b"y",), daemon=True)
     other.start()
-    other.join(5)
+    other.join(60)
     print("sent" if pub.sent > before else "stuck", flush=True)
 """
 PUTTING_HANDLER = """

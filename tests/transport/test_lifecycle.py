@@ -261,7 +261,7 @@ def test_one_that_is_forgotten_gives_a_warning_and_is_closed(make):
 
 def run(script: str, *options: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, *options, "-c", script], capture_output=True, text=True, timeout=30, cwd=os.getcwd()
+        [sys.executable, *options, "-c", script], capture_output=True, text=True, timeout=60, cwd=os.getcwd()
     )
 
 
@@ -271,7 +271,7 @@ from epypes.transport import ZMQPublisher, ZMQSubscriber
 out, into = queue.Queue(), queue.Queue()
 pub = ZMQPublisher("tcp://127.0.0.1:*", out, "t").start()
 sub = ZMQSubscriber(pub.address, into, "t").start()
-assert sub.wait_joined(5)
+assert sub.wait_joined(60)
 """
 
 
@@ -310,11 +310,11 @@ child = os.fork()
 if child == 0:
     pub.stop(); sub.stop()
     with ZMQPublisher("tcp://127.0.0.1:*", out) as mine, ZMQSubscriber(mine.address, into) as other:
-        ok = other.wait_joined(5)
+        ok = other.wait_joined(60)
     os._exit(0 if ok else 1)
 assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 out.put(b"t/ still works")
-assert into.get(timeout=5) == b"t/ still works"
+assert into.get(timeout=60) == b"t/ still works"
 sub.stop(); pub.stop()
 """
     )

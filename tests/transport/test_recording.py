@@ -26,8 +26,6 @@ from epypes.transport.mcapwriter import RecordingWriter
 from epypes.wire import Envelope, JustBytes, decode, encode
 from tests.transport.peers import wait_until
 
-pytestmark = pytest.mark.slow  # files are written, cut off and played
-
 LOCAL = "tcp://127.0.0.1:*"
 WAIT_S = 60.0
 HOUR_NS = 3_600 * 10**9
@@ -77,6 +75,7 @@ TRAFFIC = [
 ]
 
 
+@pytest.mark.slow
 def test_what_is_played_is_byte_for_byte_what_was_published(peer, tmp_path):
     source, sink = peer(zmq.XPUB), peer(zmq.SUB)
     with Recorder(LOCAL, tmp_path / "a.mcap", bind=True) as recorder:
@@ -162,6 +161,7 @@ def test_any_reader_of_mcap_finds_topics_times_and_messages(tmp_path):
         }
 
 
+@pytest.mark.slow
 def test_one_topic_can_be_recorded_alone(tmp_path):
     left, right = queue.SimpleQueue(), queue.SimpleQueue()
     with (
@@ -177,6 +177,7 @@ def test_one_topic_can_be_recorded_alone(tmp_path):
     assert recording_info(tmp_path / "a.mcap").topics == {"cam1": 1}
 
 
+@pytest.mark.slow
 def test_topics_that_are_invented_without_end_do_not_use_up_the_channels(tmp_path):
     written(tmp_path / "a.mcap", [(1, [b"t%d/" % number, b"x"]) for number in range(3_000)])
     found = recording_info(tmp_path / "a.mcap")
@@ -185,6 +186,7 @@ def test_topics_that_are_invented_without_end_do_not_use_up_the_channels(tmp_pat
     assert frames_of(tmp_path / "a.mcap")[-1] == [b"t2999/", b"x"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("speed", "least_s"), [(1.0, 0.4), (2.0, 0.2), (0.5, 0.8)])
 def test_the_distances_in_time_are_kept_and_can_be_changed(tmp_path, speed, least_s):
     start = time.time_ns()
@@ -203,6 +205,7 @@ def test_speed_0_does_not_wait_for_the_times(tmp_path):
         assert [into.get(timeout=WAIT_S) for _ in range(10)] == [b"x"] * 10
 
 
+@pytest.mark.slow
 def test_it_plays_as_often_as_it_is_told(tmp_path):
     written(tmp_path / "a.mcap", [(1, [b"a"]), (2, [b"b"])])
     into = queue.SimpleQueue()
@@ -214,6 +217,7 @@ def test_it_plays_as_often_as_it_is_told(tmp_path):
         assert not player.wait(0.0)
 
 
+@pytest.mark.slow
 def test_another_subscriber_may_join_while_it_plays(tmp_path):
     written(tmp_path / "a.mcap", [(1, [b"t/", bytes(1_000)]), (2, [b"x"])])
     first, second = queue.SimpleQueue(), queue.SimpleQueue()
@@ -228,6 +232,7 @@ def test_another_subscriber_may_join_while_it_plays(tmp_path):
                 assert bytes(second.get(timeout=WAIT_S)[0]) == b"t/"
 
 
+@pytest.mark.slow
 def test_nothing_is_sent_before_somebody_listens_unless_it_is_told_so(tmp_path):
     written(tmp_path / "a.mcap", [(1, [b"x"])])
     with Player(tmp_path / "a.mcap") as player:
@@ -250,6 +255,7 @@ def test_a_player_stops_at_once_whatever_it_waits_for(tmp_path, wait):
     assert "stopped" in repr(player)
 
 
+@pytest.mark.slow
 def test_nothing_is_lost_on_the_way_to_a_subscriber_that_reads_late(peer, tmp_path):
     written(tmp_path / "a.mcap", [(1, [b"%d" % number, bytes(10_000)]) for number in range(3_000)])
     sink = peer(zmq.SUB, rcvhwm=1)
@@ -264,6 +270,7 @@ def test_nothing_is_lost_on_the_way_to_a_subscriber_that_reads_late(peer, tmp_pa
         assert player.wait(WAIT_S)
 
 
+@pytest.mark.slow
 def test_a_subscriber_that_does_not_read_does_not_keep_a_player_from_stopping(peer, tmp_path):
     written(tmp_path / "a.mcap", [(1, [bytes(100_000)])] * 300)
     sink = peer(zmq.SUB, rcvhwm=1)
@@ -289,6 +296,7 @@ def test_a_recorder_ends_by_itself_after_as_many_messages_as_it_is_told(tmp_path
     assert frames_of(tmp_path / "a.mcap") == [[b"0"], [b"1"], [b"2"]]
 
 
+@pytest.mark.slow
 def test_what_came_can_be_played_a_second_later_while_it_still_records(tmp_path):
     out = queue.SimpleQueue()
     with ZMQPublisher(LOCAL, out) as pub, Recorder(pub.address, tmp_path / "a.mcap") as recorder:
@@ -315,6 +323,7 @@ def record(address: str, path, *options: str, code: str = "") -> subprocess.Pope
     return process
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_finishes_the_file(tmp_path, number):
     out, path = queue.SimpleQueue(), tmp_path / "a.mcap"
@@ -325,22 +334,23 @@ def test_a_signal_finishes_the_file(tmp_path, number):
         wait_until(lambda: still_there(path) > 0)
         pub.stop()
         process.send_signal(number)
-        said, complaints = process.communicate(timeout=30)
+        said, complaints = process.communicate(timeout=60)
     assert (process.returncode, complaints) == (0, "")
     assert said == f"RECORDED {path}: received 50, written 50, dropped 0.\n"
     assert recording_info(path).counts == Counts(50, 50)
     assert recording_info(path).messages == 50
 
 
+@pytest.mark.slow
 def test_a_recorder_that_is_killed_leaves_a_file_that_plays(tmp_path):
     out, path, into = queue.SimpleQueue(), tmp_path / "a.mcap", queue.SimpleQueue()
     with ZMQPublisher(LOCAL, out, "t") as pub:
         process = record(pub.address, path)
         for number in range(200):
             out.put(Envelope("x", {"n": number, "image": IMAGE}))
-        wait_until(lambda: still_there(path) >= 100, timeout_s=20)
+        wait_until(lambda: still_there(path) >= 100, timeout_s=60)
         process.kill()
-        process.communicate(timeout=30)
+        process.communicate(timeout=60)
     found = recording_info(path)
     assert found.counts is None
     player = Player(path, speed=0).start()
@@ -353,6 +363,7 @@ def test_a_recorder_that_is_killed_leaves_a_file_that_plays(tmp_path):
     player.stop()
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_the_recording_and_keeps_what_was_written(tmp_path):
     out, path = queue.SimpleQueue(), tmp_path / "a.mcap"
     limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (5_000_000, 5_000_000))"
@@ -360,7 +371,7 @@ def test_a_full_disk_ends_the_recording_and_keeps_what_was_written(tmp_path):
         process = record(pub.address, path, code=limit)
         for number in range(300):
             out.put(Envelope("x", {"n": number, "image": IMAGE}))
-        said, complaints = process.communicate(timeout=30)
+        said, complaints = process.communicate(timeout=60)
     assert process.returncode == 1
     assert complaints == f"epypes: {path} can't be written: File too large.\n"
     received, kept, dropped = map(int, re.findall(r"(?:received|written|disk failed) (\d+)", said))
@@ -390,6 +401,7 @@ class SlowDisk:
         os.close(self._end)
 
 
+@pytest.mark.slow
 def test_what_a_slow_disk_does_not_take_is_dropped_and_counted(tmp_path):
     disk, out = SlowDisk(tmp_path / "pipe"), queue.SimpleQueue()
     with ZMQPublisher(LOCAL, out) as pub:
@@ -412,6 +424,7 @@ def test_what_a_slow_disk_does_not_take_is_dropped_and_counted(tmp_path):
     assert found.messages == counts.written
 
 
+@pytest.mark.slow
 def test_a_write_that_never_returns_is_named(tmp_path):
     disk, out = SlowDisk(tmp_path / "pipe"), queue.SimpleQueue()
     with ZMQPublisher(LOCAL, out) as pub:
@@ -431,6 +444,7 @@ def threads_of_recording() -> list[str]:
     return [thread.name for thread in threading.enumerate() if thread.name.startswith("epypes-")]
 
 
+@pytest.mark.slow
 def test_stop_works_before_start_and_twice_and_start_works_again(tmp_path):
     recorder = Recorder(LOCAL, tmp_path / "a.mcap", bind=True)
     recorder.stop()
@@ -456,6 +470,7 @@ def test_stop_works_before_start_and_twice_and_start_works_again(tmp_path):
     assert threads_of_recording() == []
 
 
+@pytest.mark.slow
 def test_on_end_may_stop_what_has_ended(tmp_path):
     ended = queue.SimpleQueue()
 
@@ -473,6 +488,7 @@ def test_on_end_may_stop_what_has_ended(tmp_path):
     both[0].stop()
 
 
+@pytest.mark.slow
 def test_one_that_is_forgotten_gives_a_warning_and_ends(tmp_path):
     written(tmp_path / "a.mcap", [(1, [b"x"])])
     player = Player(tmp_path / "a.mcap").start()
@@ -555,6 +571,7 @@ def test_what_is_no_recording_is_refused_before_a_socket_is_opened(tmp_path, tex
     assert threads_of_recording() == []
 
 
+@pytest.mark.slow
 def test_a_file_cut_anywhere_gives_what_is_whole_and_one_error(tmp_path):
     whole, part = tmp_path / "a.mcap", tmp_path / "b.mcap"
     writer = RecordingWriter(whole, {}, force=False)
@@ -573,6 +590,7 @@ def test_a_file_cut_anywhere_gives_what_is_whole_and_one_error(tmp_path):
     assert len(frames_of(part)) == 10, "only the index at its end is missing, which a player does not need"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [400, pytest.param(20_000, marks=pytest.mark.soak)])
 def test_a_damaged_file_never_gives_anything_but_a_recording_error(tmp_path, count):
     path = tmp_path / "a.mcap"
@@ -607,6 +625,7 @@ def test_other_machines_are_let_in_only_when_that_is_said(tmp_path):
         Recorder("tcp://*:5555", tmp_path / "a.mcap", bind=True)
 
 
+@pytest.mark.slow
 def test_keys_keep_strangers_from_what_is_recorded_and_played(tmp_path):
     robot, known, stranger = (make_keys(tmp_path / name) for name in ("robot", "known", "stranger"))
     written(tmp_path / "a.mcap", [(1, [b"t/", b"secret"])])

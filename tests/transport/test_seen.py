@@ -85,6 +85,7 @@ def test_what_others_have_answered_is_done_unless_it_is_in_hand_or_rejected_here
     assert seen.word("other") == Word()
 
 
+@pytest.mark.fuzz
 @given(st.lists(st.sampled_from("abcdefgh")), st.integers(1, 5))
 def test_the_ids_that_were_done_last_are_remembered_and_no_more(ids, most):
     seen = Seen(most)

@@ -833,7 +833,7 @@ out, q = ep.Mailbox("block", 8), queue.Queue()
 pub = ep.Publisher("memory://b/q?create=true", out).start()
 sub = ep.Subscriber("memory://b/q", q).start()
 out.put(b"x")
-q.get(timeout=10)
+q.get(timeout=60)
 print("end", flush=True)
 """
 
@@ -850,7 +850,7 @@ out, plain, q = ep.Mailbox("block", 8), queue.Queue(), queue.Queue()
 pubs = [ep.Publisher("memory://b/q?create=true", taken).start() for taken in (out, plain)]
 sub = ep.Subscriber("memory://b/q", q).start()
 out.put(b"x")
-item = q.get(timeout=10)
+item = q.get(timeout=60)
 pid = os.fork()
 if pid == 0:
     try:
@@ -868,7 +868,7 @@ if pid == 0:
     os._exit(7)
 assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 7
 out.put(b"y")
-assert q.get(timeout=10) == b"y"
+assert q.get(timeout=60) == b"y"
 item.ack()
 for twin in (*pubs, sub):
     twin.stop()

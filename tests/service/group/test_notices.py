@@ -60,6 +60,7 @@ def test_what_another_program_says_is_refused(data):
         read_proposal(data)
 
 
+@pytest.mark.fuzz
 @given(st.binary(max_size=200) | st.text(max_size=200).map(str.encode))
 def test_anything_that_comes_is_understood_or_refused(data):
     for read in (read_notice, read_proposal):

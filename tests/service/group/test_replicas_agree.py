@@ -56,7 +56,7 @@ def http(trio, tmp_path_factory):
     _, (first, *_) = trio
     with HttpServer(first, "127.0.0.1:*", token_file=tmp_path_factory.mktemp("token") / "token") as server:
         headers = {"Authorization": f"Bearer {server.token_file.read_text().strip()}"}
-        with httpx.Client(base_url=server.url, trust_env=False, timeout=20, headers=headers) as client:
+        with httpx.Client(base_url=server.url, trust_env=False, timeout=60, headers=headers) as client:
             yield client
 
 

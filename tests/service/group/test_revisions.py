@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from epypes.service.group.revisions import Proposal, Revisions
@@ -96,7 +96,7 @@ STEPS = st.lists(
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
+@pytest.mark.fuzz
 @given(STEPS, st.lists(st.integers(1, 4), min_size=60, max_size=60))
 def test_any_interleaving_of_proposals_gives_the_same_everywhere(steps, counts):
     log = []
@@ -159,7 +159,7 @@ class NewestOnly:
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
+@pytest.mark.fuzz
 @given(st.lists(st.tuples(st.integers(0, 2), st.sampled_from(["propose", "cut", "hear", "restate"])), max_size=40))
 def test_with_a_log_that_keeps_the_newest_alone_all_agree_in_the_end(steps):
     log = NewestOnly()

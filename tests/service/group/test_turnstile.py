@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from epypes.service.group.turnstile import SETTLE_S, Turnstile
@@ -211,7 +211,7 @@ STEPS = st.lists(
 )
 
 
-@settings(max_examples=100, deadline=None)
+@pytest.mark.fuzz
 @given(STEPS, st.integers(1, 30), st.sampled_from([1, 1, 57]))
 def test_every_event_goes_through_once_and_none_waits_too_long_whatever_dies(steps, count, first):
     group = Group(3, first)
@@ -223,7 +223,7 @@ def test_every_event_goes_through_once_and_none_waits_too_long_whatever_dies(ste
 
 
 @pytest.mark.slow
-@settings(max_examples=100, deadline=None)
+@pytest.mark.fuzz
 @given(STEPS, st.integers(1, 30), st.sampled_from([1, 1, 57]))
 def test_the_order_is_kept_when_nothing_takes_longer_than_its_time(steps, count, first):
     # Deaths and lost words are allowed: what a dead replica had is delivered again in time. What it had done, and had

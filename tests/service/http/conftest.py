@@ -40,7 +40,7 @@ def http(service, tmp_path_factory):
 @pytest.fixture
 def client(http):
     """Who may look."""
-    with httpx.Client(base_url=http.url, trust_env=False, timeout=20) as client:
+    with httpx.Client(base_url=http.url, trust_env=False, timeout=60) as client:
         yield client
 
 

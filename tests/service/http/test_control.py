@@ -227,7 +227,7 @@ def test_while_a_bundle_is_deployed_another_one_is_refused_and_all_else_is_answe
             assert client.post("/v1/pause").status_code == 200
             assert client.post("/v1/resume").status_code == 200
             (tmp_path / "go").touch()
-            first.join(30)
+            first.join(60)
             assert answers[0].json()["bundle"] == str(waiting)
 
 

@@ -22,7 +22,7 @@ from tests.service.served import peer_of
 @contextmanager
 def listening(url, **query):
     """Give what a listener is told, as pairs of kind and data."""
-    with httpx.stream("GET", f"{url}/v1/events", params=query, timeout=20, trust_env=False) as answer:
+    with httpx.stream("GET", f"{url}/v1/events", params=query, timeout=60, trust_env=False) as answer:
         assert answer.status_code == 200
         yield ((event.event, json.loads(event.data)) for event in EventSource(answer).iter_sse())
 
