@@ -111,9 +111,9 @@ def map_images(
         A path, a URL or an ep.Store, where outcomes are written as they come. What is there already is not run again,
         unless ``keep`` is given: so a map that was interrupted goes on.
     name
-        What the series in the store is called; without, a digest of graph, hyperparameters, and the modules that the
-        graph imports. A series of another graph or of other code is refused; but what is inside of objects, lists and
-        dicts that functions use is not looked at: give another name when you change that.
+        What the series in the store is called; without, a digest of graph, hyperparameters, and all that functions
+        reach: code, globals, attributes, the modules that they import. A series of other code is refused. All is run
+        again if lists, dicts, arrays or objects that functions use have changed, or one can't be seen through.
     progress
         Whether there is a bar; without, in a terminal and in a notebook.
     ahead
@@ -151,9 +151,9 @@ def map_images(
         opened = stack.enter_context(opened_store(store))
         memory = None
         if opened is not None:
-            series = series_of(opened, "map", runner, name)
+            series, fingerprint = series_of(opened, "map", runner, name)
             how = "" if show == () else f"show={show and list(show)}"
-            memory = stack.enter_context(Remembered(series, how, not keep))
+            memory = stack.enter_context(Remembered(series, how, not keep, fingerprint))
         advance = stack.enter_context(progress_bar(progress, count_of(images), "map"))
         work = _Map(memory, advance, tuple(keep), None if show is None else tuple(show))
         is_copied = executor is not None or opened is not None or bool(keep)

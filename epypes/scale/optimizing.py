@@ -21,7 +21,7 @@ from epypes.scale.outcome import Outcome
 from epypes.scale.progress import progress_bar
 from epypes.scale.ranging import axes_of
 from epypes.scale.scoring import Metric, Score, Scoring
-from epypes.scale.searched import METRIC, about_search, has_changed, name_of
+from epypes.scale.searched import about_search, changed_meanwhile, name_of
 from epypes.scale.spreading import spread, worker_count
 from epypes.scale.studying import Asked, Direction, Search, Trial
 from epypes.scale.trying import Bench, Stopped
@@ -134,8 +134,8 @@ def optimize(
         search = Search(axes, present, direction, seed=seed, at_once=at_once, url=url, name=known, about=about)
         with contextlib.closing(search):
             was_stopped = _searched(search, work, n, on_trial, progress)
-            if has_changed(scoring, about):
-                search.forget(METRIC)
+            for what in changed_meanwhile(runner, scoring, about):
+                search.forget(what)
     result = OptimizeResult(search.trials, direction, scoring.name, axes, search.study, was_stopped)
     _require_one(result)
     return result

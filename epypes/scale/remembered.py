@@ -14,9 +14,9 @@ from epypes.bundle import to_source
 from epypes.errors import PlaceholderNeeded, ScaleError, SourceRefused, StoreError
 from epypes.run import CompGraphRunner
 from epypes.scale.digests import Untold, digest_of, file_digest, joined, told
+from epypes.scale.fingerprint import Fingerprint, graph_fingerprint
 from epypes.scale.items import Item
 from epypes.scale.outcome import Outcome
-from epypes.scale.sameness import computation_of
 from epypes.store import Series, Store
 
 # What is lost at most if the process is killed; to write each outcome by itself would take longer than to make it.
@@ -26,8 +26,8 @@ _NONE: Final[Mapping[str, Any]] = MappingProxyType({})
 
 def series_of(
     store: Store, kind: str, runner: CompGraphRunner, name: str | None, varied: Collection[str] = ()
-) -> Series:
-    """Return the series in which outcomes of a runner are kept.
+) -> tuple[Series, Fingerprint]:
+    """Return the series in which outcomes of a runner are kept, and the fingerprint of its graph.
 
     Parameters
     ----------
@@ -42,6 +42,11 @@ def series_of(
     varied
         The hyperparameters that each outcome has its own values of.
 
+    Warns
+    -----
+    UserWarning
+        A function uses something that can't be seen through, so nothing that is stored counts.
+
     Raises
     ------
     ScaleError
@@ -50,16 +55,19 @@ def series_of(
     """
     fixed = {token: value for token, value in runner.hyperparameters.items() if token not in varied}
     source, hyperparameters = _source_of(runner), _hyperparameters(fixed)
-    computation = computation_of(runner.cg, source)
+    found = graph_fingerprint(runner.cg, source)
     if name is None:
         if source is None:
             text = "What this graph computes can't be written as text, which would tell it from others. Give name=."
             raise ScaleError(text)
-        name = _digest(computation, repr(hyperparameters))[:16]
-    about = {"graph": computation, "hyperparameters": hyperparameters}
+        name = _digest(found.code, repr(hyperparameters))[:16]
+    about = {"graph": found.code, "hyperparameters": hyperparameters}
     series = store.series(kind, name, about=about)
     _check_same(series, about)
-    return series
+    if found.unknown:
+        text = f"The graph uses {found.unknown}, and nothing tells whether that has changed: every item is run again."
+        warn(f"{text} Use functions, numbers, texts, arrays, or objects that can be pickled.", stacklevel=4)
+    return series, found
 
 
 def _source_of(runner: CompGraphRunner) -> str | None:
@@ -112,6 +120,8 @@ class Remembered:
         What else decides about an outcome, such as the tokens of which thumbnails are made.
     are_whole
         Whether all that is wanted of an outcome is in the store; whole values of tokens are not.
+    fingerprint
+        That of the graph. Outcomes of another state don't count, and none does if it has an unknown.
 
     Notes
     -----
@@ -119,8 +129,13 @@ class Remembered:
     can say what is in it is run each time, and not written.
     """
 
-    def __init__(self, series: Series, how: str = "", are_whole: bool = True) -> None:
+    def __init__(
+        self, series: Series, how: str = "", are_whole: bool = True, fingerprint: Fingerprint | None = None
+    ) -> None:
         self._series, self._how = series, how
+        if fingerprint is not None:
+            self._how = f"{how} state={fingerprint.state}"
+            are_whole = are_whole and not fingerprint.unknown
         self._known = series.keys() if are_whole else frozenset()
         self._keys: dict[tuple[int, int], str] = {}
         self._of_item: tuple[int, str | None] = -1, None

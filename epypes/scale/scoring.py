@@ -12,7 +12,7 @@ from epypes.errors import ScaleError
 from epypes.graph import CompGraph
 from epypes.scale.cases import Case
 from epypes.scale.digests import joined
-from epypes.scale.metricdigest import function_digest
+from epypes.scale.fingerprint import function_fingerprint
 from epypes.scale.outcome import Outcome
 
 Measure = Callable[[Mapping[str, Any], Case], Any]
@@ -89,7 +89,7 @@ class Scoring:
         Untold
             Nobody can say what it computes, as of an object that is called.
         """
-        measure = "token" if self._is_token else function_digest(self._measure)
+        measure = "token" if self._is_token else function_fingerprint(self._measure)
         return joined("metric", measure, *self.keep).hex()
 
     def of_outcomes(self, outcomes: Iterable[Outcome]) -> Score:

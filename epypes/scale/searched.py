@@ -7,15 +7,16 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 from epypes.bundle import to_source
-from epypes.errors import EpypesError, ScaleError
+from epypes.errors import EpypesError, PlaceholderNeeded, ScaleError, SourceRefused
 from epypes.run import CompGraphRunner
 from epypes.scale.digests import Untold, digest_of, joined
+from epypes.scale.fingerprint import graph_fingerprint
 from epypes.scale.items import Item
 from epypes.scale.ranging import Axis, Choices
 from epypes.scale.remembered import contents_of
-from epypes.scale.sameness import computation_of
 from epypes.scale.scoring import Scoring
 
+GRAPH: Final = "graph"
 METRIC: Final = "metric"
 _PYTHON: Final = "Python"
 
@@ -48,7 +49,7 @@ def about_search(
     choices = {axis.token: axis.values for axis in axes if isinstance(axis, Choices)}
     labels = [(case.name, case.expected, case.hyperparameters) for case in scoring.cases]
     ways: dict[str, Callable[[], str]] = {
-        "graph": lambda: computation_of(runner.cg, to_source(runner.cg)),
+        GRAPH: lambda: _graph_digest(runner, is_named),
         "hyperparameters": lambda: digest_of(fixed),
         "choices": lambda: digest_of(choices),
         METRIC: scoring.digest,
@@ -69,6 +70,19 @@ def about_search(
     return found
 
 
+def _graph_digest(runner: CompGraphRunner, is_named: bool) -> str:
+    try:
+        source = to_source(runner.cg)
+    except (SourceRefused, PlaceholderNeeded):
+        if not is_named:
+            raise
+        source = None
+    found = graph_fingerprint(runner.cg, source)
+    if found.unknown:
+        raise Untold(found.unknown)
+    return joined("graph", found.code, found.state).hex()
+
+
 def name_of(metric: str, direction: str, axes: Sequence[Axis], about: Mapping[str, str]) -> str:
     """Return what a search is called in a store if the user does not say: a digest of what it computes."""
     said = [axis.labels if isinstance(axis, Choices) else repr(axis) for axis in axes]
@@ -76,12 +90,17 @@ def name_of(metric: str, direction: str, axes: Sequence[Axis], about: Mapping[st
     return f"optimize {metric} {digest.hex()[:12]}"
 
 
-def has_changed(scoring: Scoring, about: Mapping[str, str]) -> bool:
-    """Whether a metric is another one now than before the search, as one is that takes notes in a list."""
+def changed_meanwhile(runner: CompGraphRunner, scoring: Scoring, about: Mapping[str, str]) -> list[str]:
+    """Return what is another one now than before the search, as a function is that takes notes in a list."""
+    ways = {GRAPH: lambda: _graph_digest(runner, True), METRIC: scoring.digest}
+    return [what for what, way in ways.items() if about.get(what) and _or_none(way) != about[what]]
+
+
+def _or_none(way: Callable[[], str]) -> str | None:
     try:
-        return bool(about.get(METRIC)) and scoring.digest() != about[METRIC]
-    except Untold:
-        return True
+        return way()
+    except (EpypesError, Untold):
+        return None
 
 
 def changed_in(before: Mapping[str, str], about: Mapping[str, str]) -> str:

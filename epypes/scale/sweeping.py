@@ -195,8 +195,8 @@ def sweep(
         advance = stack.enter_context(progress_bar(progress, count and count * plan.size, "sweep", unit="setting"))
         memory = None
         if (opened := stack.enter_context(opened_store(store))) is not None:
-            series = series_of(opened, "sweep", runner, name, plan.names)
-            memory = stack.enter_context(Remembered(series, f"show={shown and list(shown)}", not kept))
+            series, fingerprint = series_of(opened, "sweep", runner, name, plan.names)
+            memory = stack.enter_context(Remembered(series, f"show={shown and list(shown)}", not kept, fingerprint))
         work = _Sweep(runner, Job((), in_order, kept, shown), memory, advance)
         is_copied = executor is not None or opened is not None or bool(kept)
         work.run(_items(given, images, plan, is_copied=is_copied), executor, count)

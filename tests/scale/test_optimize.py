@@ -7,7 +7,7 @@ import enum
 import functools
 import threading
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -512,8 +512,17 @@ def away(tokens: Mapping[str, Any], case: ep.Case, *, target: float = 1.0) -> fl
 
 
 class Nearest:
+    """Holds something that can't be seen through."""
+
+    def __init__(self) -> None:
+        self._levels = iter_levels()
+
     def __call__(self, tokens: Mapping[str, Any], case: ep.Case) -> float:
         return near(tokens, case)
+
+
+def iter_levels() -> Iterator[int]:
+    yield 1
 
 
 CASE = ep.Case({"x": 1}, {"y": 3})
@@ -556,7 +565,7 @@ def test_another_graph_and_other_hyperparameters_are_refused_under_a_name(tmp_pa
 def test_a_metric_that_nobody_can_tell_apart_needs_a_name(tmp_path: Path) -> None:
     runner = runner_of(lambda x, k: x + k, k=1)
     options: dict[str, Any] = {"store": tmp_path / "s.sqlite", "ranges": {"k": (0, 9)}}
-    with pytest.raises(ScaleError, match=r"Nothing tells its metric from others: a 'Nearest'"):
+    with pytest.raises(ScaleError, match=r"Nothing tells its metric from others: a 'generator'"):
         ep.optimize(runner, Nearest(), [CASE], 1, **options)
     for count in (1, 2):
         assert len(ep.optimize(runner, Nearest(), [CASE], count, name="s", **options)) == count

@@ -17,7 +17,7 @@ import pytest
 import epypes as ep
 from epypes.errors import PayloadError, ScaleError, UnknownName
 from tests.bundle.cells import cell
-from tests.calls import Calls
+from tests.calls import Calls, log_to
 from tests.scale.conftest import counting_runner
 
 
@@ -292,9 +292,14 @@ def test_processes_give_the_same(processes: Any, crops: list[Any], count: int | 
 def test_an_interrupted_sweep_goes_on_where_it_was(runner: ep.CompGraphRunner, calls: Calls, tmp_path: Path) -> None:
     place, mended = str(tmp_path / "results.sqlite"), threading.Event()
 
-    def interrupted(blurred: Any, threshold: int) -> Any:
+    def interrupt(threshold: int) -> None:
         if not mended.is_set() and threshold == 90:
             raise KeyboardInterrupt
+
+    logger = log_to(interrupt)
+
+    def interrupted(blurred: Any, threshold: int) -> Any:
+        logger.info(threshold)
         return above(blurred, threshold)
 
     cg = ep.CompGraph({**runner.cg.functions, "above": calls.of(interrupted)}, IO)

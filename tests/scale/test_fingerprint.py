@@ -1,4 +1,4 @@
-"""Is this the computation that it was?"""
+"""Fingerprints of graphs: what makes stored results count as those of another computation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 import epypes as ep
 from epypes.errors import ScaleError
-from epypes.scale.sameness import computation_of
+from epypes.scale.fingerprint import graph_fingerprint
 
 LOCK = threading.Lock()
 
@@ -45,8 +45,8 @@ DIFFERENT = {
 
 @pytest.mark.parametrize("functions", DIFFERENT.values(), ids=DIFFERENT)
 def test_code_that_no_text_can_be_made_of_is_told_by_what_it_does(functions):
-    one, other = (computation_of(graph_of(function), None) for function in functions())
-    again, _ = (computation_of(graph_of(function), None) for function in functions())
+    one, other = (graph_fingerprint(graph_of(function), None) for function in functions())
+    again, _ = (graph_fingerprint(graph_of(function), None) for function in functions())
     assert one == again != other
 
 
@@ -61,18 +61,6 @@ def test_a_name_given_twice_does_not_make_two_graphs_one(tmp_path):
             ep.map(ep.CompGraphRunner(another), images, **options)
 
 
-def test_what_is_inside_of_objects_is_the_users_word():
-    calls = []
-
-    def noted(image):
-        with LOCK:
-            calls.append(1)
-
-    before = computation_of(graph_of(noted), None)
-    calls.append(1)
-    assert computation_of(graph_of(noted), None) == before
-
-
 GAIN = 1
 
 
@@ -83,9 +71,9 @@ def test_a_global_counts_for_who_looks_it_up_and_not_for_an_attribute_of_that_na
     def has_one(image):
         return LOCK, image.GAIN
 
-    before = [computation_of(graph_of(function), None) for function in (looks_up, has_one)]
+    before = [graph_fingerprint(graph_of(function), None) for function in (looks_up, has_one)]
     monkeypatch.setitem(globals(), "GAIN", 2)
-    after = [computation_of(graph_of(function), None) for function in (looks_up, has_one)]
+    after = [graph_fingerprint(graph_of(function), None) for function in (looks_up, has_one)]
     assert [one == other for one, other in zip(before, after, strict=True)] == [False, True]
 
 
@@ -145,9 +133,9 @@ def test_installed_packages_count_by_version(monkeypatch):
     import cv2
 
     cg, text = graph_of(cv2.mean), "import cv2\n"
-    before = computation_of(cg, text)
-    assert computation_of(cg, text) == before
+    before = graph_fingerprint(cg, text)
+    assert graph_fingerprint(cg, text) == before
     from importlib import metadata
 
     monkeypatch.setattr(metadata, "version", lambda name: "0.0.1")
-    assert computation_of(cg, text) != before
+    assert graph_fingerprint(cg, text) != before

@@ -18,7 +18,7 @@ import pytest
 
 import epypes as ep
 from epypes.scale.digests import Untold
-from epypes.scale.metricdigest import function_digest
+from epypes.scale.fingerprint import function_fingerprint
 
 
 def made(source: str, **names: Any) -> Any:
@@ -77,52 +77,60 @@ PAIRS = {
 @pytest.mark.parametrize("what", PAIRS)
 def test_metrics_that_compute_something_else_are_told_apart_and_one_is_itself(what: str) -> None:
     one, other = PAIRS[what]
-    assert function_digest(one) == function_digest(one) != function_digest(other)
+    assert function_fingerprint(one) == function_fingerprint(one) != function_fingerprint(other)
 
 
 def test_metrics_that_are_made_anew_are_the_same() -> None:
-    assert function_digest(within(np.arange(5))) == function_digest(within(np.arange(5)))
-    assert function_digest(made(READS, weights={"a": [1]}, other=1)) == function_digest(
+    assert function_fingerprint(within(np.arange(5))) == function_fingerprint(within(np.arange(5)))
+    assert function_fingerprint(made(READS, weights={"a": [1]}, other=1)) == function_fingerprint(
         made("\n\n" + READS, other=2, weights={"a": [1]})
     )
 
 
 def test_a_function_that_calls_itself_has_a_digest() -> None:
     calls_itself = "def metric(tokens, case): return metric(tokens, case) if case else 1"
-    assert function_digest(made(calls_itself)) == function_digest(made(calls_itself))
+    assert function_fingerprint(made(calls_itself)) == function_fingerprint(made(calls_itself))
 
 
 class Near:
-    def __call__(self, tokens: Any, case: ep.Case) -> float:
-        return 1.0
+    limit = 1.0
 
-    def score(self, tokens: Any, case: ep.Case) -> float:
-        return 1.0
+    def __init__(self, held: Any) -> None:
+        self.held = held
+
+    def __call__(self, tokens: Any, case: ep.Case) -> float:
+        return self.limit
 
 
 @pytest.mark.parametrize(
     "metric",
     [
-        Near(),
-        Near().score,
-        within(threading.Event()),
-        functools.partial(within, object()),
-        made(READS, weights={"a": [object()]}),
+        Near(cv2.ORB_create()),
+        within(cv2.ORB_create()),
+        within(x for x in ()),
+        functools.partial(within, x=(n for n in ())),
+        made(READS, weights={"a": [threading.local()]}),
+        made("def metric(tokens, case): return eval('tokens')"),
+        np.frompyfunc(lambda tokens, case: 1, 2, 1),
     ],
 )
-def test_what_nobody_can_say_is_refused(metric: Any) -> None:
+def test_what_nobody_can_see_through_is_refused(metric: Any) -> None:
     with pytest.raises(Untold):
-        function_digest(metric)
+        function_fingerprint(metric)
+
+
+def test_objects_are_told_by_what_is_in_them() -> None:
+    assert function_fingerprint(Near(1)) == function_fingerprint(Near(1)) != function_fingerprint(Near(2))
 
 
 @pytest.mark.slow
 def test_a_metric_is_the_same_in_another_process(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(
-        "from epypes.scale.metricdigest import function_digest\n"
+        "from epypes.scale.fingerprint import function_fingerprint\n"
         "words = {'a', 'b', 'c'}\n"
         "def metric(tokens, case): return case in {'x', 'y', 'z', 'w'} and tokens in words\n"
-        "print(function_digest(metric))\n"
+        "print(function_fingerprint(metric))\n"
     )
     found = {
         subprocess.run(
