@@ -174,7 +174,7 @@ class Dispatcher:
                 is_raw = not isinstance(entry.event, Envelope)
                 frames: Sequence[Any] = [entry.event] if is_raw else encode(entry.event)
                 self._link.post({"kind": "event", "seq": entry.seq, "raw": is_raw}, frames)
-            except EpypesError as error:
+            except (EpypesError, MemoryError) as error:
                 self._resolve(entry, failed_without_worker(entry, error, self._setting(), "raised", function="f_in"))
         if self.ledger.waits and self.ledger.has_room:
             self._room.notify_all()
@@ -299,7 +299,11 @@ class Dispatcher:
                 try:
                     found = self._found()
                     for telling in found:
-                        telling()
+                        try:
+                            telling()
+                        except Exception:
+                            # What comes after it is told all the same.
+                            _log.exception("something could not be published, or told")
                 finally:
                     self._publisher = 0
             if not found:

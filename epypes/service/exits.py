@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from epypes.errors import BrokerError
+from epypes.errors import BrokerError, MessageError
 from epypes.pipeline import Mailbox
 from epypes.service.desk import Arrived
 from epypes.service.options import CONNECT, bare
@@ -55,9 +55,11 @@ class SocketExit:
         self.publisher.stop(timeout_s)
 
     def publish(self, item: Any, id: str, then: Arrived) -> None:  # noqa: A002 - as everywhere
-        """Publish an item."""
+        """Publish an item; one that could not be sent has not arrived."""
+        before = self.publisher.rejected
         self._items.put(item)
-        then(None)
+        reasons = self.publisher.rejected - before
+        then(MessageError("not sent", f"The answer could not be sent: {', '.join(reasons)}.") if reasons else None)
 
     @property
     def address(self) -> str:

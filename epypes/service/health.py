@@ -1,4 +1,4 @@
-"""How is the worker of a service doing, and when is it of no use to start another?"""
+"""How is the worker of a service doing, and when is the next one started?"""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ PAUSE_S: Final = 0.1
 _LONGEST_PAUSE_S: Final = 10.0
 # After so many good events the next death is a first one again.
 GOOD_EVENTS: Final = 5
-# A worker that ends by itself sooner than this after it was ready, or before, so often in a row, is not started again.
+# A worker that ends by itself sooner than this after it was ready, or before, so often in a row, is a fault.
 _SOON_S: Final = 1.0
 DEATHS_BEFORE_FAULT: Final = 5
+# After that it is tried again this much later, and twice as late each time.
+_FAULT_PAUSE_S: Final = 5.0
+_LONGEST_FAULT_PAUSE_S: Final = 60.0
 # One that was ready for so long and then dies is started again without a long wait.
 _STEADY_S: Final = 10.0
 
@@ -23,7 +26,9 @@ class Health:
     Attributes
     ----------
     fault
-        Why there will be no worker any more; empty if that is not so.
+        Why no event is taken until there is a worker again; empty if that is not so.
+    is_final
+        Whether none will be started any more.
     trouble
         Why there is none just now.
     stuck
@@ -39,6 +44,7 @@ class Health:
     """
 
     fault: str = ""
+    is_final: bool = False
     trouble: str = ""
     stuck: str = ""
     restarts: int = 0
@@ -57,5 +63,7 @@ class Health:
 
     def next_pause_s(self) -> float:
         """Return how long to wait before the next start."""
+        if self.deaths >= DEATHS_BEFORE_FAULT:
+            return min(_FAULT_PAUSE_S * 2.0 ** min(self.deaths - DEATHS_BEFORE_FAULT, 10), _LONGEST_FAULT_PAUSE_S)
         self.pauses += 1
         return min(PAUSE_S * 2.0 ** min(self.pauses - 1, 10), _LONGEST_PAUSE_S)

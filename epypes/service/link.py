@@ -69,8 +69,14 @@ class Link:
         self._numbers = itertools.count(1)
         self._asked: dict[tuple[str, int], queue.SimpleQueue[Message | None]] = {}
         self.process = WorkerProcess(served.path, threads)
-        for target, name in ((self._send, "to"), (self._read, "from")):
-            threading.Thread(target=target, name=f"epypes {name} worker", daemon=True).start()
+        try:
+            for target, name in ((self._send, "to"), (self._read, "from")):
+                threading.Thread(target=target, name=f"epypes {name} worker", daemon=True).start()
+        except BaseException:
+            self._outbox.put(None)
+            self.process.kill()
+            self.process.close()
+            raise
 
     @property
     def pid(self) -> int:
@@ -175,6 +181,11 @@ class Link:
             except MessageError as error:
                 # Only an event can be as large, and the subscriber has looked at it.
                 _log.error("a message to the worker was not sent: %s", error)
+            except BaseException:
+                # Memory may be short. What the worker has not got is given to the next one.
+                _log.exception("the worker can't be sent messages, so it is ended")
+                self.process.kill()
+                return
             # An event may be large: it shall not live on until another comes.
             del message
 

@@ -31,6 +31,7 @@ from epypes.service.state import ServiceState
 from epypes.service.states import Facts, State
 from epypes.service.supervisor import Supervisor
 from epypes.service.tuning import Tuning
+from epypes.wire import Envelope, decode, encode
 
 if TYPE_CHECKING:
     from epypes.bundle.writeback import WriteBack
@@ -114,6 +115,7 @@ class Service:
         """
         with self._turn:
             if not self._is_running:
+                _warm_up()
                 self._sockets.start()
                 self._is_running = True
                 self._started_ns = time_ns()
@@ -191,6 +193,11 @@ class Service:
     def reason(self) -> str:
         """Why it is in this state; empty if there is nothing to say."""
         return self._state()[1]
+
+    @property
+    def has_given_up(self) -> bool:
+        """Whether it is FAULTED and no worker will be started any more, unless another bundle is deployed."""
+        return self._supervisor.health.is_final
 
     def _state(self) -> tuple[State, str]:
         return self._announcer.state()
@@ -391,3 +398,10 @@ class Service:
     def failure_records(self, limit: int | None = None) -> list[FailureRecord]:
         """Return what is known of failures, the newest first."""
         return self.failure_store.records(limit)
+
+
+def _warm_up() -> None:
+    """Load what the first event needs: where memory is limited that fails now, and not at an event."""
+    import numpy as np
+
+    decode(encode(Envelope("epypes.warm_up", {"array": np.zeros(1)})))

@@ -89,30 +89,40 @@ def _announce(
     on_ready: Callable[[ServiceState], None],
     on_fault: Callable[[str], None],
 ) -> list[str]:
-    """Let others find the service, and say that it is ready; or that it is not.
+    """Let others find the service, and say that it is ready, once it is; or that it is not.
 
     Return a list that has the reason in it once there will be no worker any more and nobody could deploy another
     bundle; ``give_up`` is called then, so that whoever has started the service can act.
     """
     reason, fault = service.reason, list[str]()
+    announced: list[ServiceState] = []
     if service.state == "FAULTED":
         if give_up is not None:
             service.stop(0.0)
             raise ServiceError(service.path, reason)
         on_fault(reason)
 
+    def announce() -> None:
+        lock.publish(service.service_state)
+        if not announced:
+            announced.append(service.service_state)
+            on_ready(announced[0])
+
     def hear(kind: str, data: dict[str, Any]) -> None:
-        if kind == "deployed" or (kind == "state" and data["state"] == "READY"):
+        if kind == "state" and data["state"] == "READY":
+            announce()
+        elif kind == "deployed":
             lock.publish(service.service_state)
-        elif kind == "state" and data["state"] == "FAULTED" and give_up is not None:
+        elif kind == "state" and data["state"] == "FAULTED" and service.has_given_up and give_up is not None:
             fault.append(data["reason"])
             give_up()
 
     service.listen(hear)
-    lock.publish(service.service_state)
     if service.state != "FAULTED":
-        on_ready(service.service_state)
-    elif not reason:
+        announce()
+        return fault
+    lock.publish(service.service_state)
+    if not reason:
         # It was before anybody listened.
         hear("state", {"state": "FAULTED", "reason": service.reason})
     return fault

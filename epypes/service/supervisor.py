@@ -120,9 +120,9 @@ class Supervisor:
                 return
             try:
                 job()
+                self._dispatcher.publish()
             except Exception:
                 _log.exception("the supervisor goes on")
-            self._dispatcher.publish()
 
     def _wait_s(self) -> float | None:
         """Return how long there is nothing to do, if nothing changes; None for ever. With the lock held."""
@@ -146,6 +146,9 @@ class Supervisor:
             return self._watchdog.tell
         if self._to_start:
             return self._start_for_deploy
+        if self.worker is None and self._restart_s is None and not self.health.is_final:
+            # What was to start one has failed.
+            self._restart_s = now_s + PAUSE_S
         if self._restart_s is not None and self._restart_s <= now_s:
             self._restart_s = None
             return self._start_again
@@ -165,9 +168,10 @@ class Supervisor:
             served = self.served
         try:
             link = Link(served, self._threads, self._hear, self._gone)
-        except OSError as error:
+        except (OSError, MemoryError, RuntimeError) as error:
+            # The system lacks descriptors, memory or threads just now, which is not the worker's fault.
             with self._changed:
-                self._died(f"The worker can't be started: {error.strerror or error}")
+                self._start_later(f"The worker can't be started: {_reason(error)}")
             return
         with self._changed:
             if self._is_ending or self.worker is not None or served is not self.served:
@@ -252,14 +256,19 @@ class Supervisor:
     def _use(self, link: Link) -> None:
         health = self.health
         health.was_ready, health.trouble, health.stuck, health.ready_s = True, "", "", monotonic()
+        if health.fault:
+            health.fault = ""
+            self._dispatcher.refuse("")
         self._dispatcher.use(link)
         self._on_change()
 
     def _gone(self, link: Link) -> None:
         with self._changed:
-            if link is self.worker:
-                self._over(link)
-            self._changed.notify_all()
+            try:
+                if link is self.worker:
+                    self._over(link)
+            finally:
+                self._changed.notify_all()
         self._dispatcher.publish()
 
     def _over(self, link: Link) -> None:
@@ -278,25 +287,32 @@ class Supervisor:
             self._died(link.process.ending, has_cause=has_event)
 
     def _died(self, why: str, *, has_cause: bool = False) -> None:
-        """Start another worker after a while, or none any more. With the lock held."""
+        """Start another worker after a while. With the lock held."""
         health = self.health
-        if self._is_ending or health.fault:
+        if self._is_ending or health.is_final:
             return
         health.count_death(monotonic(), has_cause=has_cause)
         if health.deaths >= DEATHS_BEFORE_FAULT:
-            self._fault(f"{health.deaths} workers ended in a row as soon as they were started. The last: {why}")
+            health.fault = f"{health.deaths} workers ended in a row as soon as they were started. The last: {why}"
+            self._dispatcher.refuse(f"it can't be served: {health.fault[:300]}")
+        self._start_later(why)
+
+    def _start_later(self, why: str) -> None:
+        """Start a worker after a while that grows with each failure. With the lock held."""
+        if self._is_ending:
             return
-        pause_s = health.next_pause_s()
-        health.trouble = f"{why}. Another one is started."
+        pause_s = self.health.next_pause_s()
+        self.health.trouble = f"{why}. Another one is started."
         _log.warning("%s; another one is started in %g s", why, pause_s)
         self._restart_s = monotonic() + pause_s
         self._changed.notify_all()
         self._on_change()
 
     def _fault(self, why: str) -> None:
+        """Start no worker any more: what is wrong does not pass by itself. With the lock held."""
         if self._is_ending:
             return
-        self.health.fault = why
+        self.health.fault, self.health.is_final = why, True
         self._restart_s = None
         _log.error("the bundle is not served any more: %s", why)
         self._dispatcher.refuse(f"it can't be served: {why[:300]}")
@@ -361,8 +377,8 @@ class Supervisor:
             served, started = self._to_start.popleft()
         try:
             made: Link | Exception = Link(served, self._threads, self._hear, self._gone)
-        except OSError as error:
-            made = ServiceError(served.path, f"A worker can't be started: {error.strerror or error}.")
+        except (OSError, MemoryError, RuntimeError) as error:
+            made = ServiceError(served.path, f"A worker can't be started: {_reason(error)}.")
         with self._changed:
             started.append(made)
             self._changed.notify_all()
@@ -386,6 +402,12 @@ class Supervisor:
             self._use(link)
         if before is not None:
             threading.Thread(target=before.dismiss, args=(_END_S,), name="epypes last worker", daemon=True).start()
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, MemoryError):
+        return "there is no memory left"
+    return getattr(error, "strerror", None) or str(error)
 
 
 def _nothing() -> None:

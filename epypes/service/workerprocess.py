@@ -74,7 +74,15 @@ class WorkerProcess:
         self._listener = threading.Thread(
             target=_pass_on, args=(said, self._said), name="epypes worker's words", daemon=True
         )
-        self._listener.start()
+        try:
+            self._listener.start()
+        except BaseException:
+            os.close(said)
+            self.kill()
+            self.process.wait()
+            self.channel.close()
+            os.close(self._traces)
+            raise
 
     def kill(self) -> None:
         """Kill it, also if it is stopped or stuck."""

@@ -60,6 +60,10 @@ class Inbox:
         except MessageError as error:
             self.reject(error.reason, str(error))
             return
+        except Exception as error:
+            # Memory may be short: the message is gone, and is counted.
+            self.reject(type(error).__name__, f"it can't be read here and now: {error!r:.200}")
+            return
         self._follow(envelope)
         self.put(envelope)
 

@@ -17,6 +17,7 @@ from typing import Any
 import zmq
 
 from epypes.transport.addresses import address_error, check_port
+from epypes.transport.connectionlimit import HANDSHAKE_MS, ConnectionLimit
 from epypes.transport.gate import Gate, Gatekeeper
 
 Socket = zmq.Socket[bytes]
@@ -33,6 +34,7 @@ _OPTIONS: dict[int, int] = {
     zmq.HEARTBEAT_IVL: 5_000,
     zmq.HEARTBEAT_TIMEOUT: 15_000,
     zmq.HEARTBEAT_TTL: 30_000,
+    zmq.HANDSHAKE_IVL: HANDSHAKE_MS,
     zmq.RECONNECT_IVL: 50,
     # A peer that has come back is met soon: what it sends before that is lost.
     zmq.RECONNECT_IVL_MAX: 200,
@@ -62,6 +64,7 @@ class _Owned:
     lock: AbstractContextManager[Any]
     endpoint: str
     gate: Gate | None = None
+    limit: ConnectionLimit | None = None
     tick: Callable[[], None] | None = None
     every_s: float = 0.0
     due_s: float = float("inf")
@@ -139,22 +142,30 @@ class IOThread:
         if gate is not None:
             self._guard(gate)
         new: Socket = self._context.socket(kind)
+        limit: ConnectionLimit | None = None
         try:
             # Options count only for what is bound or connected after them.
             for option, value in [*_OPTIONS.items(), (zmq.LINGER, LINGER_MS), *options]:
                 new.setsockopt(option, value)
             if bind:
+                if not address.startswith("inproc:"):
+                    limit = ConnectionLimit(new)
                 new.bind(address)
             else:
                 new.connect(address)
         except (zmq.ZMQError, UnicodeError, ValueError, TypeError) as error:
             new.close(linger=0)
+            if limit is not None:
+                limit.monitor.close(linger=0)
             self._unguard(gate)
             number = getattr(error, "errno", None) or 0
             raise address_error(address, "bound" if bind else "connected", number, str(error)) from error
         endpoint = new.getsockopt_string(zmq.LAST_ENDPOINT) if bind else ""
         source = new if lock is None else int(new.get(_FD))
-        self._owned[new] = _Owned(source, reader, lock or nullcontext(), endpoint, gate)
+        self._owned[new] = _Owned(source, reader, lock or nullcontext(), endpoint, gate, limit)
+        if limit is not None:
+            self._readers[limit.monitor] = limit.read
+            self._poller.register(limit.monitor, zmq.POLLIN)
         self._readers[source] = reader
         self._poller.register(source, zmq.POLLIN)
         self._unfinished.add(source)
@@ -184,6 +195,11 @@ class IOThread:
             self._poller.unregister(known.source)
             self._readers.pop(known.source, None)
             self._unfinished.discard(known.source)
+            if known.limit is not None:
+                self._poller.unregister(known.limit.monitor)
+                self._readers.pop(known.limit.monitor, None)
+                self._unfinished.discard(known.limit.monitor)
+                known.limit.monitor.close(linger=0)
             with known.lock:
                 _close(owned, known.endpoint)
             self._unguard(known.gate)

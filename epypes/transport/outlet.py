@@ -153,14 +153,18 @@ class Outlet:
             raise zmq.ZMQError(zmq.ENOTSOCK)
         # Counted before: whoever has received it must find it counted.
         self._counts.sent += 1
-        is_last = False
+        is_begun = is_last = False
         try:
             for frame in frames[:-1]:
                 socket.send(frame, _MORE, copy=not _can_be_lent(frame))
+                is_begun = True
             last, is_last = frames[-1], True
             socket.send(last, _DONTWAIT, copy=len(last) < _LENT_FROM_BYTES or not _can_be_lent(last))
-        except zmq.ZMQError:
+        except (zmq.ZMQError, MemoryError):
+            # This frame has not left. The next message would be taken for the rest of this one.
             self._counts.sent -= 1
+            if is_begun:
+                _break_off(socket, frames)
             raise
         except BaseException:
             # Within the last frame nobody can tell whether it has left; mostly it has.

@@ -15,7 +15,7 @@ _ADDRESS: Final = re.compile(
     r"(?:http://)?(?:(?P<host>\[[0-9a-fA-F:.]+\]|[\w.-]+|\*):)?(?P<port>\d{1,5}|\*)/?", re.ASCII
 )
 _MAX_PORT: Final = 65_535
-_BACKLOG: Final = 128
+BACKLOG: Final = 128
 # Answers that nobody takes: the kernel ends the connection.
 _UNTAKEN_MS: Final = 20_000
 _FORMS: Final = "Write 127.0.0.1:8642, or 127.0.0.1:* for a free port."
@@ -46,7 +46,7 @@ def listening(address: str, *, insecure: bool = False) -> socket.socket:
         if sys.platform == "linux":
             listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNTAKEN_MS)
         listener.bind((host, port))
-        listener.listen(_BACKLOG)
+        listener.listen(BACKLOG)
     except OSError as error:
         listener.close()
         raise _refusal(address, port, error) from error

@@ -9,10 +9,14 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any, Final
 
+from epypes.transport.connectionlimit import connection_limit
+
 if TYPE_CHECKING:
     from uvicorn.protocols.http.h11_impl import H11Protocol
 
 MOST_CONNECTIONS: Final = 160
+# Of the descriptors that the process may have; bound sockets of ZeroMQ have another share.
+_SHARE: Final = 8
 REQUEST_TIMEOUT_S: Final = 10.0
 TAKING_TIMEOUT_S: Final = 10.0
 
@@ -81,7 +85,7 @@ class Connections:
     """All connections of a server. When there are too many, the one that has been idle for longest is dropped."""
 
     def __init__(self, most: int = MOST_CONNECTIONS) -> None:
-        self._most = most
+        self._most = connection_limit(most, _SHARE)
         self._open: dict[Connection, None] = {}
 
     def protocol(self, *, app_state: dict[str, Any], **given: Any) -> Connection:

@@ -7,14 +7,16 @@ ends in bounded time.
 from __future__ import annotations
 
 import asyncio
+import logging
 import threading
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from epypes.errors import ServiceError
-from epypes.service.http.address import listening, names_of, url_of
+from epypes.service.http.address import BACKLOG, listening, names_of, url_of
 from epypes.service.http.connections import Connections
 from epypes.service.http.token import owned_token
 from epypes.service.state import state_file
@@ -32,6 +34,12 @@ _START_TIMEOUT_S: Final = 30.0
 # How long answers may take to get out when the server stops; uvicorn counts in whole seconds what comes after.
 _TAKING_S: Final = 0.5
 _GRACE_S: Final = 2
+# asyncio accepts so many at once, before one of them is known and another can be dropped for it; and if there is no
+# descriptor left it tries so often each second, with an error for each.
+_ACCEPTED_AT_ONCE: Final = 8
+_LOG_PAUSE_S: Final = 10.0
+
+_log = logging.getLogger("epypes.service")
 
 
 class HttpServer:
@@ -65,6 +73,8 @@ class HttpServer:
         self.connections = Connections()
         self._served: Served | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
+        self._listener: socket.socket | None = None
+        self._logged_s = -_LOG_PAUSE_S
         self._error: BaseException | None = None
 
     @property
@@ -85,7 +95,7 @@ class HttpServer:
             The server did not start.
         """
         token = owned_token(self.token_file)
-        listener = listening(self.address, insecure=self.insecure)
+        listener = self._listener = listening(self.address, insecure=self.insecure)
         try:
             self._server = self._made(token, listener)
             self.url = url_of(listener)
@@ -126,13 +136,26 @@ class HttpServer:
             date_header=False,
             h11_max_incomplete_event_size=MOST_HEADER_BYTES,
             timeout_graceful_shutdown=_GRACE_S,
+            backlog=_ACCEPTED_AT_ONCE,
             callback_notify=self._on_started,
         )
         return uvicorn.Server(config)
 
     async def _on_started(self) -> None:
+        if self._loop is None and self._listener is not None:
+            # More may wait than asyncio accepts at once, which has made the one of the other.
+            self._listener.listen(BACKLOG)
         self._loop = asyncio.get_running_loop()
+        self._loop.set_exception_handler(self._on_error)
         self._started.set()
+
+    def _on_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Log what fails in the event loop; that nothing can be accepted just now seldom, and in one line."""
+        if not str(context.get("message")).startswith("socket.accept()"):
+            loop.default_exception_handler(context)
+        elif monotonic() - self._logged_s >= _LOG_PAUSE_S:
+            self._logged_s = monotonic()
+            _log.error("HTTP accepts no connection just now, and tries again: %s", context.get("exception"))
 
     def _run(self, listener: socket.socket) -> None:
         try:

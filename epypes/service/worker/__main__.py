@@ -247,6 +247,9 @@ def _loaded(channel: Channel, path: Path, threads: int) -> Worker | None:
         reasons = [] if report.identical else [str(found) for found in report.differences] or [str(report)]
         doing = f"Making the pipelines of {path}"
         worker = Worker(channel, bundle, threads) if not reasons else None
+    except MemoryError:
+        # The bundle is none the worse for it: the front tries again later.
+        raise
     except BaseException as error:  # a module may call sys.exit
         worker, reasons = None, [reason_of(error, doing, path.resolve())]
     if worker is None:
