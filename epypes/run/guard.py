@@ -101,6 +101,8 @@ def is_plain_array(value: Any) -> bool:
 # that was seen, so that a common one is found at a glance; iterators are never in it.
 COPIERS: Final[dict[type, Callable[[Any], Any] | None]] = {}
 _MOST_TYPES: Final = 1_000
+_MRO: Final = type.__dict__["__mro__"].__get__
+_NAMES: Final = type.__dict__["__dict__"].__get__
 _MUTABLE: Final = (list, dict, set, deque, bytearray, number_array)
 
 
@@ -114,12 +116,19 @@ def _learn(kind: type) -> Callable[[Any], Any] | None:
     if kind in (list, dict, set):
         copier = kind.copy  # twice as fast as copy.copy
     elif issubclass(kind, _MUTABLE):
-        copier = copy.copy
+        copier = _copy_of_container
     else:
         copier = _copy_of_frame if issubclass(kind, frames) else None
     if len(COPIERS) < _MOST_TYPES:
         COPIERS[kind] = copier
     return copier
+
+
+def _copy_of_container(value: Any) -> Any:
+    try:
+        return copy.copy(value)
+    except Exception:  # its own class refuses: it is passed as it is
+        return value
 
 
 def _copy_of_frame(frame: Any) -> Any:
@@ -138,9 +147,12 @@ def _own_copy(value: Any) -> Any:
 
 def is_iterator(kind: type) -> bool:
     """Whether values of a type are iterators: a generator, a zip, an open file."""
-    # Looked up in the classes, since a metaclass may answer for attributes that are not there.
-    found = [vars(base)["__next__"] for base in kind.__mro__ if "__next__" in vars(base)]
-    return bool(found) and found[0] is not None
+    # Past what a metaclass may answer instead.
+    for base in _MRO(kind):
+        names = _NAMES(base)
+        if "__next__" in names:
+            return names["__next__"] is not None
+    return False
 
 
 def require_reusable(value: Any, program: Program, slot: int) -> None:
