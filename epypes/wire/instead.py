@@ -33,6 +33,7 @@ _INSTEAD: Final = {
     "enum.Enum": "value.value",
     "fractions.Fraction": "(value.numerator, value.denominator)",
     "numpy.ma.MaskedArray": "value.filled()",
+    "numpy.ma.core.MaskedArray": "value.filled()",  # as NumPy 1 says it
     "numpy.datetime64": "value.astype('int64')",
     "numpy.timedelta64": "value.astype('int64')",
     "numpy.ndarray": "np.asarray(value)",
