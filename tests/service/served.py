@@ -114,6 +114,12 @@ class Peer:
             if answer.correlation_id == sent:
                 return answer
 
+    def ask_until_answered(self, number=1):
+        """Ask again and again: on a busy machine a plain event may take longer than a short time-out of a test."""
+        while (answer := self.ask(number=number)).failure is not None:
+            assert "did not return" in answer.failure.message
+        return answer
+
 
 @contextmanager
 def peer_at(sub, pub, failures):

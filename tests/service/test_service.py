@@ -212,8 +212,9 @@ def test_a_service_that_is_killed_while_it_works_is_told_to_the_caller(edge_bund
 
 @pytest.mark.slow
 def test_a_stopped_service_makes_the_call_time_out(edge_bundle, photograph):
-    with running(edge_bundle.path) as process, Client(edge_bundle.path, timeout_s=1.0) as client:
+    with running(edge_bundle.path) as process, Client(edge_bundle.path, timeout_s=TIMEOUT_S) as client:
         client.call({"image": photograph})
+        client.timeout_s = 1.0
         process.send_signal(signal.SIGSTOP)
         try:
             with pytest.raises(ServiceError, match="did not answer within 1 s"):

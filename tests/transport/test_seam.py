@@ -16,6 +16,7 @@ import pytest
 import epypes as ep
 from epypes.errors import AddressError, BrokerError, MessageError
 from epypes.transport.channels import memory, open_channel, place_of
+from epypes.transport.channels.jetstream import places
 from tests.brokers.traffic import remove
 from tests.transport.peers import wait_until
 
@@ -185,6 +186,7 @@ def test_what_was_rejected_while_nobody_could_put_it_aside_is_a_dead_letter_in_t
     """It comes again over the same connection, where it is no event that was sent twice."""
     # Sooner than it would, and later than a busy machine may take to look.
     monkeypatch.setattr("epypes.transport.channels.amqp.channel._AGAIN_S", 2.0)
+    monkeypatch.setattr(places, "_SHARED", places._SHARED.evolve(ack_wait=2.0))
     taken = queues.SimpleQueue()
     opened(peer.address(name, create=True)).send([b"spoilt"], id="spoilt")
     with ep.Subscriber(peer.address(name), taken) as subscriber:
@@ -342,11 +344,9 @@ def test_a_broadcast_reaches_all_who_listen_and_is_not_kept(peer, name, opened):
     assert opened(address).receive(ABSENT_S) is None
 
 
+# MQTT has no log: the newest message, and those that come, which tests/transport/test_mqtt.py tries.
+@pytest.mark.parametrize("peer", at("within", "rabbitmq", "nats"), indirect=True)
 def test_a_log_is_read_by_all_from_the_first_in_the_same_order(peer, name, opened):
-    if peer.name == "mosquitto":
-        pytest.skip(
-            "MQTT has no log: the newest message, and those that come, which tests/transport/test_mqtt.py tries."
-        )
     address = peer.address(name, kind="log", create=True)
     early = opened(address)
     assert early.receive(0.0) is None
