@@ -9,16 +9,16 @@ Calls in several threads share the objects. Where a call finds a change and othe
 have made it, or have read it: each of them is called again, alone, on objects that have been put back.
 
 The cache of an ``lru_cache`` is no state: arrays in it are locked when they are computed, and a value that can still be
-changed does not stay in it after the call. The global generators of ``random`` and ``numpy.random`` are put back after
-each call of a function that names them, and count as no change; so are the attributes of a node of one's own class.
-What a pipeline of one's own class keeps in its attributes is not looked at.
+changed does not stay in it after the call. The attributes of a node of the user's own class are put back without a
+failure, since it may count its calls; what a pipeline of the user's own class keeps in its attributes is not looked at.
+The global generators of ``random`` and ``numpy.random`` are not compared: a function may seed them for another one, and
+the replay finds draws without a seed.
 """
 
 from __future__ import annotations
 
 import dis
 import functools
-import random
 import sys
 import threading
 import types
@@ -86,6 +86,7 @@ class CodeSnapshot(Snapshot):
         self._settlers: list[Callable[[], None]] = []
         self._checks: list[_CacheCheck] = []
         self._words: set[str] = set()
+        self._imported: set[str] = set()
         # What is only recorded if some of the code can change it.
         self._bound: list[_Bindings] = []
         self._set: list[_Bindings] = []
@@ -176,10 +177,7 @@ class CodeSnapshot(Snapshot):
         self._bound.append(_Bindings("", known, _read_names, _write_names))
         self._set.append(_Bindings(f"{function.__name__}.", function, _read_function, _write_function))
         for name in names:
-            value = known.get(name, sys.modules.get(name))
-            if isinstance(value, types.ModuleType) and value.__name__ in ("numpy", "numpy.random", "random"):
-                self._look_at_global_generator(names, value)
-            yield name, value
+            yield name, known.get(name, sys.modules.get(name) if name in self._imported else None)
         for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
             if name in stored:
                 self.records.append(Record(name, cell, _read_cell, _write_cell))
@@ -199,6 +197,8 @@ class CodeSnapshot(Snapshot):
                 stored.add(instruction.argval)
             elif instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
                 self._words.add("STORE_GLOBAL")
+            elif instruction.opname == "IMPORT_NAME":
+                self._imported.add(instruction.argval)
             elif instruction.opname in ("STORE_ATTR", "DELETE_ATTR"):
                 self._words |= {"STORE_ATTR", f"={instruction.argval}"}
         self._words.update(code.co_names)
@@ -241,16 +241,6 @@ class CodeSnapshot(Snapshot):
             self._settlers.append(check.settle)
             self._checks.append(check)
         yield cached.__name__, cached.__wrapped__
-
-    def _look_at_global_generator(self, names: Mapping[str, None], module: types.ModuleType) -> None:
-        """Have a global random generator put back after each call, if the code names its module."""
-        if module.__name__ == "numpy" and "random" not in names:
-            return
-        hidden = random._inst if module.__name__ == "random" else sys.modules["numpy.random"].mtrand._rand
-        if id(hidden) not in self._seen:
-            self._seen[id(hidden)] = hidden
-            before = Snapshot({"": hidden})
-            self._settlers.append(before.restore)
 
 
 class _Bindings(Record):

@@ -150,7 +150,7 @@ class Snapshot:
     def look_at(self, name: str, value: Any) -> Found:
         """Record one object as far as it can change, and give what it refers to; the hook for subclasses."""
         kind = type(value)
-        if issubclass(kind, _CONSTANT) or issubclass(kind, _CODE):
+        if issubclass(kind, _CONSTANT) or issubclass(kind, _CODE) or _is_global_generator(value):
             return
         if is_array(value):
             yield from self.look_at_array(name, value)
@@ -353,7 +353,8 @@ def _ways_to_attributes(value: Any) -> Iterator[tuple[Callable[[Any], Contents],
             del found[name]
         found.update(before)
 
-    if type(getattr(value, "__dict__", None)) is dict:
+    # The functions of C libraries have attributes that are all private.
+    if type(getattr(value, "__dict__", None)) is dict and (own or not callable(value) or read_attributes(value)):
         yield read_attributes, write_attributes
     slots = {name: slot for name, slot in _slots(kind).items() if counts(name)}
 
@@ -410,6 +411,12 @@ def _state_of(value: Any) -> tuple[Callable[[Any], Contents], Callable[[Any, Con
     if callable(getattr(kind, "__next__", None)) and kind.__module__ in ("builtins", "itertools", "collections"):
         return _read_iterator, _leave
     return None
+
+
+def _is_global_generator(value: Any) -> bool:
+    """Whether this is the generator behind the functions of ``random`` or ``numpy.random``."""
+    numbers = sys.modules.get("numpy.random")
+    return value is random._inst or (numbers is not None and value is numbers.mtrand._rand)
 
 
 def _restorer(state: Any) -> Callable[[Any, Contents], object]:

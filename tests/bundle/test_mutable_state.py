@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import queue
+import sys
 import textwrap
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 
 import epypes as ep
@@ -182,6 +184,8 @@ CONSTANT = {
     "nothing": "def f(x):\n    return x",
     "constants": "KEPT = [3, 1, 2]\nTABLE = {'a': 1}\nW = np.eye(2)\ndef f(x):\n    return sorted(KEPT), {**TABLE, 'b': x}, (W + x).tolist()",
     "C objects": "import cv2\norb = cv2.ORB_create(5)\nclahe = cv2.createCLAHE()\ndef f(x):\n    return clahe.apply(np.full((9, 9), x % 255, np.uint8)).tolist()",
+    "functions of libraries": "from numpy import multiply, concatenate\nfrom random import random as draw\nfrom numpy.random import rand\n"
+    "def f(x):\n    draw(), rand()\n    return concatenate([multiply([x], 2)]).tolist()",
     "lazy import": "_json = None\ndef f(x):\n    global _json\n    if _json is None: import json as _json\n    return _json.dumps(x)",
     "lazy caches": "import pathlib, re, logging\nP, R, L = pathlib.PurePath('a/b'), re.compile('a'), logging.getLogger('l')\n"
     "many = np.vectorize(lambda n: n + 1)\ndef f(x):\n    L.debug('%s', x)\n    return str(P), hash(P) and 1, R.findall('aa'), int(many(x))",
@@ -192,7 +196,6 @@ CONSTANT = {
     "a change that is undone": "L = [1]\ndef f(x):\n    L.append(x)\n    return L.pop()",
     "the same again": "D = {'n': 1000}\ndef f(x):\n    D['n'] = int('1000')\n    return x",
     "seeded global generators": "def f(x):\n    random.seed(3)\n    np.random.seed(3)\n    return random.random(), float(np.random.rand())",
-    "global generators": "def f(x):\n    return random.random(), float(np.random.rand())",
     "dispatch": "@functools.singledispatch\ndef g(x): return x\n@g.register\ndef _(x: int): return x + 1\ndef f(x):\n    return g(x)",
     "enumeration": "import enum\nclass E(enum.Flag):\n    A = 1\n    B = 2\ndef f(x):\n    return (E.A | E.B).value, E(x % 4).value",
     "warning": "import warnings\nn = 0\ndef f(x):\n    global n\n    with warnings.catch_warnings(record=True):\n        warnings.warn('a')\n    return x + n",
@@ -227,6 +230,13 @@ def test_a_memo_keeps_its_arrays_and_its_numbers_warm(tmp_path):
     names = runner.cg.functions["f"].__globals__
     assert names["kernel"].cache_info()[:2] == (8, 1)
     assert names["fib"].cache_info().misses == 31
+
+
+def test_functions_that_reach_nothing_that_can_change_are_called_as_they_are(tmp_path):
+    source = "func_dict, func_io = {'f': np.multiply, 'g': np.sum}, {'f': (('x', 'x'), 'z'), 'g': ('z', 'y')}"
+    runner = ep.load(bundle(tmp_path / "b", source))
+    assert runner.run(x=np.arange(3))["y"] == 5
+    assert dict(runner.cg.functions) == {"f": np.multiply, "g": np.sum}
 
 
 def test_reruns_and_trials_are_compared_too(tmp_path):
@@ -433,5 +443,44 @@ def test_a_bundle_of_watched_functions_is_promoted_again(tmp_path):
         second.path / "pipeline.py"
     ).read_text()
     namespace: dict = {}
-    exec(ep.to_source(loaded), namespace)
-    assert namespace["run_graph"](2) == tuple(loaded.last[token] for token in loaded.cg.sink_tokens)
+    written = [token for token in loaded.cg.sink_tokens if token != "y_adding"]
+    exec(ep.to_source(ep.subgraph(loaded.cg, written)), namespace)
+    assert namespace["run_graph"](2) == tuple(loaded.last[token] for token in written)
+
+
+OWN_MODULE = """
+count, items = 0, []
+
+
+def add(x):
+    global count
+    if x > 100:
+        count += 1
+    return count
+"""
+
+
+@pytest.mark.parametrize(
+    ("source", "changed"),
+    [
+        ("import own_helper\ndef f(x):\n    return own_helper.add(x)", "count"),
+        ("import own_helper\ndef f(x):\n    if x > 100: own_helper.count += 1\n    return own_helper.count", "count"),
+        ("from own_helper import items\ndef f(x):\n    if x > 100: items.append(x)\n    return len(items)", "items"),
+        (
+            "import own_helper\ndef f(x):\n    import own_helper as o\n    if x > 100: o.items.append(x)\n    return len(o.items)",
+            "items",
+        ),
+    ],
+)
+def test_the_state_of_an_own_module_is_compared_too(source, changed, tmp_path, monkeypatch):
+    (tmp_path / "lib").mkdir()
+    (tmp_path / "lib" / "own_helper.py").write_text(OWN_MODULE)
+    monkeypatch.syspath_prepend(tmp_path / "lib")
+    monkeypatch.delitem(sys.modules, "own_helper", raising=False)
+    runner = ep.load(bundle(tmp_path / "b", source))
+    for _ in range(4):
+        with pytest.raises(StateChanged) as error:
+            runner.run(x=200)
+        assert error.value.changed.endswith(changed)
+        assert runner.run(x=1)["y"] == 0
+    del sys.modules["own_helper"]
