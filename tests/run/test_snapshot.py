@@ -17,6 +17,8 @@ import pytest
 
 from epypes.run.snapshot import Snapshot
 
+pytestmark = pytest.mark.filterwarnings("ignore:Setting the")  # NumPy 2.5 deprecates what some tests do to arrays
+
 
 class Plain:
     def __init__(self):
