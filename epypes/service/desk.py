@@ -16,12 +16,12 @@ from epypes.service.failures.store import FailureStore
 from epypes.service.latency import Stopwatch
 from epypes.service.ledger import Entry
 from epypes.service.outcome import Result, Setting, answer_id, event_id, failed_without_worker
+from epypes.transport.throttle import Throttle
 from epypes.wire import Envelope
 
 if TYPE_CHECKING:
     from epypes.service.eventlog import EventLog
 
-_LOG_PAUSE_NS: Final = 5_000_000_000
 # What is said of an event that failed outside of its graph.
 _FAILED: Final = {"f_in": "could not be read (f_in)", "f_out": "has an answer that could not be given (f_out)"}
 # Called with a kind of happening ("state", "run", "failure", "parameters", "deployed") and what there is to know of it.
@@ -84,7 +84,7 @@ class Desk:
         self.in_turn: Callable[[Entry, Callable[[], object]], object] = lambda entry, publish: publish()
         self._listeners: list[Listener] = []
         self.latency = Stopwatch()
-        self._logged_ns, self._unlogged = -_LOG_PAUSE_NS, 0
+        self._throttle = Throttle(_log)
 
     def listen(self, callback: Listener) -> Callable[[], None]:
         """Have everything told to a callback; return what ends that."""
@@ -160,15 +160,15 @@ class Desk:
     def _log(self, failure: FailureRecord) -> None:
         if failure.kind == "dropped":
             # In a storm a line for each would take longer than the answer.
-            self._unlogged += 1
-            now_ns = perf_counter_ns()
-            if now_ns - self._logged_ns < _LOG_PAUSE_NS:
-                return
-            _log.warning("%s; %d events since this was said last", failure.summary, self._unlogged)
-            self._logged_ns, self._unlogged = now_ns, 0
+            self._throttle.warning("dropped", failure.summary)
             return
         failed = _FAILED.get(failure.function, f"failed in {failure.function}")
-        _log.warning("event %s %s: %s", failure.event_id or "without id", failed, failure.summary)
+        text = f"event {failure.event_id or 'without id'} {failed}: {failure.summary}"
+        if failure.function == "f_in":
+            # A peer can send any number of these, and nothing is computed for them.
+            self._throttle.warning("f_in", text)
+        else:
+            _log.warning("%s", text)
 
     def _settle_failure(self, entry: Entry, result: Result, failure: FailureRecord) -> FailureRecord:
         self._log(failure)

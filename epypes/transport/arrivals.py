@@ -22,6 +22,7 @@ from epypes.transport.delivered import DeliveredBytes, DeliveredEnvelope, Delive
 from epypes.transport.forked import forget_in_child
 from epypes.transport.framing import envelope_of
 from epypes.transport.seen import Seen, Word
+from epypes.transport.throttle import Throttle
 from epypes.wire import Limits
 
 log = logging.getLogger("epypes.transport")
@@ -73,6 +74,7 @@ class Arrivals:
         self._queue, self._topic, self._limits = queue, topic, limits
         self._place, self._acknowledge, self._exhausted = place, acknowledge, exhausted
         self._lock = threading.RLock()
+        self._log = Throttle(log)
         self.seen: Seen[Delivery] = Seen()
         self.received = self.duplicates = self.dead_letters = 0
         self.rejected: Counter[str] = Counter()
@@ -122,7 +124,7 @@ class Arrivals:
     def _refuse(self, reason: str, text: str, received: Received) -> None:
         """Put aside what can't be understood."""
         self.rejected[reason] += 1
-        log.warning("rejected message %r of %s (%s): %s", received.id, self._place, reason, text)
+        self._log.warning(reason, f"rejected message {received.id!r} of {self._place} ({reason}): {text}")
         self._count_dead_letter()
         received.reject(text)
 
@@ -185,7 +187,7 @@ class Arrivals:
             # The user's queue may raise anything, as a Mailbox of policy "fault" does; the thread goes on.
             self.received -= 1
             self.dropped[type(error).__name__] += 1
-            log.warning("the queue refused a message: %r", error)
+            self._log.warning("refused", f"the queue refused a message: {error!r}")
             if isinstance(error, _ENDED):
                 item.give_back()
                 return

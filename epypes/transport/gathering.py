@@ -1,6 +1,6 @@
 """Which frames make the next message? Those that fit into the limits; of a larger one none is kept.
 
-ZeroMQ itself keeps a message until its last frame has come, whatever that takes; the limits bound what is kept here.
+ZeroMQ itself keeps a message until its last frame has come; `guard` drops the peer that never sends it.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import zmq
 
+from epypes.transport.guard import Watch
 from epypes.wire import Limits
 
 # Of a longer message the rest is read at the next turn, so that other sockets get theirs. An image of a few parts
@@ -28,7 +29,7 @@ class Gatherer:
         self._bytes = 0
         self._reason = ""
 
-    def read(self, socket: zmq.Socket[bytes]) -> Sequence[zmq.Frame] | None:
+    def read(self, socket: zmq.Socket[bytes], watch: Watch | None = None) -> Sequence[zmq.Frame] | None:
         """Return the frames of a message, or None if it goes on; none if it is `refused`.
 
         Raises
@@ -40,6 +41,8 @@ class Gatherer:
             frame = socket.recv(_DONTWAIT, copy=False)
             self._keep(frame)
             if not frame.more:
+                if watch is not None:
+                    watch.has_read(frame)
                 frames, self._frames, self._bytes = self._frames, [], 0
                 return frames
         return None

@@ -1,4 +1,4 @@
-"""What happens to a message that has arrived? It is checked, counted and put into the user's queue."""
+"""Checks and counts the messages that a ZMQSubscriber receives, and puts them into the user's queue."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import zmq
 from epypes.errors import MessageError
 from epypes.transport.framing import envelope_of
 from epypes.transport.joining import IDENTITY_BYTES, Guest
+from epypes.transport.throttle import Throttle
 from epypes.wire import Envelope, Limits
 
 log = logging.getLogger("epypes.transport")
@@ -40,6 +41,7 @@ class Inbox:
         self.rejected: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.lost: dict[Source, int] = {}
+        self._log = Throttle(log)
         self._opened_ns = 0
         self._epochs: dict[str, int] = {}
         self._last: dict[Source, int] = {}
@@ -70,7 +72,7 @@ class Inbox:
     def reject(self, reason: str, text: str) -> None:
         """Count a message that can't be understood."""
         self.rejected[reason] += 1
-        log.warning("rejected a message (%s): %s", reason, text)
+        self._log.warning(reason, f"rejected a message ({reason}): {text}")
 
     def begin(self) -> None:
         """Take note that a socket is opened."""
@@ -89,7 +91,7 @@ class Inbox:
             # The user's queue may raise anything, as a Mailbox of policy "fault" does; the others' sockets go on.
             self.received -= 1
             self.dropped[type(error).__name__] += 1
-            log.warning("the queue refused a message: %r", error)
+            self._log.warning("refused", f"the queue refused a message: {error!r}")
 
     def _follow(self, envelope: Envelope) -> None:
         if envelope.sequence == 0:

@@ -15,10 +15,11 @@ from time import monotonic
 from typing import Any
 
 import zmq
+from zmq.backend import zmq_poll
 
 from epypes.transport.addresses import address_error, check_port
-from epypes.transport.connectionlimit import HANDSHAKE_MS, ConnectionLimit
 from epypes.transport.gate import Gate, Gatekeeper
+from epypes.transport.guard import HANDSHAKE_MS, Guard, Watch
 
 Socket = zmq.Socket[bytes]
 # Reads some of what has arrived, and says whether there is more.
@@ -29,11 +30,13 @@ log = logging.getLogger("epypes.transport")
 # How long a socket that was closed, or the end of the process, may wait for a peer that does not read.
 LINGER_MS = 1_000
 _CLOSE_MS = 500
-# A silent peer is dropped after 15 s; seldom enough that an idle process stays idle.
+# A host that does not answer is dropped after 15 s, by TCP. ZeroMQ's own heartbeats end the whole process when one is
+# due on a connection that broke while its messages waited: "Assertion failed: !_io_error", libzmq#4841 (4.3.5).
 _OPTIONS: dict[int, int] = {
-    zmq.HEARTBEAT_IVL: 5_000,
-    zmq.HEARTBEAT_TIMEOUT: 15_000,
-    zmq.HEARTBEAT_TTL: 30_000,
+    zmq.TCP_KEEPALIVE: 1,
+    zmq.TCP_KEEPALIVE_IDLE: 5,
+    zmq.TCP_KEEPALIVE_INTVL: 5,
+    zmq.TCP_KEEPALIVE_CNT: 2,
     zmq.HANDSHAKE_IVL: HANDSHAKE_MS,
     zmq.RECONNECT_IVL: 50,
     # A peer that has come back is met soon: what it sends before that is lost.
@@ -43,7 +46,7 @@ _OPTIONS: dict[int, int] = {
 
 
 # As numbers: pyzmq looks an enum up at every call.
-_FD, _EVENTS, _POLLIN = int(zmq.FD), int(zmq.EVENTS), int(zmq.POLLIN)
+_FD, _POLLIN = int(zmq.FD), int(zmq.POLLIN)
 
 
 def has_arrived(owned: Socket) -> bool:
@@ -52,7 +55,9 @@ def has_arrived(owned: Socket) -> bool:
     To be asked after whatever else was done with it: that may have used up the signal by which its file descriptor
     wakes the I/O thread.
     """
-    return bool(int(owned.get(_EVENTS)) & _POLLIN)
+    # Not owned.get(EVENTS), which holds the interpreter's lock while libzmq takes in subscriptions: for 19 s if a peer
+    # sends 20,000 of 1 kB.
+    return bool(zmq_poll([(owned, _POLLIN)], 0))
 
 
 @dataclass(slots=True, eq=False)
@@ -64,7 +69,7 @@ class _Owned:
     lock: AbstractContextManager[Any]
     endpoint: str
     gate: Gate | None = None
-    limit: ConnectionLimit | None = None
+    watch: Watch | None = None
     tick: Callable[[], None] | None = None
     every_s: float = 0.0
     due_s: float = float("inf")
@@ -84,6 +89,7 @@ class IOThread:
         self._unfinished: set[Any] = set()
         self._next_due_s = float("inf")
         self._gatekeeper: Gatekeeper | None = None
+        self._guards = Guard()
         self._context = zmq.Context(io_threads=1)
         self._poller = zmq.Poller()
         self._wake_in, self._wake_out = socket.socketpair()
@@ -113,6 +119,7 @@ class IOThread:
         options: Sequence[tuple[int, int | bytes]],
         lock: AbstractContextManager[Any] | None = None,
         gate: Gate | None = None,
+        max_message_bytes: int | None = None,
     ) -> Socket:
         """Return a new socket, bound or connected, whose ``reader`` is called when it can be read.
 
@@ -132,6 +139,9 @@ class IOThread:
             Is held by whoever else touches the socket.
         gate
             Who may connect, if it is bound with keys.
+        max_message_bytes
+            What one connection may send in one message with all its parts, 0 if only subscriptions come; see `guard`.
+            It is heeded where a TCP port is bound.
 
         Raises
         ------
@@ -142,30 +152,34 @@ class IOThread:
         if gate is not None:
             self._guard(gate)
         new: Socket = self._context.socket(kind)
-        limit: ConnectionLimit | None = None
+        watch: Watch | None = None
         try:
             # Options count only for what is bound or connected after them.
             for option, value in [*_OPTIONS.items(), (zmq.LINGER, LINGER_MS), *options]:
                 new.setsockopt(option, value)
             if bind:
                 if not address.startswith("inproc:"):
-                    limit = ConnectionLimit(new)
+                    # Before it is bound, so that no connection is missed.
+                    watch = self._watch(new, max_message_bytes)
                 new.bind(address)
             else:
                 new.connect(address)
         except (zmq.ZMQError, UnicodeError, ValueError, TypeError) as error:
             new.close(linger=0)
-            if limit is not None:
-                limit.monitor.close(linger=0)
+            if watch is not None:
+                watch.end()
             self._unguard(gate)
             number = getattr(error, "errno", None) or 0
             raise address_error(address, "bound" if bind else "connected", number, str(error)) from error
         endpoint = new.getsockopt_string(zmq.LAST_ENDPOINT) if bind else ""
         source = new if lock is None else int(new.get(_FD))
-        self._owned[new] = _Owned(source, reader, lock or nullcontext(), endpoint, gate, limit)
-        if limit is not None:
-            self._readers[limit.monitor] = limit.read
-            self._poller.register(limit.monitor, zmq.POLLIN)
+        self._owned[new] = _Owned(source, reader, lock or nullcontext(), endpoint, gate, watch)
+        if watch is not None:
+            watch.endpoint = endpoint
+            self._readers[watch.descriptor] = watch.follow
+            self._poller.register(watch.descriptor, zmq.POLLIN)
+            if max_message_bytes is not None and endpoint.startswith("tcp:"):
+                self._guards.add(watch)
         self._readers[source] = reader
         self._poller.register(source, zmq.POLLIN)
         self._unfinished.add(source)
@@ -188,6 +202,20 @@ class IOThread:
         known.tick, known.every_s, known.due_s = tick, interval_s, monotonic() + interval_s
         self._next_due_s = min(self._next_due_s, known.due_s)
 
+    def watch_of(self, owned: Socket) -> Watch | None:
+        """Return what bounds the connections to a socket; None if it is not bound, or has no connections."""
+        return self._owned[owned].watch
+
+    def _watch(self, new: Socket, max_message_bytes: int | None) -> Watch:
+        def ask(then: Callable[[bool], None]) -> None:
+            def look(thread: IOThread) -> None:
+                if new in self._owned:
+                    then(not has_arrived(new))
+
+            self.submit(look, Future())
+
+        return Watch(new, max_message_bytes, ask)
+
     def close(self, owned: Socket) -> bool:
         """Close a socket, twice if you like; return whether it was the last one, so that the thread ends."""
         known = self._owned.pop(owned, None)
@@ -195,11 +223,11 @@ class IOThread:
             self._poller.unregister(known.source)
             self._readers.pop(known.source, None)
             self._unfinished.discard(known.source)
-            if known.limit is not None:
-                self._poller.unregister(known.limit.monitor)
-                self._readers.pop(known.limit.monitor, None)
-                self._unfinished.discard(known.limit.monitor)
-                known.limit.monitor.close(linger=0)
+            if known.watch is not None:
+                self._poller.unregister(known.watch.descriptor)
+                self._readers.pop(known.watch.descriptor, None)
+                self._guards.remove(known.watch)
+                known.watch.end()
             with known.lock:
                 _close(owned, known.endpoint)
             self._unguard(known.gate)
@@ -231,6 +259,7 @@ class IOThread:
                 if self._unfinished or self._next_due_s <= monotonic():
                     self._catch_up()
         finally:
+            self._guards.join()
             if self._gatekeeper is not None:
                 self._gatekeeper.close()
             self._context.term()

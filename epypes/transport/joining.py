@@ -16,7 +16,8 @@ from collections import Counter
 
 import zmq
 
-from epypes.transport.iothread import Socket, has_arrived
+from epypes.transport.guard import Watch
+from epypes.transport.iothread import Socket
 
 JOIN_PREFIX = b"\xff\xffepypes/join/"
 # Of the publisher that answers: a UUID.
@@ -25,6 +26,7 @@ IDENTITY_BYTES = 16
 _MAX_PUBLISHERS = 512
 _SUBSCRIBE, _UNSUBSCRIBE = 1, 0
 _BATCH = 100
+_DONTWAIT = int(zmq.DONTWAIT)
 # ZMQ_XPUB_MANUAL_LAST_VALUE: the next message goes only to the peer whose subscription was read last. It is a draft
 # option, which the libzmq 4.3.5 of pyzmq's wheels takes all the same; where it is refused, the answer goes to all.
 _ONLY_TO_LAST_PEER = 98
@@ -46,20 +48,27 @@ class Doorkeeper:
         self._subscriptions: Counter[bytes] = Counter()
         self._identity = uuid.uuid4().bytes
         self._socket: Socket | None = None
+        self._watch: Watch | None = None
 
-    def attach(self, socket: Socket) -> None:
-        """Take the socket whose subscriptions `read` will read."""
-        self._socket = socket
+    def attach(self, socket: Socket, watch: Watch | None) -> None:
+        """Take the socket whose subscriptions `read` will read, and what bounds them, if it is bound."""
+        self._socket, self._watch = socket, watch
 
     def read(self) -> bool:
         """Grant some of the subscriptions that have arrived; return whether there may be more."""
         socket = self._socket
         for _ in range(_BATCH):
-            if socket is None or socket.closed or not has_arrived(socket):
+            if socket is None or socket.closed:
                 return False
-            message = socket.recv(zmq.DONTWAIT)
+            try:
+                frame = socket.recv(_DONTWAIT, copy=False)
+            except zmq.Again:
+                return False
+            message = frame.bytes
             if message[:1] in {b"\0", b"\1"}:
-                self._grant(socket, message[0], message[1:])
+                change = 1 if message[0] == _SUBSCRIBE else -1
+                if self._watch is None or self._watch.may_subscribe(frame, change):
+                    self._grant(socket, message[0], message[1:])
         return True
 
     def wait(self, timeout_s: float) -> bool:

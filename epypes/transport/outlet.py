@@ -15,15 +15,15 @@ from epypes.errors import MessageError
 from epypes.transport import io
 from epypes.transport.forked import forget_in_child
 from epypes.transport.framing import Frames, Framing
+from epypes.transport.guard import SUBSCRIPTION_OPTIONS
 from epypes.transport.joining import Doorkeeper
 from epypes.transport.security import Security
+from epypes.transport.throttle import Throttle
 from epypes.wire import Limits
 from epypes.wire.arrays import is_settled
 
 log = logging.getLogger("epypes.transport")
 
-# A subscription is short; whoever sends more to a publisher is no subscriber.
-_MAX_SUBSCRIPTION_BYTES = 64 * 1024
 # Below this a copy takes less time than to keep account of a buffer that is lent.
 _LENT_FROM_BYTES = 64 * 1024
 _BREAK_TRIES = 5
@@ -47,6 +47,7 @@ class Outlet:
     def __init__(self, topic: str, limits: Limits, counts: Counts) -> None:
         self._framing = Framing(topic, limits)
         self._counts = counts
+        self._log = Throttle(log)
         self._process = os.getpid()
         # The turn is held while an item is made into frames, which runs its own code, the lock to touch the socket.
         # Re-entrant, since a signal's handler may publish anywhere: it gets the turn, and is busy or not.
@@ -64,13 +65,15 @@ class Outlet:
         options = [
             (zmq.XPUB_MANUAL, 1),
             (zmq.SNDHWM, high_water_mark),
-            (zmq.MAXMSGSIZE, _MAX_SUBSCRIPTION_BYTES),
+            *SUBSCRIPTION_OPTIONS,
             *security.options(gate),
         ]
 
         def open_socket(thread: io.IOThread) -> str:
-            self._socket = opened = thread.open(zmq.XPUB, address, security.bind, self._read, options, self._lock, gate)
-            self.doorkeeper.attach(opened)
+            self._socket = opened = thread.open(
+                zmq.XPUB, address, security.bind, self._read, options, self._lock, gate, max_message_bytes=0
+            )
+            self.doorkeeper.attach(opened, thread.watch_of(opened))
             return thread.address_of(opened, address)
 
         self.address = io.call(open_socket, start=True)
@@ -145,7 +148,7 @@ class Outlet:
         """Count an item that can't be sent."""
         self._counts.rejected[reason] += 1
         if not log_once or self._counts.rejected[reason] == 1:
-            log.warning("%s rejected an item (%s): %s", self.address, reason, text)
+            self._log.warning(reason, f"{self.address} rejected an item ({reason}): {text}")
 
     def _send(self, frames: Frames) -> None:
         socket = self._socket

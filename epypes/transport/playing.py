@@ -19,6 +19,7 @@ import zmq
 
 from epypes.errors import RecordingError, StillRunning
 from epypes.transport import io
+from epypes.transport.guard import SUBSCRIPTION_OPTIONS
 from epypes.transport.joining import Doorkeeper
 from epypes.transport.keys import Keys, PublicKey
 from epypes.transport.mcapreader import BrokenOff, Recorded, messages
@@ -27,7 +28,6 @@ from epypes.transport.within import Within
 
 # Small, since what is kept here when the last one has been handed over must still be sent before the process ends.
 _HIGH_WATER_MARK = 64
-_MAX_SUBSCRIPTION_BYTES = 64 * 1024
 # How often it is looked whether there is a subscriber, and whether a full subscriber has room again.
 _LOOK_S, _RETRY_S = 0.025, 0.001
 # Messages that are due are handed to the I/O thread together, so many at most.
@@ -203,13 +203,15 @@ class _Playing:
             (zmq.XPUB_MANUAL, 1),
             (zmq.XPUB_NODROP, 1),
             (zmq.SNDHWM, _HIGH_WATER_MARK),
-            (zmq.MAXMSGSIZE, _MAX_SUBSCRIPTION_BYTES),
+            *SUBSCRIPTION_OPTIONS,
             *security.options(gate),
         ]
 
         def open_socket(thread: io.IOThread) -> tuple[io.Socket, str]:
-            opened = thread.open(zmq.XPUB, address, security.bind, self.doorkeeper.read, options, gate=gate)
-            self.doorkeeper.attach(opened)
+            opened = thread.open(
+                zmq.XPUB, address, security.bind, self.doorkeeper.read, options, gate=gate, max_message_bytes=0
+            )
+            self.doorkeeper.attach(opened, thread.watch_of(opened))
             return opened, thread.address_of(opened, address)
 
         self._socket, self.address = io.call(open_socket, start=True)

@@ -17,6 +17,7 @@ import zmq
 from epypes.errors import StillRunning
 from epypes.transport import io
 from epypes.transport.gathering import Gatherer
+from epypes.transport.guard import Watch
 from epypes.transport.heartbeat import Pulse
 from epypes.transport.inbox import Inbox, PutQueue, Source
 from epypes.transport.joining import Guest
@@ -56,8 +57,8 @@ class ZMQSubscriber(Within):
         connects itself, the one of the peer that is bound there.
     max_message_bytes
         A peer that sends a larger frame is disconnected; a larger message of several frames is counted in `rejected`.
-        ZeroMQ keeps such a message in memory until its last frame has come: from peers that may do harm only keys
-        protect.
+        ZeroMQ keeps such a message in memory until its last frame has come. Where a TCP port is bound, a peer that has
+        sent 64 MB more than this without ending its message is disconnected.
     high_water_mark
         Messages kept by ZeroMQ until the I/O thread has read them.
     undecoded
@@ -230,7 +231,8 @@ class _Opened:
 
     def __init__(self, inbox: Inbox, pulse: Pulse, limits: Limits) -> None:
         self._inbox, self.pulse = inbox, pulse
-        self._gatherer = Gatherer(limits)
+        self._gatherer, self._limits = Gatherer(limits), limits
+        self._watch: Watch | None = None
         self._process = os.getpid()
         self._socket: io.Socket | None = None
         self.guest = Guest()
@@ -245,8 +247,15 @@ class _Opened:
 
         def open_socket(thread: io.IOThread) -> str:
             self._socket = opened = thread.open(
-                zmq.SUB, address, security.bind, self._read, [*options, *more], gate=gate
+                zmq.SUB,
+                address,
+                security.bind,
+                self._read,
+                [*options, *more],
+                gate=gate,
+                max_message_bytes=self._limits.total_bytes,
             )
+            self._watch = thread.watch_of(opened)
             thread.every(heartbeat_s, opened, self._look)
             return thread.address_of(self._socket, address)
 
@@ -277,7 +286,7 @@ class _Opened:
         if socket is None or socket.closed:
             return False
         try:
-            frames = self._gatherer.read(socket)
+            frames = self._gatherer.read(socket, self._watch)
         except zmq.Again:
             return False
         if frames is None:

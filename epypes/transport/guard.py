@@ -1,0 +1,339 @@
+"""Bounds the connections to bound sockets, and what one of them may cost; drops the peer that exceeds that.
+
+Each connection takes a file descriptor of the process, and ZeroMQ accepts as many as there are: idle ones alone would
+leave none for HTTP or for a new worker. One too many is shut down; peers that are connected stay. A ZeroMQ peer
+that was refused tries again by itself, and a connection that never says anything ends after ``HANDSHAKE_MS``.
+
+ZeroMQ bounds the size of one frame (ZMQ_MAXMSGSIZE) and the number of whole messages (the high-water mark), but neither
+the parts of a message whose last part never comes, nor the subscriptions of a peer: libzmq 4.3.5 keeps about 86 bytes
+for each byte of a subscription, and stores them in a loop inside one call, which a fast peer keeps going. So a thread
+of its own, which needs no socket's lock, asks the kernel how many bytes each connection has received, and shuts down
+the connection that has received too many. libzmq then frees what it kept for it.
+
+A UNIX socket (ipc://) has no such counter: its file permissions say which processes may connect. The number of its
+connections is bounded all the same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import resource
+import socket as sockets
+import struct
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import monotonic
+from typing import Any, Final
+
+import zmq
+from zmq.utils.monitor import parse_monitor_message
+
+from epypes.transport.throttle import Throttle
+
+MOST_CONNECTIONS: Final = 1_024
+HANDSHAKE_MS: Final = 10_000
+# Of the descriptors that the process may have: a service has three bound sockets, and HTTP.
+_SHARE: Final = 5
+# A topic has 1,024 bytes at most; a peer that sends larger frames to a publisher is no subscriber.
+_MAX_SUBSCRIPTION_FRAME_BYTES: Final = 2_048
+# What waits in libzmq and in the kernel of a peer that is dropped is still taken in, 0.3 ms for 1 kB.
+SUBSCRIPTION_OPTIONS: Final = (
+    (int(zmq.MAXMSGSIZE), _MAX_SUBSCRIPTION_FRAME_BYTES),
+    (int(zmq.RCVHWM), 100),
+    (int(zmq.RCVBUF), 16 * 1024),
+)
+# A subscriber needs one subscription for its topic and one to join; an honest one with hundreds of topics has room.
+MAX_SUBSCRIPTIONS: Final = 1_024
+MAX_SUBSCRIPTION_BYTES: Final = 64 * 1024
+# Heartbeats and joins of honest subscribers take some 300 bytes a second.
+_BURST_BYTES: Final = 2 * MAX_SUBSCRIPTION_BYTES
+_BYTES_PER_S: Final = 64 * 1024
+# What the kernel may hold of the messages behind the one that is being received, and the heads of its frames.
+_SLACK_BYTES: Final = 64 * 1024**2
+_TICK_S: Final = 0.1
+_EVENTS: Final = int(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
+_SRCFD, _HAS, _POLLIN = int(zmq.SRCFD), int(zmq.EVENTS), int(zmq.POLLIN)
+# In Linux' struct tcp_info: tcpi_bytes_received, 8 bytes.
+_RECEIVED_AT: Final = 128
+
+log = logging.getLogger("epypes.transport")
+
+
+def connection_limit(most: int, share: int) -> int:
+    """Return how many connections there may be: ``most``, or a ``share``-th of the descriptors of this process."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return most if soft == resource.RLIM_INFINITY else min(most, max(soft // share, 1))
+
+
+@dataclass(slots=True, eq=False)
+class _Connection:
+    """What is known of one accepted connection.
+
+    Attributes
+    ----------
+    fd
+        Its file descriptor, which belongs to libzmq.
+    received, read
+        Bytes that it had received, and messages that the socket had given, when it was last seen to be within bounds.
+    credit
+        Bytes that it may send at once, where only subscriptions come.
+    subscriptions, subscription_bytes
+        How many it holds, and their bytes.
+    is_known
+        Whether something that came is known to be from it.
+    """
+
+    fd: int
+    received: int = 0
+    read: int = 0
+    credit: float = float(_BURST_BYTES)
+    subscriptions: int = 0
+    subscription_bytes: int = 0
+    is_known: bool = False
+    is_dropped: bool = False
+
+
+class Watch:
+    """The connections of one bound socket.
+
+    Parameters
+    ----------
+    owned
+        The socket, before it is bound; this is called on the thread that owns it.
+    max_message_bytes
+        Of one message with all its parts; 0 for a socket that receives nothing but subscriptions, None without bounds
+        on what comes.
+    ask
+        Has a function called on the thread that reads the socket, with whether nothing is left to be read.
+
+    Attributes
+    ----------
+    descriptor
+        Readable when there is something for `follow`.
+    endpoint
+        Where the socket is bound.
+    """
+
+    def __init__(
+        self,
+        owned: zmq.Socket[bytes],
+        max_message_bytes: int | None,
+        ask: Callable[[Callable[[bool], None]], object],
+    ) -> None:
+        address = f"inproc://connections-{int(owned.get(zmq.FD))}"
+        owned.monitor(address, _EVENTS)
+        self._monitor: zmq.Socket[bytes] = owned.context.socket(zmq.PAIR)
+        # ZeroMQ's own thread would wait for room.
+        self._monitor.setsockopt(zmq.RCVHWM, 0)
+        self._monitor.connect(address)
+        self.descriptor = int(self._monitor.get(zmq.FD))
+        self._most = connection_limit(MOST_CONNECTIONS, _SHARE)
+        self._max_message_bytes, self._ask = max_message_bytes, ask
+        # Held by whoever touches the monitor or the connections.
+        self._lock = threading.Lock()
+        self._connections: dict[int, _Connection] = {}
+        self._seen: set[int] = set()
+        self._read = 0
+        self._is_over = False
+        self._log = Throttle(log)
+        self.endpoint = ""
+
+    def end(self) -> None:
+        """Watch no more; on the thread that owns the socket."""
+        with self._lock:
+            self._is_over = True
+            self._monitor.close(linger=0)
+            self._connections.clear()
+
+    def follow(self) -> bool:
+        """Take note of connections that came and went, and refuse those beyond the limit; there is no more then."""
+        with self._lock:
+            self._follow()
+        return False
+
+    def has_read(self, frame: zmq.Frame) -> None:
+        """Take note that a whole message was read, of which this is a frame; on the thread that reads."""
+        try:
+            self._seen.add(int(frame.get(_SRCFD)))
+        except zmq.ZMQError:
+            self._drop_old()
+        self._read += 1
+
+    def may_subscribe(self, frame: zmq.Frame, change: int) -> bool:
+        """Count a subscription (``change`` 1) or its end (-1); return whether the peer is within its bounds.
+
+        A peer that is not is dropped.
+        """
+        try:
+            fd = int(frame.get(_SRCFD))
+        except zmq.ZMQError:
+            # The end of what a peer had that is gone has no descriptor either.
+            if change > 0:
+                self._drop_old()
+            return change < 0
+        with self._lock:
+            # That the connection came is told before anything that it sends.
+            self._follow()
+            found = self._connections.get(fd)
+            if found is None:
+                # It has gone meanwhile.
+                return False
+            found.is_known = True
+            found.subscriptions += change
+            found.subscription_bytes += change * len(frame)
+            if found.subscriptions <= MAX_SUBSCRIPTIONS and found.subscription_bytes <= MAX_SUBSCRIPTION_BYTES:
+                return True
+            self._drop(found, "it holds too many subscriptions")
+            return False
+
+    def look(self, passed_s: float) -> None:
+        """Drop what exceeds its bounds; ``passed_s`` seconds after the last look."""
+        with self._lock:
+            if self._is_over:
+                return
+            self._follow()
+            seen, self._seen = self._seen, set()
+            for connection in [*self._connections.values()]:
+                connection.is_known |= connection.fd in seen
+                if self._max_message_bytes is None or connection.is_dropped:
+                    continue
+                received = _received_bytes(connection.fd)
+                if received is not None and self._max_message_bytes:
+                    self._look_at_message(connection, received, connection.fd in seen)
+                elif received is not None:
+                    self._look_at_rate(connection, received, passed_s)
+
+    def _look_at_rate(self, connection: _Connection, received: int, passed_s: float) -> None:
+        credit = connection.credit + passed_s * _BYTES_PER_S - (received - connection.received)
+        connection.credit, connection.received = min(credit, _BURST_BYTES), received
+        if credit < 0:
+            self._drop(connection, "it sends subscriptions too fast")
+
+    def _look_at_message(self, connection: _Connection, received: int, is_seen: bool) -> None:
+        if is_seen:
+            connection.received, connection.read = received, self._read
+        elif received - connection.received > (self._max_message_bytes or 0) + _SLACK_BYTES:
+            self._ask(lambda is_drained: self._judge(connection, is_drained))
+
+    def _judge(self, connection: _Connection, is_drained: bool) -> None:
+        """Drop a connection that has received more than a message, if there was no whole message in it.
+
+        ZeroMQ reads from connections in turns. So one that had a whole message has been read if nothing is left to be
+        read, or if more messages were read meanwhile than there are connections.
+        """
+        with self._lock:
+            had_its_turn = is_drained or self._read - connection.read > len(self._connections)
+            if had_its_turn and connection.fd not in self._seen:
+                self._drop(connection, "it sends a message without an end")
+
+    def _drop_old(self) -> None:
+        """Drop the connections that nothing is known to be from, since something came that is from none of the others.
+
+        libzmq names the connection of what comes over ZMTP 3.0 (libzmq 4.0 of 2013) and later.
+        """
+        with self._lock:
+            self._follow()
+            for connection in self._connections.values():
+                if not connection.is_known and connection.fd not in self._seen:
+                    self._drop(connection, "it speaks a ZeroMQ protocol older than ZMTP 3.0")
+
+    def _follow(self) -> None:
+        """See `follow`; the lock is held."""
+        while not self._is_over and int(self._monitor.get(_HAS)) & _POLLIN:
+            event = parse_monitor_message(self._monitor.recv_multipart())
+            fd = int(event["value"])
+            self._connections.pop(fd, None)
+            self._seen.discard(fd)
+            if event["event"] == zmq.EVENT_ACCEPTED:
+                self._connections[fd] = connection = _Connection(fd, read=self._read)
+                if len(self._connections) > self._most:
+                    self._drop(connection, f"connection limit reached: {self._most} peers are connected")
+
+    def _drop(self, connection: _Connection, why: str) -> None:
+        if connection.is_dropped:
+            return
+        connection.is_dropped = True
+        text = f"{self.endpoint} dropped a peer: {why}. With keys= and allow= only known peers can connect."
+        self._log.warning(why, text)
+        with contextlib.suppress(OSError):  # it has gone by itself
+            borrowed = sockets.socket(fileno=connection.fd)
+            try:
+                # The number may be that of another file by now.
+                if _is_at(borrowed, self.endpoint):
+                    # libzmq's close then resets the connection, which a peer that waits to send more notices.
+                    borrowed.setsockopt(sockets.SOL_SOCKET, sockets.SO_LINGER, struct.pack("ii", 1, 0))
+                    borrowed.shutdown(sockets.SHUT_RDWR)
+            finally:
+                borrowed.detach()
+
+
+class Guard:
+    """The thread that looks at all watched sockets of one I/O thread; it runs while there are any."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._watches: list[Watch] = []
+        self._thread: threading.Thread | None = None
+        self._idle = threading.Event()
+
+    def add(self, watch: Watch) -> None:
+        """Begin to look at a socket's connections."""
+        with self._lock:
+            self._watches.append(watch)
+            self._idle.clear()
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name="epypes-guard", daemon=True)
+                self._thread.start()
+
+    def remove(self, watch: Watch) -> None:
+        """Look no more at a socket's connections."""
+        with self._lock:
+            if watch in self._watches:
+                self._watches.remove(watch)
+            if not self._watches:
+                self._idle.set()
+
+    def join(self) -> None:
+        """Wait until the thread has ended, after the last `remove`."""
+        thread = self._thread
+        if thread is not None:
+            thread.join()
+
+    def _run(self) -> None:
+        looked_s = monotonic()
+        while True:
+            self._idle.wait(_TICK_S)
+            with self._lock:
+                watches = [*self._watches]
+                if not watches:
+                    self._thread = None
+                    return
+            now_s = monotonic()
+            for watch in watches:
+                watch.look(now_s - looked_s)
+            looked_s = now_s
+
+
+def _received_bytes(fd: int) -> int | None:
+    """Return how many bytes a TCP connection has received; None if it is gone."""
+    try:
+        borrowed = sockets.socket(sockets.AF_INET, sockets.SOCK_STREAM, fileno=fd)
+    except OSError:
+        return None
+    try:
+        info = borrowed.getsockopt(sockets.IPPROTO_TCP, sockets.TCP_INFO, _RECEIVED_AT + 8)
+        return int(struct.unpack_from("<Q", info, _RECEIVED_AT)[0])
+    except (OSError, struct.error):
+        return None
+    finally:
+        borrowed.detach()
+
+
+def _is_at(connected: sockets.socket, endpoint: str) -> bool:
+    """Return whether a connection was accepted where a socket is bound."""
+    local: Any = connected.getsockname()
+    if connected.family == sockets.AF_UNIX:
+        return endpoint == f"ipc://{local}"
+    return endpoint.rpartition(":")[2] == str(local[1])
