@@ -62,6 +62,11 @@ class SocketExit:
         then(MessageError("not sent", f"The answer could not be sent: {', '.join(reasons)}.") if reasons else None)
 
     @property
+    def slow_subscribers(self) -> int:
+        """How often a subscriber was so slow that it lost messages; see ZMQPublisher."""
+        return self.publisher.slow_subscribers
+
+    @property
     def address(self) -> str:
         """Where it is, once it is open."""
         return self._given if self._given.startswith(CONNECT) else self.publisher.address
@@ -79,6 +84,9 @@ class BrokerExit:
     on_change
         Called when the broker is away, or there again.
     """
+
+    # A broker keeps messages for whoever is slow.
+    slow_subscribers = 0
 
     def __init__(self, address: str, topic: str, on_change: Callable[[], object]) -> None:
         self._place, self._topic, self._on_change = place_of(bare(address)), topic, on_change

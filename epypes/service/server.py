@@ -225,12 +225,14 @@ class Service:
 
         ``received`` is the sum of answered, failed, dropped, dead_letters, waiting, in_flight and, where a broker
         delivers them, given_back; ``retried`` is how often events were tried again, ``redelivered`` how many had been
-        delivered before, ``rejected`` how many messages were no events.
+        delivered before, ``rejected`` how many messages were no events, ``slow_subscribers`` how often the queue of a
+        subscriber of the answers filled up, so that at least one answer was lost to it.
         """
         with self._dispatcher.changed:
             counts = self._dispatcher.ledger.counts()
         entrance = self._sockets.entrance
-        return {**counts, "rejected": entrance.rejected, **entrance.counts(), **self._peers.counts()}
+        counts |= {"rejected": entrance.rejected, "slow_subscribers": self._sockets.answers.slow_subscribers}
+        return {**counts, **entrance.counts(), **self._peers.counts()}
 
     def group(self) -> dict[str, Any]:
         """Return what there is to know of the replicas that share its events, this one among them, JSON-ready."""

@@ -98,6 +98,9 @@ class Doorkeeper:
             with contextlib.suppress(zmq.ZMQError):
                 socket.setsockopt(_ONLY_TO_LAST_PEER, 1)
             socket.send_multipart([topic, self._identity], zmq.DONTWAIT)
+        except zmq.Again:
+            # The peer's queue is full; it asks again.
+            pass
         except zmq.ZMQError as error:
             log.warning("a join could not be answered: %s", error)
         finally:

@@ -35,6 +35,7 @@ class Counts:
     """What a publisher has done since it was made."""
 
     sent: int = 0
+    slow_subscribers: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
 
 
@@ -65,6 +66,8 @@ class Outlet:
         options = [
             (zmq.XPUB_MANUAL, 1),
             (zmq.SNDHWM, high_water_mark),
+            # Not in order to wait for a slow subscriber, but in order to hear of it; see `_send`.
+            (zmq.XPUB_NODROP, 1),
             *SUBSCRIPTION_OPTIONS,
             *security.options(gate),
         ]
@@ -154,6 +157,25 @@ class Outlet:
         socket = self._socket
         if socket is None:
             raise zmq.ZMQError(zmq.ENOTSOCK)
+        try:
+            self._send_frames(socket, frames)
+        except zmq.Again:
+            # Nothing has left yet. A subscriber's queue is full: the message is dropped for that one, and ZeroMQ leaves
+            # it out without a word until half of its queue is empty.
+            self._counts.slow_subscribers += 1
+            text = f"{self.address}: a subscriber is too slow and loses messages, which it counts itself (lost)"
+            self._log.warning("slow subscriber", text)
+            socket.setsockopt(zmq.XPUB_NODROP, 0)
+            try:
+                self._send_frames(socket, frames)
+            finally:
+                socket.setsockopt(zmq.XPUB_NODROP, 1)
+        # The I/O thread reads it: an answer to a join must not be interrupted by a signal.
+        if io.has_arrived(socket) and not self._has_asked:
+            io.soon(lambda thread: thread.read_again(socket))
+            self._has_asked = True
+
+    def _send_frames(self, socket: io.Socket, frames: Frames) -> None:
         # Counted before: whoever has received it must find it counted.
         self._counts.sent += 1
         is_begun = is_last = False
@@ -174,10 +196,6 @@ class Outlet:
             self._counts.sent -= not is_last
             _break_off(socket, frames)
             raise
-        # The I/O thread reads it: an answer to a join must not be interrupted by a signal.
-        if io.has_arrived(socket) and not self._has_asked:
-            io.soon(lambda thread: thread.read_again(socket))
-            self._has_asked = True
 
     def _read(self) -> bool:
         with self._lock:

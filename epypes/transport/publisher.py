@@ -50,7 +50,7 @@ class ZMQPublisher(Within):
         Larger messages are rejected here, since the receiver would drop the connection.
     high_water_mark
         Messages kept for a subscriber that does not keep up; what is more is dropped, which the subscriber sees in
-        its ``lost``.
+        its ``lost``, and `slow_subscribers` here.
 
     Raises
     ------
@@ -107,6 +107,15 @@ class ZMQPublisher(Within):
     def rejected(self) -> Counter[str]:
         """How many items could not be sent, by reason; a copy."""
         return Counter(self._counts.rejected)
+
+    @property
+    def slow_subscribers(self) -> int:
+        """How often the queue of a subscriber filled up, so that at least one message was lost to it.
+
+        ZeroMQ does not say how many more it dropped for that subscriber until half of its queue had been sent; the
+        subscriber's ``lost`` does.
+        """
+        return self._counts.slow_subscribers
 
     @property
     def refused(self) -> Counter[str]:

@@ -11,6 +11,7 @@ import psutil
 import pytest
 import zmq
 
+from epypes.pipeline import Mailbox
 from epypes.transport import ZMQPublisher, ZMQSubscriber
 from epypes.wire import Envelope, encode
 from tests.transport import zmtp
@@ -172,3 +173,23 @@ def test_a_bad_message_that_is_long_makes_a_short_log_line(peer, caplog):
         sender.send_multipart([b"/", encode(Envelope("x", {"n" * MB: {1}}))[1][:-1] + b"\x7f"])
         wait_until(lambda: sub.rejected, WAIT_S)
     assert all(len(record.message) < 2_000 for record in caplog.records)
+
+
+def test_messages_that_a_slow_subscriber_loses_are_noticed_by_the_publisher_and_the_others_get_all(caplog):
+    out, into = Mailbox(), queue.SimpleQueue()
+    with (
+        ZMQPublisher(LOCAL, out, "t", high_water_mark=20) as pub,
+        ZMQSubscriber(pub.address, into, "t") as fast,
+        zmtp.connected(pub.address, b"SUB") as slow,
+    ):
+        assert fast.wait_joined(WAIT_S)
+        slow.sendall(zmtp.frame(b"\x01"))
+        sent = 0
+        # It reads nothing: the kernel's buffers fill up, and then the publisher's queue.
+        while not pub.slow_subscribers:
+            out.put(Envelope("frame", {"image": np.zeros(MB, np.uint8)}, source="camera"))
+            sent += 1
+            assert into.get(timeout=WAIT_S).sequence == sent
+        assert pub.sent == sent
+        assert fast.lost == {}
+    assert sum("too slow" in record.message for record in caplog.records) == 1

@@ -24,6 +24,7 @@ _COUNTED: Final = {
     "received": ("epypes_events_received", "Events that were accepted."),
     "retried": ("epypes_events_retried", "Further tries of events whose worker was killed."),
     "rejected": ("epypes_messages_rejected", "Messages that were no events."),
+    "slow_subscribers": ("epypes_slow_subscribers", "How often answers were lost to a subscriber that is too slow."),
 }
 # Where a broker delivers the events.
 _COUNTED_OF_BROKER: Final = {
