@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import zmq
 
 from epypes.errors import MessageError
+from epypes.transport.decoding import LARGE_HEADER_BYTES, Decoding
 from epypes.transport.framing import envelope_of
 from epypes.transport.joining import IDENTITY_BYTES, Guest
 from epypes.transport.throttle import Throttle
@@ -29,11 +30,11 @@ class PutQueue(Protocol):
     """What a subscriber puts into: queue.Queue, queue.SimpleQueue, ep.Mailbox."""
 
     def put(self, item: Any, *, block: bool) -> object:
-        """Take an item, or raise queue.Full; called with ``block=False`` on the I/O thread."""
+        """Take an item, or raise queue.Full; called with ``block=False``, by one thread at a time."""
 
 
 class Inbox:
-    """What happens to a message; all of it on the I/O thread."""
+    """What happens to a message: on the I/O thread, unless its header is large or it comes behind such a one."""
 
     def __init__(self, queue: PutQueue, limits: Limits, undecoded: bool) -> None:
         self._queue, self._limits, self._undecoded = queue, limits, undecoded
@@ -42,6 +43,7 @@ class Inbox:
         self.dropped: Counter[str] = Counter()
         self.lost: dict[Source, int] = {}
         self._log = Throttle(log)
+        self._decoding = Decoding(self._take, limits.total_bytes)
         self._opened_ns = 0
         self._epochs: dict[str, int] = {}
         self._last: dict[Source, int] = {}
@@ -51,6 +53,13 @@ class Inbox:
         # A message that is no answer for its size goes the way of others.
         if len(frames) == 2 and len(frames[1]) == IDENTITY_BYTES and guest.saw(frames[0].bytes, frames[1].bytes):
             return
+        is_large = len(frames) > 1 and len(frames[1]) > LARGE_HEADER_BYTES and not self._undecoded
+        if not is_large and not self._decoding.is_busy:
+            self._take(frames)
+        elif not self._decoding.put(frames):
+            self.reject("too many at once", "Large messages come faster than they are decoded.")
+
+    def _take(self, frames: Sequence[zmq.Frame]) -> None:
         if self._undecoded:
             self.put(tuple(frame.buffer for frame in frames))
             return
@@ -77,6 +86,11 @@ class Inbox:
     def begin(self) -> None:
         """Take note that a socket is opened."""
         self._opened_ns = time.time_ns()
+        self._decoding = Decoding(self._take, self._limits.total_bytes)
+
+    def end(self, timeout_s: float) -> bool:
+        """Put nothing more, once the socket is closed; return False if the queue's ``put`` takes too long."""
+        return self._decoding.end(timeout_s)
 
     def put(self, item: object) -> None:
         """Put an item into the queue, or count it as dropped."""

@@ -42,7 +42,8 @@ class ZMQSubscriber(Within):
         Where the publisher is: ``"tcp://127.0.0.1:5555"``.
     queue
         Any object with ``put(item, block=False)``. A message of one frame is put as bytes (2019 mode), one of more
-        frames as an Envelope, whose arrays are read-only. It is called on the I/O thread, and must be quick.
+        frames as an Envelope, whose arrays are read-only. It is called on the I/O thread, and must be quick; behind a
+        message with more than 32 kB in its header, on the thread that decodes such messages.
     topic
         Topic of the envelopes: ``"cam1"`` gets ``cam1`` and ``cam1/left``, not ``cam10``; ``""`` gets everything.
         Messages of 2019 have no topic: with one given, only those come whose own bytes begin with it and a slash.
@@ -267,6 +268,8 @@ class _Opened:
                 io.close(self._socket, timeout_s)
             except TimeoutError as error:
                 raise StillRunning(f"ZMQSubscriber {self.address}", ["put"], timeout_s) from error
+            if not self._inbox.end(timeout_s):
+                raise StillRunning(f"ZMQSubscriber {self.address}", ["put"], timeout_s)
 
     def close_soon(self) -> None:
         if self._socket is not None:

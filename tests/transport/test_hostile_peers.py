@@ -5,12 +5,14 @@ from __future__ import annotations
 import itertools
 import os
 import queue
+import threading
 
 import numpy as np
 import psutil
 import pytest
 import zmq
 
+from epypes.errors import StillRunning
 from epypes.pipeline import Mailbox
 from epypes.transport import ZMQPublisher, ZMQSubscriber
 from epypes.wire import Envelope, encode
@@ -193,3 +195,54 @@ def test_messages_that_a_slow_subscriber_loses_are_noticed_by_the_publisher_and_
         assert pub.sent == sent
         assert fast.lost == {}
     assert sum("too slow" in record.message for record in caplog.records) == 1
+
+
+def test_large_messages_are_not_decoded_on_the_io_thread_and_the_order_is_kept(peer):
+    class Noting:
+        def __init__(self):
+            self.items = queue.SimpleQueue()
+
+        def put(self, item, *, block):
+            self.items.put((item.type, threading.current_thread().name))
+
+    noting = Noting()
+    with ZMQSubscriber(LOCAL, noting, bind=True) as sub:
+        sender = peer(zmq.XPUB)
+        sender.connect(sub.address)
+        assert sender.recv() == b"\x01"
+        values = {"values": {str(number): number for number in range(20_000)}}
+        for _ in range(10):
+            sender.send_multipart(encode(Envelope("large", values)))
+            sender.send_multipart(encode(Envelope("small")))
+        arrived = [noting.items.get(timeout=WAIT_S) for _ in range(20)]
+        assert [kind for kind, _ in arrived] == ["large", "small"] * 10
+        assert not [thread for kind, thread in arrived if kind == "large" and thread == "epypes-io"]
+        assert sub.received == 20
+        assert sub.rejected == {}
+        sender.send_multipart(encode(Envelope("last")))
+        assert noting.items.get(timeout=WAIT_S)[0] == "last"
+
+
+def test_stop_waits_for_the_message_that_is_being_decoded_and_nothing_comes_after_it(peer):
+    class Held:
+        def __init__(self):
+            self.began, self.go_on, self.taken = threading.Event(), threading.Event(), 0
+
+        def put(self, item, *, block):
+            self.began.set()
+            assert self.go_on.wait(WAIT_S)
+            self.taken += 1
+
+    held = Held()
+    sub = ZMQSubscriber(LOCAL, held, bind=True).start()
+    sender = peer(zmq.XPUB)
+    sender.connect(sub.address)
+    assert sender.recv() == b"\x01"
+    for _ in range(3):
+        sender.send_multipart(encode(Envelope("large", {"text": "a" * 100_000})))
+    assert held.began.wait(WAIT_S)
+    with pytest.raises(StillRunning):
+        sub.stop(timeout_s=0.05)
+    held.go_on.set()
+    wait_until(lambda: not [thread for thread in threading.enumerate() if thread.name == "epypes-decoding"], WAIT_S)
+    assert held.taken == 1
