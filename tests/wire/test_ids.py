@@ -9,7 +9,7 @@ import threading
 from epypes.wire import Envelope
 from epypes.wire.ids import new_id
 
-WAIT_S = 20.0
+WAIT_S = 60.0
 
 
 def test_an_id_is_32_hexadecimal_digits():

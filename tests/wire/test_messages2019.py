@@ -204,9 +204,9 @@ def test_an_event_that_lacks_a_field_is_counted_and_the_next_one_is_handled():
     with pipe:
         for event in (b"", field(2, b"7"), field(1, b"good")):
             events.put(event)
-        assert answers.get(timeout=5) == 4
+        assert answers.get(timeout=60) == 4
     assert pipe.failed == 2
-    assert {failures.get(timeout=5).exception.reason for _ in range(2)} == {"incomplete"}
+    assert {failures.get(timeout=60).exception.reason for _ in range(2)} == {"incomplete"}
 
 
 def test_an_image_pair_holds_two_images():

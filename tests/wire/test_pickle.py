@@ -70,11 +70,11 @@ def test_the_trap_works(tmp_path):
 def test_a_pickle_as_an_event_is_bytes_and_stays_bytes(poison):
     out, into = queue.SimpleQueue(), queue.SimpleQueue()
     with ZMQPublisher("tcp://127.0.0.1:*", out) as pub, ZMQSubscriber(pub.address, into) as sub:
-        assert sub.wait_joined(5)
+        assert sub.wait_joined(60)
         out.put(poison)
         out.put(Envelope("x", {"small": poison, "large": poison + bytes(10_000)}))
-        assert into.get(timeout=5) == poison
-        assert into.get(timeout=5).parts["small"] == poison
+        assert into.get(timeout=60) == poison
+        assert into.get(timeout=60).parts["small"] == poison
 
 
 @pytest.mark.parametrize("place", ["alone", "topic", "header", "payload"])

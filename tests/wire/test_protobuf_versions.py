@@ -36,15 +36,21 @@ def environment(request, tmp_path_factory):
     return request.param, python
 
 
-@pytest.mark.parametrize("order", ["users first", "ours first"])
-@pytest.mark.parametrize("made_by", ["upb", "python"])
+@pytest.mark.parametrize(
+    ("made_by", "order"),
+    [
+        ("upb", "users first"),
+        ("python", "ours first"),
+        pytest.param("upb", "ours first", marks=pytest.mark.soak),
+        pytest.param("python", "users first", marks=pytest.mark.soak),
+    ],
+)
 def test_a_version_makes_the_same_bytes_and_understands_those_of_this_one(environment, made_by, order):
     version, python = environment
     variables = {
         **os.environ,
         "PYTHONPATH": str(ROOT),
         "PROTOCOL_BUFFERS_PYTHON_IMPLEMENTATION": made_by,
-        "PYTHONDONTWRITEBYTECODE": "1",
     }
     ours = exchange.made()
     done = subprocess.run(
