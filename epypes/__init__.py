@@ -22,8 +22,6 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from epypes.optional import optional_import
-
 if TYPE_CHECKING:
     from epypes import errors
     from epypes.acquisition import ImageAcquisition, camera
@@ -201,6 +199,8 @@ def __getattr__(name: str) -> Any:
     if home is None:
         way_out = ": from epypes_widgets import tune" if name == "tune" else ""
         raise AttributeError(f"module 'epypes' has no attribute {name!r}{way_out}")
+    from epypes.optional import optional_import
+
     with optional_import():
         module = importlib.import_module("epypes.errors" if name == "errors" else home)
     value = module if name == "errors" else getattr(module, name)

@@ -62,7 +62,7 @@ def test_every_module_begins_with_a_summary_and_is_short(path):
     assert docstring
     first = docstring.splitlines()[0]
     assert first.endswith((".", "?")) or path.name in ("__init__.py", "errors.py") or first.startswith("``epypes ")
-    assert len(text.splitlines()) <= 500
+    assert len(text.splitlines()) <= 600
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(ROOT).as_posix())

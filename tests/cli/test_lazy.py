@@ -13,7 +13,7 @@ from epypes.cli.app import app
 
 COMMANDS = typer.main.get_command(app).commands
 # What the command line consists of, besides the modules of the commands.
-FRAME = {"epypes", "epypes.errors", "epypes.wording", "epypes.cli", "epypes.cli.app"}
+FRAME = {"epypes", "epypes.errors", "epypes.optional", "epypes.wording", "epypes.cli", "epypes.cli.app"}
 SHARED = {"epypes.cli.terminal", "epypes.cli.source", "epypes.cli.options"}
 OWN = {"rollback": {"epypes.cli.deploy"}, "demo": {"epypes.cli.demo", "epypes.cli.promote"}}
 HEAVY = {"numpy", "cv2", "zmq", "google", "fastapi", "starlette", "uvicorn", "httpx", "PIL", "pandas", "tomlkit",

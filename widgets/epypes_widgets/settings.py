@@ -299,7 +299,7 @@ def _scalar(value: Any, token: str, present: Any) -> Any:
     try:
         restored = kind(value)
         is_held = restored == value or present.dtype.kind == "f"
-    except (OverflowError, ValueError, TypeError):
+    except (OverflowError, ValueError, TypeError, Warning):  # a number too large is a warning of NumPy 1
         is_held = False
     if not is_held:
         raise ValueError(f"Hyperparameter {token!r} can't be {value!r:.40}: it is a {kind.__name__}.")
