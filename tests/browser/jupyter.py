@@ -235,9 +235,13 @@ class Notebook:
         assert not failed, "\n".join(failed)
 
     def save(self) -> None:
-        """Save the notebook."""
-        self.page.evaluate("() => jupyterapp.commands.execute('docmanager:save')")
-        self.page.wait_for_function("() => !jupyterapp.shell.currentWidget.context.model.dirty")
+        """Save the notebook, again if an output came meanwhile."""
+        self.page.evaluate(
+            """async () => {
+                do await jupyterapp.commands.execute('docmanager:save');
+                while (jupyterapp.shell.currentWidget.context.model.dirty);
+            }"""
+        )
 
     def start(self, code: str) -> None:
         """Begin to run code in the kernel outside of any cell, and return at once."""
