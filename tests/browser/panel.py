@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from tests.browser.jupyter import Notebook
@@ -77,6 +79,15 @@ class PanelOnScreen:
         self.page.mouse.move(x, y)
         self.page.mouse.down()
         return x, y
+
+    @contextmanager
+    def restless(self) -> Iterator[None]:
+        """Only a release commits, however long a busy machine takes between two moves of the mouse."""
+        assert self.notebook.execute("import epypes_widgets.tuning as _t; _rest_s, _t.REST_S = _t.REST_S, 3600.0") == ""
+        try:
+            yield
+        finally:
+            self.notebook.execute("_t.REST_S = _rest_s")
 
     def wait(self, condition: str, argument: Any = None) -> None:
         """Return when a condition in JavaScript holds."""
