@@ -14,11 +14,13 @@ from skimage import data
 from xdist.scheduler import LoadFileScheduling
 
 import epypes as ep
+from epypes.bundle import replay
 from epypes.cli import main
 from tests import hangs
 from tests.brokers.fixtures import broker, certificates, mosquitto, nats, rabbitmq
 from tests.brokers.nats import is_installed
 from tests.browser.conftest import theme_of
+from tests.replays import WarmProcesses
 
 __all__ = ["broker", "certificates", "mosquitto", "nats", "rabbitmq"]
 
@@ -109,6 +111,22 @@ def straight_edges(photograph) -> np.ndarray:
     """The edges as straight-line OpenCV computes them."""
     gray = cv2.cvtColor(photograph, cv2.COLOR_BGR2GRAY)
     return cv2.Canny(cv2.GaussianBlur(gray, (11, 11), 0), 70, 200)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def warm_replays():
+    """Replays are forks of a process that has NumPy and EPypes loaded, but for those of `fresh_interpreter`."""
+    processes = WarmProcesses()
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(replay, "subprocess", processes)
+        yield processes
+    processes.close()
+
+
+@pytest.fixture
+def fresh_interpreter(warm_replays, monkeypatch):
+    """Replays start an interpreter, as they do for users."""
+    monkeypatch.setattr(warm_replays, "is_on", False)
 
 
 @pytest.fixture

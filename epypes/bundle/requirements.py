@@ -146,12 +146,20 @@ def _lines(name: str) -> list[str]:
 
 def twins_of(name: str) -> list[str]:
     """Return a warning if another distribution that brings the same module is installed beside one."""
-    installed = {normalized(distribution.name) for distribution in metadata.distributions()}
-    others = sorted(twin for family in _TWINS if name in family for twin in (family & installed) - {name})
+    twins = frozenset().union(*(family for family in _TWINS if name in family)) - {name}
+    others = sorted(twin for twin in twins if _is_there(twin))
     if not others:
         return []
     text = f"{name} and {', '.join(others)} are both installed and overwrite each other: uninstall all but one."
     return [f"{text} The files that were loaded are those of {name}."]
+
+
+def _is_there(name: str) -> bool:
+    try:
+        metadata.distribution(name)
+    except metadata.PackageNotFoundError:
+        return False
+    return True
 
 
 def pins(lines: Iterable[str]) -> dict[str, str]:
