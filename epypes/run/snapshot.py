@@ -33,6 +33,9 @@ from epypes.run.guard import is_array
 
 Contents = tuple[Any, ...]
 Found = Iterator[tuple[str, Any]]
+# How the contents of an object are read and written.
+_Way = tuple[Callable[[Any], Contents], Callable[[Any, Contents], object]]
+_Kind = tuple[type, Callable[[Any], Contents], Callable[[Any, Contents], object]]
 
 ATOMS: Final = frozenset(
     {int, float, complex, bool, str, bytes, type(None), type(...), type(NotImplemented), range, Decimal}
@@ -100,7 +103,7 @@ class Snapshot:
     generators, iterators and pandas objects are compared; tuples, partials, bound methods and C containers are looked
     through. Functions, classes and modules count as constants, and so do the private attributes of a library's objects.
 
-    A snapshot holds references to all that it compares, and a copy of every array that can be written to.
+    It holds references to all that it compares, and a copy of every array that can be written to.
 
     Examples
     --------
@@ -202,11 +205,9 @@ def is_same(now: Any, saved: Any) -> bool:
         return now == saved and sorted(map(_order, now)) == sorted(map(_order, saved))
     if kind is types.MethodType:
         return now.__self__ is saved.__self__ and now.__func__ is saved.__func__
-    return bool(now == saved) if kind in ATOMS else _is_scalar(kind) and _bits(now) == _bits(saved)
-
-
-def _bits(scalar: Any) -> tuple[Any, bytes]:
-    return scalar.dtype, scalar.tobytes()
+    if kind in ATOMS:
+        return bool(now == saved)
+    return _is_scalar(kind) and bool(now.dtype == saved.dtype and now.tobytes() == saved.tobytes())
 
 
 def _order(value: Any) -> tuple[str, int]:
@@ -237,23 +238,14 @@ def is_own(module: str) -> bool:
 # -- how contents are read and written -----------------------------------------------------------------------------
 
 
-def _read_dict(value: dict[Any, Any]) -> Contents:
-    return *dict.keys(value), *dict.values(value)
+def _mapping(kind: Any) -> _Kind:
+    """Return how a dict is read and written, by the methods of its kind: those of dict don't see move_to_end."""
 
+    def write(value: Any, saved: Contents) -> None:
+        kind.clear(value)
+        kind.update(value, as_dict(saved))
 
-def _write_dict(value: dict[Any, Any], saved: Contents) -> None:
-    dict.clear(value)
-    dict.update(value, as_dict(saved))
-
-
-def _read_ordered(value: collections.OrderedDict[Any, Any]) -> Contents:
-    # Those of dict don't see what move_to_end does.
-    return *collections.OrderedDict.keys(value), *collections.OrderedDict.values(value)
-
-
-def _write_ordered(value: collections.OrderedDict[Any, Any], saved: Contents) -> None:
-    collections.OrderedDict.clear(value)
-    collections.OrderedDict.update(value, as_dict(saved))
+    return kind, lambda value: (*kind.keys(value), *kind.values(value)), write
 
 
 def _write_set(value: set[Any], saved: Contents) -> None:
@@ -266,14 +258,10 @@ def _write_deque(value: collections.deque[Any], saved: Contents) -> None:
     collections.deque.extend(value, saved)
 
 
-def _write_array_array(value: array[Any], saved: Contents) -> None:
-    value[:] = array(value.typecode, saved[0])
-
-
-_KINDS: Final[tuple[tuple[type, Callable[[Any], Contents], Callable[[Any, Contents], object]], ...]] = (
+_KINDS: Final[tuple[_Kind, ...]] = (
     (list, lambda value: tuple(list.__iter__(value)), lambda value, saved: list.__setitem__(value, slice(None), saved)),
-    (collections.OrderedDict, _read_ordered, _write_ordered),
-    (dict, _read_dict, _write_dict),
+    _mapping(collections.OrderedDict),
+    _mapping(dict),
     (set, lambda value: (frozenset(set.__iter__(value)),), _write_set),
     (collections.deque, lambda value: tuple(collections.deque.__iter__(value)), _write_deque),
     (
@@ -281,14 +269,17 @@ _KINDS: Final[tuple[tuple[type, Callable[[Any], Contents], Callable[[Any, Conten
         lambda value: (bytes(value),),
         lambda value, saved: bytearray.__setitem__(value, slice(None), saved[0]),
     ),
-    (array, lambda value: (value.tobytes(),), _write_array_array),
+    (
+        array,
+        lambda value: (value.tobytes(),),
+        lambda value, saved: array.__setitem__(value, slice(None), array(value.typecode, saved[0])),
+    ),
 )
 
 
 def _items_of(value: Any) -> list[Any]:
     """Return the objects in an array of objects, or the tuples of one whose fields are some."""
-    found: list[Any] = value.ravel().tolist()
-    return found
+    return list(value.ravel().tolist())
 
 
 def _read_array(value: Any) -> Contents:
@@ -332,7 +323,7 @@ def _slots(kind: type) -> dict[str, types.MemberDescriptorType]:
     return {slot.__name__: slot for slot in slots}
 
 
-def _ways_to_attributes(value: Any) -> Iterator[tuple[Callable[[Any], Contents], Callable[[Any, Contents], object]]]:
+def _ways_to_attributes(value: Any) -> Iterator[_Way]:
     """Give how the attributes and the slots of an object are read and written, as names followed by values.
 
     Left out are cached properties, and the private attributes of objects of libraries, which are mostly caches.
@@ -396,14 +387,15 @@ def _write_table(value: Any, saved: Contents) -> None:
 # -- objects with a state of their own -----------------------------------------------------------------------------
 
 
-def _state_of(value: Any) -> tuple[Callable[[Any], Contents], Callable[[Any, Contents], object]] | None:
+def _state_of(value: Any) -> _Way | None:
     """Return how the state of a random generator, a buffer or an iterator is read and written."""
     kind = type(value)
     if issubclass(kind, random.Random):
         return lambda value: (value.getstate(),), lambda value, saved: value.setstate(saved[0])
     numbers = sys.modules.get("numpy.random")
     if numbers is not None and issubclass(kind, numbers.BitGenerator):
-        return lambda value: (_flat(value.state), value.state)[:1], _restorer(value.state)
+        state = value.state
+        return lambda value: (_flat(value.state),), lambda value, saved: setattr(value, "state", state)
     if hasattr(kind, "getvalue") and hasattr(kind, "__setstate__") and kind.__module__ == "_io":
         return lambda value: value.__getstate__()[:2], lambda value, saved: value.__setstate__((*saved, None))
     if issubclass(kind, types.GeneratorType | types.CoroutineType | types.AsyncGeneratorType):
@@ -419,13 +411,6 @@ def _is_global_generator(value: Any) -> bool:
     return value is random._inst or (numbers is not None and value is numbers.mtrand._rand)
 
 
-def _restorer(state: Any) -> Callable[[Any, Contents], object]:
-    def restore(value: Any, saved: Contents) -> None:
-        value.state = state
-
-    return restore
-
-
 def _flat(state: Any) -> Any:
     """Return the state of a generator as something that can be compared."""
     if isinstance(state, dict):
@@ -438,10 +423,8 @@ def _leave(value: Any, saved: Contents) -> None:
 
 
 def _frame(value: Any) -> types.FrameType | None:
-    return next(
-        (frame for name in ("gi_frame", "cr_frame", "ag_frame") if (frame := getattr(value, name, None)) is not None),
-        None,
-    )
+    found = (getattr(value, name, None) for name in ("gi_frame", "cr_frame", "ag_frame"))
+    return next((frame for frame in found if frame is not None), None)
 
 
 def _read_generator(value: Any) -> Contents:
@@ -513,6 +496,5 @@ def cached_values(cached: Any) -> list[Any]:
 
 
 def _locals(value: Any) -> Mapping[str, Any]:
-    """Return the local variables of a generator."""
     frame = _frame(value)
     return {} if frame is None else frame.f_locals
