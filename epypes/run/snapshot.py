@@ -296,10 +296,12 @@ def _write_array(value: Any, saved: Contents) -> None:
     shape, dtype, writeable, data = saved
     if not value.flags.writeable:
         value.setflags(write=True)
-    if value.dtype != dtype:
-        value.dtype = dtype
-    if value.shape != shape:
-        value.shape = shape
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of NumPy 2.5; it was set by others first
+        if value.dtype != dtype:
+            value.dtype = dtype
+        if value.shape != shape:
+            value.shape = shape
     if dtype.hasobject:
         value.reshape(-1)[:] = data if dtype.names else [*data]
     else:
@@ -389,15 +391,14 @@ def _write_table(value: Any, saved: Contents) -> None:
 
 def _state_of(value: Any) -> _Way | None:
     """Return how the state of a random generator, a buffer or an iterator is read and written."""
-    kind = type(value)
+    kind, numbers = type(value), sys.modules.get("numpy.random")
     if issubclass(kind, random.Random):
         return lambda value: (value.getstate(),), lambda value, saved: value.setstate(saved[0])
-    numbers = sys.modules.get("numpy.random")
     if numbers is not None and issubclass(kind, numbers.BitGenerator):
         state = value.state
         return lambda value: (_flat(value.state),), lambda value, saved: setattr(value, "state", state)
     if hasattr(kind, "getvalue") and hasattr(kind, "__setstate__") and kind.__module__ == "_io":
-        return lambda value: value.__getstate__()[:2], lambda value, saved: value.__setstate__((*saved, None))
+        return lambda value: value.__getstate__()[:-1], lambda value, saved: value.__setstate__((*saved, None))
     if issubclass(kind, types.GeneratorType | types.CoroutineType | types.AsyncGeneratorType):
         return None if _frame(value) is None else (_read_generator, _leave)
     if callable(getattr(kind, "__next__", None)) and kind.__module__ in ("builtins", "itertools", "collections"):
@@ -412,7 +413,6 @@ def _is_global_generator(value: Any) -> bool:
 
 
 def _flat(state: Any) -> Any:
-    """Return the state of a generator as something that can be compared."""
     if isinstance(state, dict):
         return tuple((name, _flat(part)) for name, part in state.items())
     return state.tobytes() if is_array(state) else state

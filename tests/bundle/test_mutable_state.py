@@ -108,7 +108,10 @@ KEPT = {
     "array that is unlocked": (
         "W = np.zeros(2)\ndef f(x):\n    if x > 100:\n        W.setflags(write=True)\n        W[0] += 1\n    return W.tolist()", "W",
     ),
-    "shape of an array": ("W = np.zeros((2, 3))\ndef f(x):\n    if x > 100: W.shape = (6,)\n    return W.shape", "W"),
+    "shape of an array": (
+        "import warnings\nW = np.zeros((2, 3))\ndef f(x):\n    with warnings.catch_warnings():\n        warnings.simplefilter('ignore')  # of NumPy 2.5\n"
+        "        if x > 100: W.shape = (6,)\n    return W.shape", "W",
+    ),
     "while it raises something else": (
         "L = []\ndef f(x):\n    if x > 100:\n        L.append(x)\n        raise ValueError(x)\n    return len(L)", "",
     ),

@@ -86,6 +86,7 @@ CHANGES = {
     "NumPy Generator": (lambda: np.random.default_rng(1), lambda v: v.random(), lambda v: v.bit_generator.state),
     "RandomState": (lambda: np.random.RandomState(1), lambda v: v.rand(), lambda v: repr(v.get_state())),
     "BytesIO": (lambda: io.BytesIO(b"ab"), lambda v: v.read(1), lambda v: v.tell()),
+    "StringIO": (lambda: io.StringIO("ab"), lambda v: v.seek(2) and v.write("c"), lambda v: (v.getvalue(), v.tell())),
     "DataFrame": (lambda: pd.DataFrame({"a": [1, 2]}), lambda v: v.insert(0, "b", 3), lambda v: v.to_csv()),
     "Series": (lambda: pd.Series([1, 2]), lambda v: v.__setitem__(0, 3), lambda v: v.to_csv()),
 }  # fmt: skip
