@@ -70,7 +70,7 @@ def test_a_quick_run_of_the_pipelines_benchmark_compares_the_same_events():
     assert found.reached is not None
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_quick_run_of_the_case_system_keeps_every_row():
     rows = case.rows(QUICK)
     assert [found.work.removeprefix("the case system: ") for found in rows] == [
@@ -86,7 +86,7 @@ def test_a_quick_run_of_the_case_system_keeps_every_row():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("threads", [1, pytest.param(2, marks=pytest.mark.soak)])
 def test_hand_written_processes_answer_as_the_case_system_does(threads):
     with ByHand(threads) as system, running(LAYOUTS["paper"], Settings(workers=threads)) as ours:
         _, by_hand = system.ask()
@@ -98,7 +98,7 @@ def test_hand_written_processes_answer_as_the_case_system_does(threads):
 ARRAYS = ("an array of 1 kB: trip", "an array of 1 MB: trip")
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_a_quick_run_of_the_brokers_benchmark_keeps_every_row():
     present = [venue for venue in brokers.venues.present() if venue.name in ("ZeroMQ", "NATS JetStream")]
     rows = brokers.rows(QUICK, present)
@@ -119,7 +119,7 @@ def test_a_quick_run_of_the_brokers_benchmark_keeps_every_row():
     assert {found.work for found in rows if found.reached is not None} == with_goal
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 @pytest.mark.parametrize("venue", [venue for venue in brokers.venues.ALL if venue.is_brokered], ids=str)
 def test_what_is_asked_by_hand_comes_back_from_replicas_that_share_the_work(venue):
     if venue.missing():
@@ -256,6 +256,7 @@ def test_what_is_counted_is_shown_and_kept_as_a_number():
 
 
 @pytest.mark.browser
+@pytest.mark.soak
 def test_a_quick_run_moves_the_sliders_of_both_servers_and_keeps_every_row(tmp_path):
     rows = apart(lambda: tuning.rows(QUICK))
     write_json(rows, [], tmp_path / "benchmarks.json")

@@ -22,7 +22,7 @@ from tests.scale.test_spreading import mixed, mortal_runner, without_times
 
 pytestmark = pytest.mark.slow
 
-_WAIT_S = 30.0
+_WAIT_S = 120.0
 
 
 @pytest.fixture(scope="module")
