@@ -25,6 +25,7 @@ def test_the_frame_nearest_to_a_time_is_found():
     assert [ring.nearest(time_ns).number for time_ns in (100, 140, 160, 240, 260, 300, 999)] == [1, 1, 2, 2, 3, 3, 3]
 
 
+@pytest.mark.fuzz
 @given(st.lists(TIMES, min_size=1, max_size=20), TIMES, st.integers(1, 12))
 def test_nearest_is_the_minimum_over_the_frames_that_are_kept(times_ns, wanted_ns, size):
     ring = ring_of(*times_ns, size=size)
@@ -38,6 +39,7 @@ def test_nearest_is_the_minimum_over_the_frames_that_are_kept(times_ns, wanted_n
     assert (found.number, found.captured_ns) == (number, captured_ns)
 
 
+@pytest.mark.fuzz
 @given(TIMES, TIMES, st.integers(1, 10**9))
 def test_no_frame_is_given_that_is_too_far_from_the_time(captured_ns, wanted_ns, away_ns):
     ring = ring_of(captured_ns)

@@ -9,7 +9,7 @@ import tomllib
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
@@ -58,7 +58,7 @@ def bits(value):
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
+@pytest.mark.fuzz
 @given(VALUES)
 @example({"kind": "tuple", "value": [1]})
 @example({"": {"kind": None}, "a.b": "\x00\x7f\r\n\t\\\"'''"})

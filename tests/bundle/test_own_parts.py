@@ -209,6 +209,7 @@ def test_the_pipeline_that_serves_is_of_the_users_class_and_answers_bytes_with_b
     assert pipe.attributes["asked"] >= 1
 
 
+@pytest.mark.usefixtures("fresh_interpreter")
 def test_an_f_out_that_makes_another_answer_is_found(promoted, tmp_path):
     import shutil
 
@@ -285,6 +286,7 @@ def double_graph(names) -> ep.CompGraph:
     return ep.CompGraph({"double": names["double"]}, {"double": ("x", "y")})
 
 
+@pytest.mark.usefixtures("fresh_interpreter")
 def test_ports_of_the_papers_pipelines_are_promoted(names, tmp_path):
     pipe = ep.SourcePipeline("s", double_graph(names), queue.Queue(), names["told"])
     pipe.run(x=4)

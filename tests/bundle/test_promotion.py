@@ -150,6 +150,7 @@ def test_a_replay_that_raises_names_the_line_in_the_bundle(bundle):
 @pytest.mark.parametrize(
     "end", ["import os; os.kill(os.getpid(), 9)", "import sys; sys.exit(3)", "import os; os._exit(4)"]
 )
+@pytest.mark.usefixtures("fresh_interpreter")
 def test_a_replay_that_dies_is_reported(bundle, end):
     module = bundle.path / "pipeline.py"
     module.write_text(f"{module.read_text()}\n{end}\n")
@@ -167,6 +168,7 @@ def test_a_replay_that_takes_too_long_is_ended(bundle):
         verify(bundle.path, timeout_s=2)
 
 
+@pytest.mark.usefixtures("fresh_interpreter")
 def test_the_replay_sees_neither_the_current_folder_nor_the_environment(bundle, tmp_path, monkeypatch):
     (tmp_path / "cv2.py").write_text("raise SystemExit('hijacked')")
     monkeypatch.chdir(tmp_path)
@@ -228,6 +230,7 @@ def test_a_hyperparameter_that_toml_cannot_hold_is_refused_by_name(tmp_path):
         ep.promote(runner, tmp_path / "b")
 
 
+@pytest.mark.usefixtures("fresh_interpreter")
 def test_hyperparameters_come_back_with_their_type(tmp_path):
     values = [3, 2.5, float("inf"), "text", True, None, (3, 5), [1, 2.0], -(2**63), 'a"b\n\\']
     hparams = {f"k{index}": value for index, value in enumerate(values)}
@@ -576,6 +579,7 @@ def test_a_bundle_that_is_replaced_while_it_is_read_is_never_mixed_with_the_next
         thread.join()
 
 
+@pytest.mark.usefixtures("fresh_interpreter")
 def test_marks_are_promoted_and_the_bundle_says_which_ports_are_rgb(tmp_path):
     runner = red_runner()
     runner.run(image=red_image())

@@ -69,6 +69,7 @@ def test_a_hyperparameter_that_names_a_file_is_refused(template, tmp_path):
 
 
 @pytest.mark.parametrize("call", ["cv2.imread('template.png', 0).max()", "len(Path('template.png').read_bytes())"])
+@pytest.mark.usefixtures("fresh_interpreter")
 def test_a_relative_path_is_refused_since_the_current_folder_is_another_one_there(
     call, template, tmp_path, monkeypatch
 ):
@@ -97,6 +98,7 @@ def test_what_is_there_wherever_the_bundle_is_or_only_written_is_fine(what, temp
     assert verify(bundle.path).identical
 
 
+@pytest.mark.usefixtures("fresh_interpreter")
 def test_connections_and_processes_are_told(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]

@@ -35,6 +35,7 @@ def read(x):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("fresh_interpreter")
 def test_lazy_imports_are_captured_and_imports_of_the_notebook_or_of_epypes_are_not(tmp_path):
     runner = ep.CompGraphRunner(ep.CompGraph({"read": notebook(SOURCE)["read"]}, {"read": ("x", "y")}))
     runner.run(x=1)
@@ -99,6 +100,7 @@ def test_the_headless_build_that_is_installed_here_is_named_alone():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("fresh_interpreter")
 def test_parts_of_a_namespace_are_told_apart(tmp_path):
     distribution(tmp_path, "lab-left", "1", [("lab/left/__init__.py", "")])
     distribution(tmp_path, "Lab_Right", "2.0+cpu", [("lab/right/__init__.py", "")])
@@ -110,6 +112,7 @@ def test_parts_of_a_namespace_are_told_apart(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("fresh_interpreter")
 def test_an_editable_install_is_named_with_a_comment(tmp_path):
     checkout, site = tmp_path / "checkout", tmp_path / "site"
     checkout.mkdir(), site.mkdir()
@@ -123,6 +126,7 @@ def test_an_editable_install_is_named_with_a_comment(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("fresh_interpreter")
 def test_python_itself_and_what_nobody_installed_are_no_requirements(tmp_path):
     (tmp_path / "loose.py").write_text("")
     assert requirements(tmp_path, "json", "email.message", "loose") == []

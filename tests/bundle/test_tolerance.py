@@ -157,6 +157,7 @@ def test_the_nodes_and_pipelines_of_the_user_are_not_run_again():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("fresh_interpreter")
 def test_a_noisy_token_is_promoted_with_its_tolerance_and_verified_by_it(tmp_path):
     runner = ep.CompGraphRunner(graph("total"))
     runner.run(x=X)

@@ -72,6 +72,7 @@ def refused(folder):
     return str(caught.value)
 
 
+@pytest.mark.usefixtures("fresh_interpreter")
 def test_a_changed_constant_is_named_with_its_line_and_the_first_difference(folder):
     change(folder / "pipeline.py", "OFFSET = 40", "OFFSET = 41")
     line = (folder / "pipeline.py").read_text().splitlines().index("OFFSET = 41") + 1
@@ -184,6 +185,7 @@ def test_sealing_again_keeps_what_the_samples_were_recorded_with(folder):
     assert changed_since_recorded(folder) == []
 
 
+@pytest.mark.usefixtures("fresh_interpreter")
 def test_values_that_differ_from_run_to_run_are_said_to(folder):
     change(folder / "pipeline.py", "smoothed > OFFSET", "smoothed > OFFSET + np.random.randint(0, 60, smoothed.shape)")
     report = replay(read_bundle(folder, sealed=False))
@@ -231,6 +233,7 @@ def test_an_older_manifest_without_comments_is_a_bundle_still(folder):
     assert "pipeline.toml was changed. Restore it" in refused(folder)
 
 
+@pytest.mark.usefixtures("fresh_interpreter")
 def test_threads_of_opencv_are_told_as_they_are(folder):
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)

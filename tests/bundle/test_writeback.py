@@ -38,6 +38,7 @@ def contents(folder):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("fresh_interpreter")
 def test_values_are_written_in_their_lines_alone_and_the_bundle_proves_them(folder):
     before = contents(folder)
     expected = write_back(folder, {"lo": 30, "hi": 90.5}, dry_run=True)
@@ -57,6 +58,7 @@ def test_values_are_written_in_their_lines_alone_and_the_bundle_proves_them(fold
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("fresh_interpreter")
 def test_values_that_a_function_refuses_leave_the_bundle_alone(folder):
     before = contents(folder)
     with pytest.raises(BundleError, match=r"were not written back: .*function 'smooth'.*side=4.*stays as it is: try"):

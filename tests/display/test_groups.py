@@ -7,7 +7,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import epypes as ep
@@ -332,7 +332,7 @@ def grouped_graphs(draw):
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
+@pytest.mark.fuzz
 @given(grouped_graphs(), st.sampled_from(["down", "right"]))
 def test_any_grouping_keeps_every_function_and_edge_and_can_be_painted(cg, direction):
     hparams = {"h": 3} if "h" in cg.tokens else {}

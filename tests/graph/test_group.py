@@ -6,7 +6,7 @@ import copy
 import pickle
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import epypes as ep
@@ -97,7 +97,7 @@ def test_a_placeholder_that_is_filled_stays_in_its_group():
     assert not filled.placeholders
 
 
-@settings(max_examples=60, deadline=None)
+@pytest.mark.fuzz
 @given(st.lists(st.sampled_from(["one", "two", None]), min_size=3, max_size=3), st.lists(st.sampled_from("abcdfgh")))
 def test_functions_keep_their_neighbours_in_a_group_through_suffix_and_renaming(places, keep):
     io = {name: (made, taken) for name, made, taken in zip("fgh", "abc", "bcd", strict=True)}

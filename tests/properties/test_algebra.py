@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import epypes as ep
@@ -45,7 +45,7 @@ def values(cg):
 three = st.tuples(graphs("a"), graphs("b"), graphs("c"))
 
 
-@settings(max_examples=100, deadline=None)
+@pytest.mark.fuzz
 @given(three)
 def test_union_is_associative_and_commutative_up_to_order(parts):
     a, b, c = parts
@@ -54,7 +54,7 @@ def test_union_is_associative_and_commutative_up_to_order(parts):
     assert values(a | b) == values(b | a) == {**values(a), **values(b)}
 
 
-@settings(max_examples=100, deadline=None)
+@pytest.mark.fuzz
 @given(graphs())
 def test_union_with_itself_changes_nothing(cg):
     assert content(cg | cg) == content(cg)
@@ -62,7 +62,7 @@ def test_union_with_itself_changes_nothing(cg):
     assert (cg | ep.CompGraph({}, {})).tokens == cg.tokens
 
 
-@settings(max_examples=100, deadline=None)
+@pytest.mark.fuzz
 @given(graphs(), st.randoms(use_true_random=False))
 def test_a_renaming_and_its_inverse_give_the_same_graph(cg, random):
     functions, tokens = (dict(zip(names, random.sample(list(names), len(names)), strict=True))
@@ -72,7 +72,7 @@ def test_a_renaming_and_its_inverse_give_the_same_graph(cg, random):
     assert content(back) == content(cg)
 
 
-@settings(max_examples=100, deadline=None)
+@pytest.mark.fuzz
 @given(graphs(), st.data())
 def test_a_suffix_is_taken_back_by_renaming_and_kept_names_stay(cg, data):
     names = [*cg.functions, *cg.tokens]
@@ -87,7 +87,7 @@ def test_a_suffix_is_taken_back_by_renaming_and_kept_names_stay(cg, data):
     assert content(back) == content(cg)
 
 
-@settings(max_examples=100, deadline=None)
+@pytest.mark.fuzz
 @given(graphs(), st.data())
 def test_running_a_subgraph_gives_what_running_the_graph_gives(cg, data):
     made = list(cg.digraph.producer)
@@ -100,7 +100,7 @@ def test_running_a_subgraph_gives_what_running_the_graph_gives(cg, data):
         assert tuple(part.functions) == run.report.ran
 
 
-@settings(max_examples=100, deadline=None)
+@pytest.mark.fuzz
 @given(graphs())
 def test_a_graph_joined_to_itself_by_suffixes_runs_like_two(cg):
     shared = [token for token in cg.source_tokens if token == "s0"]

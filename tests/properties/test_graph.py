@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import networkx as nx
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from epypes.graph.bipartite import BipartiteDigraph
@@ -27,7 +27,7 @@ def as_networkx(graph: BipartiteDigraph) -> nx.DiGraph:
 
 
 @pytest.mark.slow
-@settings(max_examples=500, deadline=None)
+@pytest.mark.fuzz
 @given(digraphs())
 def test_the_cycle_that_is_named_is_a_shortest_one(graph):
     cycle = graph.shortest_cycle()
@@ -39,7 +39,7 @@ def test_the_cycle_that_is_named_is_a_shortest_one(graph):
 
 
 @pytest.mark.slow
-@settings(max_examples=500, deadline=None)
+@pytest.mark.fuzz
 @given(digraphs())
 def test_the_run_order_is_the_topological_order_that_comes_first_by_definition(graph):
     oracle = as_networkx(graph)

@@ -294,10 +294,8 @@ class Machine(RuleBasedStateMachine):
                 assert token not in self.runner
 
 
-MACHINE = settings(max_examples=60, stateful_step_count=12, deadline=None)
-
-
 @pytest.mark.slow
+@pytest.mark.fuzz
 @pytest.mark.parametrize("way", ["the loop", "compiled at once", "in threads"])
 def test_after_any_edits_what_is_read_equals_a_run_from_scratch_and_nothing_runs_in_vain(way, monkeypatch):
     monkeypatch.setattr(compiled, "_RUNS_BEFORE", 0 if way == "compiled at once" else 10_000)
@@ -306,11 +304,11 @@ def test_after_any_edits_what_is_read_equals_a_run_from_scratch_and_nothing_runs
         Machine.workers = 2
         monkeypatch.setattr(attempt, "has_independent_steps", lambda program: True)
         monkeypatch.setattr(gain.Gain, "is_worth_it", lambda self: True)
-    run_state_machine_as_test(Machine, settings=MACHINE)
+    run_state_machine_as_test(Machine, settings=settings())
 
 
 @pytest.mark.slow
-@settings(max_examples=150, deadline=None)
+@pytest.mark.fuzz
 @given(graphs(placeholders=False), st.data())
 def test_side_by_side_ends_as_one_after_another(graph, data):
     functions, io, _, selectors = graph

@@ -9,7 +9,7 @@ import zlib
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import epypes as ep
@@ -113,7 +113,7 @@ def is_about_one_long_word(said: str, lines: list[str]) -> bool:
     return "E501" in said and len(lines[int(said.split(":")[1]) - 1].split()) <= 3
 
 
-@settings(max_examples=60, deadline=None)
+@pytest.mark.fuzz
 @given(graphs(), st.data())
 def test_any_graph_written_as_a_function_computes_the_same(drawn, data):
     cg, hparams, choices = drawn

@@ -24,6 +24,7 @@ def two_masks(draw):
 
 
 @pytest.mark.slow
+@pytest.mark.fuzz
 @given(two_masks())
 def test_the_iou_of_masks_counts_pixels_in_both_and_in_either(masks):
     one, other = masks

@@ -88,6 +88,7 @@ _ITEMS = st.none() | st.booleans() | st.integers() | st.floats() | _TEXTS
 
 
 @settings(deadline=None)
+@pytest.mark.fuzz
 @given(st.recursive(_ITEMS, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(_TEXTS, inner, max_size=3)))
 def test_whatever_json_can_say_comes_back_through_text_that_databases_take(value):
     text = to_text(value)
