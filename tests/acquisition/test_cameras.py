@@ -272,11 +272,11 @@ def test_a_capture_is_never_released_while_it_is_read():
     frames = []
     reading = threading.Thread(target=lambda: frames.append(camera.read()))
     reading.start()
-    assert capture.grabbing.wait(10)
+    assert capture.grabbing.wait(60)
     camera.close()
     assert capture.is_open
     capture.go.set()
-    reading.join(10)
+    reading.join(60)
     assert frames == [None]
     assert not capture.is_open
     assert not capture.released_while_reading

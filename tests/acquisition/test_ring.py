@@ -100,7 +100,7 @@ def test_a_ring_never_holds_more_than_its_size_while_others_ask():
         ring.append(Frame(None, number, number))
         assert len(ring) <= 3
     done.set()
-    asking.join(5)
+    asking.join(60)
     assert found == sorted(found), "a newer frame is never followed by an older one"
 
 

@@ -205,7 +205,7 @@ def test_the_pipeline_that_serves_is_of_the_users_class_and_answers_bytes_with_b
     assert (type(pipe).__name__, pipe.limit, pipe.attributes["most"]) == ("Inspector", 7, 90)
     with pipe:
         pipe.q_in.put(IMAGE.tobytes())
-        assert pipe.q_out.get(timeout=10) == promoted.pipe["edges"].tobytes()[:90]
+        assert pipe.q_out.get(timeout=60) == promoted.pipe["edges"].tobytes()[:90]
     assert pipe.attributes["asked"] >= 1
 
 
@@ -298,7 +298,7 @@ def test_ports_of_the_papers_pipelines_are_promoted(names, tmp_path):
     assert type(served) is ep.FullPipeline
     with served:
         served.q_in.put(b"21")
-        assert served.q_out.get(timeout=10) == b"42"
+        assert served.q_out.get(timeout=60) == b"42"
 
 
 def test_a_sink_takes_events_its_way_and_answers_with_envelopes(names, tmp_path):
@@ -307,7 +307,7 @@ def test_a_sink_takes_events_its_way_and_answers_with_envelopes(names, tmp_path)
     served = pipeline_of(ep.promote(pipe, tmp_path / "b"), queue.Queue(), queue.Queue(), detach=False)
     with served:
         served.q_in.put(b"21")
-        answer = served.q_out.get(timeout=10)
+        answer = served.q_out.get(timeout=60)
     assert (dict(answer.parts), answer.correlation_id) == ({"y": 42}, "")
 
 
@@ -317,7 +317,7 @@ def test_a_pipeline_of_ones_own_that_takes_no_events_learns_to(names, tmp_path):
     served = ep.load_pipeline(ep.promote(pipe, tmp_path / "b").path, queue.Queue(), queue.Queue())
     with served:
         served.q_in.put(Envelope("", {"x": 5}))
-        assert served.q_out.get(timeout=10).parts == {"y": 10}
+        assert served.q_out.get(timeout=60).parts == {"y": 10}
     assert served.attributes["called"]
     assert (ep.promote(pipe, tmp_path / "b").path / "pipeline.py").read_text().count("class AnsweringTwice(") == 1
 

@@ -76,7 +76,7 @@ def test_the_pipeline_that_serves_has_the_hyperparameters_of_the_notebook(runner
     assert dict(pipe.runner.hyperparameters) == dict(runner.hyperparameters)
     with pipe:
         pipe.q_in.put(Envelope("image", parts={"image": 2, "spread": 2}))
-        assert pipe.q_out.get(timeout=10).parts == {"low": -7, "high": 33}
+        assert pipe.q_out.get(timeout=60).parts == {"low": -7, "high": 33}
 
 
 def test_the_settings_say_only_what_is_not_usual(path):

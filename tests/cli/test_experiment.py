@@ -16,7 +16,7 @@ import pytest
 
 pytestmark = pytest.mark.slow  # each runs the command
 
-TIMEOUT_S = 30.0
+TIMEOUT_S = 60.0
 
 
 @pytest.fixture(scope="module")

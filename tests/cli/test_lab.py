@@ -131,6 +131,7 @@ class Server:
         self.settings = {SETTING: chosen}
 
 
+@pytest.mark.slow
 def test_the_websocket_of_a_gateway_is_left_alone():
     from jupyter_server.gateway.connections import GatewayWebSocketConnection
 

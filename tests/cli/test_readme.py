@@ -86,7 +86,7 @@ def here(tmp_path, monkeypatch):
             yield f"{BROKER}:{port}"
         finally:
             server.terminate()
-            server.communicate(timeout=30)
+            server.communicate(timeout=60)
 
 
 @pytest.mark.notebook

@@ -18,7 +18,7 @@ from epypes.wire import Envelope
 pytestmark = pytest.mark.slow  # each runs the commands
 
 LOCAL = "tcp://127.0.0.1:*"
-WAIT_S = 5.0
+WAIT_S = 60.0
 
 
 @pytest.fixture

@@ -30,4 +30,4 @@ def test_a_service_is_looked_at_set_exchanged_and_stopped_by_its_bundle(epypes, 
         assert json.loads(epypes("status", state.http, "--json").stdout)["parameters"] == {"lo": 60, "hi": 180}
         assert epypes("deploy", other, "--service", bundle).stdout.startswith(f"DEPLOYED {other}")
         assert epypes("stop", bundle).stdout == f"STOPPED {bundle}, process {state.pid}.\n"
-        assert process.wait(10) == 0
+        assert process.wait(60) == 0

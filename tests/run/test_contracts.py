@@ -166,6 +166,6 @@ def test_a_broken_contract_in_an_event_is_a_failure_of_that_function():
     with pipe:
         q_in.put(image(np.float64))
         q_in.put(image())
-        assert q_out.get(timeout=10) == 6 * 5
+        assert q_out.get(timeout=60) == 6 * 5
     failure = failures.get_nowait()
     assert (failure.function, failure.exception.token) == ("smooth", "image")

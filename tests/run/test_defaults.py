@@ -114,7 +114,7 @@ def test_defaults_hold_in_pipelines_of_every_kind_and_in_a_graph_of_pipelines(cg
     assert q_out.get_nowait() == (137, 143)
     with ep.FullPipeline("p", cg, q_in, q_out, f_in, f_out, {"threshold": 1}):
         q_in.put(1)
-        assert q_out.get(timeout=10) == (1, 3)
+        assert q_out.get(timeout=60) == (1, 3)
     with pytest.raises(GraphError, match="takes 1 input"):
         ep.CompGraph({"f": ep.Pipeline("p", cg)}, {"f": (("a", "b"), ("c", "d"))})
     outer = ep.CompGraph({"f": ep.Pipeline("p", cg)}, {"f": ("a", ("c", "d"))})

@@ -36,7 +36,7 @@ def test_independent_functions_run_at_once(always):
     barrier = threading.Barrier(3)
 
     def meet(x):
-        barrier.wait(10)  # passes only if three are in it at once
+        barrier.wait(60)  # passes only if three are in it at once
         return threading.get_ident()
 
     runner = ep.CompGraphRunner(fork(3, meet), workers=3)
@@ -67,7 +67,7 @@ def test_of_several_failures_the_first_in_run_order_is_the_one(always):
     release = threading.Event()
 
     def first(x):
-        release.wait(10)
+        release.wait(60)
         raise ValueError("first")
 
     def second(x):
@@ -118,7 +118,7 @@ def test_the_overhead_of_functions_side_by_side_is_wall_time_less_the_critical_p
     barrier = threading.Barrier(2)
 
     def meet(x):
-        barrier.wait(10)
+        barrier.wait(60)
         device.wait(WAIT_S)
 
     report = ep.CompGraphRunner(fork(2, meet), workers=2).run(x=1).report
@@ -132,7 +132,7 @@ def test_the_context_of_the_caller_goes_along(always):
     barrier = threading.Barrier(2)
 
     def read(x):
-        barrier.wait(10)
+        barrier.wait(60)
         return setting.get()
 
     setting.set("mine")
@@ -206,7 +206,7 @@ started = threading.Event()
 main = threading.main_thread()
 def f(x):
     if threading.current_thread() is main:
-        started.wait(10)
+        started.wait(60)
         raise KeyboardInterrupt
     started.set()
     threading.Event().wait()
@@ -226,7 +226,7 @@ except KeyboardInterrupt:
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_a_forked_process_makes_threads_of_its_own(always):
     barrier = threading.Barrier(2)
-    runner = ep.CompGraphRunner(fork(2, lambda x: barrier.wait(10)), workers=2)
+    runner = ep.CompGraphRunner(fork(2, lambda x: barrier.wait(60)), workers=2)
     runner.run(x=1)
     child = os.fork()
     if not child:

@@ -124,12 +124,12 @@ def test_of_functions_side_by_side_the_first_in_run_order_is_the_one_that_failed
 
     def slow(x):
         if x == 0 and way.name == "side by side":
-            both.wait(10)
+            both.wait(60)
         return 1 / x
 
     def quick(x):
         if x == 0:
-            both.wait(10)
+            both.wait(60)
         return 1 / x
 
     runner = way.runner(ep.CompGraph({"slow": slow, "quick": quick}, io))

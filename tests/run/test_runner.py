@@ -331,7 +331,7 @@ def test_runs_in_many_threads_do_not_mix():
     barrier = threading.Barrier(4)
 
     def slow(x):
-        barrier.wait(10)
+        barrier.wait(60)
         return x
 
     cg = ep.CompGraph({"f": slow, "g": lambda y: y * 1000}, {"f": ("x", "y"), "g": ("y", "z")})

@@ -179,7 +179,7 @@ def test_cells_never_see_half_of_a_change() -> None:
     for k in range(1, 3_000):
         assert runner.adopt(runner.trial({"k": k}))
     done.set()
-    reader.join(10)
+    reader.join(60)
     assert wrong == []
 
 

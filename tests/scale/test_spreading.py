@@ -29,7 +29,7 @@ from epypes.scale.start import Start
 from epypes.scale.travel import packed_job
 from tests.bundle.cells import cell
 
-_WAIT_S = 20.0
+_WAIT_S = 60.0
 
 
 def spawn():

@@ -35,7 +35,7 @@ def running(bundle, *options):
         process.communicate(timeout=60)
 
 
-def run_cli(*arguments, timeout_s=90, **options):
+def run_cli(*arguments, timeout_s=240, **options):
     """Run a command to its end."""
     return subprocess.run(
         [sys.executable, "-m", "epypes.cli", *map(str, arguments)],

@@ -18,7 +18,7 @@ def postgres():
         yield made
 
 
-@pytest.fixture(params=["sqlite", "postgres"])
+@pytest.fixture(params=["sqlite", pytest.param("postgres", marks=pytest.mark.slow)])
 def place(request, tmp_path):
     """An empty database, as it is given to a Store."""
     if request.param == "sqlite":

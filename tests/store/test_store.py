@@ -242,7 +242,7 @@ def test_threads_that_write_the_same_keys_in_another_order_all_get_through(store
 
     def write(name):
         keys = [f"{number}" for number in range(60)]
-        together.wait(10)
+        together.wait(60)
         series.append_all((key, {"by": name}) for key in (keys if name % 2 else keys[::-1]))
 
     with ThreadPoolExecutor(4) as pool:

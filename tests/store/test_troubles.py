@@ -223,6 +223,7 @@ def test_a_url_that_leads_nowhere_is_told_without_its_password(place, told):
     assert "s3cr3t" not in whole
 
 
+@pytest.mark.slow
 def test_who_is_not_let_in_is_told_and_the_password_is_nowhere(postgres):
     with Store(postgres.url()) as store:
         shown = repr(store) + store.place + repr(store._database.engine)
@@ -258,6 +259,7 @@ def test_a_server_that_dies_is_told_and_after_a_restart_the_same_store_works_aga
         assert sorted(series.keys()) == ["after", "before", "unnoticed"]
 
 
+@pytest.mark.slow
 def test_a_password_that_a_driver_repeats_is_left_out(postgres):
     said = sa.exc.OperationalError("CONNECT", {}, Exception(f"no connection with {PASSWORD} to the host"))
     with Store(postgres.url()) as store:
@@ -356,7 +358,7 @@ def test_threads_lose_nothing_once_their_file_was_deleted(tmp_path):
         series = store.series("map", "edges")
         # So that there are four connections to the file that is deleted.
         together = threading.Barrier(4)
-        list(pool.map(lambda _: store._database.read(lambda _connection: together.wait(10)), range(4)))
+        list(pool.map(lambda _: store._database.read(lambda _connection: together.wait(60)), range(4)))
         path.unlink()
         list(pool.map(lambda number: series.append(f"{number}", {}), range(200)))
         assert len(series) == 200
