@@ -219,7 +219,6 @@ def test_a_name_that_does_not_fit_or_means_several_things_says_nothing(name: str
     assert usual(name, value) is None
 
 
-@pytest.mark.slow
 def test_choices_are_found_by_name_where_all_functions_agree() -> None:
     assert usual("connectivity", 8).choices == (4, 8)
     assert usual("connectivity", 1).choices == (1, 2)
