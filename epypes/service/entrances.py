@@ -44,7 +44,8 @@ class SocketEntrance:
 
     def __init__(self, address: str, accept: Accepting, secured: Mapping[str, Any]) -> None:
         self._given, self._accept, self._secured = address, accept, secured
-        self._rejected_before, self._closed_at = 0, ""
+        self._rejected_before = self._lost_before = 0
+        self._closed_at = ""
         self._subscriber = self._made(address)
 
     def _made(self, address: str) -> ZMQSubscriber:
@@ -57,7 +58,7 @@ class SocketEntrance:
     def start(self) -> None:
         """Open it; again at the address where it was."""
         if self._closed_at:
-            self._rejected_before = self.rejected
+            self._rejected_before, self._lost_before = self.rejected, self._lost
             self._subscriber = self._made(self._closed_at)
             self._closed_at = ""
         self._subscriber.start()
@@ -85,6 +86,10 @@ class SocketEntrance:
         """How many messages were no events."""
         return self._rejected_before + sum(self._subscriber.rejected.values())
 
+    @property
+    def _lost(self) -> int:
+        return self._lost_before + sum(self._subscriber.lost.values())
+
     def seen(self, ids: Iterable[str]) -> None:
         """Do nothing: there are no others."""
 
@@ -92,8 +97,8 @@ class SocketEntrance:
         """Do nothing: nobody waits for others."""
 
     def counts(self) -> dict[str, int]:
-        """Return what is counted besides: nothing."""
-        return {}
+        """Return how many events were sent and never came, by the gaps in the numbers that their senders give them."""
+        return {"lost": self._lost}
 
 
 class BrokerEntrance:

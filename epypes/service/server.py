@@ -31,6 +31,7 @@ from epypes.service.state import ServiceState
 from epypes.service.states import Facts, State
 from epypes.service.supervisor import Supervisor
 from epypes.service.tuning import Tuning
+from epypes.transport.outlet import prepare_lending
 from epypes.wire import Envelope, decode, encode
 
 if TYPE_CHECKING:
@@ -226,7 +227,8 @@ class Service:
         ``received`` is the sum of answered, failed, dropped, dead_letters, waiting, in_flight and, where a broker
         delivers them, given_back; ``retried`` is how often events were tried again, ``redelivered`` how many had been
         delivered before, ``rejected`` how many messages were no events, ``slow_subscribers`` how often the queue of a
-        subscriber of the answers filled up, so that at least one answer was lost to it.
+        subscriber of the answers filled up, so that at least one answer was lost to it; ``lost``, without a broker, how
+        many events were sent and never came, by gaps in their senders' numbers.
         """
         with self._dispatcher.changed:
             counts = self._dispatcher.ledger.counts()
@@ -406,4 +408,5 @@ def _warm_up() -> None:
     """Load what the first event needs: where memory is limited that fails now, and not at an event."""
     import numpy as np
 
+    prepare_lending()
     decode(encode(Envelope("epypes.warm_up", {"array": np.zeros(1)})))

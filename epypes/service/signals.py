@@ -64,7 +64,11 @@ class Signals:
                 errors.append(error)
             self.now()
 
-        threading.Thread(target=run, name="epypes serve", daemon=True).start()
+        try:
+            threading.Thread(target=run, name="epypes serve", daemon=True).start()
+        except RuntimeError:
+            # The system has no thread to give: then no signal is heard meanwhile.
+            run()
         is_signal = self.wait()
         if errors:
             raise errors[0]

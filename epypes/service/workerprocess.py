@@ -46,43 +46,36 @@ class WorkerProcess:
 
     def __init__(self, bundle: Path, threads: int) -> None:
         self.module = bundle / MODULE
-        self.channel, theirs = channel_pair()
-        self._traces = os.memfd_create("epypes-traces")
-        said, says = os.pipe()
-        command = [sys.executable, "-I", "-m", "epypes.service.worker"]
-        given = [theirs.fileno(), self._traces]
-        try:
+        self._last_traces = ""
+        self._said: deque[str] = deque(maxlen=_LINES_KEPT)
+        # The system may be short of descriptors, memory or threads at any of these.
+        with contextlib.ExitStack() as given, contextlib.ExitStack() as kept:
+            self.channel, theirs = channel_pair()
+            kept.callback(self.channel.close)
+            given.callback(theirs.close)
+            self._traces = os.memfd_create("epypes-traces")
+            kept.callback(os.close, self._traces)
+            said, says = os.pipe()
+            kept.callback(os.close, said)
+            given.callback(os.close, says)
+            inherited = [theirs.fileno(), self._traces]
+            command = [sys.executable, "-I", "-m", "epypes.service.worker"]
             self.process = subprocess.Popen(  # noqa: S603 - this interpreter, our own module
-                [*command, str(given[0]), str(bundle), "--threads", str(threads), "--faults", str(given[1])],
-                pass_fds=given,
+                [*command, str(inherited[0]), str(bundle), "--threads", str(threads), "--faults", str(inherited[1])],
+                pass_fds=inherited,
                 stdin=subprocess.DEVNULL,
                 stdout=says,
                 stderr=says,
                 env={name: value for name, value in os.environ.items() if name not in VARIABLES},
             )
-        except BaseException:
-            self.channel.close()
-            os.close(said)
-            os.close(self._traces)
-            raise
-        finally:
-            theirs.close()
-            os.close(says)
-        self.pid = self.process.pid
-        self._last_traces = ""
-        self._said: deque[str] = deque(maxlen=_LINES_KEPT)
-        self._listener = threading.Thread(
-            target=_pass_on, args=(said, self._said), name="epypes worker's words", daemon=True
-        )
-        try:
+            self.pid = self.process.pid
+            kept.callback(self.process.wait)
+            kept.callback(self.kill)
+            self._listener = threading.Thread(
+                target=_pass_on, args=(said, self._said), name="epypes worker's words", daemon=True
+            )
             self._listener.start()
-        except BaseException:
-            os.close(said)
-            self.kill()
-            self.process.wait()
-            self.channel.close()
-            os.close(self._traces)
-            raise
+            kept.pop_all()
 
     def kill(self) -> None:
         """Kill it, also if it is stopped or stuck."""

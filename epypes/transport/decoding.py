@@ -53,8 +53,15 @@ class Decoding:
             self._waiting.append(frames)
             self._bytes += size
             if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="epypes-decoding", daemon=True)
-                self._thread.start()
+                thread = threading.Thread(target=self._run, name="epypes-decoding", daemon=True)
+                try:
+                    thread.start()
+                except RuntimeError:
+                    # The system has no thread to give just now.
+                    self._waiting.clear()
+                    self._bytes = 0
+                    return False
+                self._thread = thread
         return True
 
     def end(self, timeout_s: float) -> bool:

@@ -203,6 +203,14 @@ class Outlet:
             return self.doorkeeper.read()
 
 
+def prepare_lending() -> None:
+    """Start the thread by which pyzmq learns that ZeroMQ has read memory that was lent to it.
+
+    It starts with the first large frame otherwise, and if it can't ZeroMQ ends the process.
+    """
+    zmq.Frame(bytes(_LENT_FROM_BYTES), copy=False)
+
+
 def _can_be_lent(frame: bytes | memoryview) -> bool:
     """Return whether ZeroMQ may read a frame later: if it is worth it, and nobody can change it meanwhile."""
     if len(frame) < _LENT_FROM_BYTES:

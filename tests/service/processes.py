@@ -9,16 +9,30 @@ import sys
 import threading
 from contextlib import contextmanager
 
-START_TIMEOUT_S = 60.0
+START_TIMEOUT_S = 120.0
 
 
 @contextmanager
-def running(bundle, *options):
-    """Run ``epypes serve`` until the block ends; yield the process, with its READY line as ``.ready``."""
+def running(bundle, *options, limits="true", stderr=subprocess.PIPE):
+    """Run ``epypes serve`` until the block ends; yield the process, with its READY line as ``.ready``.
+
+    ``limits`` is what a shell does before, as ``ulimit -n 256``.
+    """
     process = subprocess.Popen(
-        [sys.executable, "-m", "epypes.cli", "serve", str(bundle), *options],
+        [
+            "bash",
+            "-c",
+            f'{limits} && exec "$@"',
+            "-",
+            sys.executable,
+            "-m",
+            "epypes.cli",
+            "serve",
+            str(bundle),
+            *options,
+        ],
         stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+        stderr=stderr,
         text=True,
         env=os.environ.copy(),
     )

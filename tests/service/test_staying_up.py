@@ -131,12 +131,13 @@ def test_a_worker_that_ends_as_soon_as_it_is_ready_is_a_fault_and_everybody_is_t
     bundle = acting_bundle(tmp_path / "dying", source=SOURCE + dying)
     with Service(bundle) as service:
         service._supervisor.health.pauses = -4
-        until(lambda: service.state == "FAULTED")
-        assert "5 workers ended in a row as soon as they were started. The last: The worker ended with status 9" in (
-            service.reason
-        )
-        assert service.alive() == service.reason
         with peer_of(service) as peer:
+            until(lambda: service.state == "FAULTED")
+            assert (
+                "5 workers ended in a row as soon as they were started. The last: The worker ended with status 9"
+                in (service.reason)
+            )
+            assert service.alive() == service.reason
             assert "can't be served" in peer.ask().failure.message
             service.deploy(acting)
             assert (service.state, service.alive()) == ("READY", "")

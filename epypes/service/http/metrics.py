@@ -25,6 +25,7 @@ _COUNTED: Final = {
     "retried": ("epypes_events_retried", "Further tries of events whose worker was killed."),
     "rejected": ("epypes_messages_rejected", "Messages that were no events."),
     "slow_subscribers": ("epypes_slow_subscribers", "How often answers were lost to a subscriber that is too slow."),
+    "lost": ("epypes_events_lost", "Events that were sent and never came, by gaps in their numbers; without a broker."),
 }
 # Where a broker delivers the events.
 _COUNTED_OF_BROKER: Final = {
