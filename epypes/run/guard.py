@@ -311,12 +311,13 @@ def _holds_arrays(value: Any) -> bool:
     kind = type(value)
     if kind is not tuple and not issubclass(kind, (list, dict, deque)) and not _is_named_tuple(value):
         return False
-    items = _items(value)
-    if len(value) < LONG:
-        return any(map(is_array, items))
-    head = next(iter(items))
-    if head is None:
-        return any(map(is_array, items))
+    try:
+        items = _items(value)
+        head = next(iter(items), None)
+        if len(value) < LONG or head is None:
+            return any(map(is_array, items))
+    except Exception:  # its own class refuses to be looked at
+        return False
     first = type(head)
     if first not in HARMLESS and not is_array(head):
         HARMLESS.add(first)

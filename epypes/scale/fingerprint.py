@@ -14,7 +14,6 @@ import dis
 import enum
 import functools
 import hashlib
-import pickle
 import sys
 import threading
 import types
@@ -403,7 +402,7 @@ class _Walk:
         return {name: state[name] for name in sorted(state, key=str) if name not in derived}
 
     def _by_name(self, value: Any, name: str) -> None:
-        module = pickle.whichmodule(value, name)  # type: ignore[attr-defined]
+        module = getattr(value, "__module__", None) or _module_of(value, name)
         self.modules.add(module)
         self._put("global", module, name)
         if _found(module, name) is not value:
@@ -459,6 +458,11 @@ def _found(module: str, name: str) -> Any:
     for part in name.split("."):
         found = getattr(found, part, None)
     return found
+
+
+def _module_of(value: Any, name: str) -> str:
+    """Return the module in which a name stands for a value that doesn't say where it was made."""
+    return next((module for module in list(sys.modules) if _found(module, name) is value), "__main__")
 
 
 def _annotations(function: types.FunctionType) -> Mapping[str, Any]:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import secrets
 import shutil
 import signal
@@ -47,6 +48,8 @@ _FLAGS = [
     "--disable-component-update",
     "--disable-sync",
 ]
+# JupyterLab shows its splash screen twice when a page is loaded again, and may take it away twice.
+_SPLASH_REMOVED_AGAIN = re.compile(r"'removeChild' on 'Node'.*\n *at \S*/jlab_core\.\S*$")
 _KERNEL = "window.jupyterapp?.shell.currentWidget?.sessionContext?.session?.kernel"
 
 
@@ -326,7 +329,8 @@ class Notebook:
         self.page.wait_for_function("theme => document.body.dataset.jpThemeName === theme", arg=name)
 
     def _keep_error(self, error: Any) -> None:
-        self.page_errors.append(str(error))
+        if not _SPLASH_REMOVED_AGAIN.search(error.stack or ""):
+            self.page_errors.append(error.stack or str(error))
 
 
 def write_notebook(path: Path, *cells: str) -> None:
