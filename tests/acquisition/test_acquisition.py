@@ -26,7 +26,7 @@ def gray(value: int) -> np.ndarray:
     return np.full((6, 8), value, np.uint8)
 
 
-def until(condition, timeout_s: float = 10.0) -> None:
+def until(condition, timeout_s: float = 60.0) -> None:
     """Wait until a condition holds."""
     asking = threading.Event()
     deadline_s = time.monotonic() + timeout_s

@@ -18,7 +18,7 @@ runner.run(image=np.arange(64 * 64, dtype=np.uint8).reshape(64, 64))
 assert "image/svg+xml" in runner._repr_mimebundle_()
 panel = tune(runner)
 panel["lo"] = 20
-panel.wait(30)
+panel.wait(60)
 assert runner["lo"] == 20
 ep.promote(runner, "bundle")
 assert verify("bundle").identical

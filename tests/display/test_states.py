@@ -19,7 +19,7 @@ from epypes.display.layout.place import lay_out
 from epypes.run import gain
 from tests.display.test_display import SVG, texts, vertices
 
-TIMEOUT_S = 10.0
+TIMEOUT_S = 60.0
 
 
 class Gate:

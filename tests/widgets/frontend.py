@@ -116,7 +116,7 @@ class BadLine:
         with self._changed:
             self._is_open = False
             self._changed.notify()
-        self._thread.join(10)
+        self._thread.join(60)
 
     def _work(self) -> None:
         while True:

@@ -291,16 +291,16 @@ def test_a_hand_that_moves_while_code_writes_is_heard_unless_it_was_written_over
     start = threading.Barrier(2)
 
     def write() -> None:
-        start.wait(10)
+        start.wait(60)
         for value in range(0, 1000, 2):
             entry.write({"x": value})
 
     thread = threading.Thread(target=write)
     thread.start()
-    start.wait(10)
+    start.wait(60)
     for value in range(1, 1000, 2):
         entry.widget.set_state({"value": value})  # as a message of the front end does
-    thread.join(10)
+    thread.join(60)
     assert at(entry) == entry.widget.value
     assert at(entry) == 998 or told[-1] == {"x": 999}
     assert {values["x"] % 2 for values in told} <= {1}
@@ -354,5 +354,5 @@ def test_a_hand_that_moves_in_the_middle_of_a_write_is_heard(
 
     entry.widget.observe(interfere, trait)
     entry.write({"x": written})
-    hands[0].join(10)
+    hands[0].join(60)
     assert (at(entry), told) == (meant, [{"x": meant}])

@@ -23,7 +23,7 @@ def test_undo_before_the_hand_lets_go_adds_an_entry_with_its_picture(panel: Pane
     screen.tell("move", places={}, values={"threshold": 60})
     screen.wait_for_values(10, threshold=60)
     screen.tell("undo")
-    panel.wait(10)
+    panel.wait(60)
     assert [entry.values["threshold"] for entry in panel._history.entries] == [100, 60]
     assert [entry.token for entry in panel._history.entries if entry.picture] == ["mask", "mask"]
 
@@ -36,7 +36,7 @@ def test_an_entry_has_the_picture_of_the_stage_before_while_one_chosen_just_now_
     def brighten(image: Any, gain: int) -> Any:
         if gain == 3:
             entered.set()
-            assert go_on.wait(10)
+            assert go_on.wait(60)
         return (image // 2 * gain).astype(np.uint8)
 
     def above(bright: Any, threshold: int = 100) -> Any:
@@ -50,17 +50,17 @@ def test_an_entry_has_the_picture_of_the_stage_before_while_one_chosen_just_now_
     runner.run(image=image)
     panel = tune(runner, token="bright")
     FrontEnd(panel, monkeypatch)
-    panel.wait(10)
+    panel.wait(60)
     panel["gain"] = 3
-    assert entered.wait(10)
+    assert entered.wait(60)
     panel.token = "mask"
     go_on.set()
-    panel.wait(10)
+    panel.wait(60)
     last = panel._history.entries[-1]
     assert (last.values["gain"], last.token) == (3, "bright")
     assert last.picture is not None
     panel["threshold"] = 90
-    panel.wait(10)
+    panel.wait(60)
     last = panel._history.entries[-1]
     assert last.token == "mask"
     assert last.picture is not None
@@ -70,7 +70,7 @@ def test_an_entry_has_the_picture_of_the_stage_before_while_one_chosen_just_now_
 def test_what_the_screen_is_told_last_is_the_newest_history(
     panel: Panel, screen: FrontEnd, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    panel.wait(10)
+    panel.wait(60)
     told, code = [], panel._screen._code
 
     def slow_code() -> str:
@@ -85,5 +85,5 @@ def test_what_the_screen_is_told_last_is_the_newest_history(
 
     monkeypatch.setattr(panel._screen, "_code", slow_code)
     panel._screen.tell_history()
-    told[0].join(10)
+    told[0].join(60)
     assert [entry["values"]["threshold"] for entry in screen.last("history")["entries"]] == [100, 61]

@@ -58,7 +58,7 @@ def test_a_click_sets_the_runner_and_runs_what_is_stale(
 ) -> None:
     calls.clear()
     clicks.say("pick", place=5)
-    picker.wait(10)
+    picker.wait(60)
     assert dict(runner.hyperparameters) == {"gain": 2, "threshold": 200}
     assert calls.counts == {"above": 1}
     assert runner.last is not None
@@ -74,7 +74,7 @@ def test_the_tile_of_the_present_setting_is_marked_and_follows_what_cells_do(
     assert clicks.last("state")["chosen"] == 4
     for values, chosen in (({"gain": 3}, 7), ({"gain": 5}, None)):
         runner.set(**values)
-        picker.wait(10)
+        picker.wait(60)
         assert clicks.last("state")["chosen"] == chosen
 
 
@@ -83,7 +83,7 @@ def test_a_setting_that_fails_leaves_the_runner_as_it_was(
 ) -> None:
     before = dict(runner.hyperparameters), runner.last
     clicks.say("pick", place=0)
-    picker.wait(10)
+    picker.wait(60)
     assert (dict(runner.hyperparameters), runner.last) == before
     assert clicks.last("state")["chosen"] == 4
     assert "13 is not a threshold" in clicks.last("state")["text"]
@@ -93,8 +93,8 @@ def test_a_setting_that_fails_leaves_the_runner_as_it_was(
 def test_an_open_panel_follows(panel: Panel, runner: ep.CompGraphRunner) -> None:
     picker = pick(ep.sweep(runner, {"gain": [1, 3], "threshold": [50, 60]}))
     picker.choose(3)
-    picker.wait(10)
-    panel.wait(10)
+    picker.wait(60)
+    panel.wait(60)
     assert panel.values == {"gain": 3, "threshold": 60}
     picker.close(10)
 
@@ -104,7 +104,7 @@ def test_a_runner_that_has_run_nothing_is_only_set(runner: ep.CompGraphRunner, i
     picker = pick(ep.sweep(new, {"threshold": [50, 60]}, [image]))
     assert picker.chosen is None
     picker.choose(1)
-    picker.wait(10)
+    picker.wait(60)
     assert new.hyperparameters["threshold"] == 60
     assert new.last is None
     assert "Nothing has been run yet" in picker.text
@@ -127,7 +127,7 @@ def test_the_view_gets_each_picture_once_and_any_token(clicks: Clicks) -> None:
 def test_of_several_settings_that_are_clicked_the_last_one_counts(picker: Picker, runner: ep.CompGraphRunner) -> None:
     for place in (1, 2, 4, 5, 8):
         picker.choose(place)
-    picker.wait(10)
+    picker.wait(60)
     assert dict(runner.hyperparameters) == {"gain": 3, "threshold": 200}
 
 
@@ -142,7 +142,7 @@ def test_a_closed_picker_follows_nothing_and_leaves_no_thread(
     picker: Picker, clicks: Clicks, runner: ep.CompGraphRunner
 ) -> None:
     picker.choose(1)
-    picker.wait(10)
+    picker.wait(60)
     picker.close(10)
     picker.close(10)
     before = len(clicks.messages)
@@ -165,7 +165,7 @@ def test_the_runner_keeps_no_picker_alive(result: ep.SweepResult) -> None:
 
 def test_a_saved_notebook_shows_the_sheet_with_the_chosen_tile_marked(picker: Picker) -> None:
     picker.choose(5)
-    picker.wait(10)
+    picker.wait(60)
     page = picker._still._html()
     assert page.count("✓ chosen") == 1
     assert page.count("<img ") == 6

@@ -161,5 +161,5 @@ def test_a_hand_that_moves_in_the_middle_of_a_write_is_heard() -> None:
 
     entry.widget.observe(interfere, "value")
     entry.write({"lo": 80})
-    hands[0].join(10)
+    hands[0].join(60)
     assert (entry.read(), told) == ({"lo": 90, "hi": 210}, [{"lo": 90, "hi": 210}])

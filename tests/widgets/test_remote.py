@@ -19,7 +19,7 @@ from tests.widgets.frontend import FrontEnd
 
 pytestmark = pytest.mark.slow
 
-TIMEOUT_S = 20.0
+TIMEOUT_S = 60.0
 
 
 class Changes:

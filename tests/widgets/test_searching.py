@@ -15,7 +15,7 @@ from epypes_widgets import Panel, tune
 from epypes_widgets.searching import Searching
 from tests.widgets.frontend import FrontEnd
 
-TIMEOUT_S = 30.0
+TIMEOUT_S = 60.0
 
 
 def near(tokens: Any, _case: ep.Case) -> float:

@@ -32,7 +32,7 @@ def test_each_committed_setting_is_a_row_that_a_later_session_reads(tmp_path: Pa
         panel = tune(runner_of(), gain=(0.0, 10.0), offset=(0, 9), store=path, name="by hand")
         for gain in gains:
             panel["gain"] = gain
-            panel.wait(10)
+            panel.wait(60)
         frame = panel.stored
         panel.close()
     assert list(frame["values.gain"]) == [2.0, 3.0, 4.0, 2.0, 5.0]
@@ -50,16 +50,16 @@ def test_what_was_committed_before_there_was_a_store_is_stored_too_and_nothing_t
     runner = runner_of()
     first = tune(runner, gain=(0.0, 10.0))
     first["gain"] = 3.0
-    first.wait(10)
+    first.wait(60)
     with ep.Store(tmp_path / "history.sqlite") as store:
         for gain in (4.0, 5.0):
             panel = tune(runner, gain=(0.0, 10.0), store=store)
             panel["gain"] = gain
-            panel.wait(10)
+            panel.wait(60)
             assert panel.undo()
-            panel.wait(10)
+            panel.wait(60)
             assert panel.redo()
-            panel.wait(10)
+            panel.wait(60)
         panel.close()
         frame = panel.stored
         assert store.names("tuning") == ("bright",), "the name of its sink token"
@@ -69,7 +69,7 @@ def test_what_was_committed_before_there_was_a_store_is_stored_too_and_nothing_t
 def test_values_that_are_no_json_are_said_shortly(tmp_path: Path) -> None:
     runner = runner_of(gain=math.inf, offset=complex(1, 2))
     panel = tune(runner, store=tmp_path / "history.sqlite")
-    panel.wait(10)
+    panel.wait(60)
     (row,) = [row for _, row in panel.stored.iterrows()]
     panel.close()
     assert row["values.gain"] == math.inf
@@ -85,7 +85,7 @@ def test_a_database_that_is_held_up_holds_no_hand_up(tmp_path: Path) -> None:
     began_s = monotonic()
     for gain in range(20):
         panel["gain"] = float(gain)
-        panel.wait(10)
+        panel.wait(60)
     assert monotonic() - began_s < 10
     other.execute("ROLLBACK")
     other.close()

@@ -15,7 +15,7 @@ from epypes.errors import ImageFileError, UnknownName
 from epypes_widgets import Panel, tune
 from tests.widgets.frontend import FrontEnd
 
-TIMEOUT_S = 10
+TIMEOUT_S = 60
 
 
 def above(image: Any, threshold: int) -> Any:

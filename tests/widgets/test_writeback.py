@@ -11,7 +11,7 @@ import pytest
 from epypes.errors import ServiceError
 from epypes_widgets.writeback import WritingBack, Written
 
-TIMEOUT_S = 10.0
+TIMEOUT_S = 60.0
 DIFF = "--- pipeline.toml\n+++ pipeline.toml\n-value = 70\n+value = 60\n"
 
 
