@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -47,6 +48,17 @@ def running(bundle, *options, limits="true", stderr=subprocess.PIPE):
         if process.poll() is None:
             process.send_signal(signal.SIGTERM)
         process.communicate(timeout=60)
+
+
+@contextmanager
+def lowered(kind, value, pid=0):
+    """Lower a soft limit of a process within the block."""
+    soft, hard = resource.prlimit(pid, kind)
+    resource.prlimit(pid, kind, (value, hard))
+    try:
+        yield
+    finally:
+        resource.prlimit(pid, kind, (soft, hard))
 
 
 def run_cli(*arguments, timeout_s=240, **options):

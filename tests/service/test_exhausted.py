@@ -19,7 +19,7 @@ import zmq
 
 from epypes.service import Service
 from epypes.service.state import read_state
-from tests.service.processes import running
+from tests.service.processes import lowered, running
 from tests.service.served import SOURCE, acting_bundle, check_counts, peer_at, peer_of, until
 
 pytestmark = pytest.mark.slow
@@ -34,17 +34,6 @@ def asked(state, path):
 
 def is_ready(state):
     return asked(state, "/v1/info")["state"] == "READY"
-
-
-@contextmanager
-def lowered(kind, value, pid=0):
-    """Lower a soft limit of a process within the block."""
-    soft, hard = resource.prlimit(pid, kind)
-    resource.prlimit(pid, kind, (value, hard))
-    try:
-        yield
-    finally:
-        resource.prlimit(pid, kind, (soft, hard))
 
 
 def idle_peers(stack, state, count):
