@@ -5,7 +5,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m uv pip install --quiet --compile-bytecode --python $(BIN)/python
-PYTEST := $(BIN)/pytest -p schemathesis.pytest.plugin -p nbval.plugin --nbval \
+# A third of the time they wait: for time-outs, and for what they have started.
+PROCESSES := $(shell expr $$(nproc) + 1)
+PYTEST := $(BIN)/pytest -n $(PROCESSES) -p schemathesis.pytest.plugin -p nbval.plugin --nbval \
 	--nbval-sanitize-with tests/notebooks/sanitize.cfg --durations=40 tests epypes widgets/epypes_widgets notebooks
 
 # Hundreds of interpreters are started by the tests: each would compile all that it imports.

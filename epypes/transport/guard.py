@@ -124,6 +124,7 @@ class Watch:
     ) -> None:
         address = f"inproc://connections-{int(owned.get(zmq.FD))}"
         owned.monitor(address, _EVENTS)
+        self._owned = owned
         self._monitor: zmq.Socket[bytes] = owned.context.socket(zmq.PAIR)
         # ZeroMQ's own thread would wait for room.
         self._monitor.setsockopt(zmq.RCVHWM, 0)
@@ -141,9 +142,11 @@ class Watch:
         self.endpoint = ""
 
     def end(self) -> None:
-        """Watch no more; on the thread that owns the socket."""
+        """Watch no more; on the thread that owns the socket, while it is open."""
         with self._lock:
             self._is_over = True
+            # First: ZeroMQ's own thread would wait for ever to tell of a connection that comes or goes meanwhile.
+            self._owned.disable_monitor()
             self._monitor.close(linger=0)
             self._connections.clear()
 

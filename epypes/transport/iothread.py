@@ -165,9 +165,9 @@ class IOThread:
             else:
                 new.connect(address)
         except (zmq.ZMQError, UnicodeError, ValueError, TypeError) as error:
-            new.close(linger=0)
             if watch is not None:
                 watch.end()
+            new.close(linger=0)
             self._unguard(gate)
             number = getattr(error, "errno", None) or 0
             raise address_error(address, "bound" if bind else "connected", number, str(error)) from error

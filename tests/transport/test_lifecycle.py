@@ -175,6 +175,38 @@ def test_a_put_that_never_returns_is_named():
     assert io_threads() == []
 
 
+# Opens and stops publishers while threads connect and leave. In a process of its own: libzmq waits with the GIL held.
+VISITED = """
+import queue, threading, zmq
+from epypes.transport import ZMQPublisher
+context, address, is_over = zmq.Context(), [None], threading.Event()
+
+def visit():
+    while not is_over.is_set():
+        with context.socket(zmq.SUB) as visitor:
+            visitor.linger = 0
+            if address[0]:
+                visitor.connect(address[0])
+            is_over.wait(0.0005)
+
+threads = [threading.Thread(target=visit) for _ in range(4)]
+for thread in threads:
+    thread.start()
+for _ in range(100):
+    with ZMQPublisher("tcp://127.0.0.1:*", queue.SimpleQueue()) as pub:
+        address[0] = pub.address
+        is_over.wait(0.003)
+is_over.set()
+for thread in threads:
+    thread.join()
+"""
+
+
+@pytest.mark.slow
+def test_peers_that_come_and_go_do_not_keep_it_from_stopping():
+    subprocess.run([sys.executable, "-c", VISITED], check=True, timeout=WAIT_S)
+
+
 def test_stop_works_from_many_threads_at_once():
     with ZMQPublisher(LOCAL, queue.Queue()) as pub, ZMQSubscriber(pub.address, queue.Queue()) as sub:
         threads = [threading.Thread(target=made.stop) for made in (pub, sub) for _ in range(5)]

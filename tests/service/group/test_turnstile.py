@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from epypes.service.group.turnstile import SETTLE_S, Turnstile
 
 CAMERA = ("camera", 17)
-TIMEOUT_S = 60.0
+TIMEOUT_S = 10.0
 
 
 def passed(turnstile, now_s=0.0):
