@@ -169,7 +169,6 @@ def test_a_noisy_token_is_promoted_with_its_tolerance_and_verified_by_it(tmp_pat
     assert bundle.settings.tolerances["total"].absolute > 0
 
 
-@pytest.mark.slow
 def test_promotion_refuses_what_draws_random_numbers_and_writes_nothing(tmp_path):
     runner = ep.CompGraphRunner(graph("draw"))
     runner.run(x=X)

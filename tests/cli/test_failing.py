@@ -157,7 +157,6 @@ def test_a_command_that_fails_says_so_in_one_line(command, row, places, epypes):
     assert says.format(**places) in one_line(done)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("command", sorted(typer.main.get_command(app).commands))
 def test_an_option_that_there_is_not_exits_with_2(command, epypes):
     done = epypes(command, "--no-such-option")

@@ -131,7 +131,6 @@ class Server:
         self.settings = {SETTING: chosen}
 
 
-@pytest.mark.slow
 def test_the_websocket_of_a_gateway_is_left_alone():
     from jupyter_server.gateway.connections import GatewayWebSocketConnection
 

@@ -54,7 +54,6 @@ def packages(modules):
     return {name.partition(".")[0] for name in modules}
 
 
-@pytest.mark.slow
 def test_help_imports_no_command():
     (modules,) = loaded([])
     assert own(modules) <= FRAME
@@ -70,7 +69,6 @@ def test_the_help_of_a_command_imports_that_command_alone():
         assert not packages(modules) & HEAVY, name
 
 
-@pytest.mark.slow
 def test_help_has_a_whole_line_for_every_command():
     done = subprocess.run(
         [sys.executable, "-m", "epypes.cli", "--help"],

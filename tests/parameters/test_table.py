@@ -13,8 +13,6 @@ import pytest
 from epypes.parameters import TABLE, Entry, entry_of, parameter_names
 from tests.parameters.calls import called, function_of, names_of
 
-pytestmark = pytest.mark.slow
-
 # Just outside of what is allowed, the library refuses these too.
 _REFUSED: Final[dict[str, dict[str, tuple[Any, ...]]]] = {
     "GaussianBlur": {"ksize": (2,)},
@@ -129,6 +127,7 @@ def default(entry: Entry) -> Any:
         return inspect.Parameter.empty
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Parameter:FutureWarning", "ignore:No inliers found:UserWarning")
 @pytest.mark.parametrize("entry", PRESENT, ids=named)
 def test_the_library_takes_what_the_table_allows(entry: Entry) -> None:
@@ -185,6 +184,7 @@ def test_the_table_is_as_large_as_promised_and_has_no_entry_twice() -> None:
     assert len(keys) == len(set(keys)) >= 110
 
 
+@pytest.mark.slow
 def test_the_table_loads_no_library_and_says_nothing_of_constants_then() -> None:
     code = (
         "import sys; from epypes.parameters import TABLE, entry_of; "

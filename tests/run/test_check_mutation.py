@@ -123,7 +123,6 @@ def grow(rows, k):
     return len(rows[0])
 
 
-@pytest.mark.slow
 def test_promotion_refuses_a_function_that_changes_an_object_inside_its_input(tmp_path):
     runner = ep.CompGraphRunner(ep.CompGraph({"grow": grow}, {"grow": (("rows", "k"), "count")}), {"k": 1})
     runner.run(rows=[[1]])

@@ -282,7 +282,6 @@ def test_a_memory_mapped_file_that_a_function_writes_again_changes_no_earlier_ru
     assert [numbers(run["a"]) for run in runs] == [{x} for x in range(way.runs)]
 
 
-@pytest.mark.slow
 def test_what_map_keeps_is_of_its_own_image():
     frame = pd.DataFrame({"a": [0, 0]})
 

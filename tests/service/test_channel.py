@@ -91,7 +91,6 @@ def test_messages_larger_than_all_buffers_arrive_whole_in_both_directions_at_onc
         assert all(frame.readonly for frame in got)
 
 
-@pytest.mark.slow
 def test_more_frames_than_the_system_takes_at_once_arrive_whole(ends):
     frames = [bytes([number % 256]) * (number % 7) for number in range(5_000)]
     send = in_thread(ends[0].send, {}, frames)

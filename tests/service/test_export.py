@@ -118,7 +118,6 @@ def run(*arguments):
     return ended.value.code or 0
 
 
-@pytest.mark.slow
 def test_the_command_writes_a_unit_and_refuses_options_that_serve_does_not_take(bundle, tmp_path, capsys):
     assert run("export", "systemd", bundle, "--user", "vision", "--", "--sub", "tcp://127.0.0.1:5555") == 0
     assert "--sub tcp://127.0.0.1:5555" in capsys.readouterr().out

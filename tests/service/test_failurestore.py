@@ -71,7 +71,6 @@ def test_records_come_newest_first_and_as_many_as_asked_for(store):
     assert all(ID.fullmatch(found) for found in ids)
 
 
-@pytest.mark.slow
 def test_ids_of_many_threads_are_unique_and_rise_when_the_clock_goes_back():
     with ThreadPoolExecutor(8) as pool:
         found = list(pool.map(lambda _: with_id(FAILED).id, range(4_000)))

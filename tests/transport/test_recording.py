@@ -75,7 +75,6 @@ TRAFFIC = [
 ]
 
 
-@pytest.mark.slow
 def test_what_is_played_is_byte_for_byte_what_was_published(peer, tmp_path):
     source, sink = peer(zmq.XPUB), peer(zmq.SUB)
     with Recorder(LOCAL, tmp_path / "a.mcap", bind=True) as recorder:
@@ -161,7 +160,6 @@ def test_any_reader_of_mcap_finds_topics_times_and_messages(tmp_path):
         }
 
 
-@pytest.mark.slow
 def test_one_topic_can_be_recorded_alone(tmp_path):
     left, right = queue.SimpleQueue(), queue.SimpleQueue()
     with (
@@ -205,7 +203,6 @@ def test_speed_0_does_not_wait_for_the_times(tmp_path):
         assert [into.get(timeout=WAIT_S) for _ in range(10)] == [b"x"] * 10
 
 
-@pytest.mark.slow
 def test_it_plays_as_often_as_it_is_told(tmp_path):
     written(tmp_path / "a.mcap", [(1, [b"a"]), (2, [b"b"])])
     into = queue.SimpleQueue()
@@ -217,7 +214,6 @@ def test_it_plays_as_often_as_it_is_told(tmp_path):
         assert not player.wait(0.0)
 
 
-@pytest.mark.slow
 def test_another_subscriber_may_join_while_it_plays(tmp_path):
     written(tmp_path / "a.mcap", [(1, [b"t/", bytes(1_000)]), (2, [b"x"])])
     first, second = queue.SimpleQueue(), queue.SimpleQueue()
@@ -401,7 +397,6 @@ class SlowDisk:
         os.close(self._end)
 
 
-@pytest.mark.slow
 def test_what_a_slow_disk_does_not_take_is_dropped_and_counted(tmp_path):
     disk, out = SlowDisk(tmp_path / "pipe"), queue.SimpleQueue()
     with ZMQPublisher(LOCAL, out) as pub:
@@ -444,7 +439,6 @@ def threads_of_recording() -> list[str]:
     return [thread.name for thread in threading.enumerate() if thread.name.startswith("epypes-")]
 
 
-@pytest.mark.slow
 def test_stop_works_before_start_and_twice_and_start_works_again(tmp_path):
     recorder = Recorder(LOCAL, tmp_path / "a.mcap", bind=True)
     recorder.stop()
@@ -470,7 +464,6 @@ def test_stop_works_before_start_and_twice_and_start_works_again(tmp_path):
     assert threads_of_recording() == []
 
 
-@pytest.mark.slow
 def test_on_end_may_stop_what_has_ended(tmp_path):
     ended = queue.SimpleQueue()
 

@@ -139,7 +139,6 @@ def test_listeners_hear_of_the_group_each_second(http):
     assert told[0]["replicas"] == 3
 
 
-@pytest.mark.slow
 def test_a_service_on_a_socket_is_a_group_of_its_own(acting):
     told = Service(acting).group()
     assert (told["is_shared"], told["replicas"], told["agree"]) == (False, 1, True)
