@@ -17,8 +17,6 @@ from tests.conftest import EDGE_HPARAMS, EDGE_IO
 from tests.properties.test_straight_line import ruff_says
 from tests.seeds import printed
 
-pytestmark = pytest.mark.slow  # what is written is run beside what it was written from
-
 EDGE_CELL = """
 # Weighs the channels as people see them.
 def grayscale(im):
@@ -162,6 +160,7 @@ def choosing(keys):
     return cg | inner | ep.switch("outer", dict(zip(keys, ("chosen", "e"), strict=True)), by="method", output="y")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("keys", [("p", "q"), (None, True), (1, 2.5), (Method.CANNY, Method.SOBEL), ((1, "a"), b"\n'")])
 def test_of_a_switch_only_the_chosen_branch_runs(keys):
     cg = choosing(keys)
@@ -260,6 +259,7 @@ VALUES = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", VALUES, ids=lambda value: f"{type(value).__name__}")
 def test_a_hyperparameters_value_is_made_again_to_the_last_bit(value):
     made = executed(source_with(value))()
@@ -399,6 +399,7 @@ def test_switches_too_deep_to_indent_are_refused_with_the_way_out():
     assert executed(shallow)(-2, *range(15)) == 2
 
 
+@pytest.mark.slow
 def test_the_text_is_the_same_under_any_hash_seed():
     code = (
         "import epypes as ep, math\n"
@@ -410,6 +411,7 @@ def test_the_text_is_the_same_under_any_hash_seed():
     assert len(texts) == 1
 
 
+@pytest.mark.slow
 def test_a_chain_of_ten_thousand_functions_is_written():
     names = notebook("".join(f"def f{number}(x):\n    return x + 1\n\n\n" for number in range(100)))
     functions = {f"f{number}": names[f"f{number % 100}"] if number % 2 else math.floor for number in range(10_000)}

@@ -15,8 +15,6 @@ from skimage import data
 import epypes as ep
 from epypes.acquisition import write_image
 
-pytestmark = pytest.mark.slow  # each runs commands on a bundle
-
 
 @pytest.fixture(scope="module")
 def labelled(tmp_path_factory):
@@ -68,6 +66,7 @@ def cases(labelled, tmp_path):
     return written
 
 
+@pytest.mark.slow
 def test_a_set_that_passes_exits_with_0(labelled, cases, epypes, tmp_path):
     junit = tmp_path / "checks.xml"
     done = epypes("check", labelled / "edges", cases(30), "--junit", junit)
@@ -99,6 +98,7 @@ def things(n):
     return [0] * n if n > 0 else Uncountable()
 
 
+@pytest.mark.slow
 def test_a_metric_that_raises_without_a_text_exits_with_1_and_is_an_error(epypes, tmp_path):
     runner = ep.CompGraphRunner(ep.CompGraph({"things": things}, {"things": ("n", "found")}))
     runner.run(n=3)

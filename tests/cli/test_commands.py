@@ -19,8 +19,6 @@ from epypes.service import Service
 from epypes.service.state import StateLock
 from tests.colours import red_image, red_runner
 
-pytestmark = pytest.mark.slow  # each promotes or serves a bundle
-
 ANY = "tcp://127.0.0.1:*"
 
 
@@ -59,6 +57,7 @@ def test_what_looks_like_markup_is_printed_as_it_is(console, capsys):
     assert (said.out + said.err).count(key) == 4
 
 
+@pytest.mark.slow
 def test_call_writes_the_answer_and_prints_the_times(epypes, bundle, photograph, tmp_path):
     write_image(tmp_path / "photo.png", photograph)
     with StateLock(bundle.path) as lock, Service(bundle.path, ANY, ANY) as service:
@@ -90,6 +89,7 @@ def test_calling_where_nothing_serves_is_one_line(epypes, bundle, photograph, tm
     assert "No service runs for" in said
 
 
+@pytest.mark.slow
 def test_verify_says_identical_or_what_differs(epypes, bundle):
     done = epypes("verify", bundle.path)
     assert (done.returncode, done.stderr) == (0, "")
@@ -135,6 +135,7 @@ def test_files_are_given_to_tokens():
         by_token(["lefd=l.png", "right=r.png"], ["left", "right"], "input")
 
 
+@pytest.mark.slow
 def test_a_module_that_an_extra_brings_is_named():
     code = (
         "import sys; sys.modules['tomlkit'] = None\n"
@@ -150,6 +151,7 @@ def test_a_module_that_an_extra_brings_is_named():
     assert done.stderr.strip() == "epypes: Package 'tomlkit' is missing. Run: pip install 'epypes[serve]'"
 
 
+@pytest.mark.slow
 def test_files_have_the_right_colours_whatever_the_order_of_the_tokens(epypes, tmp_path):
     runner = red_runner()
     runner.run(image=red_image())

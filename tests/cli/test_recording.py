@@ -15,8 +15,6 @@ from epypes.transport.mcapformat import Counts
 from epypes.transport.mcapwriter import RecordingWriter
 from epypes.wire import Envelope
 
-pytestmark = pytest.mark.slow  # each runs the commands
-
 LOCAL = "tcp://127.0.0.1:*"
 WAIT_S = 60.0
 
@@ -64,6 +62,7 @@ def test_record_takes_as_many_messages_as_it_is_told_and_says_what_became_of_the
     assert recording_info(path).topics == {"cam1": 3}
 
 
+@pytest.mark.slow
 def test_record_ends_after_the_time_it_is_told(epypes, tmp_path):
     before = time.monotonic()
     done = epypes("record", f"bind:{LOCAL}", tmp_path / "a.mcap", "--seconds", 0.1)
@@ -121,6 +120,7 @@ def test_what_can_not_be_recorded_is_one_line(epypes, recording, tmp_path):
     assert not (tmp_path / "b.mcap").exists()
 
 
+@pytest.mark.slow
 def test_what_can_not_be_played_is_one_line(epypes, recording, tmp_path):
     (tmp_path / "text.mcap").write_text("no recording")
     for name, words in (("text.mcap", "is no MCAP file"), ("nothing.mcap", "can't be read")):

@@ -23,8 +23,6 @@ from epypes.display.views.graphview import GraphView
 from epypes.display.views.source import LINE_CHARACTERS, SIGNATURE_CHARACTERS, SOURCE_LINES, signature_and_source
 from tests.pictures import assert_same_picture
 
-pytestmark = pytest.mark.slow  # whole pages are made and measured
-
 SVG = "{http://www.w3.org/2000/svg}"
 
 
@@ -271,6 +269,7 @@ def limit_of(bundle: dict[str, str], graph: GraphView) -> int:
     return 20_000 + 600 * (len(graph.functions) + len(graph.tokens)) + min(thumbnails, 80_000)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", GRAPHS)
 def test_a_picture_and_its_page_keep_their_limits(kind):
     make, value = GRAPHS[kind]

@@ -15,8 +15,6 @@ from epypes.errors import StillRunning
 from epypes_widgets import Panel, sender, tune
 from tests.widgets.frontend import BadLine, FrontEnd
 
-pytestmark = pytest.mark.slow  # messages are lost and delayed
-
 
 @pytest.fixture
 def front_end(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> FrontEnd:
@@ -28,6 +26,7 @@ def move(panel: Panel, name: str, value: Any) -> None:
     panel._hand.control(name).widget.value = value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(3, 24))])
 def test_the_last_value_is_shown_over_a_line_that_loses_doubles_delays_and_exchanges(
     panel: Panel, monkeypatch: pytest.MonkeyPatch, seed: int
@@ -81,6 +80,7 @@ def test_values_from_another_thread_than_the_answers_are_all_shown_in_the_end(
         line.close()
 
 
+@pytest.mark.slow
 def test_one_frame_is_in_flight_however_many_values_come(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> None:
     answers: list[Any] = []
     front_end = FrontEnd(panel, monkeypatch)
@@ -119,6 +119,7 @@ def test_a_drag_is_computed_and_committed_when_it_is_let_go(
     assert runner["threshold"] == 130
 
 
+@pytest.mark.slow
 def test_a_hand_that_rests_commits(panel: Panel, front_end: FrontEnd) -> None:
     move(panel, "threshold", 110)
     move(panel, "threshold", 111)
@@ -128,6 +129,7 @@ def test_a_hand_that_rests_commits(panel: Panel, front_end: FrontEnd) -> None:
     assert list(panel.history["threshold"]) == [100, 111, 112]
 
 
+@pytest.mark.slow
 def test_a_control_that_is_held_is_never_written_to(
     panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner
 ) -> None:
@@ -143,6 +145,7 @@ def test_a_control_that_is_held_is_never_written_to(
     assert panel.values == {"gain": 3, "threshold": 50} == dict(runner.hyperparameters)
 
 
+@pytest.mark.slow
 def test_what_the_hand_does_after_a_cell_wins(panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner) -> None:
     front_end.tell("hold", names=["threshold"])
     runner["threshold"] = 50
@@ -153,6 +156,7 @@ def test_what_the_hand_does_after_a_cell_wins(panel: Panel, front_end: FrontEnd,
     assert (panel["threshold"], runner["threshold"]) == (111, 111)
 
 
+@pytest.mark.slow
 def test_a_cell_that_sets_a_hyperparameter_moves_the_control_and_the_picture(
     panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner, calls: Any
 ) -> None:
@@ -167,6 +171,7 @@ def test_a_cell_that_sets_a_hyperparameter_moves_the_control_and_the_picture(
     assert calls.counts == {"above": 2, "brighten": 1}
 
 
+@pytest.mark.slow
 def test_a_value_that_a_cell_sets_out_of_range_is_shown_and_said(
     panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner
 ) -> None:
@@ -327,6 +332,7 @@ def test_a_message_that_makes_no_sense_is_logged_and_harms_nothing(panel: Panel,
     assert front_end.last("log")["lines"]
 
 
+@pytest.mark.slow
 def test_what_a_cell_sets_on_a_panel_waits_for_the_hand(
     panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner
 ) -> None:
@@ -345,6 +351,7 @@ def test_what_a_cell_sets_on_a_panel_waits_for_the_hand(
     assert (panel["threshold"], runner["threshold"]) == (90, 90)
 
 
+@pytest.mark.slow
 def test_places_of_a_slider_that_is_dragged_come_with_acknowledgements(
     panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner
 ) -> None:
@@ -376,6 +383,7 @@ def slowed(panel: Panel, monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Eve
     return begun, go_on
 
 
+@pytest.mark.slow
 def test_of_a_panel_and_a_cell_the_one_that_set_last_wins(
     panel: Panel, front_end: FrontEnd, runner: ep.CompGraphRunner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
