@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ast
 import dis
-import io
 import linecache
 import sys
 import types
@@ -29,7 +28,7 @@ from epypes.bundle.classvalues import (
     values_of_fields,
 )  # fmt: skip
 from epypes.bundle.source import Refused, evaluated
-from epypes.bundle.text import class_code, nested_codes, own_text, parsed, same_methods
+from epypes.bundle.text import class_code, lines_in, nested_codes, own_text, parsed, same_methods
 from epypes.bundle.uses import names_from_outside
 
 # What Python itself puts into every class.
@@ -102,7 +101,7 @@ def class_definition(kind: type, around: Mapping[str, Any], what: str) -> ClassD
         raise Refused(f"{text}. Define it at the margin of a cell.")
     why = ""
     for file in _files(kind):
-        lines = io.StringIO("".join(linecache.getlines(file)), newline=None).readlines()
+        lines = lines_in(file)
         for node in _classes(lines, kind.__name__):
             problem = next(_differences(kind, node, "".join(lines), around), "")
             if not problem:
@@ -154,7 +153,7 @@ def _functions_in(value: Any) -> Iterator[types.FunctionType]:
     if isinstance(value, cached_property):
         parts.append(value.func)
     for part in parts:
-        if isinstance(part, types.FunctionType) and linecache.getlines(part.__code__.co_filename):
+        if isinstance(part, types.FunctionType) and lines_in(part.__code__.co_filename):
             home = part.__globals__.get("__name__")
             if home == "__main__" or home not in sys.modules:
                 yield part

@@ -13,7 +13,7 @@ from epypes.bundle.text import (
     codes_in,
     computes_the_same,
     is_comment,
-    lines_of,
+    lines_in,
     parsed,
     spelled_tree,
 )
@@ -24,7 +24,7 @@ UNNAMED: Final = "function"
 
 def lambdas_of(code: types.CodeType) -> tuple[list[str], list[ast.Lambda]]:
     """Return the lines that code is from, and the lambdas among them that may be it: one, if it can be told."""
-    lines = lines_of(code)
+    lines = lines_in(code.co_filename)
     tree = parsed("".join(lines))
     if tree is None:
         return lines, []

@@ -26,20 +26,22 @@ LATE_ANNOTATIONS: Final = __future__.annotations.compiler_flag
 _ABOUT_THE_FILE: Final = re.compile(r"\s*#(!|.*coding[:=])")
 
 
-def lines_of(code: types.CodeType) -> list[str]:
-    """Return the lines of the file or cell that code is from; none if there is no text."""
+def lines_in(file: str) -> list[str]:
+    """Return the lines of a file or cell; none if there is no text."""
+    # From Python 3.13 on "<string>" has the text of `python -c`; what exec and libraries make has that name too.
+    text = "" if file == "<string>" else "".join(linecache.getlines(file))
     # As Python counts lines: others end them at form feeds too.
-    return io.StringIO("".join(linecache.getlines(code.co_filename)), newline=None).readlines()
+    return io.StringIO(text, newline=None).readlines()
 
 
 def definition_of(code: types.CodeType) -> tuple[list[str], ast.FunctionDef | None]:
     """Return the lines that code is from, and the definition among them that compiles to this very code."""
-    lines = lines_of(code)
+    lines = lines_in(code.co_filename)
     found = _defined_as(lines, code)
     if found is None and os.path.isfile(code.co_filename):
         # Lines that were remembered may be older than the file that was run last.
         linecache.checkcache(code.co_filename)
-        lines = lines_of(code)
+        lines = lines_in(code.co_filename)
         found = _defined_as(lines, code)
     return lines, found
 
