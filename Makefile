@@ -23,15 +23,17 @@ test: $(VENV)/.test chromium postgres brokers
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	@sh .ci/matrix $(BIN)/python 3.13 lowest
 	$(PYTEST) -m "not soak"
 
 # The long forms: every combination, long series, and far more examples for what searches at random. Takes hours.
 soak: $(VENV)/.test chromium postgres brokers
 	EPYPES_SOAK=1 $(PYTEST) -m "soak or fuzz" -o timeout=3600 -o faulthandler_timeout=3000
 
-# The default selection on every other Python that is found, and on the lowest versions that pyproject.toml admits.
+# The default selection on every other Python that is found, and on the lowest versions that pyproject.toml admits;
+# `make test` runs a part of it.
 test-matrix: $(VENV)/.test
-	@sh .ci/matrix $(BIN)/python
+	@sh .ci/matrix $(BIN)/python 3.12 3.13 3.14 lowest
 
 lab: $(VENV)/.all
 	$(BIN)/epypes lab notebooks

@@ -12,10 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import nbformat
 import numpy as np
 import pytest
-from nbconvert import HTMLExporter
 from skimage import data
 
 import epypes as ep
@@ -553,6 +551,9 @@ def test_states_are_told_apart_without_colour(sheet: Sheet, states: str) -> None
 def test_a_notebook_that_was_converted_to_html_can_be_explored_and_read(
     sheet: Sheet, photo: np.ndarray, tmp_path: Path, colours: str
 ) -> None:
+    import nbformat  # takes seconds
+    from nbconvert import HTMLExporter
+
     bundle = mimebundle(edge_runner().run(image=photo))
     output = nbformat.v4.new_output("display_data", dict(bundle))
     cell = nbformat.v4.new_code_cell("run", outputs=[output], execution_count=1)

@@ -67,6 +67,7 @@ def test_values_that_a_function_refuses_leave_the_bundle_alone(folder):
     assert not [*folder.parent.glob(".*")]
 
 
+@pytest.mark.slow
 def test_values_that_stand_there_already_change_nothing(promoted):
     assert write_back(promoted.path, HPARAMS) == write_back(promoted.path, {})
     assert write_back(promoted.path, HPARAMS).diff == ""

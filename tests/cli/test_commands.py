@@ -79,6 +79,7 @@ def test_call_writes_the_answer_and_prints_the_times(epypes, bundle, photograph,
         assert "can't be written: [Errno 2] No such file" in said
 
 
+@pytest.mark.slow
 def test_an_image_path_that_does_not_exist_is_one_line(epypes, bundle):
     assert "Image 'nothing.png' can't be read" in one_line(epypes("call", bundle.path, "nothing.png", "--out", "x.png"))
 

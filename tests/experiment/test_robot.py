@@ -104,6 +104,7 @@ def test_a_request_that_nobody_answers_ends_after_its_time_out(robot_with):
     assert math.isnan(came.t_trip)
 
 
+@pytest.mark.slow
 def test_messages_that_are_no_answers_are_counted_and_do_not_prolong_the_wait(robot_with):
     given_up = threading.Event()
 

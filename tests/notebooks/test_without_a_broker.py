@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import nbformat
 import pytest
-from nbclient import NotebookClient
 
 TUTORIAL = Path(__file__).parents[2] / "notebooks" / "09_beyond_one_machine.ipynb"
 # As on a machine that has no server of this name.
@@ -15,6 +13,9 @@ HIDDEN = "import shutil\n\nshutil.which = lambda *arguments, **options: None"
 
 @pytest.mark.notebook
 def test_each_cell_says_that_no_broker_is_installed_and_none_fails(tmp_path):
+    import nbformat  # takes seconds
+    from nbclient import NotebookClient
+
     notebook = nbformat.read(TUTORIAL, as_version=4)
     notebook.cells.insert(0, nbformat.v4.new_code_cell(HIDDEN))
     NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(tmp_path)}}).execute()

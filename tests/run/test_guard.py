@@ -162,6 +162,7 @@ def test_a_buffer_that_a_function_holds_is_neither_locked_nor_changed_later(shap
             assert (np.asarray(kept) == x).all()
 
 
+@pytest.mark.slow
 def test_threads_that_share_an_array_with_an_unguarded_function_get_it_writable():
     failed = []
 

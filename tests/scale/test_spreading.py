@@ -51,6 +51,7 @@ def forked():
         yield pool
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("who", ["threads", "processes", "forked"])
 def test_results_are_the_same_whoever_does_the_jobs(who, runner, crops, folder, request):
     expected = ep.map(runner, mixed(crops, folder), keep=["edges", "keypoints"])
@@ -202,6 +203,7 @@ def test_a_module_next_to_the_notebook_is_named_first_with_who_can_run_it(proces
     assert "epypes-parcel" not in str(refused.value)
 
 
+@pytest.mark.slow
 def test_a_function_that_keeps_something_is_refused_and_told_to_be_run_without_an_executor(crops, processes):
     apply = cv2.createBackgroundSubtractorMOG2().apply
     runner = ep.CompGraphRunner(ep.CompGraph({"apply": apply}, {"apply": ("image", "mask")}))

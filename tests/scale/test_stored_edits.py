@@ -187,6 +187,7 @@ def mapped(function: Any, store: Any) -> ep.Outcome:
     return outcome
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS)
 def test_failure_72_no_stored_result_of_a_named_map_survives_an_edit_behind(form: str, tmp_path: Path) -> None:
     store, function = tmp_path / "r.sqlite", notebook(form, 1)

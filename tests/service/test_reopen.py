@@ -6,8 +6,6 @@ import queue
 import shutil
 import warnings
 
-import nbclient
-import nbformat
 import pytest
 
 import epypes as ep
@@ -277,6 +275,9 @@ def test_a_failure_is_opened_from_a_running_service_by_its_url_or_connection(bri
 @pytest.mark.slow
 @pytest.mark.notebook
 def test_in_a_notebook_a_failure_shows_itself_and_the_next_cell_goes_on_from_it(bright_bundle):
+    import nbclient  # takes seconds
+    import nbformat
+
     failure = keep(bright_bundle, request(RAISES))
     cells = [
         f"import epypes as ep\nrunner = ep.load_failure({failure!r}, {str(bright_bundle)!r})\nrunner",

@@ -259,6 +259,7 @@ def test_a_server_that_dies_is_told_and_after_a_restart_the_same_store_works_aga
         assert sorted(series.keys()) == ["after", "before", "unnoticed"]
 
 
+@pytest.mark.slow
 def test_a_password_that_a_driver_repeats_is_left_out(postgres):
     said = sa.exc.OperationalError("CONNECT", {}, Exception(f"no connection with {PASSWORD} to the host"))
     with Store(postgres.url()) as store:

@@ -197,6 +197,7 @@ def test_messages_that_a_slow_subscriber_loses_are_noticed_by_the_publisher_and_
     assert sum("too slow" in record.message for record in caplog.records) == 1
 
 
+@pytest.mark.slow
 def test_large_messages_are_not_decoded_on_the_io_thread_and_the_order_is_kept(peer):
     class Noting:
         def __init__(self):

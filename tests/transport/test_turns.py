@@ -314,6 +314,7 @@ def test_a_forked_child_leaves_the_connection_to_its_parent(turns, pipe):
     assert len(pipe.heard) == 1
 
 
+@pytest.mark.slow
 def test_a_connection_that_is_over_keeps_nobody_busy(turns, pipe, troubles):
     def end() -> None:
         raise ConnectionError("over")

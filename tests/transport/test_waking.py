@@ -89,6 +89,7 @@ def test_closed_there_is_nobody_to_be_woken():
     made.wake()
 
 
+@pytest.mark.slow
 def test_a_forked_child_that_drops_its_copy_changes_nothing_here(waiting, ends):
     one, other = ends
     waiting.watch(one, READ)

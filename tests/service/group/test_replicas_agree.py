@@ -83,6 +83,7 @@ def test_replicas_share_the_events_and_know_each_other(trio):
         assert (told["ready"], told["agree"], told["trouble"]) == (3, True, "")
 
 
+@pytest.mark.slow
 def test_a_change_at_one_replica_reaches_all_with_one_revision(trio):
     line, replicas = trio
     before = replicas[0].parameters().revision
@@ -139,6 +140,7 @@ def test_listeners_hear_of_the_group_each_second(http):
     assert told[0]["replicas"] == 3
 
 
+@pytest.mark.slow
 def test_a_service_on_a_socket_is_a_group_of_its_own(acting):
     told = Service(acting).group()
     assert (told["is_shared"], told["replicas"], told["agree"]) == (False, 1, True)
