@@ -12,6 +12,7 @@ import pytest
 
 import epypes as ep
 from epypes.errors import HyperparameterError, PayloadError, UnknownName
+from tests.transport.peers import wait_until
 
 TIMEOUT_S = 60.0
 
@@ -129,6 +130,7 @@ def test_of_alternating_good_and_bad_frames_each_answer_and_each_failure_has_the
         for number in range(400):
             pipe.q_in.put(Numbered(str(number), number))
         answers = [pipe.q_out.get(timeout=TIMEOUT_S) for _ in range(200)]
+        wait_until(lambda: len(failures) == 200)
     assert answers == [(str(n), n, -n, n + 1000, 2 * (n + 1000)) for n in range(0, 400, 2)]
     told = [(int(failure.event_id), failure.function, dict(failure.inputs)) for failure in failures]
     assert told == [(n, "first", {"x": n}) if n % 4 == 1 else (n, "second", {"y": n + 1000}) for n in range(1, 400, 2)]

@@ -174,7 +174,9 @@ def test_a_function_that_does_not_return_is_named_and_the_worker_is_replaced(act
 
 def test_a_worker_that_was_stopped_is_replaced(acting):
     with serving(acting, job_timeout_s=0.3) as (service, peer):
-        os.kill(service.info()["worker_pid"], signal.SIGSTOP)
+        worker = psutil.Process(service.info()["worker_pid"])
+        worker.suspend()
+        until(lambda: worker.status() == psutil.STATUS_STOPPED)
         failure = peer.ask().failure
         assert "did not return within 0.3 s" in failure.message
         assert peer.ask_until_answered(number=3).parts["out"] == 6
