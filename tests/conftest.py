@@ -33,7 +33,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # `make soak` asks for far more examples; tests that search at random are marked "fuzz" and don't set their number.
 hypothesis.settings.register_profile("quick", max_examples=100, stateful_step_count=20, deadline=None)
-hypothesis.settings.register_profile("soak", parent=hypothesis.settings.get_profile("quick"), max_examples=10_000)
+hypothesis.settings.register_profile("soak", parent=hypothesis.settings.get_profile("quick"), max_examples=2_000)
 hypothesis.settings.load_profile("soak" if "EPYPES_SOAK" in os.environ else "quick")
 
 

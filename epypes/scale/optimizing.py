@@ -241,8 +241,9 @@ def _searched(
             advance(len(done), sum(trial.value is None for trial in done))
         try:
             with contextlib.closing(work.scores(search, n - len(done))) as coming:
-                for asked, score in coming:
-                    _require_readable(asked, score, len(done))
+                for number, (asked, score) in enumerate(coming):
+                    if number == 0:
+                        _require_readable(score)
                     trial = search.tell(asked, score.value, score.failure, score.total_ns)
                     advance(1, trial.value is None)
                     if on_trial is not None:
@@ -252,9 +253,9 @@ def _searched(
     return work.is_stopped
 
 
-def _require_readable(asked: Asked, score: Score, first: int) -> None:
-    """Raise ScaleError if an input can't be read in the first trial that is run: it could not in any other."""
-    if asked.number == first and score.unreadable:
+def _require_readable(score: Score) -> None:
+    """Raise ScaleError if an input can't be read in the trial that comes back first: it could not in any other."""
+    if score.unreadable:
         raise ScaleError(f"No trial can complete: {ended(score.unreadable)} Mend the file, or leave it out.")
 
 

@@ -46,6 +46,7 @@ def members(told):
 
 def test_each_replica_is_one_line_with_the_state_that_the_group_knows(epypes, acting):
     with replicas("lines", a=(acting, {}), b=(acting, {})) as (first, _):
+        until(lambda: "ready 2" in epypes("status", acting).stdout)
         told = epypes("status", acting).stdout
         alone = epypes("status", acting, "--replica", "b").stdout
         first.pause()
