@@ -46,7 +46,7 @@ fix: $(VENV)/.test
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) .matrix demo-output test-output notebooks/edge_service notebooks/orb.* notebooks/*.toml notebooks/services notebooks/many_images services
+	rm -rf $(VENV) .matrix demo-output test-output results edges.html edges.png notebooks/edge_service notebooks/orb.* notebooks/*.toml notebooks/services notebooks/many_images services
 
 # uv comes from the same registry as everything else and installs eight times faster than pip.
 $(BIN)/python:

@@ -174,14 +174,24 @@ class IteratorRefused(EpypesError, TypeError):
 
 
 class InputMutated(EpypesError, RuntimeError):
-    """A function has changed an object inside its input, which ``check_mutation`` has found and put back."""
+    """A function has changed an object inside its input, which ``check_mutation`` has found and put back.
 
-    def __init__(self, function: str, token: str) -> None:
+    It can't put an iterator back that was read.
+    """
+
+    def __init__(self, function: str, token: str, *, has_read_iterator: bool = False) -> None:
         self.function, self.token = function, token
-        super().__init__(
-            f"Function {function!r} has changed its input {token!r} in place, which other functions and reruns read. "
-            f"What it had changed was put back. Let it work on a copy, made with copy.deepcopy."
-        )
+        if has_read_iterator:
+            text = (
+                f"Function {function!r} has read an iterator inside its input {token!r}, which can be read only once, "
+                "but other functions and reruns read it. Make it a list where it is made."
+            )
+        else:
+            text = (
+                f"Function {function!r} has changed its input {token!r} in place, which other functions and reruns "
+                "read. What it had changed was put back. Let it work on a copy, made with copy.deepcopy."
+            )
+        super().__init__(text)
 
 
 class PlaceholderNeeded(EpypesError, NotImplementedError):

@@ -37,7 +37,6 @@ EXTRAS: Final[Mapping[str, tuple[str, str]]] = {
     "networkx": ("networkx", "widgets"),
     "numpy": ("numpy", "widgets"),
     "optuna": ("optuna", "scale"),
-    "packaging": ("packaging", "serve"),
     "paho": ("paho-mqtt", "mqtt"),
     "pandas": ("pandas", "scale"),
     "pika": ("pika", "rabbitmq"),

@@ -103,10 +103,12 @@ class MutableState:
             result, error = attempt(args, kwargs)
             changed = snapshot.changed()
             with turns.changed:
-                is_alone = turns.was_alone(entered)
-                if changed is not None and is_alone:
-                    is_restored = snapshot.restored()
-                turns.leave()
+                try:
+                    is_alone = turns.was_alone(entered)
+                    if changed is not None and is_alone:
+                        is_restored = snapshot.restored()
+                finally:
+                    turns.leave()
             if not is_alone and (changed is not None or snapshot.emptied != emptied):
                 with turns.alone():
                     snapshot.restore()

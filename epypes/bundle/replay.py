@@ -179,7 +179,10 @@ def _told(error: BaseException, folder: Path) -> str:
     notes = "; ".join(getattr(error, "__notes__", ()))
     text = f"The replay of {folder} failed{where}: {type(error).__name__}: {' '.join(str(error).split())}"
     if isinstance(error, ModuleNotFoundError):
-        text += ". Only installed packages can be imported in a bundle: install it, or move the code into the notebook"
+        text += (
+            ". Only installed packages can be imported in a bundle: install what its requirements.txt lists, "
+            "or move the code into the notebook"
+        )
     elif (
         isinstance(error, FileNotFoundError) and error.filename and not Path(os.fsdecode(error.filename)).is_absolute()
     ):

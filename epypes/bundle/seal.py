@@ -197,7 +197,8 @@ def _read_manifest(folder: Path) -> dict[str, str]:
             raise BundleError(
                 folder, f"{folder / MANIFEST} can't be read: {line!r:.60} is no line of it. Promote again."
             )
-        recorded[name] = value
+        if recorded.setdefault(name, value) != value:
+            raise BundleError(folder, f"{folder / MANIFEST} has two digests for {name!r}. Promote again.")
     return recorded
 
 

@@ -98,7 +98,7 @@ def _call_checked(program: Program, step: Step, values: Sequence[Any], *args: An
     token = before.changed()
     if token is not None:
         before.restore()
-        raise InputMutated(step.name, token)
+        raise InputMutated(step.name, token, has_read_iterator=before.changed() is not None)
     return result
 
 

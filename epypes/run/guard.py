@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import re
 import sys
 import threading
 from array import array as number_array
@@ -387,8 +388,7 @@ def is_same_guarded_array(old: Any, new: Any, given: Sequence[Any]) -> bool:
 
 def explain_write(function: str, tokens: Sequence[str], exception: BaseException) -> str | None:
     """Return a sentence on why writing in place failed, if that is what this exception is about."""
-    text = str(exception).replace("-", "").replace(" ", "")
-    if "readonly" not in text:
+    if not re.search("read-?only", str(exception)):
         return None
     which = ", ".join(map(repr, tokens))
     return (

@@ -21,7 +21,7 @@ import sys
 import types
 import warnings
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import date, time, timedelta, tzinfo
 from decimal import Decimal
 from enum import Enum
@@ -43,6 +43,11 @@ ATOMS: Final = frozenset(
 # Values of these kinds never change, although some of them fill caches of their own.
 _CONSTANT: Final = (Enum, PurePath, Logger, date, time, timedelta, tzinfo, types.CodeType, types.ModuleType)
 _CODE: Final = (type, types.FunctionType)
+# Of objects of OpenCV, which the garbage collector knows nothing about.
+_ATTRIBUTES_OF_CV2: Final = {
+    "KeyPoint": ("angle", "class_id", "octave", "pt", "response", "size"),
+    "DMatch": ("distance", "imgIdx", "queryIdx", "trainIdx"),
+}
 _ATOMIC_ITERATORS: Final = (itertools.count, itertools.repeat)
 
 
@@ -61,7 +66,7 @@ class Record:
         """Whether the contents are others than they were."""
         try:
             now = self.read(self.value)
-        except RuntimeError:  # another thread changes it at this moment
+        except Exception:  # another thread changes it at this moment, or it was closed
             return True
         saved = self.saved
         if len(now) == len(saved) and all(map(operator.is_, now, saved)):
@@ -100,8 +105,9 @@ class Snapshot:
     Notes
     -----
     Lists, dicts with their order, sets, deques, bytearrays, arrays, the attributes and slots of objects, random
-    generators, iterators and pandas objects are compared; tuples, partials, bound methods and C containers are looked
-    through. Functions, classes and modules count as constants, and so do the private attributes of a library's objects.
+    generators, iterators, pandas objects, key points and matches of OpenCV are compared; tuples, partials, bound
+    methods and C containers are looked through. Functions, classes and modules count as constants, and so do the
+    private attributes of a library's objects.
 
     It holds references to all that it compares, and a copy of every array that can be written to.
 
@@ -144,11 +150,12 @@ class Snapshot:
     def restore(self) -> None:
         """Put the contents of every object that has changed back.
 
-        An iterator can't be set back: it goes on counting as changed.
+        What can't be put back, as an iterator or a buffer that was closed, goes on counting as changed.
         """
         for record in self.records:
             if record.differs():
-                record.restore()
+                with contextlib.suppress(Exception):
+                    record.restore()
 
     def look_at(self, name: str, value: Any) -> Found:
         """Record one object as far as it can change, and give what it refers to; the hook for subclasses."""
@@ -390,10 +397,15 @@ def _write_table(value: Any, saved: Contents) -> None:
 
 
 def _state_of(value: Any) -> _Way | None:
-    """Return how the state of a random generator, a buffer or an iterator is read and written."""
+    """Return how the state of a random generator, a buffer, an iterator or an object of OpenCV is read and written."""
     kind, numbers = type(value), sys.modules.get("numpy.random")
+    if kind.__module__ == "cv2" and kind.__name__ in _ATTRIBUTES_OF_CV2:
+        return _ways_to(_ATTRIBUTES_OF_CV2[kind.__name__])
     if issubclass(kind, random.Random):
         return lambda value: (value.getstate(),), lambda value, saved: value.setstate(saved[0])
+    if numbers is not None and issubclass(kind, numbers.RandomState):
+        drawn = value.get_state(legacy=False)
+        return lambda value: (_flat(value.get_state(legacy=False)),), lambda value, saved: value.set_state(drawn)
     if numbers is not None and issubclass(kind, numbers.BitGenerator):
         state = value.state
         return lambda value: (_flat(value.state),), lambda value, saved: setattr(value, "state", state)
@@ -404,6 +416,16 @@ def _state_of(value: Any) -> _Way | None:
     if callable(getattr(kind, "__next__", None)) and kind.__module__ in ("builtins", "itertools", "collections"):
         return _read_iterator, _leave
     return None
+
+
+def _ways_to(names: Sequence[str]) -> _Way:
+    """Return how attributes are read and written."""
+
+    def write(value: Any, saved: Contents) -> None:
+        for name, part in zip(names, saved, strict=True):
+            setattr(value, name, part)
+
+    return operator.attrgetter(*names), write
 
 
 def _is_global_generator(value: Any) -> bool:

@@ -120,7 +120,7 @@ def required(extra):
 
 @pytest.mark.slow
 def test_every_package_that_is_imported_is_brought_by_an_extra_that_an_error_names():
-    own = {*sys.stdlib_module_names, "epypes", "epypes_widgets", "typer", "rich"}
+    own = {*sys.stdlib_module_names, "epypes", "epypes_widgets", "packaging", "rich", "typer"}
     assert {name for path in MODULES for name in imported(path)} - own <= EXTRAS.keys()
     # What these bring by themselves: nothing asks for them by name.
     within = {"ipython": "ipykernel", "traitlets": "ipywidgets", "jupyter-client": "nbclient", "jupyter-server": "jupyterlab",

@@ -10,7 +10,7 @@ import pytest
 import epypes as ep
 from epypes.bundle import verify, write_back
 from epypes.bundle.load import read_bundle
-from epypes.bundle.seal import MANIFEST, MOST_BYTES
+from epypes.bundle.seal import MANIFEST, MOST_BYTES, seal
 from epypes.errors import BundleChanged, BundleError, DeployRefused
 from epypes.service import Service
 from tests.service.served import acting_bundle
@@ -47,6 +47,16 @@ def test_verify_runs_a_changed_bundle_anyway_if_it_is_asked_to_and_refuses_it_al
     with pytest.raises(BundleChanged, match="pipeline.py was changed.* It still computes what was recorded"):
         verify(tampered, run_anyway=True)
     assert (tmp_path / "ran").exists()
+
+
+def test_a_manifest_with_two_digests_for_a_file_is_refused(folder, tampered, tmp_path):
+    seal(tampered)
+    module = [line for line in (tampered / MANIFEST).read_text().splitlines() if line.endswith("  pipeline.py")]
+    with (folder / MANIFEST).open("a") as manifest:
+        manifest.write(f"{module[0]}\n")
+    with pytest.raises(BundleError, match="two digests for 'pipeline.py'"):
+        ep.load(folder)
+    assert not (tmp_path / "ran").exists()
 
 
 @pytest.mark.parametrize("use", [ep.load, lambda path: ep.load_pipeline(path, None, None), Service])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -25,12 +26,16 @@ DEEP = {
     "an array in a list of lists": (lambda: [[np.zeros(2)]], lambda x: set_item(x[0][0], 0, 1)),
     "an attribute": (Shape, lambda x: setattr(x, "points", [])),
     "a list in an attribute": (Shape, lambda x: x.points.append(3)),
+    "a key point": (lambda: [cv2.KeyPoint(1, 2, 3)], lambda x: setattr(x[0], "size", 9.0)),
+    "a match": (lambda: [cv2.DMatch(1, 2, 3)], lambda x: setattr(x[0], "queryIdx", 9)),
     "an object in an array": (lambda: np.array([[1], None], object), lambda x: x[0].append(3)),
 }
 
 
 def read(value):
     """Return all that a value holds as a text."""
+    if isinstance(value, list) and isinstance(value[0], cv2.KeyPoint | cv2.DMatch):
+        return repr([(getattr(one, "size", 0), getattr(one, "queryIdx", 0)) for one in value])
     return repr(value.points if isinstance(value, Shape) else value)
 
 
@@ -40,6 +45,12 @@ def graph(spoil, make=None):
         {"spoil": (("x", "k"), "none"), "read": (("x", "k"), "seen")},
     )
     return cg if make is None else cg | ep.CompGraph({"make": lambda n: make()}, {"make": ("n", "x")})
+
+
+def test_an_iterator_inside_an_input_that_is_read_names_function_and_token():
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": lambda x: list(x[0])}, {"f": ("x", "y")}), check_mutation=True)
+    with pytest.raises(InputMutated, match=r"'f' has read an iterator inside its input 'x', .* Make it a list"):
+        runner.run(x=[map(int, "12")])
 
 
 @pytest.mark.parametrize("deep", DEEP)

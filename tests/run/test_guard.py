@@ -245,3 +245,10 @@ except ValueError as error:
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "assignment destination is read-only [0. 0.]\n"
+
+
+def test_what_can_be_read_only_once_is_not_explained_as_a_write_to_a_read_only_input():
+    cg = ep.CompGraph({"pairs": lambda a, b: zip(a, b, strict=True)}, {"pairs": (("a", "b"), "c")})
+    with pytest.raises(ep.errors.IteratorRefused) as error:
+        ep.CompGraphRunner(cg).run(a=[1], b=[2])
+    assert not any("read-only" in note for note in error.value.__notes__)
