@@ -26,7 +26,8 @@ test: $(VENV)/.test chromium postgres brokers
 	@sh .ci/matrix $(BIN)/python 3.13 lowest
 	$(PYTEST) -m "not soak"
 
-# The long forms: every combination, long series, and far more examples for what searches at random. Takes hours.
+# The long forms: every combination, long series, and far more examples for what searches at random:
+# a quarter of an hour.
 soak: $(VENV)/.test chromium postgres brokers
 	EPYPES_SOAK=1 $(PYTEST) -m "soak or fuzz" -o timeout=3600 -o faulthandler_timeout=3000
 

@@ -57,10 +57,14 @@ def flat(piece: Piece) -> str:
 
 
 def width(text: str) -> int:
-    """Return how many columns text takes: two for a character of East Asia."""
-    if text.isascii():
-        return len(text)
-    return sum(2 if unicodedata.east_asian_width(character) in "WF" else 1 for character in text)
+    """Return how many columns text takes: two for a character of East Asia, none for a mark on the one before."""
+    return len(text) if text.isascii() else sum(map(_columns, text))
+
+
+def _columns(character: str) -> int:
+    if unicodedata.category(character) in ("Mn", "Me", "Cf"):
+        return 0
+    return 2 if unicodedata.east_asian_width(character) in "WF" else 1
 
 
 def fits(depth: int, text: str) -> bool:

@@ -138,3 +138,9 @@ def test_any_graph_written_as_a_function_computes_the_same(drawn, data):
     expected = tuple(run[token] for token in returned)
     assert repr(made) == repr(expected[0] if len(expected) == 1 else expected or None)
     assert logged == LOG
+
+
+def test_a_mark_takes_no_column_of_a_line():
+    cg = ep.CompGraph({"f": max}, {"f": (("x", "key"), "y")})
+    for count in range(40, 80):
+        assert ruff_says(ep.to_source(cg, {"key": "0" * count + "\u0941"})) == ""
