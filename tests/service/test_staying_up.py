@@ -244,7 +244,7 @@ def test_events_that_come_while_it_loads_wait_in_the_mailbox(acting):
     thread = threading.Thread(target=service.start)
     thread.start()
     try:
-        until(lambda: not service.service_state.failures.endswith("*"))
+        until(lambda: service.state != "STOPPED")
         with peer_of(service) as peer:
             assert peer.ask(number=5).parts["out"] == 10
     finally:
