@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 
-from epypes.wire.schema import message_class
+from epypes.wire.protobuf import message_class
 
 
 def mutate_bytes(data: bytes, rng: random.Random) -> bytes:

@@ -12,7 +12,7 @@ import pytest
 
 from epypes.errors import MessageError
 from epypes.wire import Envelope, FailureRecord, Limits, decode, encode
-from epypes.wire.schema import message_class
+from epypes.wire.protobuf import message_class
 from tests.wire.mutants import mutate_description, mutate_frames
 
 

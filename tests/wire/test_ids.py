@@ -6,8 +6,7 @@ import os
 import re
 import threading
 
-from epypes.wire import Envelope
-from epypes.wire.ids import new_id
+from epypes.wire import Envelope, new_id
 
 WAIT_S = 60.0
 

@@ -28,7 +28,7 @@ from epypes.wire import (
     parsed,
     save_sample,
 )
-from epypes.wire.schema import message_class
+from epypes.wire.protobuf import message_class
 
 PICKLERS = {"pickle", "marshal", "shelve", "dill", "cloudpickle", "joblib"}
 # What would read a pickle without importing one of them.

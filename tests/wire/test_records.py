@@ -12,8 +12,8 @@ import pytest
 
 from epypes.errors import MessageError
 from epypes.wire import Envelope, Limits, decode, encode, load_sample, save_sample
-from epypes.wire.records import record_fields
-from epypes.wire.schema import message_class
+from epypes.wire.opencv_pandas import record_fields
+from epypes.wire.protobuf import message_class
 
 
 def back(value, tmp_path, inline_below=8192):
