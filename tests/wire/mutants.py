@@ -1,4 +1,4 @@
-"""How is a message broken: in its frames, its bytes, or what it says of itself?"""
+"""Mutations of messages: of their frames, their bytes, their descriptions."""
 
 from __future__ import annotations
 

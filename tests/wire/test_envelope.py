@@ -1,4 +1,4 @@
-"""Is an envelope what its frames say, and are bad frames refused by a MessageError and nothing else?"""
+"""An envelope comes back from its frames; bad frames are refused by a MessageError and nothing else."""
 
 from __future__ import annotations
 
