@@ -8,9 +8,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from epypes.wire.codecs import set_order
-from epypes.wire.records import FIELDS, record_fields, record_type
-from epypes.wire.tables import is_table, table_parts
+from epypes.wire.encoder import set_sort_key
+from epypes.wire.opencv_pandas import FIELDS, is_table, record_fields, record_type, table_parts
 
 # As Python and OpenCV write them; other text may hold numbers that look alike.
 _ADDRESS: Final = re.compile(r"( at |< ?[\w.]+ )0x[0-9a-fA-F]+")
@@ -129,7 +128,7 @@ def _in_sequences(expected: Any, got: Any, tolerance: Tolerance | None, where: s
 
 
 def _in_sets(expected: Any, got: Any, tolerance: Tolerance | None, where: str) -> Iterator[Unlike]:
-    left, right = ({*map(set_order, items)} for items in (expected, got))
+    left, right = ({*map(set_sort_key, items)} for items in (expected, got))
     if left != right:
         yield _named(where, f"{sorted(left - right)!r:.60} in the set", f"{sorted(right - left)!r:.60}")
 

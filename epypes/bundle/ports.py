@@ -41,10 +41,10 @@ def payload_of(inputs: Sequence[str], rgb: Collection[str] = ()) -> Callable[[An
 
 def in_order(envelope: Envelope, rgb: Collection[str]) -> dict[str, Any]:
     """Return the parts of an envelope; images that came in another order than their token's are converted, once."""
-    from epypes.wire.arrays import recoloured
+    from epypes.wire.arrays import exchange_colours
 
     return {
-        token: value if (token in envelope.rgb) == (token in rgb) else recoloured(value)
+        token: value if (token in envelope.rgb) == (token in rgb) else exchange_colours(value)
         for token, value in envelope.parts.items()
     }
 

@@ -18,7 +18,8 @@ from typing import Any, Final
 
 from epypes.errors import MessageError
 from epypes.run.guard import is_array, is_plain_array
-from epypes.wire.codecs import to_value
+from epypes.wire.encoder import ValueWriter
+from epypes.wire.protobuf import message_class
 
 _BYTES: Final = 16
 _SHOWN: Final = 60
@@ -208,11 +209,12 @@ def _of_array(array: Any) -> bytes:
 
 
 def _of_wire(value: Any) -> bytes:
+    message, writer = message_class("epypes.v1.Value")(), ValueWriter()
     try:
-        message, payloads = to_value(value, "value")
+        writer.write_named(message, value, "value")
     except MessageError as error:
         raise Untold(f"a {type(value).__name__!r}") from error
-    beside = (_digest(payload.data) for payload in payloads)
+    beside = (_digest(payload.data) for payload in writer.payloads)
     return joined(_kind(value), message.SerializeToString(deterministic=True), *beside)
 
 

@@ -11,8 +11,7 @@ from epypes.errors import MailboxOverflow, MessageError, ServiceError
 from epypes.run import Failure
 from epypes.service.failures.record import FailureRecord
 from epypes.service.ledger import Entry, Outcome
-from epypes.wire import Envelope
-from epypes.wire.failures import failure_event
+from epypes.wire import Envelope, failure_event
 
 FAILURE_TOPIC: Final = "failure"
 Kind = Literal["raised", "killed", "stuck", "dropped", "exhausted"]

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 
 from epypes.errors import MessageError
 from epypes.run import Failure
-from epypes.wire import Envelope, Limits, decode, encode, failure_event, serialized
-from epypes.wire.multipart import Stamp
+from epypes.wire import EncodedEnvelope, Envelope, Limits, decode, failure_event, serialized
 
 Frames = Sequence[bytes | memoryview]
 
@@ -69,8 +68,8 @@ class Framing:
     def _envelope_frames(self, envelope: Envelope) -> Frames:
         check_source(envelope.source)
         number = self._sequences[envelope.source] + 1
-        stamp = Stamp(self._epoch, number, time.time_ns())
-        frames = encode(envelope, self._topic, limits=self._limits, stamp=stamp)
+        encoded = EncodedEnvelope.encode(envelope, self._topic, limits=self._limits)
+        frames = encoded.stamped(self._epoch, number, time.time_ns()).frames
         # Counted when it can be sent: a rejected item is no loss on the way.
         self._sequences[envelope.source] = number
         return frames

@@ -24,9 +24,8 @@ from epypes.transport.channels.seam import Frames
 from epypes.transport.connection import Connection
 from epypes.transport.forked import forget_in_child
 from epypes.transport.framing import Framing
-from epypes.wire import Envelope, Limits, failure_event
-from epypes.wire.arrays import is_settled
-from epypes.wire.ids import new_id
+from epypes.wire import Envelope, Limits, failure_event, new_id
+from epypes.wire.arrays import is_immutable
 
 log = logging.getLogger("epypes.transport")
 
@@ -381,7 +380,7 @@ def _own(frame: bytes | memoryview) -> bytes | memoryview:
     if isinstance(frame, bytes) or isinstance(frame.obj, bytes):
         return frame
     # An array can only be under it if somebody has imported numpy.
-    return frame if "numpy" in sys.modules and is_settled(frame) else bytes(frame)
+    return frame if "numpy" in sys.modules and is_immutable(frame) else bytes(frame)
 
 
 def _tell(then: Then, error: Exception | None) -> None:

@@ -20,7 +20,7 @@ from epypes.transport.joining import Doorkeeper
 from epypes.transport.security import Security
 from epypes.transport.throttle import Throttle
 from epypes.wire import Limits
-from epypes.wire.arrays import is_settled
+from epypes.wire.arrays import is_immutable
 
 log = logging.getLogger("epypes.transport")
 
@@ -215,7 +215,7 @@ def _can_be_lent(frame: bytes | memoryview) -> bool:
     """Return whether ZeroMQ may read a frame later: if it is worth it, and nobody can change it meanwhile."""
     if len(frame) < _LENT_FROM_BYTES:
         return False
-    return isinstance(frame, bytes) or is_settled(frame)
+    return isinstance(frame, bytes) or is_immutable(frame)
 
 
 def _break_off(socket: io.Socket, frames: Frames) -> None:

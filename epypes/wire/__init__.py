@@ -1,4 +1,4 @@
-"""How a value travels: the v1 envelope, the codecs, the messages of 2019, samples in files.
+"""Messages: the v1 envelope and its values, the messages published in 2019, samples in files.
 
 Neither protobuf nor numpy is imported before it is needed.
 """
@@ -8,15 +8,14 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from epypes.optional import optional_import
-
 if TYPE_CHECKING:
-    from epypes.wire.attribute_list import add_attribute, attributes
-    from epypes.wire.complete import parsed, serialized
-    from epypes.wire.envelope import Envelope, FailureRecord
-    from epypes.wire.failures import failure_event
+    from epypes.wire.decoder import decode
+    from epypes.wire.encoded_envelope import EncodedEnvelope
+    from epypes.wire.encoder import encode, topic_frame
+    from epypes.wire.envelope import Envelope, FailureRecord, failure_event, new_id
     from epypes.wire.limits import Limits
-    from epypes.wire.messages2019 import (
+    from epypes.wire.protobuf import parsed, serialized
+    from epypes.wire.published2019 import (
         Attribute,
         AttributeList,
         Event,
@@ -25,13 +24,15 @@ if TYPE_CHECKING:
         JustBytes,
         TimeStamp,
         TimeStampList,
+        add_attribute,
+        attributes,
     )
-    from epypes.wire.multipart import decode, encode, topic_frame
     from epypes.wire.samples import load_sample, save_sample
 
 __all__ = [
     "Attribute",
     "AttributeList",
+    "EncodedEnvelope",
     "Envelope",
     "Event",
     "FailureRecord",
@@ -47,35 +48,31 @@ __all__ = [
     "encode",
     "failure_event",
     "load_sample",
+    "new_id",
     "parsed",
     "save_sample",
     "serialized",
     "topic_frame",
 ]
 
-_HOME = {
-    "Envelope": "envelope",
-    "FailureRecord": "envelope",
-    "Limits": "limits",
-    "add_attribute": "attribute_list",
-    "attributes": "attribute_list",
-    "decode": "multipart",
-    "encode": "multipart",
-    "failure_event": "failures",
-    "load_sample": "samples",
-    "parsed": "complete",
-    "save_sample": "samples",
-    "serialized": "complete",
-    "topic_frame": "multipart",
+_MODULES = {
+    "decoder": ("decode",),
+    "encoded_envelope": ("EncodedEnvelope",),
+    "encoder": ("encode", "topic_frame"),
+    "envelope": ("Envelope", "FailureRecord", "failure_event", "new_id"),
+    "limits": ("Limits",),
+    "protobuf": ("parsed", "serialized"),
+    "samples": ("load_sample", "save_sample"),
 }
+# published2019 has all other names.
+_HOME = {name: module for module, names in _MODULES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    with optional_import():
-        found = getattr(importlib.import_module(f"epypes.wire.{_HOME.get(name, 'messages2019')}"), name)
-    # So that the next look-up does not come here.
+    found = getattr(importlib.import_module(f"epypes.wire.{_HOME.get(name, 'published2019')}"), name)
+    # The next look-up finds it without this function.
     globals()[name] = found
     return found
 

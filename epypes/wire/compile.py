@@ -1,4 +1,4 @@
-"""How is ``schema.binpb`` made from ``proto/``? By ``python -m epypes.wire.compile``."""
+"""Compiler of ``proto/`` into ``schema.binpb``: ``python -m epypes.wire.compile``."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import logging
 import tempfile
 from pathlib import Path
 
+from epypes.wire.protobuf import SCHEMA_PATH
+
 PROTO_FILES = ("epypes2019/messages.proto", "epypes/v1/envelope.proto")
-SCHEMA_PATH = Path(__file__).with_name("schema.binpb")
 
 log = logging.getLogger("epypes.wire")
 

@@ -1,18 +1,57 @@
-"""What is a v1 message? An Envelope: named values, and where they come from."""
+"""The v1 message as Python objects: Envelope, the failure it may report, and ids of new messages."""
 
 from __future__ import annotations
 
+import contextlib
+import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Final
 
-from epypes.wire.ids import new_id
+from epypes.run import Failure
+
+# The type of an envelope that reports a failure.
+FAILURE: Final = "epypes.failure"
+# Fields of one name and meaning in Envelope, in EncodedEnvelope and in the protobuf message.
+SCALAR_FIELDS: Final = (
+    "id",
+    "type",
+    "source",
+    "epoch",
+    "sequence",
+    "acquired_ns",
+    "published_ns",
+    "correlation_id",
+    "revision",
+    "bundle_digest",
+)
+_EMPTY: Final[Mapping[str, Any]] = MappingProxyType({})
+_FAILURE_CHARACTERS: Final = 2_000
+_ID_BYTES: Final = 16
+# A call of the kernel releases the interpreter's lock, and the caller then waits to get it back: so many ids per call.
+_IDS_PER_CALL: Final = 256
+_unused_ids: Final[list[str]] = []
+
+
+def new_id() -> str:
+    """Return 32 random hexadecimal digits; from any thread."""
+    while True:
+        try:
+            return _unused_ids.pop()
+        except IndexError:
+            digits, size = os.urandom(_ID_BYTES * _IDS_PER_CALL).hex(), 2 * _ID_BYTES
+            _unused_ids.extend(digits[begin : begin + size] for begin in range(0, len(digits), size))
+
+
+# A forked child must not use the ids that its parent will use.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_unused_ids.clear)
 
 
 @dataclass(frozen=True, slots=True)
 class FailureRecord:
-    """What is sent of a failure.
+    """A failure as a message reports it.
 
     Attributes
     ----------
@@ -25,9 +64,9 @@ class FailureRecord:
     message
         Its text.
     input_id
-        Id of the envelope that was worked on.
+        Id of the envelope that was processed.
     attempt
-        From 1; 0 is "not counted".
+        Count of attempts, from 1; 0 is "not counted".
     """
 
     function: str
@@ -38,26 +77,23 @@ class FailureRecord:
     attempt: int = 0
 
 
-_NOTHING: Mapping[str, Any] = MappingProxyType({})
-
-
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Envelope:
-    """A v1 message: named values, and where they come from. Its mappings are read-only.
+    """A v1 message: named values and their origin. Its mappings are read-only.
 
     Attributes
     ----------
     type
-        What kind of event it is, as the user names them.
+        The kind of event, in the user's own terms.
     parts
-        The values by name: None, bool, int, float, str, bytes, list, tuple, dict, numpy array or numpy scalar.
+        The values by name, of any type that `encode` takes.
     id
         Unique; a new one unless given.
     source
-        Who sent it.
+        Name of the sender.
     epoch, sequence
-        Start of the publisher (Unix time, ns) and a count that rises by 1 from 1: so that loss becomes visible.
-        The publisher stamps them.
+        Start of the publisher (Unix time, ns) and a count that rises by 1 from 1, so that a subscriber detects loss.
+        The publisher sets them.
     acquired_ns, published_ns
         Unix time in nanoseconds; 0 is "not known".
     correlation_id
@@ -67,11 +103,11 @@ class Envelope:
     bundle_digest
         Digest of the bundle that computed them.
     attributes
-        Small values by name, as those of parts.
+        Small values by name, of the same types as those of parts.
     timings
         Durations by function name, in nanoseconds.
     failure
-        None, or what failed.
+        None, or the failure that this envelope reports.
     rgb
         Names of the parts whose images have three or four channels in RGB order; those of all others are BGR.
     """
@@ -95,8 +131,8 @@ class Envelope:
     def __post_init__(self) -> None:
         put = object.__setattr__
         put(self, "parts", MappingProxyType(dict(self.parts)))
-        put(self, "attributes", MappingProxyType(dict(self.attributes)) if self.attributes else _NOTHING)
-        put(self, "timings", MappingProxyType(dict(self.timings)) if self.timings else _NOTHING)
+        put(self, "attributes", MappingProxyType(dict(self.attributes)) if self.attributes else _EMPTY)
+        put(self, "timings", MappingProxyType(dict(self.timings)) if self.timings else _EMPTY)
         put(self, "rgb", frozenset((self.rgb,) if isinstance(self.rgb, str) else self.rgb))
 
     def __repr__(self) -> str:
@@ -104,3 +140,47 @@ class Envelope:
         names = ", ".join(map(str, self.parts)) or "no parts"
         text = f"<Envelope {str(self.type)[:20]!r}{number}: {names}"
         return f"{text[:95]}...>" if len(text) > 97 else f"{text}>"
+
+
+def scalar_fields(message: Any) -> dict[str, Any]:
+    """Return the SCALAR_FIELDS of an Envelope, an EncodedEnvelope or a protobuf message, by name."""
+    return {name: getattr(message, name) for name in SCALAR_FIELDS}
+
+
+def failure_event(failure: Failure, source: str = "", bundle_digest: str = "") -> Envelope:
+    """Return the Envelope that reports a failure; its correlation id is the id of the event that failed.
+
+    Parameters
+    ----------
+    failure
+        The failure.
+    source
+        Name of the sender; by default the failure's own source.
+    bundle_digest
+        Digest of the bundle that was run, if it was one.
+    """
+    input_id = _sendable(failure.event_id)
+    record = FailureRecord(
+        function=_sendable(failure.function),
+        tokens=tuple(map(_sendable, failure.tokens)),
+        exception=_sendable(failure.kind),
+        message=_sendable(" | ".join([failure.message, *_notes(failure.exception)])),
+        input_id=input_id,
+        attempt=failure.attempt,
+    )
+    sender = _sendable(source or failure.source)
+    return Envelope(FAILURE, source=sender, correlation_id=input_id, bundle_digest=bundle_digest, failure=record)
+
+
+def _notes(exception: BaseException) -> list[str]:
+    # The exception's own attributes are user code, which may raise anything.
+    with contextlib.suppress(BaseException):
+        notes = getattr(exception, "__notes__", None)
+        if isinstance(notes, list):
+            return [str.__str__(note) for note in list.__iter__(notes) if isinstance(note, str)]
+    return []
+
+
+def _sendable(text: str) -> str:
+    """Return text cut to the length of a report, without lone surrogates, which no message can hold."""
+    return text[:_FAILURE_CHARACTERS].encode("utf-8", "replace").decode("utf-8")

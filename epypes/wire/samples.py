@@ -1,8 +1,8 @@
-"""How are recorded values kept in a file? As an .npz that numpy alone can open.
+"""Recorded values in a file: an .npz archive that numpy alone can open.
 
 Every array is an entry of its own with a readable name (``inputs.image``, ``outputs.keypoints.0``); the entry
-``description`` holds the rest as JSON. The same values give the same bytes, so that a bundle can be sealed and
-a change can be seen in version control.
+``description`` holds the rest as JSON. The same values give the same bytes, so that the manifest of a bundle and
+version control see every change.
 """
 
 from __future__ import annotations
@@ -19,32 +19,23 @@ from typing import TYPE_CHECKING, Any
 from epypes.errors import MessageError
 from epypes.optional import optional_import
 from epypes.wire.arrays import flat_bytes
-from epypes.wire.codecs import Payload, to_value
+from epypes.wire.decoder import ValueReader
+from epypes.wire.encoder import Payload, ValueWriter
 from epypes.wire.limits import Limits
-from epypes.wire.reading import Reader
-from epypes.wire.schema import message_class
+from epypes.wire.protobuf import message_class
 
 if TYPE_CHECKING:
     from epypes.wire.arrays import AnyArray
 
 FORMAT = 1
 _DESCRIPTION = "description"
+_SIDES = ("inputs", "outputs")
 # A zip entry carries a time; a fixed one makes the file depend on its values alone.
 _EPOCH = (1980, 1, 1, 0, 0, 0)
-# A sample is the user's own file, not a stranger's message: any number of arrays and keys may be in it.
+# A sample is the user's own file, not a peer's message: it may hold any number of arrays and keys.
 _LIMITS = Limits(frames=2**31, parts=2**31, keys=2**31)
-# What zipfile and numpy raise for broken files; RuntimeError for encrypted or unknown compression.
-_BROKEN = (
-    OSError,
-    ValueError,
-    TypeError,
-    LookupError,
-    EOFError,
-    AttributeError,
-    MemoryError,
-    RuntimeError,
-    zipfile.BadZipFile,
-)
+# Errors of zipfile and numpy for broken files; RuntimeError for encryption or an unknown compression.
+_BROKEN = (OSError, ValueError, TypeError, LookupError, EOFError, AttributeError, MemoryError, RuntimeError)
 
 
 def save_sample(
@@ -55,7 +46,7 @@ def save_sample(
     Parameters
     ----------
     path
-        The file, with its suffix; one that exists is replaced.
+        The file, with its suffix; an existing one is replaced.
     inputs, outputs
         Values by token name, of the types that `epypes.wire.encode` takes.
     rgb
@@ -68,77 +59,35 @@ def save_sample(
     OSError
         If the file can't be written.
     """
+    import numpy as np
+
     with optional_import():
         from google.protobuf.json_format import MessageToDict
 
-    entries: dict[str, AnyArray] = {}
-    described: dict[str, Any] = {"format": FORMAT, "arrays": []}
-    for side, values in (("inputs", inputs), ("outputs", outputs)):
+    writer = ValueWriter(_LIMITS, inline_below=0)
+    arrays: dict[str, AnyArray] = {}
+    described: dict[str, Any] = {"format": FORMAT}
+    for side, values in zip(_SIDES, (inputs, outputs), strict=True):
         described[side] = []
         for name, value in values.items():
-            order = "rgb" if name in rgb else "bgr"
-            message, payloads = to_value(
-                value, name, inline_below=0, order=order, first_frame=len(entries), limits=_LIMITS
-            )
+            message = message_class("epypes.v1.Value")()
+            writer.write_named(message, value, name, "rgb" if name in rgb else "bgr")
             described[side].append([name, MessageToDict(message, preserving_proto_field_name=True)])
-            for payload in payloads:
-                entries[_entry_name(side, payload, entries)] = _as_array(payload)
-    described["arrays"] = list(entries)
+        for payload in writer.payloads[len(arrays) :]:
+            arrays[_entry_name(side, payload, arrays)] = _as_array(payload)
+    described["arrays"] = list(arrays)
     text = json.dumps(described, sort_keys=True, indent=1, ensure_ascii=True)
-    _write_npz(Path(path), entries, text)
-
-
-def load_sample(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the inputs and the outputs of a file that `save_sample` wrote; arrays are read-only.
-
-    Raises
-    ------
-    MessageError
-        Of reason ``"bad sample"`` if the file is missing, broken or something else; no pickle is ever read.
-    """
-    try:
-        return _load(Path(path))
-    except MessageError as error:
-        raise MessageError("bad sample", f"{path} is no sample of EPypes: {error}") from error
-    except (*_BROKEN, zlib.error) as error:
-        raise MessageError("bad sample", f"{path} is no sample of EPypes: {error}") from error
-
-
-def _load(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    # Not np.load: it leaves the file open when the archive is broken.
-    with path.open("rb") as file, zipfile.ZipFile(file) as archive:
-        described = json.loads(str(_read_entry(archive, _DESCRIPTION)[()]))
-        if described["format"] != FORMAT:
-            raise ValueError(f"its format is {described['format']!r}, and this version reads {FORMAT}")
-        views = [flat_bytes(_read_entry(archive, name)) for name in described["arrays"]]
-    reader = Reader(views, _LIMITS)
-    inputs, outputs = (dict(_read_side(reader, described[side])) for side in ("inputs", "outputs"))
-    reader.check_all_used()
-    return inputs, outputs
-
-
-def _read_entry(archive: zipfile.ZipFile, name: str) -> AnyArray:
-    import numpy as np
-
-    with archive.open(f"{name}.npy") as entry:
-        array: AnyArray = np.lib.format.read_array(entry, allow_pickle=False)
-        return array
-
-
-def _read_side(reader: Reader, entries: Any) -> Iterator[tuple[str, Any]]:
-    with optional_import():
-        from google.protobuf.json_format import ParseDict, ParseError
-
-    for name, value in entries:
-        try:
-            message = ParseDict(value, message_class("epypes.v1.Value")())
-        except ParseError as error:
-            raise MessageError("bad sample", f"{name!r} is not described: {error}") from error
-        yield name, reader.read(message, (name,))
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, array in {_DESCRIPTION: np.array(text), **arrays}.items():
+            buffer = io.BytesIO()
+            np.lib.format.write_array(buffer, array, allow_pickle=False)
+            info = zipfile.ZipInfo(f"{name}.npy", _EPOCH)
+            info.compress_type = zipfile.ZIP_DEFLATED
+            archive.writestr(info, buffer.getvalue())
 
 
 def _entry_name(side: str, payload: Payload, taken: Mapping[str, object]) -> str:
-    # Readable in any zip tool: the path, without what file systems refuse.
+    # The path, readable in any zip tool, without the characters that file systems refuse.
     name = ".".join([side, *(re.sub(r"[^\w-]+", "_", str(step))[:80] for step in payload.path)])
     unique, count = name, 1
     while unique in taken:
@@ -155,13 +104,44 @@ def _as_array(payload: Payload) -> AnyArray:
     return np.ascontiguousarray(payload.data).reshape(payload.data.shape)
 
 
-def _write_npz(path: Path, entries: Mapping[str, AnyArray], description: str) -> None:
+def load_sample(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the inputs and the outputs of a file that `save_sample` wrote; arrays are read-only.
+
+    Raises
+    ------
+    MessageError
+        Of reason ``"bad sample"`` if the file is missing, broken or no sample; no pickle is ever read.
+    """
+    try:
+        # Not np.load: it leaves the file open when the archive is broken.
+        with Path(path).open("rb") as file, zipfile.ZipFile(file) as archive:
+            described = json.loads(str(_read_entry(archive, _DESCRIPTION)[()]))
+            if described["format"] != FORMAT:
+                raise ValueError(f"its format is {described['format']!r}, and this version reads {FORMAT}")
+            views = [flat_bytes(_read_entry(archive, name)) for name in described["arrays"]]
+        reader = ValueReader(views, _LIMITS)
+        inputs, outputs = (dict(_read_side(reader, described[side])) for side in _SIDES)
+        reader.check_all_used()
+    except (MessageError, zipfile.BadZipFile, zlib.error, *_BROKEN) as error:
+        raise MessageError("bad sample", f"{path} is no sample of EPypes: {error}") from error
+    return inputs, outputs
+
+
+def _read_entry(archive: zipfile.ZipFile, name: str) -> AnyArray:
     import numpy as np
 
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, array in {_DESCRIPTION: np.array(description), **entries}.items():
-            buffer = io.BytesIO()
-            np.lib.format.write_array(buffer, array, allow_pickle=False)
-            info = zipfile.ZipInfo(f"{name}.npy", _EPOCH)
-            info.compress_type = zipfile.ZIP_DEFLATED
-            archive.writestr(info, buffer.getvalue())
+    with archive.open(f"{name}.npy") as entry:
+        array: AnyArray = np.lib.format.read_array(entry, allow_pickle=False)
+        return array
+
+
+def _read_side(reader: ValueReader, entries: Any) -> Iterator[tuple[str, Any]]:
+    with optional_import():
+        from google.protobuf.json_format import ParseDict, ParseError
+
+    for name, value in entries:
+        try:
+            message = ParseDict(value, message_class("epypes.v1.Value")())
+        except ParseError as error:
+            raise MessageError("bad sample", f"the description of {name!r} is damaged: {error}") from error
+        yield name, reader.read_named(message, name)

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 import epypes as ep
-from epypes.wire.failures import failure_event
+from epypes.wire import failure_event
 
 TIMEOUT_S = 60.0
 

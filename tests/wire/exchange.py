@@ -1,4 +1,4 @@
-"""What does this version of protobuf make of the same values, and of bytes that another version made?
+"""Exchange of messages between two versions of protobuf.
 
 Run as a script it needs numpy and protobuf alone: it reads bytes from another version on standard input, checks that
 they mean the same here, and prints its own.
@@ -167,8 +167,8 @@ def main(order: str) -> None:
     check(json.load(sys.stdin))
     if order == "ours first":
         users_own()
-    said = {"protobuf": google.protobuf.__version__, "made_by": api_implementation.Type(), "refusals": refusals()}
-    json.dump({**said, "made": made()}, sys.stdout)
+    report = {"protobuf": google.protobuf.__version__, "made_by": api_implementation.Type(), "refusals": refusals()}
+    json.dump({**report, "made": made()}, sys.stdout)
 
 
 if __name__ == "__main__":

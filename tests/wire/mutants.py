@@ -1,10 +1,10 @@
-"""How is a message broken: in its frames, its bytes, or what it says of itself?"""
+"""Mutations of messages: of their frames, their bytes, their descriptions."""
 
 from __future__ import annotations
 
 import random
 
-from epypes.wire.schema import message_class
+from epypes.wire.protobuf import message_class
 
 
 def mutate_bytes(data: bytes, rng: random.Random) -> bytes:

@@ -9,7 +9,7 @@ import pytest
 
 from epypes.errors import MessageError
 from epypes.wire import Envelope, Limits, decode, encode
-from epypes.wire.schema import message_class
+from epypes.wire.protobuf import message_class
 
 # Multiples of this number all have the hash 0.
 MODULUS = 2**61 - 1

@@ -1,4 +1,4 @@
-"""Is an envelope what its frames say, and are bad frames refused by a MessageError and nothing else?"""
+"""An envelope comes back from its frames; bad frames are refused by a MessageError and nothing else."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from epypes.errors import MessageError
 from epypes.wire import Envelope, FailureRecord, Limits, decode, encode
-from epypes.wire.schema import message_class
+from epypes.wire.protobuf import message_class
 from tests.wire.mutants import mutate_description, mutate_frames
 
 

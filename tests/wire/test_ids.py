@@ -1,4 +1,4 @@
-"""What new messages are called."""
+"""Ids of new messages."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import os
 import re
 import threading
 
-from epypes.wire import Envelope
-from epypes.wire.ids import new_id
+from epypes.wire import Envelope, new_id
 
 WAIT_S = 60.0
 
@@ -17,7 +16,7 @@ def test_an_id_is_32_hexadecimal_digits():
     assert re.fullmatch("[0-9a-f]{32}", Envelope(type="image").id)
 
 
-def test_no_two_are_alike_whichever_thread_asks():
+def test_ids_are_unique_over_threads():
     found: list[list[str]] = [[] for _ in range(8)]
 
     def ask(mine: list[str]) -> None:
@@ -31,7 +30,7 @@ def test_no_two_are_alike_whichever_thread_asks():
     assert len(set().union(*found)) == 16_000
 
 
-def test_a_forked_child_gives_other_names_than_its_parent():
+def test_a_forked_child_makes_other_ids_than_its_parent():
     # So that there are some left.
     new_id()
     read, write = os.pipe()
@@ -40,8 +39,8 @@ def test_a_forked_child_gives_other_names_than_its_parent():
         os.write(write, "".join(new_id() for _ in range(100)).encode())
         os._exit(0)
     os.close(write)
-    with os.fdopen(read) as told:
-        text = told.read()
+    with os.fdopen(read) as stream:
+        text = stream.read()
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
     its = {text[begin : begin + 32] for begin in range(0, len(text), 32)}
     assert len(its) == 100

@@ -1,4 +1,4 @@
-"""Do all versions of protobuf that a user may have make the same bytes, and understand each other's?"""
+"""All supported versions of protobuf make the same bytes and read those of the others."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.packaging
 
 ROOT = Path(__file__).parents[2]
 VERSIONS = ["4.25", "5.29", "6", "7"]
-# As uv says it, alone or among others; anything else that goes wrong is a failure.
+# The texts of uv; any other error is a failure of the test.
 NO_WHEEL = ("has no usable wheels", "has no wheels with a matching Python")
 
 

@@ -1,4 +1,4 @@
-"""Is a recorded sample a file that numpy can open, the same every time?"""
+"""A recorded sample is a file that numpy can open, with the same bytes every time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Does every value come back exactly as it was?"""
+"""Every value comes back exactly as it was."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_an_image_travels_with_its_colour_order():
 
 
 @pytest.mark.parametrize("inline_below", [0, 8192])
-def test_the_receiver_is_told_which_parts_are_rgb_and_nothing_is_converted(inline_below):
+def test_the_receiver_knows_which_parts_are_rgb_and_nothing_is_converted(inline_below):
     image = np.arange(2 * 3 * 4, dtype=np.uint16).reshape(2, 3, 4)
     parts = {"left": image, "right": image, "both": [image, {"mask": image[:, :, 0]}], "depth": image[:, :, 0]}
     sent = Envelope("", parts, attributes={"right": image}, rgb=["left", "both", "depth"])

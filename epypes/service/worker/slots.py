@@ -24,8 +24,7 @@ from epypes.service.channel import Channel
 from epypes.service.packing import BytesLike
 from epypes.service.worker.inbox import Event, Inbox
 from epypes.service.worker.traces import failure_told
-from epypes.wire import Envelope, decode, encode, serialized
-from epypes.wire.failures import failure_event
+from epypes.wire import Envelope, decode, encode, failure_event, serialized
 
 _LOG: Final = logging.getLogger("epypes.service")
 

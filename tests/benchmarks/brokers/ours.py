@@ -13,8 +13,7 @@ import numpy as np
 
 import epypes as ep
 from epypes.transport.channels import Channel, is_brokered, open_channel
-from epypes.wire import Envelope
-from epypes.wire.ids import new_id
+from epypes.wire import Envelope, new_id
 from tests.benchmarks.brokers.parties import DEADLINE_S, PREFETCH, Meeting, keep_busy
 from tests.benchmarks.work import passed
 

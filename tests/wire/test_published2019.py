@@ -1,4 +1,4 @@
-"""Can a peer built on the published library be talked to?"""
+"""The messages of 2019 have the published bytes, so that peers built on the published library understand them."""
 
 from __future__ import annotations
 
@@ -271,7 +271,7 @@ def test_a_users_own_messages_of_the_same_names_do_not_clash(order):
     subprocess.run([sys.executable, "-c", USER + order], check=True, timeout=60)
 
 
-def test_help_tells_of_the_messages_and_their_fields():
+def test_help_lists_the_messages_and_their_fields():
     import pydoc
 
     from epypes import wire

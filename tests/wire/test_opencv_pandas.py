@@ -1,4 +1,4 @@
-"""Do the objects of OpenCV and the tables of pandas come back as they were, and is what can't be one refused?"""
+"""Objects of OpenCV and tables of pandas come back as they were; what can't be one is refused."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import pytest
 
 from epypes.errors import MessageError
 from epypes.wire import Envelope, Limits, decode, encode, load_sample, save_sample
-from epypes.wire.records import record_fields
-from epypes.wire.schema import message_class
+from epypes.wire.protobuf import message_class
 
 
 def back(value, tmp_path, inline_below=8192):
@@ -21,6 +20,12 @@ def back(value, tmp_path, inline_below=8192):
     frames = [bytes(frame) for frame in encode(Envelope("", {"value": value}), inline_below=inline_below)]
     save_sample(tmp_path / "s.npz", {"value": value}, {})
     return decode(frames).parts["value"], load_sample(tmp_path / "s.npz")[0]["value"]
+
+
+def record_fields(record):
+    if isinstance(record, cv2.DMatch):
+        return (record.queryIdx, record.trainIdx, record.imgIdx, record.distance)
+    return (*record.pt, record.size, record.angle, record.response, record.octave, record.class_id)
 
 
 def plain(value):
@@ -201,13 +206,13 @@ def test_the_bytes_of_a_set_do_not_depend_on_the_seed_of_hashes():
         "import sys; from epypes.wire import Envelope, encode; "
         "print(encode(Envelope('', id='x', parts={'v': {'a', 'b', 'c', frozenset({'d', 'e'}), b'f', None}}))[1].hex())"
     )
-    said = {
+    outputs = {
         subprocess.run(
             [sys.executable, "-c", code], capture_output=True, text=True, check=True, env={"PYTHONHASHSEED": seed}
         ).stdout
         for seed in ("0", "1", "2")
     }
-    assert len(said) == 1
+    assert len(outputs) == 1
 
 
 def test_what_is_read_where_opencv_or_pandas_is_missing_says_so(monkeypatch):
