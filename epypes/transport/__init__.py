@@ -10,7 +10,7 @@ from epypes.optional import optional_import
 if TYPE_CHECKING:
     from epypes.transport.addresses import check_bind, is_loopback, is_loopback_host
     from epypes.transport.keys import Keys, make_keys, read_keys
-    from epypes.transport.mcapreader import RecordingInfo, recording_info
+    from epypes.transport.mcap import RecordingInfo, recording_info
     from epypes.transport.playing import Player
     from epypes.transport.publisher import ZMQPublisher
     from epypes.transport.receiving import Subscriber
@@ -40,7 +40,7 @@ _HOME = {
     "Player": "playing",
     "Publisher": "sending",
     "Recorder": "recording",
-    "RecordingInfo": "mcapreader",
+    "RecordingInfo": "mcap",
     "Subscriber": "receiving",
     "ZMQPublisher": "publisher",
     "ZMQSubscriber": "subscriber",
@@ -49,7 +49,7 @@ _HOME = {
     "is_loopback_host": "addresses",
     "make_keys": "keys",
     "read_keys": "keys",
-    "recording_info": "mcapreader",
+    "recording_info": "mcap",
 }
 
 

@@ -22,7 +22,7 @@ from epypes.transport import io
 from epypes.transport.guard import SUBSCRIPTION_OPTIONS
 from epypes.transport.joining import Doorkeeper
 from epypes.transport.keys import Keys, PublicKey
-from epypes.transport.mcapreader import BrokenOff, Recorded, messages
+from epypes.transport.mcap import BrokenOff, Recorded, messages
 from epypes.transport.security import Security, security
 from epypes.transport.within import Within
 
