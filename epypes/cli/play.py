@@ -34,7 +34,7 @@ def play(
     only_info: Annotated[bool, typer.Option("--info", help="Send nothing; print what is in the file.")] = False,
 ) -> None:
     """Publish the messages of a file as they came, at the same distances in time."""
-    from epypes.service.signals import Signals
+    from epypes.service.serving import SignalWait
     from epypes.transport import Player, recording_info
 
     if only_info:
@@ -44,7 +44,7 @@ def play(
         raise RecordingError(file, "--speed inf is no speed. 0 is as fast as possible.")
     place = address.removeprefix(_CONNECT)
     bind = not address.startswith(_CONNECT)
-    with Signals() as signals:
+    with SignalWait() as signals:
         player = Player(
             file,
             place,

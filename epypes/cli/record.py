@@ -31,7 +31,7 @@ def record(
     allow: Allow = None,
 ) -> None:
     """Write every message that is published into a file, until SIGTERM or Ctrl+C."""
-    from epypes.service.signals import Signals
+    from epypes.service.serving import SignalWait
     from epypes.transport import Recorder
 
     if seconds is not None and seconds > threading.TIMEOUT_MAX:
@@ -39,7 +39,7 @@ def record(
         raise RecordingError(file, text)
     bind = address.startswith(_BIND)
     place = address.removeprefix(_BIND)
-    with Signals() as signals:
+    with SignalWait() as signals:
         recorder = Recorder(
             place,
             file,

@@ -14,7 +14,7 @@ from epypes.cli.options import Allow, Keys
 from epypes.cli.terminal import failures_at, out
 
 if TYPE_CHECKING:
-    from epypes.service.state import ServiceState
+    from epypes.service.state_file import ServiceState
 
 _ANY_PORT = "tcp://127.0.0.1:*"
 
@@ -64,9 +64,6 @@ def serve(
     replica: Annotated[
         str, typer.Option(help="What it is called among those that share a broker's queue; a number without.")
     ] = "",
-    ordered: Annotated[
-        bool, typer.Option("--ordered", help="Keep the order of events over all replicas of a broker's queue.")
-    ] = False,
 ) -> None:
     """Serve a bundle between a SUB and a PUB socket, or a broker's queues, until SIGTERM or Ctrl+C.
 
@@ -78,7 +75,7 @@ def serve(
     vhost=NAME, ca=FILE.
     """
     from epypes.service import serve as serve_bundle
-    from epypes.service.words import STANDARD_ERROR
+    from epypes.service.standard_error import STANDARD_ERROR
 
     # Nobody may read it: no thread of the service waits for that.
     handler = logging.StreamHandler(cast("TextIO", STANDARD_ERROR))
@@ -124,7 +121,6 @@ def serve(
         allow=allow,
         store=store,
         replica=replica,
-        ordered=ordered,
         on_ready=on_ready,
         on_fault=on_fault,
     )

@@ -11,7 +11,7 @@ from epypes.errors import KeysError, ServiceError
 
 if TYPE_CHECKING:
     from epypes.service.remote.connection import Connection
-    from epypes.service.state import ServiceState
+    from epypes.service.state_file import ServiceState
 
 Source = Annotated[str, typer.Argument(help="The bundle that is served, or the http URL of its service.")]
 TokenFile = Annotated[
@@ -43,7 +43,7 @@ def states_of(source: str, replica: str = "") -> list[ServiceState]:
     ServiceError
         None runs for this bundle, or at this address.
     """
-    from epypes.service.state import read_states, running_at
+    from epypes.service.state_file import read_states, running_at
 
     if is_url(source):
         at = running_at(source)

@@ -13,7 +13,7 @@ from epypes.cli.terminal import failures_at, out
 from epypes.errors import EpypesError
 
 if TYPE_CHECKING:
-    from epypes.service.state import ServiceState
+    from epypes.service.state_file import ServiceState
 
 _COUNTS = ("received", "answered", "failed", "dropped", "waiting")
 # What is counted besides where a broker delivers the events.

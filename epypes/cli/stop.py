@@ -16,7 +16,7 @@ from epypes.cli.terminal import out
 from epypes.errors import ServiceError
 
 if TYPE_CHECKING:
-    from epypes.service.state import ServiceState
+    from epypes.service.state_file import ServiceState
 
 _MS_PER_S = 1000
 

@@ -10,7 +10,7 @@ from epypes.optional import optional_import
 if TYPE_CHECKING:
     from epypes.service.client import Answer, Client, call
     from epypes.service.parameters import Parameters
-    from epypes.service.server import Service
+    from epypes.service.service import Service
     from epypes.service.serving import serve
 
 __all__ = ["Answer", "Client", "Parameters", "Service", "call", "serve"]
@@ -19,14 +19,14 @@ _HOME = {
     "Answer": "client",
     "Client": "client",
     "Parameters": "parameters",
-    "Service": "server",
+    "Service": "service",
     "call": "client",
     "serve": "serving",
 }
 
 
 def __getattr__(name: str) -> Any:
-    # A worker, which is in this room too, needs none of them.
+    # The worker process, whose modules are in this package too, needs none of them.
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     with optional_import():

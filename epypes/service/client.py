@@ -15,7 +15,7 @@ from epypes.bundle.load import SETTINGS
 from epypes.bundle.ports import REQUEST, in_order
 from epypes.bundle.settings import read_settings
 from epypes.errors import RemoteFailure, ServiceError
-from epypes.service.state import ServiceState, read_state
+from epypes.service.state_file import ServiceState, read_state
 from epypes.transport import Publisher, Subscriber, ZMQPublisher, ZMQSubscriber
 from epypes.transport.channels import is_brokered, place_of
 

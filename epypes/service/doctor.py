@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.bundle.seal import check_seal
 from epypes.errors import EpypesError
-from epypes.service.state import read_states
+from epypes.service.state_file import read_states
 
 if TYPE_CHECKING:
     from packaging.requirements import Requirement
@@ -200,7 +200,7 @@ def _browser() -> Check:
 
 
 def _state_folder() -> Check:
-    from epypes.service.state import state_file
+    from epypes.service.state_file import state_file
 
     folder = state_file(".").parent
     mode = stat.S_IMODE(folder.stat().st_mode)

@@ -8,12 +8,12 @@ from pathlib import Path
 from time import perf_counter_ns, time_ns
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.service.outcome import Result, Setting, event_id
+from epypes.service.result_publisher import Provenance, Result
 from epypes.store.later import SeriesWriter
 
 if TYPE_CHECKING:
+    from epypes.service.dispatcher import AcceptedEvent
     from epypes.service.failures.record import FailureRecord
-    from epypes.service.ledger import Entry
 
 _log = logging.getLogger("epypes.service")
 
@@ -29,7 +29,7 @@ class EventLog:
         A path, a URL or a Store; None to keep nothing.
     name
         Of the bundle.
-    setting
+    provenance
         Returns what events are worked on with.
     replica
         What the service is called among several.
@@ -40,19 +40,21 @@ class EventLog:
         There can be no such database. One that is away is told in the log.
     """
 
-    def __init__(self, store: str | Path | None, name: str, setting: Callable[[], Setting], replica: str = "") -> None:
-        self._setting, self._began_ns, self._replica = setting, time_ns(), replica
+    def __init__(
+        self, store: str | Path | None, name: str, provenance: Callable[[], Provenance], replica: str = ""
+    ) -> None:
+        self._provenance, self._began_ns, self._replica = provenance, time_ns(), replica
         self._writer = None if store is None else SeriesWriter(store, KIND, name)
 
-    def keep(self, entry: Entry, result: Result, failure: FailureRecord | None) -> None:
+    def keep(self, entry: AcceptedEvent, result: Result, failure: FailureRecord | None) -> None:
         """Have a row of an event written; returns at once and raises nothing."""
         if self._writer is not None:
-            row = {**_row(entry, result, failure, self._setting().digest), **self._of_broker(entry)}
+            row = {**_row(entry, result, failure, self._provenance().digest), **self._of_broker(entry)}
             self._writer.append(f"{self._began_ns}-{entry.seq}", row)
 
-    def _of_broker(self, entry: Entry) -> dict[str, Any]:
+    def _of_broker(self, entry: AcceptedEvent) -> dict[str, Any]:
         """Return what a row has besides where replicas share the events of a broker."""
-        deliveries = getattr(entry.event, "attempt", None)
+        deliveries = entry.received.attempt
         return {} if deliveries is None else {"deliveries": deliveries, "replica": self._replica}
 
     def counts(self) -> Mapping[str, int]:
@@ -65,11 +67,11 @@ class EventLog:
             _log.warning("%d rows of events could not be stored in time", self._writer.counts()["waiting"])
 
 
-def _row(entry: Entry, result: Result, failure: FailureRecord | None, digest: str) -> dict[str, Any]:
+def _row(entry: AcceptedEvent, result: Result, failure: FailureRecord | None, digest: str) -> dict[str, Any]:
     now_ns = time_ns()
     row = {
         "seq": entry.seq,
-        "event_id": event_id(entry.event),
+        "event_id": entry.id,
         "outcome": "answered",
         "received_ns": now_ns - (perf_counter_ns() - entry.accepted_ns),
         "answered_ns": now_ns,

@@ -1,7 +1,7 @@
-"""How do the frames of a message become one block of bytes, and what is refused when it is read?
+"""Frames of a message as one block of bytes.
 
-A block is a table (a mark, the number of frames, the size of each) and then the frames, one after another. Whoever
-reads looks at the table first, so nothing is allocated for what a broken or hostile block only claims to hold.
+A block is a table (a mark, the number of frames, the size of each) and then the frames, one after another. A reader
+checks the table first, so nothing is allocated for what a broken or hostile block only claims to hold.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from itertools import accumulate, pairwise
 from typing import Final
 
 from epypes.errors import MessageError
-from epypes.wire.envelope import Envelope
+from epypes.wire import EncodedEnvelope, Envelope
 from epypes.wire.limits import DEFAULT_LIMITS
 
 BytesLike = bytes | bytearray | memoryview
@@ -22,14 +22,14 @@ MARK: Final = b"EPF1"
 _HEAD: Final = struct.Struct("<4sI")
 HEAD_BYTES: Final = _HEAD.size
 SIZE_BYTES: Final = 8
-# What an event begins with, once it is one block.
+# The first byte of an event in one block.
 _ENVELOPE: Final = b"v"
 _RAW: Final = b"r"
 
 
 @dataclass(frozen=True, slots=True)
 class BlockLimits:
-    """What a block may hold.
+    """Limits of a block.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ def table_of(frames: Sequence[BytesLike], limits: BlockLimits = ONE_MESSAGE) -> 
     Raises
     ------
     MessageError
-        There are more frames than the reader takes, or they are larger.
+        There are more frames than the reader accepts, or they are larger.
     """
     sizes = [memoryview(frame).nbytes for frame in frames]
     _require_room(len(sizes), sum(sizes), limits)
@@ -61,7 +61,7 @@ def table_of(frames: Sequence[BytesLike], limits: BlockLimits = ONE_MESSAGE) -> 
 
 
 def count_in(head: BytesLike, limits: BlockLimits = ONE_MESSAGE) -> int:
-    """Return how many frames a table speaks of, from its first HEAD_BYTES bytes; SIZE_BYTES for each follow.
+    """Return the number of frames in a table, from its first HEAD_BYTES bytes; SIZE_BYTES for each follow.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def pack(frames: Sequence[BytesLike]) -> bytes:
     Raises
     ------
     MessageError
-        There are more frames than `unpack` takes, or they are larger.
+        There are more frames than `unpack` accepts, or they are larger.
     """
     return b"".join([table_of(frames), *frames])
 
@@ -123,7 +123,7 @@ def unpack(data: BytesLike) -> list[memoryview]:
     begin = HEAD_BYTES + SIZE_BYTES * count
     sizes = sizes_in(block[HEAD_BYTES:begin], count)
     if len(block) != begin + sum(sizes):
-        held = f"{len(block) - begin:,} bytes after its table, which speaks of {sum(sizes):,}"
+        held = f"{len(block) - begin:,} bytes after its table, which announces {sum(sizes):,}"
         raise MessageError("wrong size", f"The block has {held}.")
     return [block[start:end] for start, end in pairwise(accumulate(sizes, initial=begin))]
 
@@ -135,24 +135,26 @@ def _view(data: BytesLike) -> memoryview:
         raise MessageError("no bytes", f"A block of frames is bytes: {error}.") from error
 
 
-def pack_event(event: Envelope | bytes) -> bytes:
-    """Return an event as one block, which is what a store of failures keeps.
+def pack_event(event: Envelope | EncodedEnvelope | BytesLike) -> bytes:
+    """Return an event as one block, the format of the failure store.
 
     Parameters
     ----------
     event
-        An Envelope, or bytes for a message of one frame, as peers of 2019 send it.
+        An Envelope, decoded or not, or bytes for a message of one frame, as peers of 2019 send it.
 
     Raises
     ------
     MessageError
         The envelope can't be sent.
     """
+    if isinstance(event, EncodedEnvelope):
+        return _ENVELOPE + pack(event.frames)
     if isinstance(event, Envelope):
         from epypes.wire import encode
 
         return _ENVELOPE + pack(encode(event))
-    return _RAW + event
+    return _RAW + bytes(event)
 
 
 def unpack_event(data: BytesLike) -> Envelope | bytes:

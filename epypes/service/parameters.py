@@ -1,25 +1,39 @@
-"""Which values do the hyperparameters of a service have, and which may they be given?"""
+"""The hyperparameters of a running service: their values and ranges, and how they are changed.
+
+A change is all or nothing, happens between two events, and has a revision that every output is stamped with.
+"""
 
 from __future__ import annotations
 
+import logging
 import math
+import threading
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from epypes.bundle.entries import written
-from epypes.errors import BundleError, UnknownName
+from epypes.errors import BundleError, ParametersRefused, RevisionConflict, ServiceError, UnknownName
+
+if TYPE_CHECKING:
+    from epypes.service.bundle_info import BundleInfo
+    from epypes.service.dispatcher import Dispatcher
+    from epypes.service.result_publisher import Listener
+    from epypes.service.worker_connection import WorkerConnection
+
+_log = logging.getLogger("epypes.service")
 
 Entries = Mapping[str, Mapping[str, Any]]
-# Of one step; a float that was typed or sent as text is not on a step to the last bit.
+# Of one step: a float that was typed or sent as text is not on a step to the last bit.
 _STEP_TOLERANCE: Final = 1e-6
-# What may be given anew as JSON has it: the kinds of `epypes.bundle.entries` that are a number, a text or a flat list.
+# Kinds of `epypes.bundle.entries` that JSON can give: a number, a text or a flat list.
 _KINDS: Final = (None, "none", "tuple", "numpy", "enum")
 _VALUE_KEYS: Final = ("value", "kind", "dtype", "enum", "shape")
 _TYPES: Final[Mapping[type, str]] = {bool: "bool", int: "int", float: "float", str: "text", list: "list"}
-# What TOML has no whole number for.
+# TOML has no larger integer.
 _MOST_WHOLE: Final = 2**63
 
 
@@ -55,7 +69,7 @@ def read_entries(settings: Path) -> dict[str, dict[str, Any]]:
 
 
 def _json_ready(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an entry without what JSON has no number for: a range that is open at an end."""
+    """Return an entry without numbers that JSON lacks: a range that is open at an end."""
     return {key: part for key, part in entry.items() if not any(map(_has_no_number, _items(part)))}
 
 
@@ -67,7 +81,7 @@ def _has_no_number(item: Any) -> bool:
     return isinstance(item, float) and not math.isfinite(item)
 
 
-def changed(entries: Entries, values: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+def changed_entries(entries: Entries, values: Mapping[str, Any]) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
     """Return the entries with new values, and a reason for each value that can't be taken; then nothing is changed.
 
     Parameters
@@ -99,7 +113,7 @@ def _with_value(entries: Entries, token: str, given: Any) -> dict[str, Any]:
     if entry.get("choices") is not None:
         return {**_chosen(token, given, entry), **rest}
     if "value" not in entry:
-        # It was None, which says nothing of what else it may be.
+        # It was None, so its type is not known.
         return {**written(tuple(given) if isinstance(given, list) else given), **rest}
     value = _converted(token, given, entry)
     _check_range(token, value, entry)
@@ -107,7 +121,7 @@ def _with_value(entries: Entries, token: str, given: Any) -> dict[str, Any]:
 
 
 def type_of(entry: Mapping[str, Any]) -> str:
-    """Return which values an entry takes, for readers of JSON, to whom 1.0 and 1 are the same.
+    """Return the type of an entry's values, for readers of JSON, where 1.0 and 1 are the same.
 
     Returns
     -------
@@ -128,7 +142,7 @@ def _may_have_fraction(entry: Mapping[str, Any]) -> bool:
 
 
 def value_of(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what of an entry is its value, without its range."""
+    """Return the value of an entry, without its range."""
     return {key: entry[key] for key in _VALUE_KEYS if key in entry}
 
 
@@ -154,19 +168,19 @@ def misfits(entries: Entries, values: Mapping[str, Any]) -> dict[str, str]:
 
 
 def others_than(entries: Entries, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those of some values, by token, that are others than those of entries."""
+    """Return the values, by token, that differ from those of entries."""
     return {token: value for token, value in values.items() if value != value_of(entries.get(token, {}))}
 
 
 def differing_values(written: Entries, before: Entries, after: Entries) -> list[str]:
-    """Return a line for each hyperparameter that has another value after a bundle has taken another's place.
+    """Return a line for each hyperparameter whose value differs after a bundle has replaced another one.
 
     Parameters
     ----------
     written
-        What the bundle before has in its pipeline.toml.
+        Entries in the pipeline.toml of the bundle before.
     before, after
-        What was, and what is.
+        Entries before and after.
 
     Examples
     --------
@@ -187,16 +201,16 @@ def _shown(entry: Mapping[str, Any]) -> str:
 
 
 def _check_plain(token: str, given: Any) -> None:
-    """Raise ValueError for what is neither a scalar of JSON nor a list of them, or has no number."""
+    """Raise ValueError for anything but a scalar of JSON or a list of them."""
     for item in _items(given):
         is_beyond = isinstance(item, int) and abs(item) >= _MOST_WHOLE
         if not isinstance(item, bool | int | float | str | None) or is_beyond or _has_no_number(item):
-            text = "write a number, text, true, false, null or a list of these"
+            text = "give a number, text, true, false, null or a list of these"
             raise ValueError(f"{token!r} can't be {_brief(given)}: {text}.")
 
 
 def _chosen(token: str, given: Any, entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entry of the choice that was meant."""
+    """Return the entry of the choice with this value."""
     choices = entry["choices"]
     for choice in choices:
         has_kind = isinstance(choice, dict) and "kind" in choice
@@ -261,3 +275,173 @@ def _kind(value: Any) -> str:
 def _brief(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+# -- changing them ----------------------------------------------------------------------------------------------------
+
+
+class ParameterControl:
+    """The parameters of the worker, kept over its restarts.
+
+    Parameters
+    ----------
+    bundle
+        The bundle, whose parameters are the first ones.
+    dispatcher
+        Knows the worker.
+    notify
+        Called with ``"parameters"`` and their new values.
+    timeout_s
+        How long a change may wait for the event that is worked on, in seconds.
+
+    Attributes
+    ----------
+    current
+        The parameters.
+    bundle
+        The bundle that they belong to.
+    newest
+        Returns revision and values, by the digest of a bundle, that its other replicas compute with; None without any.
+    """
+
+    def __init__(self, bundle: BundleInfo, dispatcher: Dispatcher, notify: Listener, timeout_s: float) -> None:
+        self.current = Parameters(0, bundle.entries)
+        self.bundle, self._path = bundle, bundle.path
+        self.newest: Callable[[str], tuple[int, Mapping[str, Any]] | None] = lambda digest: None
+        self._dispatcher, self._notify, self._timeout_s = dispatcher, notify, timeout_s
+        self._changing = threading.Lock()
+        self._pending: Parameters | None = None
+
+    @property
+    def digest(self) -> str:
+        """Of the bundle that the parameters belong to."""
+        return self.bundle.digest
+
+    def set(self, values: Mapping[str, Any], revision: int | None, at_least: int = 0) -> Parameters:
+        """Change values, under a revision of ``at_least`` or more; return all of them, with their revision.
+
+        Raises
+        ------
+        RevisionConflict
+            They have another revision by now.
+        ParametersRefused
+            A value can't be taken; nothing is changed.
+        ServiceError
+            There is no worker, or it is busy.
+        """
+        with self._exclusive():
+            while True:
+                before = self.current
+                if revision is not None and revision != before.revision:
+                    raise RevisionConflict(self._path, before)
+                entries, problems = changed_entries(before.entries, values)
+                if problems:
+                    raise ParametersRefused(self._path, problems)
+                sent = _differing(before.entries, entries)
+                if not sent:
+                    return before
+                wanted = Parameters(max(before.revision + 1, at_least), entries)
+                connection = self._begin(before, wanted)
+                # Otherwise another bundle has taken over since.
+                if connection is not None:
+                    break
+            problems = connection.change_parameters(wanted.revision, sent, self._timeout_s)
+            if problems:
+                raise ParametersRefused(self._path, problems)
+            if self.current is not wanted:
+                # Another bundle has taken over meanwhile, with parameters of its own.
+                raise RevisionConflict(self._path, self.current)
+            return wanted
+
+    def follow(self, digest: str, revision: int, values: Mapping[str, Any]) -> Mapping[str, str]:
+        """Take the values of another replica under their revision; return the problems by token, if there are any.
+
+        Raises
+        ------
+        ServiceError
+            There is no worker, it is busy, or it is one of another bundle by now.
+        """
+        with self._exclusive():
+            before, bundle = self.current, self.bundle
+            if bundle.digest == digest and (problems := misfits(bundle.entries, values)):
+                return problems
+            wanted = Parameters(revision, _with_values(bundle.entries, values))
+            connection = self._begin(before, wanted) if bundle.digest == digest else None
+            if connection is None:
+                raise ServiceError(self._path, "Another bundle has taken over. Try again.")
+            sent = _differing(before.entries, wanted.entries)
+            return connection.change_parameters(revision, sent, self._timeout_s)
+
+    @contextmanager
+    def _exclusive(self) -> Iterator[None]:
+        if not self._changing.acquire(timeout=self._timeout_s):
+            raise ServiceError(self._path, "The parameters are being changed by another caller. Try again.")
+        try:
+            yield
+        finally:
+            self._changing.release()
+            self._dispatcher.publish()
+
+    def _begin(self, before: Parameters, wanted: Parameters) -> WorkerConnection | None:
+        """Return the worker that must take a change; None if the parameters changed concurrently."""
+        with self._dispatcher.lock:
+            if self.current is not before:
+                return None
+            connection = self._dispatcher.connection
+            if connection is None:
+                raise ServiceError(self._path, "There is no worker just now. Try again in a moment.")
+            if self._pending is not None:
+                raise ServiceError(self._path, "A change is waiting for an event to end. Try again in a moment.")
+            self._pending = wanted
+            return connection
+
+    def settled(self, connection: WorkerConnection, header: Mapping[str, Any]) -> None:
+        """Take a worker's answer to a change; called on its receiving thread, before events that come after it."""
+        with self._dispatcher.lock:
+            pending = self._pending
+            if connection is not self._dispatcher.connection or pending is None:
+                return
+            if header.get("revision") != pending.revision:
+                return
+            self._pending = None
+            if header["kind"] == "parameters":
+                changes = differing_values(self.current.entries, self.current.entries, pending.entries)
+                _log.info("parameters, revision %d: %s", pending.revision, "; ".join(changes))
+                self._change(pending)
+
+    def _change(self, parameters: Parameters) -> None:
+        self.current = parameters
+        data = {"revision": parameters.revision, "parameters": parameters.entries}
+        self._dispatcher.publish_later(lambda: self._notify("parameters", data))
+
+    def for_new_worker(self) -> tuple[int, dict[str, Any]] | None:
+        """Return the revision and the values that a new worker must take; None if it has them. With the lock held."""
+        # A change that the last worker has not confirmed was in no output.
+        self._pending = None
+        if not self.current.revision:
+            return None
+        return self.current.revision, {token: value_of(entry) for token, entry in self.current.entries.items()}
+
+    def take_over(self, bundle: BundleInfo) -> None:
+        """Begin with the parameters of another bundle, or of its other replicas. With the lock held.
+
+        The revision rises, so that these are newer than all earlier ones.
+        """
+        self._pending, self.bundle = None, bundle
+        revision, values = self.newest(bundle.digest) or (0, {})
+        problems = misfits(bundle.entries, values)
+        if problems:
+            _log.error("revision %d of the other replicas of %s is ignored: %s", revision, bundle.path, problems)
+            # So that the bundle's own values are newer for all replicas.
+            revision, values = revision + 1, {}
+        self._change(Parameters(max(revision, self.current.revision + 1), _with_values(bundle.entries, values)))
+
+
+def _differing(before: Entries, after: Entries) -> dict[str, dict[str, Any]]:
+    """Return the values of the entries that changed."""
+    return {token: value_of(entry) for token, entry in after.items() if entry != before.get(token)}
+
+
+def _with_values(entries: Entries, values: Mapping[str, Any]) -> Entries:
+    """Return entries with these values, and with their own where there is none."""
+    return {token: with_value(entry, values[token]) if token in values else entry for token, entry in entries.items()}

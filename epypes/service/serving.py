@@ -1,17 +1,26 @@
-"""How is a bundle served until somebody says stop?"""
+"""Serving a bundle until SIGTERM or SIGINT, and waiting for these signals."""
 
 from __future__ import annotations
 
+import signal
+import socket
+import threading
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Any
+from types import FrameType
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from epypes.errors import ServiceError
-from epypes.service.options import Options
-from epypes.service.server import Service
-from epypes.service.signals import Signals
-from epypes.service.state import ServiceState, StateLock
+from epypes.service.state_file import ServiceState, StateLock
+
+if TYPE_CHECKING:
+    from epypes.service.options import Options
+    from epypes.service.service import Service
+
+_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT)
+# No signal has this number.
+_DONE: Final = 0
 
 
 def serve(
@@ -31,9 +40,9 @@ def serve(
     Parameters
     ----------
     http
-        Where it is controlled over HTTP, as ``127.0.0.1:8642``; nowhere without.
+        Address of the HTTP control, as ``127.0.0.1:8642``; none without.
     token_file
-        Where the token for that is; one is made without.
+        The file of the token for that; one is made without.
     on_ready
         Called when events are answered.
     on_fault
@@ -44,14 +53,18 @@ def serve(
     Raises
     ------
     ServiceError
-        The bundle is being served already, can't be served, or not any more and there is no HTTP to mend that by; or
-        the service was stopped at once.
+        The bundle is being served already, or can't be served and there is no HTTP to deploy another one; or the
+        service was stopped at once.
     BundleError, AddressError
         As for Service.
     """
+    # `epypes record` and `play` wait for signals too, and serve nothing.
+    from epypes.service.options import Options
+    from epypes.service.service import Service
+
     given = Options(sub, pub, insecure=insecure, **options)
     given.check(path)
-    with Signals() as signals, _lock(path, given) as lock, ExitStack() as control:
+    with SignalWait() as signals, _lock(path, given) as lock, ExitStack() as control:
         service = Service(path, sub, pub, insecure=insecure, **{**options, "replica": lock.replica})
         if http:
             _serve_http(service, http, token_file, insecure, control)
@@ -89,10 +102,10 @@ def _announce(
     on_ready: Callable[[ServiceState], None],
     on_fault: Callable[[str], None],
 ) -> list[str]:
-    """Let others find the service, and say that it is ready, once it is; or that it is not.
+    """Publish the state file, and call ``on_ready`` once the service is ready, or ``on_fault`` if it can't be.
 
-    Return a list that has the reason in it once there will be no worker any more and nobody could deploy another
-    bundle; ``give_up`` is called then, so that whoever has started the service can act.
+    Return a list that gets the reason once there will be no worker any more and without HTTP no other bundle can be
+    deployed; ``give_up`` is called then, so that the process ends.
     """
     reason, fault = service.reason, list[str]()
     announced: list[ServiceState] = []
@@ -108,7 +121,7 @@ def _announce(
             announced.append(service.service_state)
             on_ready(announced[0])
 
-    def hear(kind: str, data: dict[str, Any]) -> None:
+    def on_event(kind: str, data: dict[str, Any]) -> None:
         if kind == "state" and data["state"] == "READY":
             announce()
         elif kind == "deployed":
@@ -117,18 +130,18 @@ def _announce(
             fault.append(data["reason"])
             give_up()
 
-    service.listen(hear)
+    service.listen(on_event)
     if service.state != "FAULTED":
         announce()
         return fault
     lock.publish(service.service_state)
     if not reason:
-        # It was before anybody listened.
-        hear("state", {"state": "FAULTED", "reason": service.reason})
+        # The state changed before `listen`.
+        on_event("state", {"state": "FAULTED", "reason": service.reason})
     return fault
 
 
-def _stop(service: Service, signals: Signals) -> None:
+def _stop(service: Service, signals: SignalWait) -> None:
     """Stop a service; at once, if another signal comes.
 
     Raises
@@ -139,3 +152,67 @@ def _stop(service: Service, signals: Signals) -> None:
     if not signals.wait_during(service.stop):
         count = service.abandon()
         raise ServiceError(service.path, f"Stopped at once by a second signal; {count} events were not finished.")
+
+
+class SignalWait:
+    """While its block runs, SIGTERM and SIGINT end `wait` instead of the process.
+
+    The system may deliver a signal to any thread, and the main thread, which waits, would not notice. So each writes
+    its number into a socket, which the main thread reads from.
+    """
+
+    def __enter__(self) -> Self:
+        self._reader, self._writer = socket.socketpair()
+        self._writer.setblocking(False)
+        self._woken_before = signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
+        self._before = {number: signal.signal(number, _ignore) for number in _SIGNALS}
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        signal.set_wakeup_fd(self._woken_before)
+        self._reader.close()
+        self._writer.close()
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait for a signal, for `now`, or for ``timeout_s`` seconds; return whether it was a signal."""
+        self._reader.settimeout(timeout_s)
+        with suppress(TimeoutError):
+            while (number := self._reader.recv(1)[0]) not in (*_SIGNALS, _DONE):
+                continue
+            return number != _DONE
+        return False
+
+    def now(self) -> None:
+        """End `wait`; from any thread. Does nothing if it has ended."""
+        with suppress(OSError):
+            self._writer.send(bytes([_DONE]))
+
+    def wait_during(self, work: Callable[[], Any]) -> bool:
+        """Run a function on a thread of its own; return whether it was done before a signal came.
+
+        Exceptions of the function are raised.
+        """
+        errors: list[BaseException] = []
+
+        def run() -> None:
+            try:
+                work()
+            except BaseException as error:
+                errors.append(error)
+            self.now()
+
+        try:
+            threading.Thread(target=run, name="epypes serve", daemon=True).start()
+        except RuntimeError:
+            # The system has no thread to give: signals wait meanwhile.
+            run()
+        is_signal = self.wait()
+        if errors:
+            raise errors[0]
+        return not is_signal
+
+
+def _ignore(number: int, frame: FrameType | None) -> None:
+    """Do nothing: the signal's number has been written."""

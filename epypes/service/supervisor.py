@@ -1,6 +1,6 @@
-"""Who starts workers, watches over them, and replaces those that died or are stuck?
+"""Starts workers, watches them, and replaces those that died or hang.
 
-One thread, that lives as long as the service: the system ends a worker with the thread that has started it.
+One thread, which lives as long as the service: the system ends a worker with the thread that has started it.
 """
 
 from __future__ import annotations
@@ -10,19 +10,18 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from time import monotonic
-from typing import Any, Final
+from typing import Final
 
 from epypes.bundle.replay import REPLAY_TIMEOUT_S
 from epypes.errors import ServiceError
-from epypes.service.dispatch import Dispatcher
-from epypes.service.health import DEATHS_BEFORE_FAULT, GOOD_EVENTS, PAUSE_S, Health
-from epypes.service.link import SETTLING, Link, Message
-from epypes.service.notify import Watchdog
-from epypes.service.parameters import others_than
-from epypes.service.served import Served
-from epypes.service.stuck import whereabouts
+from epypes.service.bundle_info import BundleInfo
+from epypes.service.dispatcher import Dispatcher
+from epypes.service.lifecycle import DEATHS_BEFORE_FAULT, RESTART_PAUSE_S, WorkerHealth
+from epypes.service.parameters import ParameterControl, others_than
+from epypes.service.systemd import Watchdog
+from epypes.service.worker_connection import SETTLING, Message, WorkerConnection
 
-_END_S: Final = 2.0
+_END_TIMEOUT_S: Final = 2.0
 
 _log = logging.getLogger("epypes.service")
 
@@ -30,56 +29,61 @@ _log = logging.getLogger("epypes.service")
 class Supervisor:
     """Starts, watches and replaces workers.
 
-    ``is_rewritten`` is for who writes into the bundle: a worker that is started meanwhile is not used.
-
     Parameters
     ----------
     dispatcher
-        Who gives events to the worker.
-    served
-        The bundle.
+        Gives events to the worker.
+    bundle
+        The bundle that is served.
     threads
         How many events a worker works on at once.
     job_timeout_s
         How long an event may take, in seconds.
     parameters
-        Returns the revision and all values, by token as in pipeline.toml, that a new worker must take; None if those
-        of its bundle will do.
+        What a new worker computes with.
     on_change
-        Called when the state may be another one.
-    hear
-        Called with what a worker says of parameters.
+        Called, with the lock held, when the state of the service may have changed.
+
+    Attributes
+    ----------
+    bundle
+        The bundle that is served.
+    health
+        Of the worker.
+    is_rewritten
+        Set while parameters are written into the bundle: a worker that is started meanwhile is not used.
     """
 
     def __init__(
         self,
         dispatcher: Dispatcher,
-        served: Served,
+        bundle: BundleInfo,
         threads: int,
         job_timeout_s: float,
-        parameters: Callable[[], tuple[int, Mapping[str, Any]] | None],
+        parameters: ParameterControl,
         on_change: Callable[[], None],
-        hear: Callable[[Link, Mapping[str, Any]], None],
     ) -> None:
-        self.served, self.health = served, Health()
+        self.bundle, self.health = bundle, WorkerHealth()
         self.is_rewritten = False
-        self.worker: Link | None = None
+        self.worker: WorkerConnection | None = None
         self._dispatcher, self._threads = dispatcher, threads
         self._timeout_s, self._timeout_ns = job_timeout_s, int(job_timeout_s * 1e9)
-        self._parameters, self._on_change, self._hear_more = parameters, on_change, hear
+        self._parameters, self._on_change = parameters, on_change
         self._changed = dispatcher.changed
-        self._to_start: deque[tuple[Served, list[Link | Exception]]] = deque()
+        self._to_start: deque[tuple[BundleInfo, list[WorkerConnection | Exception]]] = deque()
         self._restart_s: float | None = None
         self._loading_until_s = 0.0
         self._is_ending = False
         self._thread: threading.Thread | None = None
         self._watchdog = Watchdog()
+        # `Dispatcher.answered_in_row` when the last worker ended.
+        self._answered_before = 0
 
     def start(self) -> None:
-        """Begin, with a worker of the bundle."""
+        """Start the thread, and a worker of the bundle."""
         with self._changed:
             self._is_ending = False
-            self.health = Health()
+            self.health = WorkerHealth()
             self._restart_s = monotonic()
             self._thread = threading.Thread(target=self._run, name="epypes supervisor", daemon=True)
             self._thread.start()
@@ -92,20 +96,19 @@ class Supervisor:
             self._dispatcher.use(None)
             self._changed.notify_all()
         if worker is not None:
-            worker.dismiss(_END_S)
+            worker.dismiss(_END_TIMEOUT_S)
         thread, self._thread = self._thread, None
         if thread is not None:
             thread.join()
 
     def abandon(self) -> None:
-        """Kill the worker: what it has is not waited for."""
+        """Kill the worker without waiting for its events."""
         with self._changed:
             self._is_ending = True
             worker = self.worker
             self._changed.notify_all()
         if worker is not None:
-            worker.is_dismissed = True
-            worker.process.kill()
+            worker.kill()
 
     # -- the thread -----------------------------------------------------------------------------------------------
 
@@ -125,7 +128,7 @@ class Supervisor:
                 _log.exception("the supervisor goes on")
 
     def _wait_s(self) -> float | None:
-        """Return how long there is nothing to do, if nothing changes; None for ever. With the lock held."""
+        """Return how long to wait if nothing changes; None for ever. With the lock held."""
         now_s = monotonic()
         due_in_s = self._dispatcher.due_in_s(self._timeout_ns)
         self._dispatcher.is_unwatched = due_in_s is None
@@ -138,22 +141,22 @@ class Supervisor:
         return max(min(known), 0.0) if known else None
 
     def _next(self) -> Callable[[], object] | None:
-        """Return what is to be done now. With the lock held."""
+        """Return what must be done now, None if nothing. With the lock held."""
         now_s = monotonic()
         if self._is_ending:
             return _nothing
-        if (told_in_s := self._watchdog.due_in_s()) is not None and told_in_s <= 0:
-            return self._watchdog.tell
+        if (sign_due_in_s := self._watchdog.due_in_s()) is not None and sign_due_in_s <= 0:
+            return self._watchdog.send
         if self._to_start:
             return self._start_for_deploy
         if self.worker is None and self._restart_s is None and not self.health.is_final:
-            # What was to start one has failed.
-            self._restart_s = now_s + PAUSE_S
+            # The last attempt to start one has failed.
+            self._restart_s = now_s + RESTART_PAUSE_S
         if self._restart_s is not None and self._restart_s <= now_s:
             self._restart_s = None
             return self._start_again
         due_in_s = self._dispatcher.due_in_s(self._timeout_ns)
-        if self._dispatcher.link is not None and due_in_s is not None and due_in_s <= 0:
+        if self._dispatcher.connection is not None and due_in_s is not None and due_in_s <= 0:
             return self._end_stuck
         if self._is_loading and self._loading_until_s <= now_s:
             return self._end_loading
@@ -161,137 +164,134 @@ class Supervisor:
 
     @property
     def _is_loading(self) -> bool:
-        return self.worker is not None and self.worker is not self._dispatcher.link
+        return self.worker is not None and self.worker is not self._dispatcher.connection
 
     def _start_again(self) -> None:
         with self._changed:
-            served = self.served
+            bundle = self.bundle
         try:
-            link = Link(served, self._threads, self._hear, self._gone)
+            connection = WorkerConnection(bundle, self._threads, self._on_message, self._on_end)
         except (OSError, MemoryError, RuntimeError) as error:
             # The system lacks descriptors, memory or threads just now, which is not the worker's fault.
             with self._changed:
                 self._start_later(f"The worker can't be started: {_reason(error)}")
             return
         with self._changed:
-            if self._is_ending or self.worker is not None or served is not self.served:
+            if self._is_ending or self.worker is not None or bundle is not self.bundle:
                 # Another bundle has taken over while it was started, or other values were written into it.
-                self._dismiss_for_another(link)
+                self._dismiss_for_another(connection)
                 return
-            self.worker, self._loading_until_s = link, monotonic() + REPLAY_TIMEOUT_S
+            self.worker, self._loading_until_s = connection, monotonic() + REPLAY_TIMEOUT_S
             self.health.restarts += self.health.was_ready
             if self.health.was_ready:
-                _log.info("the worker is started again: process %d, restart %d", link.pid, self.health.restarts)
+                _log.info("the worker is started again: process %d, restart %d", connection.pid, self.health.restarts)
             # It may have been ready before this thread came here.
-            if link.status == "ready":
-                self._begin(link)
-            elif link.status != "loading":
-                self._over(link)
+            if connection.status == "ready":
+                self._begin(connection)
+            elif connection.status != "loading":
+                self._over(connection)
 
     def _end_loading(self) -> None:
         if (worker := self.worker) is not None:
             _log.error("the worker has not proved its bundle within %g s, so it is killed", REPLAY_TIMEOUT_S)
             worker.process.kill()
 
-    # -- what a worker says, on its own thread ----------------------------------------------------------------------
+    # -- messages of a worker, on its receiving thread -----------------------------------------------------------------
 
-    def _hear(self, link: Link, message: Message) -> None:
+    def _on_message(self, connection: WorkerConnection, message: Message) -> None:
         header, frames = message
         kind = header.get("kind")
         if kind == "done":
-            self._dispatcher.done(link, header, frames)
-            with self._changed:
-                self.health.deaths = 0
-                if self._dispatcher.answered_in_row >= GOOD_EVENTS:
-                    self.health.pauses = 0
+            self._dispatcher.done(connection, header, frames)
         elif kind in SETTLING:
-            self._hear_more(link, header)
+            self._parameters.settled(connection, header)
             with self._changed:
-                if link is self.worker and link is not self._dispatcher.link:
-                    self._confirmed(link, header.get("problems") or {})
+                if connection is self.worker and connection is not self._dispatcher.connection:
+                    self._confirmed(connection, header.get("problems") or {})
             self._dispatcher.publish()
         elif kind == "ready":
             with self._changed:
-                if link is self.worker:
-                    self._begin(link)
+                if connection is self.worker:
+                    self._begin(connection)
                 self._changed.notify_all()
             self._dispatcher.publish()
 
-    def _begin(self, link: Link) -> None:
+    def _begin(self, connection: WorkerConnection) -> None:
         """Give events to a worker that is ready. With the lock held."""
-        if link.served is not self.served or self.is_rewritten:
+        if connection.bundle is not self.bundle or self.is_rewritten:
             # Its values are written back meanwhile: another one reads them.
-            self._dismiss_for_another(link)
+            self._dismiss_for_another(connection)
             return
-        if link.about.get("digest") != self.served.digest:
-            link.is_dismissed = True
-            link.process.kill()
-            self._fault(f"{self.served.path} is not the bundle any more that is served. Deploy it, or restore it.")
+        if connection.about.get("digest") != self.bundle.digest:
+            connection.kill()
+            self._fault(f"{self.bundle.path} is not the bundle any more that is served. Deploy it, or restore it.")
             return
-        parameters = self._parameters()
+        parameters = self._parameters.for_new_worker()
         if parameters is None:
-            self._use(link)
+            self._use(connection)
         else:
             # It gets events once it has confirmed them.
-            link.tell_parameters(*parameters)
+            connection.post_parameters(*parameters)
 
-    def _dismiss_for_another(self, link: Link) -> None:
+    def _dismiss_for_another(self, connection: WorkerConnection) -> None:
         """End a worker of what is not served any more; start another if there is none. With the lock held."""
-        self.worker = None if self.worker is link else self.worker
-        link.is_dismissed = True
-        link.process.kill()
+        self.worker = None if self.worker is connection else self.worker
+        connection.kill()
         if self.worker is None and not self._is_ending:
-            self._restart_s = monotonic() + PAUSE_S
+            self._restart_s = monotonic() + RESTART_PAUSE_S
 
-    def _confirmed(self, link: Link, problems: Mapping[str, str]) -> None:
+    def _confirmed(self, connection: WorkerConnection, problems: Mapping[str, str]) -> None:
         """Give events to a worker if it has taken the parameters of the one before. With the lock held."""
         if not problems:
-            self._use(link)
+            self._use(connection)
             return
-        self.worker, link.is_dismissed = None, True
-        link.process.kill()
+        self.worker, connection.is_dismissed = None, True
+        connection.process.kill()
         why = " ".join(f"{token!r}: {problem}" for token, problem in problems.items())
         self._fault(f"A new worker does not take the parameters of the last one. {why}")
 
-    def _use(self, link: Link) -> None:
+    def _use(self, connection: WorkerConnection) -> None:
         health = self.health
         health.was_ready, health.trouble, health.stuck, health.ready_s = True, "", "", monotonic()
         if health.fault:
             health.fault = ""
             self._dispatcher.refuse("")
-        self._dispatcher.use(link)
+        self._dispatcher.use(connection)
         self._on_change()
 
-    def _gone(self, link: Link) -> None:
+    def _on_end(self, connection: WorkerConnection) -> None:
         with self._changed:
             try:
-                if link is self.worker:
-                    self._over(link)
+                if connection is self.worker:
+                    self._over(connection)
             finally:
                 self._changed.notify_all()
         self._dispatcher.publish()
 
-    def _over(self, link: Link) -> None:
+    def _over(self, connection: WorkerConnection) -> None:
         """Note that the worker is gone. With the lock held."""
         self.worker = None
-        if link.status == "refused":
+        in_row = self._dispatcher.answered_in_row
+        answered = in_row if in_row > self._answered_before else 0
+        self._answered_before = in_row
+        if connection.status == "refused":
             self._dispatcher.worker_ended()
-            self._fault(" ".join(link.reasons))
-        elif link.is_dismissed:
+            self._fault(" ".join(connection.reasons))
+        elif connection.is_dismissed:
             self._dispatcher.worker_ended()
-            self._died(self.health.stuck or link.process.ending, has_cause=True)
+            self._died(self.health.stuck or connection.process.ending, answered, has_cause=True)
         else:
-            # Of an event it may die again and again: each is put aside in the end, so that it gets on.
-            has_event = bool(self._dispatcher.ledger.running())
-            self._dispatcher.worker_died(link.process.ending, link.process.died_in)
-            self._died(link.process.ending, has_cause=has_event)
+            # Events may kill it again and again: each is a dead letter in the end, so that it goes on.
+            has_event, self._answered_before = bool(self._dispatcher.running), 0
+            self._dispatcher.worker_died(connection.process.ending, connection.process.died_in)
+            self._died(connection.process.ending, answered, has_cause=has_event)
 
-    def _died(self, why: str, *, has_cause: bool = False) -> None:
+    def _died(self, why: str, answered: int, *, has_cause: bool = False) -> None:
         """Start another worker after a while. With the lock held."""
         health = self.health
         if self._is_ending or health.is_final:
             return
-        health.count_death(monotonic(), has_cause=has_cause)
+        health.count_death(monotonic(), answered, has_cause=has_cause)
         if health.deaths >= DEATHS_BEFORE_FAULT:
             health.fault = f"{health.deaths} workers ended in a row as soon as they were started. The last: {why}"
             self._dispatcher.refuse(f"it can't be served: {health.fault[:300]}")
@@ -318,32 +318,32 @@ class Supervisor:
         self._dispatcher.refuse(f"it can't be served: {why[:300]}")
         self._on_change()
 
-    # -- what takes too long ----------------------------------------------------------------------------------------
+    # -- events that take too long -------------------------------------------------------------------------------------
 
     def _end_stuck(self) -> None:
-        link = self._dispatcher.link
-        overdue = [entry.seq for entry in self._dispatcher.overdue(self._timeout_ns)]
-        if link is None or not overdue:
+        connection = self._dispatcher.connection
+        overdue = [event.seq for event in self._dispatcher.overdue(self._timeout_ns)]
+        if connection is None or not overdue:
             return
-        where = whereabouts(link, overdue)
+        report = connection.hang_report(overdue)
         with self._changed:
-            stuck = self._dispatcher.still_stuck(where, overdue, self._timeout_ns)
+            stuck = self._dispatcher.stuck(report, overdue, self._timeout_ns)
             if stuck is None:
                 # They were done, or have not taken so long, and the worker goes on.
                 return
-            self._dispatcher.fail_stuck(stuck, where.functions, self._timeout_s)
-            named = next((name for seq in stuck if (name := where.functions[seq])), "")
-            told = f"Function {named!r}" if named else "The worker"
-            how = " The process was stopped." if link.process.is_stopped else ""
-            self.health.stuck = f"{told} did not return within {self._timeout_s:g} s.{how} The worker is replaced"
-            link.is_dismissed = True
+            self._dispatcher.fail_stuck(stuck, report.functions, self._timeout_s)
+            named = next((name for seq in stuck if (name := report.functions[seq])), "")
+            where = f"Function {named!r}" if named else "The worker"
+            how = " The process was stopped." if connection.process.is_stopped else ""
+            self.health.stuck = f"{where} did not return within {self._timeout_s:g} s.{how} The worker is replaced"
+            connection.is_dismissed = True
             self._on_change()
         _log.error("%s", self.health.stuck)
-        link.process.kill()
+        connection.process.kill()
 
     # -- another bundle -----------------------------------------------------------------------------------------------
 
-    def load(self, served: Served) -> Link:
+    def load(self, bundle: BundleInfo) -> WorkerConnection:
         """Start a worker of another bundle beside the one that is served; return it when it has proved the bundle.
 
         Raises
@@ -351,57 +351,63 @@ class Supervisor:
         ServiceError
             It refused the bundle, or died; the text says why.
         """
-        started: list[Link | Exception] = []
+        started: list[WorkerConnection | Exception] = []
         with self._changed:
-            self._to_start.append((served, started))
+            self._to_start.append((bundle, started))
             self._changed.notify_all()
             self._changed.wait_for(lambda: started or self._is_ending)
-            link = started[0] if started else ServiceError(served.path, "The service stops.")
-            if not isinstance(link, Link):
-                raise link
-            is_over = self._changed.wait_for(lambda: link.status != "loading" or self._is_ending, REPLAY_TIMEOUT_S)
-        if link.status == "ready" and link.about.get("digest") == served.digest:
-            return link
-        link.is_dismissed = True
-        link.process.kill()
-        if link.status == "ready":
+            connection = started[0] if started else ServiceError(bundle.path, "The service stops.")
+            if not isinstance(connection, WorkerConnection):
+                raise connection
+            is_over = self._changed.wait_for(
+                lambda: connection.status != "loading" or self._is_ending, REPLAY_TIMEOUT_S
+            )
+        if connection.status == "ready" and connection.about.get("digest") == bundle.digest:
+            return connection
+        connection.kill()
+        if connection.status == "ready":
             why = "it was changed while it was loaded. Deploy it again."
-        elif link.status == "refused":
-            why = " ".join(link.reasons)
+        elif connection.status == "refused":
+            why = " ".join(connection.reasons)
         else:
-            why = link.process.ending or f"it was not loaded {'in time' if not is_over else 'while the service stops'}"
-        raise ServiceError(served.path, why)
+            why = (
+                connection.process.ending
+                or f"it was not loaded {'in time' if not is_over else 'while the service stops'}"
+            )
+        raise ServiceError(bundle.path, why)
 
     def _start_for_deploy(self) -> None:
         with self._changed:
-            served, started = self._to_start.popleft()
+            bundle, started = self._to_start.popleft()
         try:
-            made: Link | Exception = Link(served, self._threads, self._hear, self._gone)
+            made: WorkerConnection | Exception = WorkerConnection(bundle, self._threads, self._on_message, self._on_end)
         except (OSError, MemoryError, RuntimeError) as error:
-            made = ServiceError(served.path, f"A worker can't be started: {_reason(error)}.")
+            made = ServiceError(bundle.path, f"A worker can't be started: {_reason(error)}.")
         with self._changed:
             started.append(made)
             self._changed.notify_all()
 
-    def can_switch(self, link: Link) -> bool:
+    def can_switch(self, connection: WorkerConnection) -> bool:
         """Whether a worker can take over: it has not ended meanwhile, and neither has the service."""
-        return not self._is_ending and link.status == "ready"
+        return not self._is_ending and connection.status == "ready"
 
-    def switch(self, link: Link) -> None:
+    def switch(self, connection: WorkerConnection) -> None:
         """Give events to the worker of another bundle from now on; the one before is ended. With no event in flight."""
         with self._changed:
-            before, self.worker = self.worker, link
-            self.served, self._restart_s = link.served, None
+            before, self.worker = self.worker, connection
+            self.bundle, self._restart_s = connection.bundle, None
             restarts = self.health.restarts
-            self.health = Health(was_ready=True, restarts=restarts)
+            self.health = WorkerHealth(was_ready=True, restarts=restarts)
             self._dispatcher.refuse("")
-            parameters = self._parameters()
+            parameters = self._parameters.for_new_worker()
             if parameters is not None:
                 # Its own values it has proved; others are those that other workers of this bundle have taken.
-                link.tell_parameters(parameters[0], others_than(link.served.entries, parameters[1]))
-            self._use(link)
+                connection.post_parameters(parameters[0], others_than(connection.bundle.entries, parameters[1]))
+            self._use(connection)
         if before is not None:
-            threading.Thread(target=before.dismiss, args=(_END_S,), name="epypes last worker", daemon=True).start()
+            threading.Thread(
+                target=before.dismiss, args=(_END_TIMEOUT_S,), name="epypes last worker", daemon=True
+            ).start()
 
 
 def _reason(error: Exception) -> str:

@@ -6,9 +6,13 @@ what lets a function crash, hang or hold the interpreter, and the service go on.
 
 from __future__ import annotations
 
+import json
 import os
 import queue
+import subprocess
+import sys
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -26,11 +30,14 @@ from epypes.wire import Envelope
 from tests.benchmarks.orb import _straight
 from tests.benchmarks.row import OURS, Goal, Row, row
 from tests.benchmarks.timing import Effort, Times
+from tests.service.bundles import written_bundle
 
 ANY = "tcp://127.0.0.1:*"
 IN_PROCESS = "in one process"
 BY_HAND = "hand, 2 threads"
 SERVED = "EPypes, threads=2"
+CALLS = "Python calls"
+FILES = "files"
 _EVENTS = 60
 _OUTSTANDING = 6
 
@@ -57,6 +64,7 @@ def rows(effort: Effort) -> list[Row]:
             _latency(effort, small, "1 kB through a service", np.zeros((32, 32), np.uint8), 300),
             _latency(effort, small, "1 MB through a service", np.zeros((1000, 1000), np.uint8), 150),
             _throughput(effort, folder),
+            _calls(effort, folder),
         ]
 
 
@@ -149,3 +157,70 @@ def _in_turn(
             if not np.array_equal(result, expected):
                 raise ValueError(f"{name} computes something else")
     return durations
+
+
+_MARK = 255
+_COUNTED = '''
+    import sys
+
+    import cv2
+
+
+    def half(image):
+        counter = sys.modules.get("call_counter")
+        if counter is not None and image[0, 0] == 255:
+            counter.dump()
+        return cv2.pyrDown(image)
+
+
+    func_dict = {"half": half}
+    func_io = {"half": ("image", "out")}
+'''
+
+
+def _calls(effort: Effort, folder: Path) -> Row:
+    """Python calls per event in the front and the worker, and how many files they are in."""
+    events = 20 if effort.quick else 200
+    image = np.zeros((32, 32), np.uint8)
+    sample = {"image": image}, {"out": cv2.pyrDown(image)}
+    bundle = written_bundle(folder / "counted", _COUNTED, ["image"], ["out"], sample=sample)
+    os.environ["CALL_COUNTS"] = str(folder / "calls.json")
+    with subprocess.Popen(
+        [sys.executable, "-m", "tests.benchmarks.call_counter", "front", str(bundle)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as front, ExitStack() as stack:
+        assert front.stdin is not None
+        assert front.stdout is not None
+        stack.callback(front.stdin.close)
+        requests, answers = _peer(stack, *json.loads(front.stdout.readline()))
+        before = _marked(front, requests, answers, folder)
+        for _ in range(events - 1):
+            requests.put(Envelope(type="x", parts={"image": image}))
+            answers.get(timeout=60)
+        after = _marked(front, requests, answers, folder)
+    # What happens now and then, as a heartbeat, is left out: it is in no file that every event passes.
+    calls = {file: count / events for file, count in (after - before).items() if count >= events / 2}
+    return Row(
+        "Python calls per event, front and worker",
+        {CALLS: sum(calls.values()), FILES: float(len(calls))},
+        goal=Goal("total", 150),
+        limit=FILES,
+        ours=CALLS,
+        note="of one event of 1 kB; at most 150 calls in 20 files",
+        unit="count",
+    )
+
+
+def _marked(
+    front: subprocess.Popen[str], requests: ep.Mailbox, answers: queue.SimpleQueue[Any], folder: Path
+) -> Counter[str]:
+    """Return the calls so far, by file, of the front and the worker."""
+    requests.put(Envelope(type="x", parts={"image": np.full((32, 32), _MARK, np.uint8)}))
+    answers.get(timeout=60)
+    assert front.stdin is not None
+    assert front.stdout is not None
+    front.stdin.write("\n")
+    front.stdin.flush()
+    return Counter(json.loads(front.stdout.readline())) + Counter(json.loads((folder / "calls.json").read_text()))

@@ -14,7 +14,7 @@ import pytest
 
 import epypes as ep
 from epypes.bundle.ports import REQUEST
-from epypes.service.state import read_state
+from epypes.service.state_file import read_state
 from epypes.wire import Envelope
 from tests.browser.jupyter import JupyterLab, Notebook, write_notebook
 from tests.browser.panel import PanelOnScreen

@@ -16,7 +16,7 @@ from epypes.cli import terminal
 from epypes.cli.call import by_token
 from epypes.errors import ServiceError, UnknownName
 from epypes.service import Service
-from epypes.service.state import StateLock
+from epypes.service.state_file import StateLock
 from tests.colours import red_image, red_runner
 
 ANY = "tcp://127.0.0.1:*"

@@ -15,7 +15,7 @@ import epypes as ep
 from epypes.bundle.seal import seal
 from epypes.service import Service
 from epypes.service.http import HttpServer
-from epypes.service.state import StateLock
+from epypes.service.state_file import StateLock
 from tests.service.failing import CRASHES, FINE, HANGS, KILLS, RAISES, keep, promoted, request
 
 WAIT_S = 60.0

@@ -16,7 +16,7 @@ from epypes.acquisition import write_image
 from epypes.errors import KeysError, ServiceError
 from epypes.service import Service, call
 from epypes.service.failures.news import failures_from_now_on
-from epypes.service.state import StateLock
+from epypes.service.state_file import StateLock
 from epypes.transport import make_keys, read_keys, recording_info
 from tests.transport.peers import wait_until
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.service.state import read_state
+from epypes.service.state_file import read_state
 from tests.service.processes import running
 
 pytestmark = pytest.mark.slow

@@ -10,7 +10,7 @@ import pytest
 
 from epypes.service import Service
 from epypes.service.http import HttpServer
-from epypes.service.state import StateLock
+from epypes.service.state_file import StateLock
 from epypes.transport.channels import memory
 from tests.service.served import acting_bundle, until
 

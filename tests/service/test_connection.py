@@ -10,7 +10,7 @@ import pytest
 
 import epypes as ep
 from epypes.errors import NotComputed, ParametersRefused, RevisionConflict, ServiceError
-from epypes.service.state import StateLock
+from epypes.service.state_file import StateLock
 from tests.conftest import EDGE_FUNCTIONS, EDGE_HPARAMS, EDGE_IO
 from tests.service.standing import Standing, standing
 
@@ -101,7 +101,7 @@ def test_the_token_is_taken_from_the_address_the_environment_or_the_state_of_the
         patch.setenv("EPYPES_TOKEN", server.token)
         with ep.connect(server.url) as connection:
             assert connection.set(canny_lo=61).revision == 2
-    from epypes.service.state import ServiceState
+    from epypes.service.state_file import ServiceState
 
     with StateLock(service.folder) as lock:
         state = ServiceState(1, "tcp://a", "tcp://b", "d", http=server.url, token_file=str(server.token_file))

@@ -13,7 +13,7 @@ from epypes.bundle.seal import check_seal, seal
 from epypes.errors import DeployRefused, ServiceError, UnknownName
 from epypes.service import Service
 from epypes.service.failures.source import failures_of, found_by
-from epypes.service.state import read_state
+from epypes.service.state_file import read_state
 from tests.service.processes import run_cli, running
 from tests.service.served import SOURCE, acting_bundle, serving, until
 

@@ -18,7 +18,7 @@ import pytest
 import zmq
 
 from epypes.service import Service
-from epypes.service.state import read_state
+from epypes.service.state_file import read_state
 from tests.service.processes import lowered, running
 from tests.service.served import SOURCE, acting_bundle, check_counts, peer_at, peer_of, until
 

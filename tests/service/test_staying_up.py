@@ -19,7 +19,7 @@ from epypes.errors import (
     UnknownName,
 )
 from epypes.service import Service
-from epypes.service.health import DEATHS_BEFORE_FAULT, Health
+from epypes.service.lifecycle import DEATHS_BEFORE_FAULT, WorkerHealth
 from epypes.service.packing import unpack
 from epypes.wire import decode
 from tests.service.served import SOURCE, TIMEOUT_S, acting_bundle, check_counts, peer_of, serving, until

@@ -12,7 +12,7 @@ from contextlib import nullcontext
 
 import pytest
 
-from epypes.service.state import read_state
+from epypes.service.state_file import read_state
 from tests.service.processes import lowered, running
 from tests.service.served import check_counts, peer_at
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import os
 
-from epypes.service.words import Words
+from epypes.service.standard_error import Words
 
 TIMEOUT_S = 60.0
 

@@ -10,8 +10,8 @@ import threading
 from contextlib import contextmanager
 from itertools import count
 
-from epypes.service.channel import channel_pair
 from epypes.service.packing import unpack
+from epypes.service.worker_connection import frame_sockets
 from epypes.wire import Envelope, decode, encode
 
 TIMEOUT_S = 60.0
@@ -44,18 +44,17 @@ class Front:
 
     def send_event(self, event):
         seq = next(self.seqs)
-        is_raw = isinstance(event, bytes)
-        frames = [event] if is_raw else encode(event)
-        self.channel.send({"kind": "event", "seq": seq, "raw": is_raw}, frames)
+        frames = [event] if isinstance(event, bytes) else encode(event)
+        self.channel.send({"kind": "event", "seq": seq}, frames)
         return seq
 
     def done(self):
         """Return the header of the next event that is done, and its answers."""
         header, frames = self.receive("done")
         answers, left = [], list(frames)
-        for answer in header["answers"]:
-            mine, left = left[: answer["frames"]], left[answer["frames"] :]
-            answers.append(bytes(mine[0]) if answer["raw"] else decode(mine))
+        for count in header["answers"]:
+            mine, left = left[:count], left[count:]
+            answers.append(bytes(mine[0]) if count == 1 else decode(mine))
         assert not left
         return header, answers
 
@@ -79,7 +78,7 @@ class Front:
 
     def ask(self, what, **content):
         ask = self.send_ask(what, **content)
-        header, frames = self.receive("asked")
+        header, frames = self.receive("answer")
         assert header["ask"] == ask
         return header, [bytes(frame) for frame in frames]
 
@@ -96,7 +95,7 @@ class Front:
 @contextmanager
 def worker_of(bundle, tmp_path, *options, environment=None):
     """Start a worker; yield its front before it is ready. It is gone when the block ends."""
-    channel, theirs = channel_pair()
+    channel, theirs = frame_sockets()
     faults = tmp_path / "faults.txt"
     with faults.open("wb") as file, (tmp_path / "stderr.txt").open("wb") as stderr, theirs:
         command = [sys.executable, "-I", "-m", "epypes.service.worker", str(theirs.fileno()), str(bundle)]

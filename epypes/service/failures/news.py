@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import ServiceError
 from epypes.service.client import why_unreachable
+from epypes.service.endpoints import FAILURE_TOPIC
 from epypes.service.failures.record import FailureRecord, record_of
 from epypes.service.failures.source import connected, path_of
-from epypes.service.outcome import FAILURE_TOPIC
-from epypes.service.state import read_states
+from epypes.service.state_file import read_states
 from epypes.transport import ZMQSubscriber
 from epypes.transport.channels import is_brokered
 from epypes.wire import Envelope

@@ -22,7 +22,7 @@ from epypes.service.failures.record import FailureRecord, record_of, with_id
 from epypes.store.writer import Writer
 
 if TYPE_CHECKING:
-    from epypes.wire import Envelope
+    from epypes.wire import EncodedEnvelope, Envelope
 
 __all__ = ["FailureRecord", "FailureStore", "failures_folder", "record_of"]
 
@@ -76,7 +76,7 @@ class FailureStore:
 
     # -- keeping ------------------------------------------------------------------------------------------------
 
-    def keep(self, record: FailureRecord, event: Envelope | bytes | None = None) -> FailureRecord:
+    def keep(self, record: FailureRecord, event: Envelope | EncodedEnvelope | bytes | None = None) -> FailureRecord:
         """Have a failure kept; return its record with the id that it has got.
 
         Returns at once and raises nothing. The event's arrays must not change any more.

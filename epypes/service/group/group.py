@@ -19,7 +19,6 @@ from epypes.service.group.order import Order, place_in_stream
 from epypes.service.group.talk import Talk
 from epypes.service.group.turnstile import Stream
 from epypes.service.group.watch import Watch
-from epypes.service.outcome import event_id
 from epypes.transport.channels import Place, Received
 
 _log = logging.getLogger("epypes.service")
@@ -372,4 +371,4 @@ class Group:
 def _id_of(event: Any) -> str:
     """Return the id that a broker's deliveries of an event are told by."""
     delivery = getattr(event, "delivery", None)
-    return event_id(event) if delivery is None else str(delivery.id)
+    return str(event.id if delivery is None else delivery.id)

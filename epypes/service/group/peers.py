@@ -1,186 +1,137 @@
-"""How does a service take part in a group? By what it does with its events and its parameters; or it stands alone."""
+"""Replicas of one bundle that share the events of a broker's queue, by the group of this package."""
 
 from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
 from time import monotonic
+from types import SimpleNamespace
 from typing import Any, Final
 
-from epypes.service.desk import Desk
-from epypes.service.dispatch import Dispatcher
-from epypes.service.entrances import BrokerEntrance, SocketEntrance
+from epypes.errors import ParametersRefused, RevisionConflict
 from epypes.service.group.group import Group
 from epypes.service.group.membership import Heard, Member, summary, told
-from epypes.service.ledger import Entry
-from epypes.service.options import Options, bare
-from epypes.service.parameters import Parameters
-from epypes.service.tuning import Tuning
-from epypes.transport.channels import place_of
+from epypes.service.parameters import ParameterControl, Parameters, changed_entries
 
-_JOINING: Final = "joining the group"
-# So long events wait at most for the replica to read what the others have agreed on.
-_JOIN_S: Final = 5.0
-_MOST_REASON: Final = 500
+# Events wait so long for the parameters of the other replicas.
+_JOIN_TIMEOUT_S: Final = 5.0
+_MAX_REASON: Final = 500
 
 
-@dataclass(frozen=True, slots=True)
-class Parts:
-    """What of a service its group is told, and acts on.
+class Replicas:
+    """One replica among those that take events from the same queue; or a service that stands alone.
 
-    Attributes
+    Parameters
     ----------
-    options
-        How it is served.
-    dispatcher, desk, tuning
-        Its events, who tells what has become of them, its parameters.
-    about
-        Returns what its name, state, counts and address are, as fields of `Member`.
-    entrance
-        Where its events come from.
-    changed
-        Called when the service's state may be another one.
-    """
-
-    options: Options
-    dispatcher: Dispatcher
-    desk: Desk
-    tuning: Tuning
-    about: Callable[[], Mapping[str, Any]]
-    entrance: SocketEntrance | BrokerEntrance
-    changed: Callable[[], object]
-
-    def member(self, id: str = "") -> Member:  # noqa: A002
-        """Return what there is to say of this service."""
-        said = dict(self.about())
-        said["reason"] = str(said.get("reason", ""))[:_MOST_REASON]
-        ours: dict[str, Any] = {"replica": self.options.replica, "host": socket.gethostname(), "pid": os.getpid()}
-        ours["ordered"] = self.options.ordered
-        served: dict[str, Any] = {"digest": self.tuning.digest, "revision": self.tuning.current.revision}
-        return Member(id, **ours, **served, **said)
-
-
-class Alone:
-    """A service that shares its events with nobody."""
-
-    is_joining = False
-
-    def __init__(self, parts: Parts) -> None:
-        self._parts = parts
-
-    def start(self) -> None:
-        """Do nothing."""
-
-    def give_up(self) -> None:
-        """Do nothing."""
-
-    def stop(self, timeout_s: float) -> None:
-        """Do nothing."""
-
-    def set(self, values: Mapping[str, Any], revision: int | None) -> Parameters:
-        """Change parameters; see `Service.set_parameters`."""
-        return self._parts.tuning.set(values, revision)
-
-    def told(self) -> dict[str, Any]:
-        """Return what there is to know of the group, of which this is the one member; JSON-ready."""
-        present = [Heard(self._parts.member(), 0.0)]
-        heard = {"trouble": "", "rejected": 0, "members": [told(present[0], is_self=True)], "lost": []}
-        return {"is_shared": False, **summary(present), **heard}
-
-    def counts(self) -> dict[str, int]:
-        """Return what is counted besides: nothing."""
-        return {}
-
-
-class Peers:
-    """A service that shares the events of a broker with other replicas of its bundle.
+    address
+        The queue of the broker; None for a service without a broker.
+    facts
+        Returns replica, name, state, reason, counts and http of the service.
+    parameters
+        The hyperparameters of this replica.
+    on_answered
+        Called with ids of events that another replica has answered.
+    on_change
+        Called when `is_joining` or the members may have changed.
 
     Attributes
     ----------
     is_joining
-        Whether its events wait until the parameters are read that the others have agreed on.
+        Whether events must wait: the parameters that the other replicas compute with are not known yet.
     """
 
-    def __init__(self, parts: Parts) -> None:
-        self._parts = parts
-        self._place = place_of(bare(parts.options.sub))
-        self._overtaking: set[int] = set()
-        self._joining_until_s = 0.0
+    def __init__(
+        self,
+        address: Any,
+        facts: Callable[[], Mapping[str, Any]],
+        parameters: ParameterControl,
+        on_answered: Callable[[Iterable[str]], object],
+        on_change: Callable[[], object],
+    ) -> None:
+        self._address, self._facts, self._parameters = address, facts, parameters
+        self._on_answered, self._on_change = on_answered, on_change
         self.is_joining = False
-        self._group = self._made()
-        parts.tuning.agreed = lambda digest: self._group.agreement.taken_over(digest)
-        parts.dispatcher.on_accepted = lambda event: self._group.arrived(event)
-        parts.dispatcher.on_done = self._done
-        if parts.options.ordered:
-            parts.desk.in_turn = self._in_turn
+        self._joined_s = 0.0
+        self._group = self._make()
 
-    def _made(self) -> Group:
-        options, parts = self._parts.options, self._parts
-        timeout_s = options.job_timeout_s if options.ordered else None
-        seen, make_room = parts.entrance.seen, parts.entrance.make_room
-        return Group(self._place, parts.member, parts.tuning, seen, self._changed, make_room, timeout_s)
-
-    # -- beginning and end --------------------------------------------------------------------------------------------
+    def _make(self) -> Group | None:
+        if self._address is None:
+            return None
+        tuned = _Planned(self._parameters)
+        return Group(self._address, self._member, tuned, self._on_answered, self._changed, lambda waiting: None)
 
     def start(self) -> None:
-        """Take part, as soon as the broker is there; events wait for a while until the others' parameters are known."""
-        self._group = self._made()
-        self._joining_until_s, self.is_joining = monotonic() + _JOIN_S, True
-        self._parts.dispatcher.hold(_JOINING)
-        self._group.start()
-
-    def give_up(self) -> None:
-        """Let no more answers through that wait for their turn: their events are given back."""
-        self._group.give_up()
+        """Take part as soon as the broker is there; raises nothing."""
+        self._group = self._make()
+        if self._group is not None:
+            self._joined_s, self.is_joining = monotonic() + _JOIN_TIMEOUT_S, True
+            self._group.start()
 
     def stop(self, timeout_s: float) -> None:
-        """Leave the group; bounded by ``timeout_s``."""
-        self._group.stop(timeout_s)
-        self._let_go()
+        """Leave the group, within ``timeout_s``."""
+        self.is_joining = False
+        if self._group is not None:
+            self._group.stop(timeout_s)
 
     def _changed(self) -> None:
-        if self.is_joining and (self._group.agreement.is_current or monotonic() > self._joining_until_s):
-            self._let_go()
+        if self.is_joining and self._group is not None:
+            self.is_joining = not (self._group.agreement.is_current or monotonic() > self._joined_s)
+        self._on_change()
 
-    def _let_go(self) -> None:
-        self.is_joining = False
-        self._parts.dispatcher.let_go(_JOINING)
-        self._parts.changed()
-
-    # -- events -------------------------------------------------------------------------------------------------------
-
-    def _in_turn(self, entry: Entry, publish: Callable[[], object]) -> None:
-        def let_through(has_overtaken: bool) -> None:
-            if has_overtaken:
-                self._overtaking.add(entry.seq)
-            publish()
-
-        self._group.wait_turn(entry.event, let_through)
-
-    def _done(self, entry: Entry, acknowledge: Callable[[], object]) -> None:
-        has_overtaken = entry.seq in self._overtaking
-        self._overtaking.discard(entry.seq)
-        # What was put aside nobody else may call done: if the broker has not heard of it, it would be no dead letter.
-        is_aside = entry.outcome == "dead_letters"
-        self._group.done(entry.event, has_overtaken, is_aside=is_aside, acknowledge=acknowledge)
-
-    # -- what is asked ------------------------------------------------------------------------------------------------
+    def answered(self, event_id: str) -> None:
+        """Have the other replicas know that this one has answered an event; returns at once."""
+        if self._group is not None:
+            self._group.done(SimpleNamespace(id=event_id))
 
     def set(self, values: Mapping[str, Any], revision: int | None) -> Parameters:
         """Change parameters in all replicas; see `Service.set_parameters`."""
+        if self._group is None:
+            return self._parameters.set(values, revision)
         return self._group.agreement.set(values, revision)
 
-    def told(self) -> dict[str, Any]:
-        """Return what there is to know of the group, JSON-ready."""
-        return {"is_shared": True, **self._group.told()}
+    def newest(self, digest: str) -> tuple[int, Mapping[str, Any]] | None:
+        """Return revision and values that the replicas of a bundle compute with, None if none is known."""
+        return None if self._group is None else self._group.agreement.taken_over(digest)
 
-    def counts(self) -> dict[str, int]:
-        """Return how many answers have overtaken others, where they keep their order."""
-        return {"overtaken": self._group.overtaken} if self._parts.options.ordered else {}
+    def describe(self) -> dict[str, Any]:
+        """Return the group as this replica knows it, JSON-ready."""
+        if self._group is not None:
+            return {"is_shared": True, **self._group.told()}
+        present = [Heard(self._member(), 0.0)]
+        members = [told(present[0], is_self=True)]
+        return {"is_shared": False, **summary(present), "trouble": "", "rejected": 0, "members": members, "lost": []}
+
+    def _member(self, id: str = "") -> Member:  # noqa: A002
+        facts = dict(self._facts())
+        facts["reason"] = str(facts.get("reason", ""))[:_MAX_REASON]
+        served: dict[str, Any] = {"digest": self._parameters.digest, "revision": self._parameters.current.revision}
+        return Member(id, host=socket.gethostname(), pid=os.getpid(), **served, **facts)
 
 
-def peers_of(parts: Parts) -> Alone | Peers:
-    """Return how a service takes part in a group, if there can be one."""
-    return Peers(parts) if parts.options.has_broker else Alone(parts)
+class _Planned:
+    """The parameters as the group's agreement uses them."""
+
+    def __init__(self, parameters: ParameterControl) -> None:
+        self._parameters = parameters
+        self.path = parameters.bundle.path
+
+    def follow(self, digest: str, revision: int, values: Mapping[str, Any]) -> dict[str, str]:
+        return dict(self._parameters.follow(digest, revision, values))
+
+    @property
+    def current(self) -> Parameters:
+        return self._parameters.current
+
+    @property
+    def digest(self) -> str:
+        return self._parameters.digest
+
+    def planned(self, values: Mapping[str, Any], revision: int | None) -> Parameters:
+        before = self.current
+        if revision is not None and revision != before.revision:
+            raise RevisionConflict(self.digest, before)
+        entries, problems = changed_entries(before.entries, values)
+        if problems:
+            raise ParametersRefused(self.digest, problems)
+        return before if entries == before.entries else Parameters(before.revision + 1, entries)

@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry
     from prometheus_client.core import Metric
 
-    from epypes.service.latency import Latency
-    from epypes.service.server import Service
+    from epypes.service.result_publisher import Latency
+    from epypes.service.service import Service
 
 _STATES: Final = ("LOADING", "READY", "PAUSED", "DEGRADED", "DRAINING", "FAULTED", "STOPPED")
 _NS_PER_S: Final = 1e9

@@ -13,7 +13,7 @@ from epypes.service.http.models import Refusal
 from epypes.service.http.told import Told
 
 if TYPE_CHECKING:
-    from epypes.service.server import Service
+    from epypes.service.service import Service
 
 _MOST_CALLS: Final = 8
 _PATIENCE_S: Final = 2.0

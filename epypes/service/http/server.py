@@ -19,7 +19,7 @@ from epypes.errors import ServiceError
 from epypes.service.http.address import BACKLOG, listening, names_of, url_of
 from epypes.service.http.connections import Connections
 from epypes.service.http.token import owned_token
-from epypes.service.state import state_file
+from epypes.service.state_file import state_file
 
 if TYPE_CHECKING:
     import socket
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import uvicorn
 
     from epypes.service.http.served import Served
-    from epypes.service.server import Service
+    from epypes.service.service import Service
 
 STOP_TIMEOUT_S: Final = 3.0
 _START_TIMEOUT_S: Final = 30.0

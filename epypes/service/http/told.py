@@ -22,7 +22,7 @@ from epypes.errors import EpypesError, ServiceError
 from epypes.service.http.answers import json_ready, typed, written
 
 if TYPE_CHECKING:
-    from epypes.service.server import Service
+    from epypes.service.service import Service
 
 MOST_LISTENERS: Final = 64
 _MOST_WAITING: Final = 100

@@ -334,10 +334,11 @@ def _check_version(url: str, info: Mapping[str, Any]) -> None:
 
 def _token_on_this_machine(address: str) -> str:
     """Return the token of a service of this user's; empty if there is none."""
-    from epypes.service import state
+    # It is of no use where no service can run.
+    from epypes.service import state_file
 
     try:
-        found = state.running_at(address)
+        found = state_file.running_at(address)
         return Path(found.token_file).read_text(encoding="ascii").strip() if found and found.token_file else ""
     except (OSError, UnicodeDecodeError, ServiceError):
         return ""

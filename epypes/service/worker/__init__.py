@@ -1,1 +1,1 @@
-"""The process that runs a bundle's functions, told what to do over a channel."""
+"""The worker process of a service."""

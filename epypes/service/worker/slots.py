@@ -1,37 +1,46 @@
-"""How does a worker run events, one at a time in each of its slots?
+"""Slots of a worker: each runs one event at a time; and the parameters of all of them.
 
-A slot is a FullPipeline of the bundle and the two queues at its ends. That the pipeline asks its q_in for the next
-event tells that it has finished with the one before, whatever it did with that: answered it once, several times or
-not at all, or failed.
+A slot is a FullPipeline of the bundle and the two queues at its ends. When the pipeline asks its q_in for the next
+event, it has finished the one before, whatever it did with that: answered it once, several times or not at all, or
+failed.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Mapping
+import traceback
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
 from time import perf_counter_ns
 from typing import Any, Final
 
+import epypes
+from epypes.bundle.entries import Member, read
 from epypes.bundle.load import Bundle, pipeline_of
 from epypes.errors import MessageError
-from epypes.pipeline import FullPipeline
+from epypes.pipeline import FullPipeline, Pipeline
 from epypes.pipeline.answering import Answering
 from epypes.pipeline.reactive import SinkPipeline
 from epypes.run import Failure, Run
-from epypes.service.channel import Channel
 from epypes.service.packing import BytesLike
-from epypes.service.worker.inbox import Event, Inbox
-from epypes.service.worker.traces import failure_told
+from epypes.service.worker.inputs import InputQueue, WorkerEvent
+from epypes.service.worker_connection import FrameSocket
 from epypes.wire import Envelope, decode, encode, failure_event, serialized
 
-_LOG: Final = logging.getLogger("epypes.service")
+_MAX_TRACE_FRAMES: Final = 20
+_MAX_LINE: Final = 500
+_MAX_MESSAGE: Final = 2_000
+_EPYPES_FOLDER: Final = str(Path(epypes.__file__).parent)
+
+_log: Final = logging.getLogger("epypes.service")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Completed:
-    """A run that has completed: of which event, and with which revision of the parameters."""
+class CompletedRun:
+    """A completed run, the id of its event, and the revision of its parameters."""
 
     run: Run
     event_id: str
@@ -45,12 +54,12 @@ class Slot:
     ----------
     bundle
         Whose pipeline it is.
-    inbox
+    inputs
         Where events come from.
-    channel
-        Where is told that they are done.
-    revision
-        Returns the revision of the parameters that a run begins with.
+    socket
+        To the front.
+    parameters
+        Whose revision a run begins with.
     on_completed
         Called on the slot's thread with each run that has completed; must return at once.
     """
@@ -58,24 +67,24 @@ class Slot:
     def __init__(
         self,
         bundle: Bundle,
-        inbox: Inbox,
-        channel: Channel,
-        revision: Callable[[], int],
-        on_completed: Callable[[Completed], object],
+        inputs: InputQueue,
+        socket: FrameSocket,
+        parameters: SlotParameters,
+        on_completed: Callable[[CompletedRun], object],
     ) -> None:
-        self._inbox, self._channel, self._revision, self._on_completed = inbox, channel, revision, on_completed
+        self._inputs, self._socket, self._parameters, self._on_completed = inputs, socket, parameters, on_completed
         self._digest = bundle.digest
         self._work: _Work | None = None
         self._pid = os.getpid()
         self.pipeline: FullPipeline = pipeline_of(bundle, self, self, detach=False)
         self.pipeline.on_error = self._failed
-        # What handle itself raises, where a subclass has one of its own.
+        # What a handle of a subclass raises.
         self.pipeline.loop.on_error = lambda event, error: self._failed(Failure("handle", (), {}, error, _id_of(event)))
         self._is_last_put = _puts_last(self.pipeline)
 
     @property
-    def under_way(self) -> dict[str, Any] | None:
-        """The event under way by its number, and what runs; None between events."""
+    def running(self) -> dict[str, Any] | None:
+        """The number of the event that is worked on, and the functions that run; None between events."""
         work = self._work
         if work is None:
             return None
@@ -89,26 +98,26 @@ class Slot:
     # -- as q_in ------------------------------------------------------------------------------------------------
 
     def get(self, block: bool = True, timeout: float | None = None) -> Any:
-        """Tell that the event before is done, and wait for the next one, however long; no time-out wakes anybody up.
+        """Send the result of the event before, and wait for the next one; there is no time-out.
 
         Raises
         ------
         queue.Empty
-            None will come; without ``block``: there is none now.
+            There will be none; without ``block``: there is none now.
         """
         if os.getpid() != self._pid:
-            # A function has forked, and its child has come back: it is not to go on as a worker.
+            # A function has forked, and its child has returned: it must not go on as a worker.
             os._exit(0)
         self._finish()
         while True:
-            item = self._inbox.take(block)
-            if not isinstance(item, Event):
+            item = self._inputs.take(block)
+            if not isinstance(item, WorkerEvent):
                 item.run()
-                self._inbox.finished()
+                self._inputs.finished()
                 continue
-            self._work = work = _Work(item.seq, self._revision(), self.pipeline.runner.last)
+            self._work = work = _Work(item.seq, self._parameters.revision, self.pipeline.runner.last)
             try:
-                event = bytes(item.frames[0]) if item.is_raw else decode(item.frames)
+                event = bytes(item.frames[0]) if len(item.frames) == 1 else decode(item.frames)
             except Exception as error:
                 self._failed(Failure("f_in", self.pipeline.runner.free_source_tokens, {}, error))
                 self._finish()
@@ -119,12 +128,12 @@ class Slot:
     # -- as q_out -----------------------------------------------------------------------------------------------
 
     def put(self, item: Any, block: bool = True, timeout: float | None = None) -> None:
-        """Take an answer to the event under way.
+        """Take an answer to the event that is worked on.
 
         Raises
         ------
         MessageError
-            It can't be sent, which is a failure of the event; or no event is under way.
+            It can't be sent, which is a failure of the event; or no event is worked on.
         """
         work = self._work
         if work is None:
@@ -132,20 +141,20 @@ class Slot:
         answer = _answer(item, work.revision)
         if not self._is_last_put:
             # What is put may be written to again before the event is done.
-            answer = _Answer(answer.is_raw, [bytes(frame) for frame in answer.frames])
+            answer = [*map(bytes, answer)]
         work.answers.append(answer)
 
-    # -- what becomes of an event -------------------------------------------------------------------------------
+    # -- results -------------------------------------------------------------------------------
 
     def _failed(self, failure: Failure) -> None:
         work = self._work
         if work is None:
-            _LOG.error("%s failed while no event was being worked on: %s", self.pipeline.name, failure)
+            _log.error("%s failed while no event was being worked on: %s", self.pipeline.name, failure)
         elif work.failure is None:
             work.failure = failure
 
     def _finish(self) -> None:
-        """Tell that the event under way is done, if there is one."""
+        """Send the result of the event that is worked on, if there is one."""
         work, self._work = self._work, None
         if work is None:
             return
@@ -153,7 +162,7 @@ class Slot:
         if run is work.before:
             run = None
         if run is not None and run.failure is None:
-            self._on_completed(Completed(run, work.event_id, work.revision))
+            self._on_completed(CompletedRun(run, work.event_id, work.revision))
         try:
             self._send(work, run)
         except MessageError as error:
@@ -161,47 +170,42 @@ class Slot:
             work.failure = Failure("f_out", self.pipeline.cg.sink_tokens, {}, error, work.event_id)
             self._send(work, run)
         except EOFError:
-            _LOG.info("%s has nobody to answer any more", self.pipeline.name)
-        self._inbox.finished()
+            _log.info("%s: the front is gone", self.pipeline.name)
+        self._inputs.finished()
 
     def _send(self, work: _Work, run: Run | None) -> None:
-        answers = [*work.answers]
+        answers = work.answers
         if work.failure is not None:
             event = failure_event(work.failure, self.pipeline.name, self._digest)
-            answers.append(_answer(event, work.revision))
+            answers = [*answers, _answer(event, work.revision)]
         header = {
             "kind": "done",
             "seq": work.seq,
             "revision": work.revision,
-            "failure": None if work.failure is None else failure_told(work.failure),
+            "failure": None if work.failure is None else _describe_failure(work.failure),
             "total_ns": perf_counter_ns() - work.start_ns,
             "durations_ns": {} if run is None else dict(run.report.durations_ns),
-            "answers": [{"raw": answer.is_raw, "frames": len(answer.frames)} for answer in answers],
+            # How many frames belong to each: one of 2019, or those of an envelope.
+            "answers": [*map(len, answers)],
         }
-        self._channel.send(header, [frame for answer in answers for frame in answer.frames])
+        self._socket.send(header, [*chain.from_iterable(answers)])
 
 
 class _Work:
-    """What is known of the event under way."""
+    """The event that is worked on, and its answers so far."""
 
     __slots__ = ("answers", "before", "event_id", "failure", "revision", "seq", "start_ns")
 
     def __init__(self, seq: int, revision: int, before: Run | None) -> None:
         self.seq, self.revision, self.before = seq, revision, before
         self.event_id = ""
-        self.answers: list[_Answer] = []
+        self.answers: list[list[BytesLike]] = []
         self.failure: Failure | None = None
         self.start_ns = perf_counter_ns()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Answer:
-    is_raw: bool
-    frames: list[BytesLike]
-
-
-def _answer(item: Any, revision: int) -> _Answer:
-    """Return the frames of what was put on q_out, as a publisher would take it.
+def _answer(item: Any, revision: int) -> list[BytesLike]:
+    """Return the frames of an item that was put on q_out.
 
     Raises
     ------
@@ -210,11 +214,11 @@ def _answer(item: Any, revision: int) -> _Answer:
     """
     if isinstance(item, Envelope):
         stamped = item if item.revision == revision else replace(item, revision=revision)
-        return _Answer(False, [*encode(stamped)])
+        return [*encode(stamped)]
     if isinstance(item, bytes | bytearray | memoryview):
-        return _Answer(True, [bytes(item)])
+        return [bytes(item)]
     if callable(getattr(item, "SerializeToString", None)):
-        return _Answer(True, [serialized(item)])
+        return [serialized(item)]
     if isinstance(item, Failure):
         return _answer(failure_event(item), revision)
     kind = type(item).__name__
@@ -233,3 +237,123 @@ def _puts_last(pipeline: FullPipeline) -> bool:
 
 def _id_of(event: Any) -> str:
     return event.id if isinstance(event, Envelope) else ""
+
+
+def _describe_failure(failure: Failure) -> dict[str, Any]:
+    """Return an event's failure as JSON."""
+    return {
+        "function": failure.function,
+        "tokens": list(failure.tokens),
+        "exception": failure.kind,
+        "message": failure.message[:_MAX_MESSAGE],
+        "trace": _trace_of(failure.exception),
+        "kind": "raised",
+    }
+
+
+def _trace_of(exception: BaseException) -> list[str]:
+    """Return the lines of a traceback, outermost call first, without frames of EPypes.
+
+    The exception's own code may do anything when its text is read; the lines are bounded all the same.
+    """
+    try:
+        frames = traceback.extract_tb(exception.__traceback__)
+        users = [frame for frame in frames if not frame.filename.startswith((_EPYPES_FOLDER, "<epypes"))]
+        lines = [_describe_frame(frame) for frame in users[-_MAX_TRACE_FRAMES:]]
+        texts = traceback.format_exception_only(exception)
+        return [line[:_MAX_LINE] for text in (*lines, *texts) for line in text.splitlines()[:_MAX_TRACE_FRAMES]]
+    except BaseException:  # whatever the exception's own methods do
+        return []
+
+
+def _describe_frame(frame: traceback.FrameSummary) -> str:
+    return f'File "{frame.filename}", line {frame.lineno}, in {frame.name}\n  {frame.line}'
+
+
+# -- parameters -------------------------------------------------------------------------------------------------------
+
+
+class SlotParameters:
+    """The parameters of all slots: they change everywhere, or nowhere.
+
+    Parameters
+    ----------
+    trial
+        A pipeline of the same graph that answers no events: values are set on it first.
+    enums
+        The bundle's enumerations, whose members may be values.
+
+    Attributes
+    ----------
+    pipelines
+        Of the slots.
+    revision
+        Of the last change; 0 with the bundle's own values.
+    """
+
+    def __init__(self, trial: Pipeline, enums: Mapping[str, Any]) -> None:
+        self._trial, self._enums = trial, enums
+        self.pipelines: Sequence[Pipeline] = ()
+        self.revision = 0
+
+    def apply(self, revision: int, entries: Mapping[str, Any]) -> dict[str, str]:
+        """Set these values everywhere; return the reason by token for those that can't be set: then none is.
+
+        Called while no slot works.
+
+        Parameters
+        ----------
+        revision
+            Counts the changes.
+        entries
+            Values by token, written as in pipeline.toml.
+        """
+        values, problems = _values(entries, self._enums)
+        problems |= self._tried(values)
+        if not problems:
+            problems = self._set(values)
+        if not problems:
+            self.revision = revision
+        return problems
+
+    def _tried(self, values: Mapping[str, Any]) -> dict[str, str]:
+        before, problems = self._trial.runner.hyperparameters, {}
+        for token, value in values.items():
+            try:
+                self._trial.set(**{token: value})
+            except BaseException as error:  # a value's own comparison may raise whatever it likes
+                problems[token] = _text_of(error)
+        if problems:
+            self._trial.runner.set(**before)
+        return problems
+
+    def _set(self, values: Mapping[str, Any]) -> dict[str, str]:
+        """Set values that the graph allows; a pipeline of the bundle's own may still refuse them."""
+        before = [dict(pipeline.runner.hyperparameters) for pipeline in self.pipelines]
+        try:
+            for pipeline in self.pipelines:
+                pipeline.set(**values)
+        except BaseException as error:  # see above
+            for pipeline, its_values in zip((self._trial, *self.pipelines), (before[0], *before), strict=True):
+                pipeline.runner.set(**its_values)
+            token = getattr(error, "token", None)
+            return {name: _text_of(error) for name in values if token not in values or name == token}
+        return {}
+
+
+def _values(entries: Mapping[str, Any], enums: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+    values, problems = {}, {}
+    for token, entry in entries.items():
+        try:
+            values[token] = read(entry, enums)
+        except Exception as error:  # an entry of a kind may fail in the making of a value of that kind
+            problems[token] = f"This value can't be read: {_text_of(error)}."
+            continue
+        if isinstance(values[token], Member):
+            problems[token] = f"The bundle has no enumeration {values[token].enum!r}."
+    return values, problems
+
+
+def _text_of(error: BaseException) -> str:
+    failure = Failure("", (), {}, error)
+    return failure.message or failure.kind

@@ -1,4 +1,4 @@
-"""Which bundle is served? What the front knows of one without executing any of its code."""
+"""What the front knows of a bundle without executing any of its code."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from epypes.service.parameters import read_entries
 
 
 @dataclass(frozen=True, slots=True)
-class Served:
-    """A bundle whose seal was checked.
+class BundleInfo:
+    """A bundle whose manifest was checked.
 
     Attributes
     ----------
@@ -25,7 +25,7 @@ class Served:
     digest
         Which state of it.
     settings
-        What its pipeline.toml says.
+        The contents of its pipeline.toml.
     entries
         The hyperparameters there, with their ranges.
     """
@@ -36,7 +36,7 @@ class Served:
     entries: Mapping[str, Mapping[str, Any]]
 
 
-def read_served(path: str | Path) -> Served:
+def read_bundle_info(path: str | Path) -> BundleInfo:
     """Read what the front must know of a bundle.
 
     Raises
@@ -46,19 +46,19 @@ def read_served(path: str | Path) -> Served:
     """
     folder = Path(path).resolve()
     digest = check_seal(folder)
-    served = Served(folder, digest, read_settings(folder / SETTINGS), read_entries(folder / SETTINGS))
+    found = BundleInfo(folder, digest, read_settings(folder / SETTINGS), read_entries(folder / SETTINGS))
     # A promotion may have put another folder in its place meanwhile.
     if check_seal(folder) != digest:
         raise BundleError(folder, f"{folder} was promoted anew while it was read. Try again.")
-    return served
+    return found
 
 
 def differing_ports(before: Settings, after: Settings) -> list[str]:
-    """Return what a bundle has otherwise than the one whose place it shall take: its peers would not understand it."""
+    """Return the ports that differ from those of the bundle that is replaced: its peers would not understand them."""
     found = []
     for what in ("inputs", "outputs", "rgb"):
         had, has = sorted(getattr(before, what)), sorted(getattr(after, what))
         if had != has:
-            told = f"its {what} are [{', '.join(has)}]; those of the bundle that is served are [{', '.join(had)}]"
-            found.append(f"The bundle has other ports: {told}. Serve it as a service of its own.")
+            text = f"its {what} are [{', '.join(has)}]; those of the bundle that is served are [{', '.join(had)}]"
+            found.append(f"The bundle has other ports: {text}. Serve it as a service of its own.")
     return found

@@ -1,47 +1,40 @@
-"""What is a service? A bundle between sockets, that stays up whatever its functions do."""
+"""The front of a service: a bundle between sockets or a broker's queues, which stays up whatever its functions do."""
 
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from time import monotonic, time_ns
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from epypes.service.about import about
-from epypes.service.announcing import Announcer
-from epypes.service.asks import Asks
-from epypes.service.deploying import Deployer
-from epypes.service.desk import Desk, Listener
-from epypes.service.dispatch import Dispatcher
+from epypes.service.bundle_info import read_bundle_info
+from epypes.service.deploy import Deployer
+from epypes.service.dispatcher import Dispatcher
+from epypes.service.endpoints import Endpoints, group_address
 from epypes.service.eventlog import EventLog
 from epypes.service.failures.record import FailureRecord
 from epypes.service.failures.store import FailureStore, failures_folder
-from epypes.service.group.peers import Parts, peers_of
-from epypes.service.intake import Intake
-from epypes.service.latency import Latency
-from epypes.service.notify import notify
+from epypes.service.group.peers import Replicas
+from epypes.service.lifecycle import Lifecycle, State
 from epypes.service.options import ANY_PORT, Options
-from epypes.service.outcome import Setting
-from epypes.service.parameters import Parameters
-from epypes.service.served import read_served
-from epypes.service.sockets import Sockets
-from epypes.service.state import ServiceState
-from epypes.service.states import Facts, State
+from epypes.service.parameters import ParameterControl, Parameters
+from epypes.service.result_publisher import Latency, Listener, Provenance, ResultPublisher
+from epypes.service.state_file import ServiceState
 from epypes.service.supervisor import Supervisor
-from epypes.service.tuning import Tuning
-from epypes.transport.outlet import prepare_lending
+from epypes.service.systemd import notify
+from epypes.service.worker_queries import WorkerQueries
 from epypes.wire import Envelope, decode, encode
 
 if TYPE_CHECKING:
     from epypes.bundle.writeback import WriteBack
 
-# What of a drain's time is left for reporting what could not be worked off, and for closing.
+# The share of a drain's time for working on accepted events; the rest is for reporting others, and for closing.
 _DRAIN_SHARE: Final = 0.7
-_CHANGE_S: Final = 10.0
-# While it is so, other replicas are better off with a broker's events.
-_OF_NO_USE: Final = ("STOPPED", "LOADING", "FAULTED")
+_CHANGE_TIMEOUT_S: Final = 10.0
+_JOINING: Final = "joining the replicas"
 
 
 class Service:
@@ -57,7 +50,7 @@ class Service:
     Attributes
     ----------
     http, token_file
-        Where it answers over HTTP, and where the token for that is kept; set by who serves it there.
+        Its HTTP address, and the file of the token for that; set by the HTTP server.
 
     Raises
     ------
@@ -72,40 +65,42 @@ class Service:
     def __init__(self, path: str | Path, sub: str = ANY_PORT, pub: str = ANY_PORT, **options: Any) -> None:
         self.options = given = Options(sub, pub, **options)
         given.check(path)
-        served = read_served(path)
-        self.path, self.threads = served.path, given.threads
+        bundle = read_bundle_info(path)
+        self.path, self.threads = bundle.path, given.threads
         self.job_timeout_s, self.drain_timeout_s = given.job_timeout_s, given.drain_timeout_s
         self.http = self.token_file = ""
-        self.failure_store = FailureStore(failures_folder(served.path))
-        self.event_log = EventLog(given.store, served.settings.name, self._setting, given.replica)
-        self._desk = Desk(
-            lambda *answer: self._sockets.answer(*answer),
-            lambda item: self._sockets.report(item),
+        self.failure_store = FailureStore(failures_folder(bundle.path))
+        self.event_log = EventLog(given.store, bundle.settings.name, self._provenance, given.replica)
+        self._results = ResultPublisher(
+            lambda *answer: self._endpoints.answers.publish(*answer),
+            lambda failure: self._endpoints.failures.publish(failure, "", lambda error: None),
             lambda: self.failure_store,
             self.event_log,
-            self._setting,
+            self._provenance,
         )
-        self._dispatcher = Dispatcher(given.ledger(), self._desk, self._setting)
-        self._tuning = Tuning(served, self._dispatcher, self._desk, min(given.job_timeout_s, _CHANGE_S))
-        self._announcer = Announcer(self._dispatcher, self._desk, self._facts, self._follow)
-        settling = self._tuning.for_new_worker, self._announcer.look, self._tuning.heard
-        self._supervisor = Supervisor(self._dispatcher, served, given.threads, given.job_timeout_s, *settling)
-        self._asks = Asks(lambda: self._supervisor.served, lambda: self._dispatcher.link)
-        self._sockets = Sockets(given, self._dispatcher, self._changed)
-        self._intake = Intake(self._dispatcher, self._sockets, self._changed, lambda: self.state not in _OF_NO_USE)
-        self._is_running = False
-        self._started_ns = 0
+        self._dispatcher = Dispatcher(given, self._results, self._provenance)
+        self._endpoints = Endpoints(given, self._dispatcher.accept, self._dispatcher.accept_exhausted, self._changed)
+        change_timeout_s = min(given.job_timeout_s, _CHANGE_TIMEOUT_S)
+        self._parameters = ParameterControl(bundle, self._dispatcher, self._results.notify, change_timeout_s)
+        self._lifecycle = Lifecycle(self._dispatcher, self._endpoints, self._results, lambda: self._supervisor.health)
+        self._supervisor = Supervisor(
+            self._dispatcher, bundle, given.threads, given.job_timeout_s, self._parameters, self._lifecycle.check
+        )
+        self._queries = WorkerQueries(lambda: self._supervisor.bundle, lambda: self._dispatcher.connection)
         self._deployer = Deployer(
-            self._dispatcher, self._supervisor, self._tuning, given.job_timeout_s, self._desk.tell
+            self._dispatcher, self._supervisor, self._parameters, given.job_timeout_s, self._results.notify
         )
-        told = self._health, self._sockets.entrance, self._changed
-        self._peers = peers_of(Parts(given, self._dispatcher, self._desk, self._tuning, *told))
-        self._turn = threading.Lock()
+        answered = self._endpoints.events.answered
+        self._replicas = Replicas(group_address(given), self._facts, self._parameters, answered, self._replicas_changed)
+        self._parameters.newest = self._replicas.newest
+        self._dispatcher.on_answered = self._replicas.answered
+        self._started_ns = 0
+        self._lock = threading.Lock()
 
-    # -- beginning and end ----------------------------------------------------------------------------------------
+    # -- start and stop -----------------------------------------------------------------------------------------------
 
     def start(self) -> ServiceState:
-        """Bind the sockets, start a worker, wait until it has proved the bundle; return what is to be known of it.
+        """Bind the sockets, start a worker, wait until it has proved the bundle; return addresses and process.
 
         If the bundle can't be served the state is FAULTED, and `reason` says why.
 
@@ -114,14 +109,15 @@ class Service:
         AddressError
             An address can't be bound.
         """
-        with self._turn:
-            if not self._is_running:
+        with self._lock:
+            if not self._lifecycle.is_running:
                 _warm_up()
-                self._sockets.start()
-                self._is_running = True
+                self._endpoints.start()
+                self._lifecycle.is_running = True
                 self._started_ns = time_ns()
                 self._dispatcher.refuse("")
-                self._peers.start()
+                self._replicas.start()
+                self._replicas_changed()
                 self._supervisor.start()
                 self._changed()
         self._dispatcher.wait_for(lambda: self.state != "LOADING", None)
@@ -129,15 +125,14 @@ class Service:
 
     @property
     def service_state(self) -> ServiceState:
-        """What is to be known of it, for its state file."""
-        where = self._sockets.addresses
-        digest = self._supervisor.served.digest
+        """The contents of its state file."""
+        addresses = self._endpoints.addresses
         return ServiceState(
             os.getpid(),
-            where["sub"],
-            where["pub"],
-            digest,
-            where["failures"],
+            addresses["sub"],
+            addresses["pub"],
+            self._supervisor.bundle.digest,
+            addresses["failures"],
             self.http,
             self.token_file,
             self.options.replica,
@@ -145,32 +140,35 @@ class Service:
         )
 
     def stop(self, timeout_s: float | None = None) -> None:
-        """Take no more events, answer or report those that were accepted, end the worker; bounded by ``timeout_s``.
+        """Take no more events, answer or report those that were accepted, end the worker.
 
-        Without it, by drain_timeout_s. What could not be worked off in time is answered with a failure.
+        Parameters
+        ----------
+        timeout_s
+            Longest time, in seconds; drain_timeout_s without. An event that is not done in time is answered with a
+            failure.
         """
         timeout_s = self.drain_timeout_s if timeout_s is None else timeout_s
         deadline_s = monotonic() + timeout_s
-        with self._turn:
-            if not self._is_running:
+        with self._lock:
+            if not self._lifecycle.is_running:
                 return
             notify("STOPPING=1")
-            self._intake.close(timeout_s, for_good=True)
-            self._intake.work_off(timeout_s * _DRAIN_SHARE)
-            self._peers.give_up()
-            self._intake.give_up()
+            self._lifecycle.close(timeout_s, is_stopping=True)
+            self._lifecycle.wait_empty(timeout_s * _DRAIN_SHARE)
+            self._lifecycle.give_up()
             self._supervisor.stop()
             self.failure_store.flush(max(deadline_s - monotonic(), 0.1))
             self.event_log.close(max(deadline_s - monotonic(), 0.1))
-            # A broker that does not answer may take all the time that there is, from the group too.
+            # A broker that does not answer may take all the time that is left, also the replicas' share.
             share = 0.5 if self.options.has_broker else 1.0
-            self._sockets.stop(max((deadline_s - monotonic()) * share, 0.5))
-            self._peers.stop(max(deadline_s - monotonic(), 0.5))
-            self._is_running = self._intake.is_draining = self._intake.is_stopping = self._dispatcher.is_closed = False
-            self._changed()
+            self._endpoints.stop(max((deadline_s - monotonic()) * share, 0.5))
+            self._replicas.stop(max(deadline_s - monotonic(), 0.5))
+            self._dispatcher.release(_JOINING)
+            self._lifecycle.stopped()
 
     def abandon(self) -> int:
-        """Kill the worker, and report all that was accepted as not finished; return how many events that were."""
+        """Kill the worker, and report all accepted events as not finished; return how many events that were."""
         self._supervisor.abandon()
         count = self._dispatcher.give_up("The service was stopped at once")
         self._dispatcher.publish()
@@ -183,42 +181,34 @@ class Service:
     def __exit__(self, *exception: object) -> None:
         self.stop()
 
-    # -- how it is --------------------------------------------------------------------------------------------------
+    # -- description --------------------------------------------------------------------------------------------------
 
     @property
     def state(self) -> State:
         """LOADING, READY, PAUSED, DEGRADED, DRAINING, FAULTED or STOPPED."""
-        return self._state()[0]
+        return self._lifecycle.state()[0]
 
     @property
     def reason(self) -> str:
         """Why it is in this state; empty if there is nothing to say."""
-        return self._state()[1]
+        return self._lifecycle.state()[1]
 
     @property
     def has_given_up(self) -> bool:
         """Whether it is FAULTED and no worker will be started any more, unless another bundle is deployed."""
         return self._supervisor.health.is_final
 
-    def _state(self) -> tuple[State, str]:
-        return self._announcer.state()
-
-    def _facts(self) -> Facts:
-        health, has_worker = self._supervisor.health, self._dispatcher.link is not None
-        is_so = self._is_running, self._intake.is_draining, self._intake.is_paused
-        return Facts(*is_so, has_worker, health.was_ready, health.fault, health.trouble, self._sockets.trouble)
-
     def alive(self) -> str:
         """Return why nothing is computed, or will be; empty if something is, however busy it is."""
         health = self._supervisor.health
         if health.fault or health.stuck:
             return health.fault or f"{health.stuck}."
-        late = self._dispatcher.overdue(int(self.job_timeout_s * 1e9))
-        return f"An event has been worked on for more than {self.job_timeout_s:g} s." if late else ""
+        overdue = self._dispatcher.overdue(int(self.job_timeout_s * 1e9))
+        return f"An event has been worked on for more than {self.job_timeout_s:g} s." if overdue else ""
 
     def ready(self) -> str:
         """Return why events would not be answered now; empty if they are."""
-        state, reason = self._state()
+        state, reason = self._lifecycle.state()
         return "" if state == "READY" else reason or f"It is {state}."
 
     def counts(self) -> dict[str, int]:
@@ -230,36 +220,39 @@ class Service:
         subscriber of the answers filled up, so that at least one answer was lost to it; ``lost``, without a broker, how
         many events were sent and never came, by gaps in their senders' numbers.
         """
-        with self._dispatcher.changed:
-            counts = self._dispatcher.ledger.counts()
-        entrance = self._sockets.entrance
-        counts |= {"rejected": entrance.rejected, "slow_subscribers": self._sockets.answers.slow_subscribers}
-        return {**counts, **entrance.counts(), **self._peers.counts()}
+        return {**self._dispatcher.counts(), **self._endpoints.counts()}
 
     def group(self) -> dict[str, Any]:
-        """Return what there is to know of the replicas that share its events, this one among them, JSON-ready."""
-        return self._peers.told()
-
-    def _health(self) -> dict[str, Any]:
-        state, reason = self._state()
-        name = self._supervisor.served.settings.name
-        return {"name": name, "state": state, "reason": reason, "counts": self.counts(), "http": self.http}
+        """Return the replicas that share its events, this one among them, JSON-ready."""
+        return self._replicas.describe()
 
     def latency(self) -> Latency:
         """Return how long events took, from their acceptance to their answer."""
-        return self._desk.latency.read()
+        return self._results.latency.read()
 
     def info(self) -> dict[str, Any]:
-        """Return what there is to know of it, JSON-ready."""
-        state, reason = self._state()
+        """Return a description of the bundle, the processes and the state, JSON-ready."""
+        import epypes
+
+        state, reason = self._lifecycle.state()
+        bundle, connection = self._supervisor.bundle, self._dispatcher.connection
         return {
-            **about(self._supervisor.served, self._dispatcher.link),
+            "name": bundle.settings.name,
+            "bundle": str(bundle.path),
+            "digest": bundle.digest,
+            "inputs": list(bundle.settings.inputs),
+            "outputs": list(bundle.settings.outputs),
+            "rgb": list(bundle.settings.rgb),
+            "func_io": {} if connection is None else dict(connection.about.get("func_io", {})),
+            "pid": os.getpid(),
+            "worker_pid": None if connection is None else connection.pid,
+            "versions": {"epypes": epypes.__version__, "python": sys.version.split()[0]},
             "state": state,
             "reason": reason,
             "replica": self.options.replica,
             "threads": self.threads,
-            "revision": self._tuning.current.revision,
-            "addresses": {**self._sockets.addresses, "http": self.http},
+            "revision": self._parameters.current.revision,
+            "addresses": {**self._endpoints.addresses, "http": self.http},
             "shows_failures": self.options.shows_failures,
             "started_ns": self._started_ns,
             "restarts": self._supervisor.health.restarts,
@@ -267,62 +260,73 @@ class Service:
         }
 
     def listen(self, callback: Listener) -> Callable[[], None]:
-        """Have it told to a callback what happens; return what ends that.
+        """Call a function with whatever happens from now on; return what ends that.
 
         Parameters
         ----------
         callback
             Called on threads of the service with a kind (``"state"``, ``"run"``, ``"failure"``, ``"parameters"``,
-            ``"deployed"``: another bundle, or other values in it) and what there is to know. It must return at once,
-            and change nothing of the service.
+            ``"deployed"``: another bundle, or other values in it) and its data. It must return at once, and change
+            nothing of the service.
         """
-        return self._desk.listen(callback)
+        return self._results.listen(callback)
 
     def _changed(self) -> None:
-        self._announcer.changed()
+        self._lifecycle.changed()
 
-    def _follow(self, before: State, now: State) -> None:
-        if (before in _OF_NO_USE) != (now in _OF_NO_USE):
-            self._intake.follow()
+    def _facts(self) -> dict[str, Any]:
+        """Return what the other replicas are told of this one."""
+        state, reason = self._lifecycle.state()
+        name, replica = self._supervisor.bundle.settings.name, self.options.replica
+        about = {"state": state, "reason": reason, "counts": self.counts(), "http": self.http}
+        return {"replica": replica, "name": name, **about}
 
-    def _setting(self) -> Setting:
-        served, current = self._supervisor.served, self._tuning.current
-        return Setting(served.settings.name, str(served.path), served.digest, current.revision, current.entries)
+    def _replicas_changed(self) -> None:
+        """Hold events while the parameters of the other replicas are not known."""
+        if self._replicas.is_joining:
+            self._dispatcher.hold(_JOINING)
+        elif self._dispatcher.is_held(_JOINING):
+            self._dispatcher.release(_JOINING)
+        self._changed()
 
-    # -- what it is told to do --------------------------------------------------------------------------------------
+    def _provenance(self) -> Provenance:
+        bundle, current = self._supervisor.bundle, self._parameters.current
+        return Provenance(bundle.settings.name, str(bundle.path), bundle.digest, current.revision, current.entries)
+
+    # -- operation ----------------------------------------------------------------------------------------------------
 
     def pause(self) -> None:
         """Have events wait in the mailbox."""
-        self._intake.pause()
+        self._lifecycle.pause()
 
     def resume(self) -> None:
         """Work on events again, also after `pause` and `drain`."""
-        with self._turn:
-            self._intake.resume()
+        with self._lock:
+            self._lifecycle.resume()
 
     def drain(self, timeout_s: float | None = None) -> bool:
-        """Take no more events, until `resume`, and work off those that were accepted; return whether that was done."""
+        """Take no more events, until `resume`, and finish those that were accepted; return whether that was done."""
         timeout_s = self.drain_timeout_s if timeout_s is None else timeout_s
-        with self._turn:
-            if not self._is_running:
+        with self._lock:
+            if not self._lifecycle.is_running:
                 return True
-            self._intake.close(timeout_s)
-        is_done = self._intake.work_off(timeout_s)
-        if is_done and self._intake.is_draining:
-            self._intake.leave(timeout_s)
+            self._lifecycle.close(timeout_s)
+        is_done = self._lifecycle.wait_empty(timeout_s)
+        if is_done and self._lifecycle.is_draining:
+            self._lifecycle.leave(timeout_s)
         return is_done
 
     def deploy(self, path: str | Path) -> dict[str, Any]:
-        """Serve another bundle from now on; return what there is to know of the service then.
+        """Serve another bundle from now on; return `info`, and which values changed.
 
         A second worker proves it beside the first one, and gets the events when none is worked on. It has its own
-        parameters, with the next revision: ``changed`` of what is returned has a line for each value that is another
-        one now, as ``"sigma 1.4 -> 1.0 (tuned, not written back)"``.
+        parameters, with the next revision: ``changed`` has a line for each value that differs, as
+        ``"sigma 1.4 -> 1.0 (tuned, not written back)"``.
 
         Raises
         ------
         DeployRefused
-            It does not compute what was recorded, or has other ports; the one that is served goes on.
+            It does not compute what was recorded, or has other ports; the bundle that is served goes on.
         ServiceError
             Another one is being deployed.
         """
@@ -331,12 +335,12 @@ class Service:
     def rollback(self) -> dict[str, Any]:
         """Serve the bundle again that was served before; return what `deploy` returns.
 
-        The one that is left is the one before then: to roll back twice is to be where one was.
+        The bundle that is left is the one before then, so a second rollback undoes the first.
 
         Raises
         ------
         DeployRefused
-            There was none, or it is not any more what it was.
+            There was none, or it was changed since.
         """
         return {"changed": self._deployer.rollback(), **self.info()}
 
@@ -344,17 +348,17 @@ class Service:
 
     def parameters(self) -> Parameters:
         """Return the hyperparameters, their ranges and their revision."""
-        return self._tuning.current
+        return self._parameters.current
 
     def set_parameters(self, values: Mapping[str, Any], revision: int | None = None) -> Parameters:
-        """Change hyperparameters between two events, all of them or none; return what they are then.
+        """Change hyperparameters between two events, all of them or none; return all of them.
 
         Parameters
         ----------
         values
             By token, as JSON has them.
         revision
-            The one that is known to who changes them; None to change them whatever it is.
+            The revision that the caller knows; None to change them whatever it is.
 
         Raises
         ------
@@ -365,7 +369,7 @@ class Service:
         ServiceError
             There is no worker, or it is busy for too long.
         """
-        return self._peers.set(values, revision)
+        return self._replicas.set(values, revision)
 
     def write_back(self, *, dry_run: bool = False) -> WriteBack:
         """Write the parameters into the pipeline.toml of the bundle that is served; return the diff and its digest.
@@ -385,22 +389,22 @@ class Service:
 
     def view(self) -> bytes:
         """Return the graph with the values of the last completed run, as JSON of a GraphView."""
-        return self._asks.graph("view")
+        return self._queries.graph("view")
 
     def graph_svg(self) -> bytes:
         """Return the graph with the values of the last completed run, as a picture."""
-        return self._asks.graph("svg")
+        return self._queries.graph("svg")
 
     def preview(self, token: str, max_side_px: int = 512) -> tuple[str, bytes]:
         """Return the media type and the bytes of a picture or text of a token in the last completed run."""
-        return self._asks.preview(token, max_side_px)
+        return self._queries.preview(token, max_side_px)
 
     def run(self, tokens: Sequence[str] = (), revision: int | None = None) -> bytes:
         """Return tokens of the last completed run, or of one with this revision, as one packed Envelope."""
-        return self._asks.run(tokens, revision)
+        return self._queries.run(tokens, revision)
 
     def failure_records(self, limit: int | None = None) -> list[FailureRecord]:
-        """Return what is known of failures, the newest first."""
+        """Return the records of failures, the newest first."""
         return self.failure_store.records(limit)
 
 
@@ -408,5 +412,4 @@ def _warm_up() -> None:
     """Load what the first event needs: where memory is limited that fails now, and not at an event."""
     import numpy as np
 
-    prepare_lending()
     decode(encode(Envelope("epypes.warm_up", {"array": np.zeros(1)})))

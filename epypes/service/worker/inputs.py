@@ -1,7 +1,6 @@
-"""In which order do the slots of a worker take what comes?
+"""The queue of a worker: events and jobs for whichever slot is free, and changes of parameters between them.
 
-One line of work for all slots: events and jobs are taken by whichever slot is free; a change of parameters waits
-until no slot works, and what came after it waits for the change.
+A change waits until no slot works, and what came after it waits for the change.
 """
 
 from __future__ import annotations
@@ -13,16 +12,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-# As in EventLoop, whose threads ask again and again once everything has ended.
+# As in EventLoop, whose threads poll once everything has ended.
 _ENDED_POLL_S: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Event:
-    """An event as it came: its number, whether it is bytes of a peer of 2019, and its frames."""
+class WorkerEvent:
+    """An event: its number, and its frames; one frame is a message of 2019."""
 
     seq: int
-    is_raw: bool
     frames: list[memoryview]
 
 
@@ -34,37 +32,38 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Change:
+class ParameterChange:
     """A change of parameters, made while no slot works; it must not raise."""
 
     revision: int
     apply: Callable[[], object]
 
 
-class Inbox:
-    """What waits for the slots."""
+class InputQueue:
+    """Events, jobs and changes that wait for the slots."""
 
     def __init__(self) -> None:
-        self._changed = threading.Condition(threading.Lock())
-        self._items: deque[Event | Job | Change] = deque()
+        self._lock = threading.Lock()
+        self._changed = threading.Condition(self._lock)
+        self._items: deque[WorkerEvent | Job | ParameterChange] = deque()
         self._working = 0
         self._has_ended = False
 
-    def put(self, item: Event | Job | Change) -> None:
-        """Add something to the line."""
-        with self._changed:
+    def put(self, item: WorkerEvent | Job | ParameterChange) -> None:
+        """Add an item."""
+        with self._lock:
             self._items.append(item)
             self._changed.notify()
 
-    def take(self, block: bool = True) -> Event | Job:
-        """Wait for something to work on; it is under way until `finished` is called.
+    def take(self, block: bool = True) -> WorkerEvent | Job:
+        """Wait for an item to work on; the slot works on it until `finished` is called.
 
         Raises
         ------
         queue.Empty
             Everything has ended: nothing waits, and nothing will come. Without ``block``: nothing waits now.
         """
-        with self._changed:
+        with self._lock:
             while True:
                 item = self._next()
                 if item is not None:
@@ -77,24 +76,24 @@ class Inbox:
                     raise queue.Empty
                 self._changed.wait()
 
-    def _next(self) -> Event | Job | None:
+    def _next(self) -> WorkerEvent | Job | None:
         """Return what may be worked on now, having made the changes that come before it."""
         while self._items:
             item = self._items[0]
-            if isinstance(item, Change):
+            if isinstance(item, ParameterChange):
                 if self._working:
                     return None
                 self._items.popleft()
                 item.apply()
             else:
-                del self._items[0]
-                return item
+                return self._items.popleft()  # type: ignore[return-value]  # it is the item above
         return None
 
     def withdraw(self, revision: int) -> bool:
-        """Forget a change that has not been made; return whether it was there."""
-        with self._changed:
-            found = next((item for item in self._items if isinstance(item, Change) and item.revision == revision), None)
+        """Remove a change that has not been made; return whether it was there."""
+        with self._lock:
+            changes = (item for item in self._items if isinstance(item, ParameterChange))
+            found = next((item for item in changes if item.revision == revision), None)
             if found is not None:
                 self._items.remove(found)
                 # What came after it need not wait any more.
@@ -102,15 +101,15 @@ class Inbox:
             return found is not None
 
     def finished(self) -> None:
-        """Tell that what was taken has been done."""
-        with self._changed:
+        """Note that a slot is free again."""
+        with self._lock:
             self._working -= 1
-            if not self._working:
-                # A change may have waited for this; then what came after it is for all.
+            if not self._working and self._items:
+                # A change may have waited for this; then what came after it is for all slots.
                 self._changed.notify_all()
 
     def end(self) -> None:
-        """Let slots go once nothing waits any more."""
-        with self._changed:
+        """Let slots end once nothing waits any more."""
+        with self._lock:
             self._has_ended = True
             self._changed.notify_all()

@@ -1,0 +1,656 @@
+"""The front's connection to one worker process: frames over a socket pair, and the process at its other end.
+
+A message is a table (see `packing`), a header as JSON, and frames. Frames are never joined: the kernel takes them
+where they are, and the reader allocates each once, when its size has been checked. When one side ends, whatever the
+cause, the other reads the end of the stream at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import itertools
+import json
+import logging
+import os
+import queue
+import re
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic, sleep
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from epypes.bundle.load import MODULE
+from epypes.errors import MessageError, ServiceError
+from epypes.service.packing import HEAD_BYTES, MARK, SIZE_BYTES, BlockLimits, BytesLike, count_in, sizes_in
+from epypes.service.standard_error import STANDARD_ERROR
+from epypes.service.systemd import VARIABLES
+
+if TYPE_CHECKING:
+    from epypes.service.bundle_info import BundleInfo
+
+_log = logging.getLogger("epypes.service")
+
+Message = tuple[dict[str, Any], list[memoryview]]
+WorkerStatus = Literal["loading", "ready", "refused", "gone"]
+
+MAX_HEADER_BYTES: Final = 1024**2
+# Of one message: an event's answers may be several Envelopes.
+LIMITS: Final = BlockLimits(frames=16_384, total_bytes=1024**3)
+# Shared memory does not avoid the copy: a new segment per frame takes four times as long (8 ms for 8 MB, against 2 ms
+# here), and one that is used again must wait until the last array of the worker that looks into it is gone.
+# Asked for; the system gives what it allows. With 4 MB a frame of 1 MB takes 0.23 ms, with 0.2 MB 0.25 to 0.4 ms.
+_BUFFER_BYTES: Final = 4 * 1024**2
+# Messages up to this size are read at once, and sent by the caller's thread if the kernel takes them without waiting.
+_SMALL_BYTES: Final = 64 * 1024
+# The most buffers that one sendmsg takes.
+_MAX_BUFFERS: Final = 1_024
+_SENT_DIRECTLY: Final = socket.MSG_NOSIGNAL | socket.MSG_DONTWAIT
+
+ASK_TIMEOUT_S: Final = 2.0
+# How long a worker may take to report whether a change that timed out was made.
+_WITHDRAW_TIMEOUT_S: Final = 0.5
+# How long a worker that seems to hang may take to report what it runs.
+_HANG_REPORT_TIMEOUT_S: Final = 0.5
+# Kinds of messages that settle a change of parameters.
+SETTLING: Final = ("parameters", "parameters_refused", "parameters_withdrawn")
+
+_LINES_KEPT: Final = 20
+_READ_BYTES: Final = 64 * 1024
+# How long a process may take to write the stacks of its threads, and how often the file is read meanwhile.
+_TRACE_TIMEOUT_S: Final = 0.5
+_TRACE_PERIOD_S: Final = 0.01
+_MAX_TRACE_BYTES: Final = 256 * 1024
+# How long a process may take to end once its socket has.
+_END_TIMEOUT_S: Final = 1.0
+_FRAME: Final = re.compile(r'^  File "(?P<file>.*)", line \d+ in (?P<name>\S+)$')
+
+_to_json: Final = json.JSONEncoder(separators=(",", ":")).encode
+
+
+def frame_sockets() -> tuple[FrameSocket, socket.socket]:
+    """Return one end of a new connection, and the socket for the process at its other end."""
+    ours, theirs = socket.socketpair()
+    for end in (ours, theirs):
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+    return FrameSocket(ours), theirs
+
+
+class FrameSocket:
+    """One end of a connected pair of stream sockets, which carries headers and frames.
+
+    Parameters
+    ----------
+    end
+        The socket; it is closed by `close`.
+    """
+
+    def __init__(self, end: socket.socket) -> None:
+        end.setblocking(True)
+        self._socket = end
+        self._sending, self._receiving = threading.Lock(), threading.Lock()
+        self._reader = io.BufferedReader(io.FileIO(end.fileno(), closefd=False), _SMALL_BYTES)
+
+    def send(self, header: Mapping[str, Any], frames: Sequence[BytesLike] = ()) -> None:
+        """Send a message, from any thread; wait for as long as the other side does not read.
+
+        When it returns, the frames' memory may be written to again.
+
+        Parameters
+        ----------
+        header
+            What json takes.
+        frames
+            Contiguous bytes.
+
+        Raises
+        ------
+        EOFError
+            The other side is gone.
+        MessageError
+            The header or the frames are larger than the reader accepts; nothing was sent.
+        """
+        left = buffers_of(header, frames)
+        with self._sending:
+            self._send_all(left)
+
+    def send_at_once(self, left: list[memoryview]) -> list[memoryview]:
+        """Send as much of a message as the kernel takes without waiting; return the rest.
+
+        No other thread may send on this end until the rest is sent, by `send_rest`.
+
+        Raises
+        ------
+        EOFError
+            The other side is gone.
+        """
+        with self._sending:
+            try:
+                return _after(left, self._socket.sendmsg(left[:_MAX_BUFFERS], (), _SENT_DIRECTLY))
+            except BlockingIOError:
+                return left
+            except OSError as error:
+                raise EOFError("The other side of the connection is gone.") from error
+
+    def send_rest(self, left: list[memoryview]) -> None:
+        """Send buffers of `buffers_of`, or what `send_at_once` has left of them; as `send`."""
+        with self._sending:
+            self._send_all(left)
+
+    def _send_all(self, left: list[memoryview]) -> None:
+        try:
+            while left:
+                left = _after(left, self._socket.sendmsg(left[:_MAX_BUFFERS], (), socket.MSG_NOSIGNAL))
+        except OSError as error:
+            raise EOFError("The other side of the connection is gone.") from error
+        except BaseException:
+            # Half a message may be sent: what came after it could not be understood.
+            self._end()
+            raise
+
+    def receive(self) -> Message:
+        """Wait for a message, and return its header and its frames, read-only; called by one thread.
+
+        Raises
+        ------
+        EOFError
+            The other side is gone, or this one was closed.
+        MessageError
+            The bytes are no message. What comes after them can't be understood: close the connection.
+        """
+        with self._receiving:
+            count = count_in(self._read(HEAD_BYTES), LIMITS)
+            sizes = sizes_in(self._read(SIZE_BYTES * count), count, LIMITS)
+            if not sizes or sizes[0] > MAX_HEADER_BYTES:
+                text = f"A message begins with a header of at most {MAX_HEADER_BYTES:,} bytes."
+                raise MessageError("no header", text)
+            total = sum(sizes)
+            if total <= _SMALL_BYTES:
+                block, begin = memoryview(self._read(total)), 0
+                frames = []
+                for size in sizes:
+                    frames.append(block[begin : begin + size])
+                    begin += size
+            else:
+                frames = [memoryview(self._read(size)) for size in sizes]
+        try:
+            header = json.loads(bytes(frames.pop(0)))
+        except (ValueError, RecursionError) as error:
+            raise MessageError("no header", f"The header of a message is no JSON: {error}.") from error
+        if not isinstance(header, dict):
+            raise MessageError("no header", f"The header of a message is an object, not a {type(header).__name__}.")
+        return header, frames
+
+    def _read(self, size: int) -> bytes:
+        try:
+            # The reader allocates the bytes without filling them, and reads large ones in place.
+            data = self._reader.read(size)
+        except (OSError, ValueError) as error:
+            raise EOFError("The connection is closed.") from error
+        if len(data) < size:
+            raise EOFError("The other side of the connection is gone.")
+        return data
+
+    def close(self) -> None:
+        """End both directions, and wake up threads that read or send; may be called twice, from any thread."""
+        self._end()
+        # The descriptor may be another file's once it is closed, so no thread may be in a call on it.
+        with self._sending, self._receiving:
+            self._reader.close()
+            self._socket.close()
+
+    def close_in_forks(self) -> None:
+        """Close it in forked child processes, or the other side would not see this process end."""
+        os.register_at_fork(after_in_child=self._socket.close)
+
+    def _end(self) -> None:
+        with contextlib.suppress(OSError):  # it has ended already
+            self._socket.shutdown(socket.SHUT_RDWR)
+
+
+def buffers_of(header: Mapping[str, Any], frames: Sequence[BytesLike] = ()) -> list[memoryview]:
+    """Return a message as buffers to send; raise MessageError if the reader would refuse it."""
+    head = _to_json(header).encode()
+    if len(head) > MAX_HEADER_BYTES:
+        raise MessageError("too large", f"A header of {len(head):,} bytes; the limit is {MAX_HEADER_BYTES:,}.")
+    views = [memoryview(part).cast("B") for part in (head, *frames)]
+    sizes = [*map(len, views)]
+    if len(sizes) > LIMITS.frames or sum(sizes) > LIMITS.total_bytes:
+        text = f"{len(sizes):,} frames of {sum(sizes):,} bytes; the limits are {LIMITS.frames:,} and"
+        raise MessageError("too large", f"{text} {LIMITS.total_bytes:,}.")
+    table = struct.pack(f"<4sI{len(sizes)}Q", MARK, len(sizes), *sizes)
+    return [memoryview(table), *filter(len, views)]
+
+
+def _after(buffers: list[memoryview], sent: int) -> list[memoryview]:
+    """Return what is left of the buffers when so many bytes of them are sent."""
+    for place, buffer in enumerate(buffers):
+        if sent < len(buffer):
+            return [buffer[sent:], *buffers[place + 1 :]]
+        sent -= len(buffer)
+    return []
+
+
+class WorkerProcess:
+    """The process that runs a bundle's code.
+
+    The system ends it with the thread that made this object, so that thread must live as long as the service.
+
+    Parameters
+    ----------
+    bundle
+        The bundle's folder.
+    threads
+        How many events it works on at once.
+    """
+
+    def __init__(self, bundle: Path, threads: int) -> None:
+        self.module = bundle / MODULE
+        self._last_traces = ""
+        self._lines: deque[str] = deque(maxlen=_LINES_KEPT)
+        # The system may be short of descriptors, memory or threads at any of these.
+        with contextlib.ExitStack() as given, contextlib.ExitStack() as kept:
+            self.socket, theirs = frame_sockets()
+            kept.callback(self.socket.close)
+            given.callback(theirs.close)
+            self._traces = os.memfd_create("epypes-traces")
+            kept.callback(os.close, self._traces)
+            output, standard_error = os.pipe()
+            kept.callback(os.close, output)
+            given.callback(os.close, standard_error)
+            inherited = [theirs.fileno(), self._traces]
+            command = [sys.executable, "-I", "-m", "epypes.service.worker"]
+            self.process = subprocess.Popen(  # noqa: S603 - this interpreter, our own module
+                [*command, str(inherited[0]), str(bundle), "--threads", str(threads), "--faults", str(inherited[1])],
+                pass_fds=inherited,
+                stdin=subprocess.DEVNULL,
+                stdout=standard_error,
+                stderr=standard_error,
+                env={name: value for name, value in os.environ.items() if name not in VARIABLES},
+            )
+            self.pid = self.process.pid
+            kept.callback(self.process.wait)
+            kept.callback(self.kill)
+            self._output = threading.Thread(
+                target=_copy_output, args=(output, self._lines), name="epypes worker output", daemon=True
+            )
+            self._output.start()
+            kept.pop_all()
+
+    def kill(self) -> None:
+        """Kill it, also if it is stopped or hangs."""
+        with contextlib.suppress(ProcessLookupError):
+            self.process.kill()
+
+    def wait(self, timeout_s: float) -> bool:
+        """Return whether it has ended within ``timeout_s`` seconds."""
+        try:
+            self.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Release its resources when its socket has ended; kill it if it does not end then."""
+        if not self.wait(_END_TIMEOUT_S):
+            self.kill()
+        self.process.wait()
+        if self._traces == -1:
+            return
+        self._last_traces = self._read_traces(0)
+        self.socket.close()
+        # Its last output may be on the way; a process that it has started may hold the pipe open for longer.
+        self._output.join(0.2)
+        # Once: later the number may be that of another file.
+        traces, self._traces = self._traces, -1
+        os.close(traces)
+
+    @property
+    def ending(self) -> str:
+        """How it ended, with its last line of output; empty while it runs."""
+        status = self.process.poll()
+        if status is None:
+            return ""
+        how = f"was killed by {_signal_name(-status)}" if status < 0 else f"ended with status {status}"
+        last = next((line for line in reversed(self._lines) if line.strip()), "")
+        return f"The worker {how}" + (f"; its last output: {last.strip()[:300]}" if last else "")
+
+    def functions_by_trace(self) -> tuple[str, ...]:
+        """Return the functions of the bundle's module that its threads are in, as faulthandler writes them.
+
+        None of its threads needs to run Python code for that. A process that is stopped writes nothing.
+        """
+        try:
+            begin = os.fstat(self._traces).st_size
+            self.process.send_signal(signal.SIGUSR1)
+            deadline = monotonic() + _TRACE_TIMEOUT_S
+            size = begin
+            while monotonic() < deadline:
+                sleep(_TRACE_PERIOD_S)
+                before, size = size, os.fstat(self._traces).st_size
+                if size == before > begin:
+                    break
+            return functions_in_trace(self._read_traces(begin), str(self.module))
+        except OSError:
+            return ()
+
+    @property
+    def died_in(self) -> tuple[str, ...]:
+        """The functions of the bundle's module that it was in when it crashed, as far as faulthandler wrote them."""
+        return functions_in_trace(self._last_traces, str(self.module))
+
+    def _read_traces(self, begin: int) -> str:
+        size = min(os.fstat(self._traces).st_size - begin, _MAX_TRACE_BYTES)
+        return os.pread(self._traces, size, begin).decode(errors="replace")
+
+    @property
+    def is_stopped(self) -> bool:
+        """Whether the process was stopped by SIGSTOP, or by a debugger."""
+        try:
+            status = Path(f"/proc/{self.pid}/stat").read_text(encoding="utf-8", errors="replace")
+        except OSError:
+            return False
+        return status.rpartition(")")[2].split()[:1] in (["T"], ["t"])
+
+
+def functions_in_trace(text: str, module: str) -> tuple[str, ...]:
+    """Return, for each thread of a trace of faulthandler, the outermost function of a module that it is in.
+
+    Examples
+    --------
+    >>> trace = '''Thread 0x7f (most recent call first):
+    ...   File "/b/pipeline.py", line 9 in helper
+    ...   File "/b/pipeline.py", line 4 in match
+    ...   File "/x/epypes/run/call.py", line 30 in call
+    ... '''
+    >>> functions_in_trace(trace, "/b/pipeline.py")
+    ('match',)
+    """
+    found: list[str] = []
+    for block in text.split("most recent call first):\n"):
+        frames = [frame for line in block.splitlines() if (frame := _FRAME.match(line))]
+        names = [frame["name"] for frame in frames if frame["file"] == module]
+        found += names[-1:]
+    return tuple(found)
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+def _copy_output(output: int, lines: deque[str]) -> None:
+    """Copy what a process prints to our own standard error, and keep the last lines."""
+    rest = b""
+    with contextlib.suppress(OSError):
+        while data := os.read(output, _READ_BYTES):
+            STANDARD_ERROR.write(data)
+            *whole, rest = (rest + data).split(b"\n")
+            lines.extend(line.decode(errors="replace") for line in whole[-_LINES_KEPT:])
+            rest = rest[-_READ_BYTES:]
+    if rest:
+        lines.append(rest.decode(errors="replace"))
+    os.close(output)
+
+
+@dataclass(frozen=True, slots=True)
+class HangReport:
+    """What a worker runs that seems to hang.
+
+    Attributes
+    ----------
+    functions
+        By the number of the event, the function that runs; empty where that can't be known.
+    elapsed_ns
+        How long the worker has worked on an event. An event that is missing here waits in the worker: for a change of
+        parameters, or for something else that the worker does.
+    has_answered
+        Whether the worker answered. Otherwise none of its threads runs Python code.
+    """
+
+    functions: Mapping[int, str]
+    elapsed_ns: Mapping[int, int]
+    has_answered: bool
+
+
+class WorkerConnection:
+    """A worker process, and the messages between it and the front.
+
+    No method but `ask`, `change_parameters` and `dismiss` waits: a thread sends what the kernel does not take at once,
+    another one receives.
+
+    Parameters
+    ----------
+    bundle
+        The bundle that it runs.
+    threads
+        How many events it works on at once.
+    on_message
+        Called on the receiving thread with the connection and each message that does not answer an `ask`.
+    on_end
+        Called there at the end, when the process is gone.
+
+    Attributes
+    ----------
+    status
+        ``"loading"`` until the worker has proved the bundle or refused it.
+    about
+        Its ``ready`` message: functions, report.
+    reasons
+        Why it refused the bundle.
+    is_dismissed
+        Whether the front itself ends it, so that its events did not cause its end.
+    """
+
+    def __init__(
+        self,
+        bundle: BundleInfo,
+        threads: int,
+        on_message: Callable[[WorkerConnection, Message], None],
+        on_end: Callable[[WorkerConnection], None],
+    ) -> None:
+        self.bundle = bundle
+        self.status: WorkerStatus = "loading"
+        self.about: Mapping[str, Any] = {}
+        self.reasons: tuple[str, ...] = ()
+        self.is_dismissed = False
+        self._on_message, self._on_end = on_message, on_end
+        self._posting = threading.Lock()
+        # Buffers that the kernel has not taken; while there are any, later messages queue behind them.
+        self._unsent: deque[list[memoryview]] = deque()
+        self._wake: queue.SimpleQueue[bool] = queue.SimpleQueue()
+        self._is_over = False
+        self._numbers = itertools.count(1)
+        self._asked: dict[tuple[str, int], queue.SimpleQueue[Message | None]] = {}
+        self.process = WorkerProcess(bundle.path, threads)
+        try:
+            for target, name in ((self._send, "to"), (self._receive, "from")):
+                threading.Thread(target=target, name=f"epypes {name} worker", daemon=True).start()
+        except BaseException:
+            self._wake.put(False)
+            self.process.kill()
+            self.process.close()
+            raise
+
+    @property
+    def pid(self) -> int:
+        """The process."""
+        return self.process.pid
+
+    # -- sending ------------------------------------------------------------------------------------------------------
+
+    def post(self, header: Mapping[str, Any], frames: Sequence[BytesLike] = ()) -> None:
+        """Send a message after those before it; returns at once. To a worker that is gone nothing is sent."""
+        try:
+            left = buffers_of(header, frames)
+        except MessageError as error:
+            # Only an event can be as large, and the subscriber has checked its size.
+            _log.error("a message to the worker was not sent: %s", error)
+            return
+        with self._posting:
+            if not self._unsent and sum(map(len, left)) <= _SMALL_BYTES:
+                try:
+                    left = self.process.socket.send_at_once(left)
+                except EOFError:
+                    return
+                if not left:
+                    return
+            self._unsent.append(left)
+            if len(self._unsent) == 1:
+                self._wake.put(True)
+
+    def _send(self) -> None:
+        while self._wake.get():
+            left: list[memoryview] | None = self._unsent[0]
+            while left is not None:
+                try:
+                    self.process.socket.send_rest(left)
+                except EOFError:
+                    return
+                except BaseException:
+                    # Memory may be short. What the worker has not got is given to the next one.
+                    _log.exception("the worker can't be sent messages, so it is ended")
+                    self.process.kill()
+                    return
+                # An event may be large: its memory must not be held until another one comes.
+                with self._posting:
+                    self._unsent.popleft()
+                    left = self._unsent[0] if self._unsent else None
+
+    # -- questions ----------------------------------------------------------------------------------------------------
+
+    def ask(self, what: str, timeout_s: float = ASK_TIMEOUT_S, **more: Any) -> Message:
+        """Send a question to the worker, and wait for the answer.
+
+        Raises
+        ------
+        ServiceError
+            It is gone, or does not answer in time.
+        """
+        number = next(self._numbers)
+        with self._answers_to(("answer", number)) as answers:
+            self.post({"kind": "ask", "ask": number, "what": what, **more})
+            try:
+                return self._answer(answers, timeout_s)
+            except queue.Empty:
+                text = f"The worker has not answered within {timeout_s:g} s: it is busy. Try again."
+                raise ServiceError(self.bundle.path, text) from None
+
+    def change_parameters(self, revision: int, values: Mapping[str, Any], timeout_s: float) -> dict[str, str]:
+        """Have it take values of hyperparameters, by token as in pipeline.toml; return its problems by token.
+
+        Raises
+        ------
+        ServiceError
+            It is gone, or works on an event for longer than ``timeout_s``.
+        """
+        with self._answers_to(("parameters", revision)) as answers:
+            self.post_parameters(revision, values)
+            try:
+                header, _ = self._answer(answers, timeout_s)
+            except queue.Empty:
+                self.post({"kind": "withdraw", "revision": revision})
+                try:
+                    header, _ = self._answer(answers, _WITHDRAW_TIMEOUT_S)
+                except queue.Empty:
+                    text = (
+                        f"The worker does not answer; the outcome is unknown. If it goes on before it is replaced, the "
+                        f"change may still be made, as revision {revision}: read the parameters then."
+                    )
+                    raise ServiceError(self.bundle.path, text) from None
+        if header["kind"] == "parameters_withdrawn":
+            text = f"The worker works on an event for longer than {timeout_s:g} s, so nothing was changed. Try again."
+            raise ServiceError(self.bundle.path, text)
+        return dict(header.get("problems") or {})
+
+    def post_parameters(self, revision: int, values: Mapping[str, Any]) -> None:
+        """Have it take values of hyperparameters as soon as it works on no event; a message reports whether it has."""
+        # Not in the header, which is bounded: a table may be large.
+        self.post({"kind": "parameters", "revision": revision}, [json.dumps(values).encode()])
+
+    @contextlib.contextmanager
+    def _answers_to(self, key: tuple[str, int]) -> Any:
+        answers = self._asked[key] = queue.SimpleQueue()
+        try:
+            if self._is_over:
+                answers.put(None)
+            yield answers
+        finally:
+            del self._asked[key]
+
+    def _answer(self, answers: queue.SimpleQueue[Message | None], timeout_s: float) -> Message:
+        answer = answers.get(timeout=timeout_s)
+        if answer is None:
+            raise ServiceError(self.bundle.path, "The worker is gone, and is started again. Try again in a moment.")
+        return answer
+
+    def hang_report(self, seqs: Sequence[int]) -> HangReport:
+        """Return what the worker runs for some events: by its answer, or by faulthandler if it does not answer."""
+        try:
+            header, _ = self.ask("running", _HANG_REPORT_TIMEOUT_S)
+        except ServiceError:
+            # A function holds the interpreter's lock, or the process is stopped.
+            names = self.process.functions_by_trace()
+            known = [name for name in names if name in self.about.get("functions", ())] or list(names)
+            return HangReport(dict.fromkeys(seqs, ", ".join(dict.fromkeys(known))), {}, has_answered=False)
+        slots: list[Mapping[str, Any]] = list(header.get("slots", ()))
+        functions = dict.fromkeys(seqs, "") | {slot["seq"]: ", ".join(slot["functions"]) for slot in slots}
+        return HangReport(functions, {slot["seq"]: slot["ns"] for slot in slots}, has_answered=True)
+
+    # -- receiving ----------------------------------------------------------------------------------------------------
+
+    def _receive(self) -> None:
+        try:
+            while True:
+                self._take(self.process.socket.receive())
+        except EOFError:
+            pass
+        except BaseException:
+            _log.exception("the worker's messages can't be understood, so it is ended")
+        self._wake.put(False)
+        self.process.close()
+        if self.status != "refused":
+            self.status = "gone"
+        self._is_over = True
+        for answers in list(self._asked.values()):
+            answers.put(None)
+        self._on_end(self)
+
+    def _take(self, message: Message) -> None:
+        header = message[0]
+        kind = header.get("kind")
+        if kind == "answer":
+            answers = self._asked.get(("answer", header.get("ask") or 0))
+        else:
+            answers = self._asked.get(("parameters", header.get("revision") or 0)) if kind in SETTLING else None
+            if kind == "ready":
+                self.about, self.status = header, "ready"
+            elif kind == "refused":
+                self.reasons, self.status = tuple(map(str, header.get("reasons") or ["It gave no reason."])), "refused"
+            # A change of parameters is noted before anything that comes after it is read.
+            self._on_message(self, message)
+        if answers is not None:
+            answers.put(message)
+
+    def dismiss(self, timeout_s: float) -> None:
+        """Let it finish its events and end; kill it if that takes longer than ``timeout_s``."""
+        self.is_dismissed = True
+        self.post({"kind": "end"})
+        if not self.process.wait(timeout_s):
+            self.process.kill()
+
+    def kill(self) -> None:
+        """End it at once, by the front: its events are not to blame."""
+        self.is_dismissed = True
+        self.process.kill()
