@@ -160,7 +160,7 @@ def _in_turn(
 
 
 _MARK = 255
-_COUNTED = '''
+_COUNTED = """
     import sys
 
     import cv2
@@ -175,7 +175,7 @@ _COUNTED = '''
 
     func_dict = {"half": half}
     func_io = {"half": ("image", "out")}
-'''
+"""
 
 
 def _calls(effort: Effort, folder: Path) -> Row:
@@ -185,12 +185,15 @@ def _calls(effort: Effort, folder: Path) -> Row:
     sample = {"image": image}, {"out": cv2.pyrDown(image)}
     bundle = written_bundle(folder / "counted", _COUNTED, ["image"], ["out"], sample=sample)
     os.environ["CALL_COUNTS"] = str(folder / "calls.json")
-    with subprocess.Popen(
-        [sys.executable, "-m", "tests.benchmarks.call_counter", "front", str(bundle)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as front, ExitStack() as stack:
+    with (
+        subprocess.Popen(
+            [sys.executable, "-m", "tests.benchmarks.call_counter", "front", str(bundle)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        ) as front,
+        ExitStack() as stack,
+    ):
         assert front.stdin is not None
         assert front.stdout is not None
         stack.callback(front.stdin.close)

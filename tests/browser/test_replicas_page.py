@@ -77,7 +77,7 @@ def test_the_page_shows_who_has_gone_without_a_word(browser, replicas, monkeypat
             page.wait_for_selector("#replicas tbody tr:nth-child(2) .badge.good:has-text('READY')")
             assert first.group()["lost"] == []
             # As if it were killed.
-            monkeypatch.setattr(second._peers._group._talk, "say", lambda data: None)
+            monkeypatch.setattr(second._replicas._group._talk, "say", lambda data: None)
         page.wait_for_selector("#replicas tbody tr:nth-child(2) .badge.error:has-text('LOST')")
         assert "ago, and has not said that it ends; its counts are of then" in rows(page)[1][1]
         assert page.locator("#replicas tbody a").count() == 0, "nobody answers there"

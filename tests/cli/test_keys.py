@@ -210,7 +210,7 @@ def test_a_stranger_that_knocks_is_counted_by_its_key(guarded, keys):
     own = {"keys": keys / "stranger", "allow": keys / "service.key"}
     stranger = read_keys(keys / "stranger").public
     with ep.ZMQSubscriber(guarded.service_state.pub, queue.SimpleQueue(), **own):
-        wait_until(lambda: guarded._sockets.answers.publisher.refused[stranger], WAIT_S)
+        wait_until(lambda: guarded._endpoints.answers._publisher.refused[stranger], WAIT_S)
 
 
 def test_a_key_file_that_is_none_is_named(bundle, keys, tmp_path):

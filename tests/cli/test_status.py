@@ -98,7 +98,7 @@ def test_each_that_is_lost_is_one_line_with_its_reason(epypes, acting, monkeypat
     with replicas("lost", a=(acting, {}), b=(acting, {}), c=(acting, {})) as (first, *others):
         for other in others:
             # It runs here, and the others hear nothing of it.
-            monkeypatch.setattr(other._peers._group._talk, "say", lambda data: None)
+            monkeypatch.setattr(other._replicas._group._talk, "say", lambda data: None)
         until(lambda: len(first.group()["lost"]) == 2)
         told = epypes("status", acting).stdout
     assert "Group: replicas 1, ready 1, lost 2, all with the same bundle and parameters" in told

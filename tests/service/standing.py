@@ -14,7 +14,7 @@ from epypes.display.views.view import view
 from epypes.errors import NotComputed, ParametersRefused, RevisionConflict, ServiceError
 from epypes.service.http.server import HttpServer
 from epypes.service.packing import pack
-from epypes.service.parameters import Parameters, changed
+from epypes.service.parameters import Parameters, changed_entries
 from epypes.wire import Envelope, encode
 
 
@@ -116,7 +116,7 @@ class Standing:
             self.asked.append((dict(values), revision))
             if revision is not None and revision != self.revision:
                 raise RevisionConflict(self.folder, self.parameters())
-            entries, problems = changed(self.entries, values)
+            entries, problems = changed_entries(self.entries, values)
             if problems:
                 raise ParametersRefused(self.folder, problems)
             self.entries, self.revision = entries, self.revision + 1

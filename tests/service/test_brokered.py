@@ -135,7 +135,7 @@ def test_an_event_that_kills_the_worker_again_and_again_is_a_dead_letter_of_the_
     assert answer.failure.input_id == sent
     until(lambda: more("dead_letters") == 1)
     dead = line.dead()
-    assert "put aside" in dead.headers["epypes-reason"]
+    assert "It is put aside" in dead.headers["epypes-reason"]
     assert dead.id == sent
     until(lambda: line.held() == 0)
     assert line.left() == 0
@@ -169,14 +169,14 @@ def test_an_event_that_was_delivered_too_often_is_put_aside_and_can_be_opened(ac
             channel.close()
         with replica_of(acting, line) as service:
             (answer,) = line.take()
-            assert "delivered 3 times before, and nobody has answered it" in answer.failure.message
+            assert "delivered 3 times before, and never answered" in answer.failure.message
             until(lambda: service.counts()["dead_letters"] == 1)
             assert service.counts()["rejected"] == 0
             assert service.counts()["redelivered"] == 1
             assert service.failure_store.flush()
             (record,) = service.failure_records()
             assert (record.dead_letter, record.event_id, record.attempt) == (True, sent, 3)
-            assert "nobody has answered it" in line.dead().headers["epypes-reason"]
+            assert "never answered" in line.dead().headers["epypes-reason"]
     with pytest.warns(UserWarning, match="it is not known which function it is, so none was run"):
         runner = ep.load_failure(record.id)
     assert runner.rerun("out") is not None
@@ -205,7 +205,7 @@ def test_a_replica_has_no_event_in_hand_that_it_does_not_work_on(acting, host, t
     with line_of(host) as line, replica_of(acting, line, threads=2) as service:
         for number in range(6):
             line.send(f"hold:{tmp_path}", number)
-        until(lambda: len(service._dispatcher.ledger.running()) == 2)
+        until(lambda: len(service._dispatcher.running) == 2)
         until((tmp_path / "started").exists)
         assert (line.left(), service.counts()["received"]) == (4, 2)
         (tmp_path / "release").touch()
@@ -242,7 +242,7 @@ def test_a_service_is_degraded_while_its_broker_is_away_and_goes_on_afterwards(a
             assert host in service.ready()
             assert service.alive() == ""
             (tmp_path / "release").touch()
-            until(lambda: not service._dispatcher.ledger.running())
+            until(lambda: not service._dispatcher.running)
         until(lambda: service.state == "READY")
         (answer,) = line.take()
         assert (answer.correlation_id, answer.parts["out"]) == (sent, 2)
@@ -263,7 +263,7 @@ def test_a_service_whose_broker_is_away_stops_in_time_and_has_answered_nothing_t
             with memory.away(host):
                 until(lambda: service.state == "DEGRADED")
                 (tmp_path / "release").touch()
-                until(lambda: not service._dispatcher.ledger.running())
+                until(lambda: not service._dispatcher.running)
                 service.stop(0.3)
             assert (service.counts()["given_back"], service.counts()["answered"]) == (1, 0)
         with replica_of(acting, line):

@@ -8,7 +8,7 @@ import pytest
 
 from epypes.bundle.entries import Member, read
 from epypes.errors import BundleError
-from epypes.service.parameters import changed, misfits, read_entries, type_of, value_of
+from epypes.service.parameters import changed_entries, misfits, read_entries, type_of, value_of
 
 ENTRIES = {
     "side": {"value": 5, "low": 1, "high": 31, "odd": True, "unit": "px"},
@@ -53,7 +53,7 @@ def test_an_entry_says_which_type_its_value_has_also_where_json_does_not(token, 
     ],
 )  # fmt: skip
 def test_a_value_within_its_range_is_taken_as_the_kind_it_was(token, given, value):
-    after, problems = changed(ENTRIES, {token: given})
+    after, problems = changed_entries(ENTRIES, {token: given})
     assert not problems
     found = read(after[token])
     assert (found, type(found)) == (value, type(value))
@@ -78,7 +78,7 @@ def test_a_value_within_its_range_is_taken_as_the_kind_it_was(token, given, valu
     ],
 )  # fmt: skip
 def test_a_value_that_cannot_be_is_refused_with_the_reason(token, given, text):
-    after, problems = changed(ENTRIES, {"sigma": 9.0, token: given})
+    after, problems = changed_entries(ENTRIES, {"sigma": 9.0, token: given})
     assert not after, "nothing is changed"
     assert list(problems) == [token]
     assert text in problems[token]
@@ -114,7 +114,7 @@ GIVEN = {
 
 @pytest.mark.parametrize("token", GIVEN)
 def test_what_a_change_has_made_of_an_entry_fits_it(token):
-    after, problems = changed(ENTRIES, {token: GIVEN[token]})
+    after, problems = changed_entries(ENTRIES, {token: GIVEN[token]})
     assert not problems
     values = json.loads(json.dumps({name: value_of(entry) for name, entry in after.items()}))
     assert misfits(ENTRIES, values) == {}

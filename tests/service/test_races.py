@@ -9,7 +9,7 @@ import threading
 import pytest
 
 from epypes.errors import RevisionConflict, ServiceError
-from epypes.service import asks, supervisor, tuning
+from epypes.service import parameters, supervisor, worker_queries
 from tests.service.bundles import written_bundle
 from tests.service.served import SOURCE, TIMEOUT_S, acting_bundle, serving, until
 
@@ -87,7 +87,7 @@ def test_a_worker_that_refuses_the_parameters_of_the_last_one_is_not_used(tmp_pa
 def test_a_worker_started_while_another_bundle_takes_over_is_not_used(acting, better, monkeypatch):
     made, switched = threading.Event(), threading.Event()
 
-    class Late(supervisor.Link):
+    class Late(supervisor.WorkerConnection):
         def __init__(self, served, *more):
             super().__init__(served, *more)
             if made_late and served.path == acting.resolve():
@@ -95,7 +95,7 @@ def test_a_worker_started_while_another_bundle_takes_over_is_not_used(acting, be
                 switched.wait(TIMEOUT_S)
 
     made_late = []
-    monkeypatch.setattr(supervisor, "Link", Late)
+    monkeypatch.setattr(supervisor, "WorkerConnection", Late)
     with serving(acting) as (service, peer):
         load = service._supervisor.load
 
@@ -116,7 +116,7 @@ def test_a_worker_started_while_another_bundle_takes_over_is_not_used(acting, be
 
 @pytest.mark.parametrize("revision", [None, 0])
 def test_a_change_that_another_bundle_overtakes_is_made_for_that_one_or_refused(acting, better, monkeypatch, revision):
-    real, looked, deployed = tuning.changed, threading.Event(), threading.Event()
+    real, looked, deployed = parameters.changed_entries, threading.Event(), threading.Event()
 
     def late(*arguments):
         found = real(*arguments)
@@ -125,7 +125,7 @@ def test_a_change_that_another_bundle_overtakes_is_made_for_that_one_or_refused(
             deployed.wait(TIMEOUT_S)
         return found
 
-    monkeypatch.setattr(tuning, "changed", late)
+    monkeypatch.setattr(parameters, "changed_entries", late)
     with serving(acting) as (service, peer):
         outcome = []
 
@@ -152,7 +152,7 @@ def test_a_change_that_another_bundle_overtakes_is_made_for_that_one_or_refused(
 
 def test_a_change_that_did_not_come_in_time_is_not_made_later(acting, tmp_path):
     with serving(acting, job_timeout_s=20) as (service, peer):
-        service._tuning._timeout_s = 0.1
+        service._parameters._timeout_s = 0.1
         peer.send(f"hold:{tmp_path}", 1)
         until((tmp_path / "started").exists)
         with pytest.raises(ServiceError, match="nothing was changed"):
@@ -204,7 +204,7 @@ def test_whether_it_is_paused_is_whether_events_wait_for_that(acting):
     with serving(acting) as (service, peer):
         service.pause()
         # As if another thread had resumed it between two steps of that.
-        service._dispatcher.let_go("pause")
+        service._dispatcher.release("pause")
         assert service.state == "READY"
         assert peer.ask(number=2).parts["out"] == 4
 
@@ -223,11 +223,11 @@ def test_what_another_bundle_has_shown_is_not_shown_for_this_one(acting, better)
 
 
 def test_what_is_remembered_for_when_there_is_no_worker_is_bounded_in_bytes(acting, monkeypatch):
-    monkeypatch.setattr(asks, "_MOST_BYTES", 1000)
+    monkeypatch.setattr(worker_queries, "_MAX_BYTES", 1000)
     with serving(acting) as (service, peer):
         peer.ask(number=5)
         for side in range(100, 400):
             service.preview("out", side)
-        known = service._asks._known
+        known = service._queries._cache
         assert 1 < sum(frame.nbytes for _, frames in known.values() for frame in frames) <= 1000
-        assert service._asks._bytes == sum(frame.nbytes for _, frames in known.values() for frame in frames)
+        assert service._queries._bytes == sum(frame.nbytes for _, frames in known.values() for frame in frames)

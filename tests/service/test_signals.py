@@ -11,8 +11,8 @@ import pytest
 
 from epypes.errors import DeployRefused
 from epypes.service import Service
-from epypes.service.systemd import notify
 from epypes.service.state_file import read_state
+from epypes.service.systemd import notify
 from tests.service.processes import running
 from tests.service.served import SOURCE, TIMEOUT_S, acting_bundle, peer_at, until
 

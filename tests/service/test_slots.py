@@ -268,7 +268,7 @@ def test_what_is_run_again_for_who_asks_runs_in_no_more_threads_than_there_are_s
             front.send_event(Envelope(type="x", parts={"x": 3}))
         for _ in range(1, 40):
             assert front.done()[0]["failure"] is None
-        answers = [front.receive("asked")[0] for _ in asks]
+        answers = [front.receive("answer")[0] for _ in asks]
         assert {answer["ask"] for answer in answers} == asks
         assert not [answer for answer in answers if "error" in answer]
 

@@ -114,15 +114,15 @@ def test_events_that_do_not_return_one_after_another_are_reported_and_the_servic
 
 
 def test_only_deaths_without_an_event_right_after_the_start_are_a_crash_loop():
-    health = Health()
+    health = WorkerHealth()
     for second in range(20):
         health.ready_s = float(second)
-        health.count_death(second + 1.0, has_cause=False)
+        health.count_death(second + 1.0, 0, has_cause=False)
         assert health.deaths == 0, "it had been ready for a while"
     for _ in range(4):
-        health.count_death(0.0, has_cause=False)
+        health.count_death(0.0, 0, has_cause=False)
     assert health.deaths == DEATHS_BEFORE_FAULT - 1
-    health.count_death(0.0, has_cause=True)
+    health.count_death(0.0, 0, has_cause=True)
     assert health.deaths == 0, "it was an event's fault"
 
 
@@ -202,7 +202,7 @@ def test_an_event_that_waits_in_the_worker_for_a_change_has_its_time_from_when_i
         until(lambda: service.counts()["in_flight"] == 1)
         changing = threading.Thread(target=service.set_parameters, args=({"k": 3},))
         changing.start()
-        until(lambda: service._tuning._pending is not None)
+        until(lambda: service._parameters._pending is not None)
         # It is given to the worker now, which begins it when the first is done.
         peer.send("sleep:1.8", 2)
         assert [answer.parts["out"] for answer in peer.take(2)] == [2, 6]

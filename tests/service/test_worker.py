@@ -18,8 +18,8 @@ import pytest
 
 from epypes.bundle.seal import seal
 from epypes.display.views.jsonview import from_json
-from epypes.service.channel import channel_pair
 from epypes.service.packing import MARK, unpack
+from epypes.service.worker_connection import frame_sockets
 from epypes.wire import Envelope, decode, encode
 from tests.service.bundles import written_bundle
 from tests.service.workers import TIMEOUT_S, ready_worker, worker_of
@@ -295,7 +295,7 @@ def test_an_event_that_f_in_does_not_understand_fails(shared, event, message):
 
 def test_an_event_that_cannot_be_decoded_fails_and_the_worker_goes_on(shared):
     seq = next(shared.seqs)
-    shared.channel.send({"kind": "event", "seq": seq, "raw": False}, [b"x/", b"\xff\xff"])
+    shared.channel.send({"kind": "event", "seq": seq}, [b"x/", b"\xff\xff"])
     header, (answer,) = shared.done()
     assert (header["seq"], header["failure"]["function"]) == (seq, "f_in")
     assert "no Envelope" in answer.failure.message
@@ -358,12 +358,12 @@ def test_parameters_are_set_when_no_slot_works_and_asked_values_wait_for_that(ow
         front.set(4, k=8)
         ask = front.send_ask("run", tokens=["told"], revision=4)
         other = front.send_ask("svg")
-        assert front.receive("asked")[0]["ask"] == other
+        assert front.receive("answer")[0]["ask"] == other
         assert not front.waiting, "neither is answered as long as the event is under way"
         front.release.touch()
         assert front.done()[0]["revision"] == 0
         assert front.receive("parameters")[0]["revision"] == 4
-        header, (packed,) = front.receive("asked")
+        header, (packed,) = front.receive("answer")
         assert header["ask"] == ask
         assert decode(unpack(packed)).parts["told"] == "held 8"
 
@@ -395,9 +395,9 @@ def test_asked_values_are_not_computed_beside_the_events_of_the_only_slot(own):
         front.send_ask("run", tokens=["told"], revision=4)
         front.ask("running")
         front.send_ask("svg")
-        front.receive("asked")
+        front.receive("answer")
         front.release.touch()
-        values = front.receive("asked")[1]
+        values = front.receive("answer")[1]
         assert decode(unpack(values[0])).parts["told"] == "held 8", "the event's own values came in time"
 
 
@@ -472,7 +472,7 @@ def test_what_is_asked_is_of_the_last_completed_run(shared):
         ({"what": "preview", "token": ["out"], "max_side_px": 64}, "failed", "list"),
         ({"what": "preview", "token": "out", "max_side_px": None}, "failed", "NoneType"),
         ({"what": "run", "tokens": 3}, "failed", "int"),
-        ({"what": "everything"}, "unknown question", "everything"),
+        ({"what": "everything"}, "unknown query", "everything"),
     ],
 )
 def test_what_cannot_be_answered_is_told_with_its_reason(shared, ask, reason, text):
@@ -537,7 +537,7 @@ def test_too_many_questions_are_refused_and_none_is_left_without_answer(own):
     with own() as front:
         front.run(what="zeros")
         asks = [front.send_ask("preview", token="out", max_side_px=16 + number) for number in range(300)]
-        answers = [front.receive("asked")[0] for _ in asks]
+        answers = [front.receive("answer")[0] for _ in asks]
         assert sorted(answer["ask"] for answer in answers) == asks
         assert {answer.get("reason") for answer in answers} <= {None, "busy"}
 
@@ -578,7 +578,7 @@ worker = subprocess.Popen([sys.executable, "-I", "-m", "epypes.service.worker", 
 print(worker.pid, flush=True)
 sys.stdin.read()
 """
-    ours, theirs = channel_pair()
+    ours, theirs = frame_sockets()
     started = tmp_path / "started"
     with theirs:
         parent = subprocess.Popen(

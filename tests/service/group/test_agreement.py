@@ -16,7 +16,7 @@ from epypes.service.group.group import Group
 from epypes.service.group.membership import Member
 from epypes.service.group.notices import written
 from epypes.service.group.revisions import Proposal
-from epypes.service.parameters import Parameters, changed, with_value
+from epypes.service.parameters import Parameters, changed_entries, with_value
 from epypes.transport.channels import memory, open_channel, place_of
 from epypes.wire import Envelope
 from tests.service.served import TIMEOUT_S, until
@@ -41,7 +41,7 @@ class Values:
         with self.turn:
             if revision not in (None, self.current.revision):
                 raise RevisionConflict(self.path, self.current)
-            after, problems = changed(self.current.entries, values)
+            after, problems = changed_entries(self.current.entries, values)
             if not problems and after["k"]["value"] == 13:
                 problems = {"k": "13 brings bad luck"}
             if problems:

@@ -80,7 +80,7 @@ def test_a_service_stops_in_time_though_its_broker_does_not_answer(acting):
     with nats_server.server() as broker:
         service = Service(acting, broker.address("events", create="true"), broker.address("answers", create="true"))
         service.start()
-        until(lambda: not service.group()["trouble"] and service._sockets.entrance.subscriber.is_connected)
+        until(lambda: not service.group()["trouble"] and service._endpoints.events._subscriber.is_connected)
         broker.process.send_signal(signal.SIGSTOP)
         try:
             began_s = monotonic()

@@ -238,7 +238,7 @@ def test_an_event_that_another_has_answered_is_not_worked_on_again(acting, host)
         until(lambda: first.counts()["answered"] + second.counts()["answered"] == 1)
         done_by = first if first.counts()["answered"] else second
         done_by.pause()
-        until(lambda: sent in other._sockets.entrance.subscriber._arrivals.seen._done)
+        until(lambda: sent in other._endpoints.events._subscriber._arrivals.seen._done)
         done_by.drain(5.0)
         channel = open_channel(place_of(line.sub))
         try:
@@ -271,7 +271,7 @@ def test_an_ordered_replica_that_stops_gives_back_what_waits_for_its_turn(acting
         # Else it might take all of them, with whom they can't wait.
         holding.pause()
         sent = [line.send(number=number) for number in range(2, 12)]
-        until(lambda: other._peers._group._order.waiting > 0)
+        until(lambda: other._replicas._group._order.waiting > 0)
         other.stop(0.5)
         holding.resume()
         counts = other.counts()
