@@ -54,6 +54,8 @@ class AcceptedEvent:
         Its place in the order of acceptance, from 1.
     received
         Its frames, and the broker's delivery if there is one.
+    id
+        Id of the event, or of the message that it came in; empty if there is none.
     accepted_ns, started_ns
         When it was accepted, and given to the worker for the last time; of `time.perf_counter_ns`.
     attempts
@@ -66,16 +68,12 @@ class AcceptedEvent:
 
     seq: int
     received: ReceivedEvent
+    id: str
     accepted_ns: int
     started_ns: int = 0
     attempts: int = 0
     deaths: int = 0
     result: Result | None = None
-
-    @property
-    def id(self) -> str:
-        """Id of the event, or of the message that it came in; empty if there is none."""
-        return self.received.id
 
 
 class Dispatcher:
@@ -174,7 +172,7 @@ class Dispatcher:
             event.attempts = (received.attempt or 1) - 1
             event.result = exhausted_result(event, self._provenance())
             self._count(event, event.result)
-            self._to_publish.append(partial(self._publish_result, event, event.result))
+            self._to_publish.append(partial(self._results.publish, event, event.result, self._settled))
         self.publish()
 
     def _accepted(self, received: ReceivedEvent) -> AcceptedEvent:
@@ -182,12 +180,13 @@ class Dispatcher:
         self._totals["received"] += 1
         if self._has_broker:
             self._totals["redelivered"] += (received.attempt or 0) > 1
-        return AcceptedEvent(self._last_seq, received, perf_counter_ns())
+        return AcceptedEvent(self._last_seq, received, received.id, perf_counter_ns())
 
     def _drop(self, event: AcceptedEvent, reason: str) -> None:
         """Drop an event, which is published at once and not in the order of acceptance."""
         self._totals["dropped"] += 1
-        self._to_publish.append(partial(self._publish_result, event, dropped_result(event, reason, self._provenance())))
+        result = dropped_result(event, reason, self._provenance())
+        self._to_publish.append(partial(self._results.publish, event, result, self._settled))
 
     def _has_room(self) -> bool:
         """Whether an event that comes now is neither dropped nor has another one dropped."""
@@ -309,7 +308,7 @@ class Dispatcher:
                 return
             del self._begun[eldest.seq]
             self._count(eldest, eldest.result)
-            self._to_publish.append(partial(self._publish_result, eldest, eldest.result))
+            self._to_publish.append(partial(self._results.publish, eldest, eldest.result, self._settled))
 
     def _count(self, event: AcceptedEvent, result: Result) -> None:
         """Count an event that is released; one whose answer a broker confirms is in flight until then."""
@@ -451,9 +450,6 @@ class Dispatcher:
                             _log.exception("a result could not be published, or a listener called")
                 finally:
                     self._publishing_thread = 0
-
-    def _publish_result(self, event: AcceptedEvent, result: Result) -> None:
-        self._results.publish(event, result, self._settled)
 
     def _settled(self, event: AcceptedEvent, result: Result, error: Exception | None) -> None:
         """Note that an answer is confirmed; without that, its broker will deliver the event again."""

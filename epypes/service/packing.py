@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from typing import Final
 
@@ -19,84 +18,15 @@ from epypes.wire.limits import DEFAULT_LIMITS
 BytesLike = bytes | bytearray | memoryview
 
 MARK: Final = b"EPF1"
-_HEAD: Final = struct.Struct("<4sI")
-HEAD_BYTES: Final = _HEAD.size
-SIZE_BYTES: Final = 8
+# Mark and number of frames; the size of each follows in 8 bytes.
+HEAD: Final = struct.Struct("<4sI")
+_SIZE_BYTES: Final = 8
+# Of one encoded Envelope: topic, header and payloads.
+_MAX_FRAMES: Final = DEFAULT_LIMITS.frames + 2
+_MAX_BYTES: Final = DEFAULT_LIMITS.total_bytes
 # The first byte of an event in one block.
 _ENVELOPE: Final = b"v"
 _RAW: Final = b"r"
-
-
-@dataclass(frozen=True, slots=True)
-class BlockLimits:
-    """Limits of a block.
-
-    Attributes
-    ----------
-    frames
-        How many frames.
-    total_bytes
-        All of them together.
-    """
-
-    frames: int = DEFAULT_LIMITS.frames + 2
-    total_bytes: int = DEFAULT_LIMITS.total_bytes
-
-
-# One encoded Envelope: topic, header and payloads.
-ONE_MESSAGE: Final = BlockLimits()
-
-
-def table_of(frames: Sequence[BytesLike], limits: BlockLimits = ONE_MESSAGE) -> bytes:
-    """Return the table that stands before the frames.
-
-    Raises
-    ------
-    MessageError
-        There are more frames than the reader accepts, or they are larger.
-    """
-    sizes = [memoryview(frame).nbytes for frame in frames]
-    _require_room(len(sizes), sum(sizes), limits)
-    return struct.pack(f"<4sI{len(sizes)}Q", MARK, len(sizes), *sizes)
-
-
-def count_in(head: BytesLike, limits: BlockLimits = ONE_MESSAGE) -> int:
-    """Return the number of frames in a table, from its first HEAD_BYTES bytes; SIZE_BYTES for each follow.
-
-    Raises
-    ------
-    MessageError
-        This is no table, or there are too many frames.
-    """
-    if len(head) < HEAD_BYTES:
-        raise MessageError("cut off", f"The block has {len(head)} bytes, and its table is longer.")
-    mark, count = _HEAD.unpack_from(head)
-    if mark != MARK:
-        raise MessageError("no frames", f"A block of frames begins with {MARK!r}, not with {bytes(mark)!r}.")
-    _require_room(count, 0, limits)
-    return int(count)
-
-
-def sizes_in(table: BytesLike, count: int, limits: BlockLimits = ONE_MESSAGE) -> tuple[int, ...]:
-    """Return the size of each frame, from what follows the head of a table.
-
-    Raises
-    ------
-    MessageError
-        The table is cut off, or the frames are too large.
-    """
-    if len(table) < SIZE_BYTES * count:
-        raise MessageError("cut off", f"The table of {count} frames is cut off.")
-    sizes = struct.unpack_from(f"<{count}Q", table)
-    _require_room(count, sum(sizes), limits)
-    return sizes
-
-
-def _require_room(count: int, total_bytes: int, limits: BlockLimits) -> None:
-    if count > limits.frames:
-        raise MessageError("too many frames", f"{count:,} frames; the limit is {limits.frames:,}.")
-    if total_bytes > limits.total_bytes:
-        raise MessageError("too large", f"Frames of {total_bytes:,} bytes; the limit is {limits.total_bytes:,}.")
 
 
 def pack(frames: Sequence[BytesLike]) -> bytes:
@@ -107,7 +37,9 @@ def pack(frames: Sequence[BytesLike]) -> bytes:
     MessageError
         There are more frames than `unpack` accepts, or they are larger.
     """
-    return b"".join([table_of(frames), *frames])
+    sizes = [memoryview(frame).nbytes for frame in frames]
+    _check_limits(len(sizes), sum(sizes))
+    return b"".join([struct.pack(f"<4sI{len(sizes)}Q", MARK, len(sizes), *sizes), *frames])
 
 
 def unpack(data: BytesLike) -> list[memoryview]:
@@ -116,16 +48,31 @@ def unpack(data: BytesLike) -> list[memoryview]:
     Raises
     ------
     MessageError
-        For anything that `pack` does not make, and nothing else; its ``reason`` is a short word to count by.
+        For anything that `pack` does not make, and nothing else; its ``reason`` is a short key to count by.
     """
     block = _view(data)
-    count = count_in(block)
-    begin = HEAD_BYTES + SIZE_BYTES * count
-    sizes = sizes_in(block[HEAD_BYTES:begin], count)
+    if len(block) < HEAD.size:
+        raise MessageError("cut off", f"The block has {len(block)} bytes, and its table is longer.")
+    mark, count = HEAD.unpack_from(block)
+    if mark != MARK:
+        raise MessageError("no frames", f"A block of frames begins with {MARK!r}, not with {mark!r}.")
+    _check_limits(count, 0)
+    begin = HEAD.size + _SIZE_BYTES * count
+    if len(block) < begin:
+        raise MessageError("cut off", f"The table of {count} frames is cut off.")
+    sizes = struct.unpack_from(f"<{count}Q", block, HEAD.size)
+    _check_limits(count, sum(sizes))
     if len(block) != begin + sum(sizes):
         held = f"{len(block) - begin:,} bytes after its table, which announces {sum(sizes):,}"
         raise MessageError("wrong size", f"The block has {held}.")
     return [block[start:end] for start, end in pairwise(accumulate(sizes, initial=begin))]
+
+
+def _check_limits(count: int, total_bytes: int) -> None:
+    if count > _MAX_FRAMES:
+        raise MessageError("too many frames", f"{count:,} frames; the limit is {_MAX_FRAMES:,}.")
+    if total_bytes > _MAX_BYTES:
+        raise MessageError("too large", f"Frames of {total_bytes:,} bytes; the limit is {_MAX_BYTES:,}.")
 
 
 def _view(data: BytesLike) -> memoryview:

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.bundle.load import MODULE
 from epypes.errors import MessageError, ServiceError
-from epypes.service.packing import HEAD_BYTES, MARK, SIZE_BYTES, BlockLimits, BytesLike, count_in, sizes_in
+from epypes.service.packing import HEAD, MARK, BytesLike
 from epypes.service.standard_error import STANDARD_ERROR
 from epypes.service.systemd import VARIABLES
 
@@ -44,7 +44,8 @@ WorkerStatus = Literal["loading", "ready", "refused", "gone"]
 
 MAX_HEADER_BYTES: Final = 1024**2
 # Of one message: an event's answers may be several Envelopes.
-LIMITS: Final = BlockLimits(frames=16_384, total_bytes=1024**3)
+_MAX_FRAMES: Final = 16_384
+_MAX_BYTES: Final = 1024**3
 # Shared memory does not avoid the copy: a new segment per frame takes four times as long (8 ms for 8 MB, against 2 ms
 # here), and one that is used again must wait until the last array of the worker that looks into it is gone.
 # Asked for; the system gives what it allows. With 4 MB a frame of 1 MB takes 0.23 ms, with 0.2 MB 0.25 to 0.4 ms.
@@ -74,6 +75,7 @@ _END_TIMEOUT_S: Final = 1.0
 _FRAME: Final = re.compile(r'^  File "(?P<file>.*)", line \d+ in (?P<name>\S+)$')
 
 _to_json: Final = json.JSONEncoder(separators=(",", ":")).encode
+_from_json: Final = json.JSONDecoder().decode
 
 
 def frame_sockets() -> tuple[FrameSocket, socket.socket]:
@@ -135,7 +137,8 @@ class FrameSocket:
         """
         with self._sending:
             try:
-                return _after(left, self._socket.sendmsg(left[:_MAX_BUFFERS], (), _SENT_DIRECTLY))
+                sent = self._socket.sendmsg(left[:_MAX_BUFFERS], (), _SENT_DIRECTLY)
+                return _after(left, sent) if sent < sum(map(len, left)) else []
             except BlockingIOError:
                 return left
             except OSError as error:
@@ -149,7 +152,8 @@ class FrameSocket:
     def _send_all(self, left: list[memoryview]) -> None:
         try:
             while left:
-                left = _after(left, self._socket.sendmsg(left[:_MAX_BUFFERS], (), socket.MSG_NOSIGNAL))
+                sent = self._socket.sendmsg(left[:_MAX_BUFFERS], (), socket.MSG_NOSIGNAL)
+                left = _after(left, sent) if sent < sum(map(len, left)) else []
         except OSError as error:
             raise EOFError("The other side of the connection is gone.") from error
         except BaseException:
@@ -168,37 +172,35 @@ class FrameSocket:
             The bytes are no message. What comes after them can't be understood: close the connection.
         """
         with self._receiving:
-            count = count_in(self._read(HEAD_BYTES), LIMITS)
-            sizes = sizes_in(self._read(SIZE_BYTES * count), count, LIMITS)
-            if not sizes or sizes[0] > MAX_HEADER_BYTES:
-                text = f"A message begins with a header of at most {MAX_HEADER_BYTES:,} bytes."
-                raise MessageError("no header", text)
-            total = sum(sizes)
-            if total <= _SMALL_BYTES:
-                block, begin = memoryview(self._read(total)), 0
-                frames = []
-                for size in sizes:
-                    frames.append(block[begin : begin + size])
-                    begin += size
-            else:
-                frames = [memoryview(self._read(size)) for size in sizes]
+            try:
+                # The reader allocates the bytes without filling them, and reads large ones in place.
+                read = self._reader.read
+                mark, count = HEAD.unpack(read(HEAD.size))
+                if mark != MARK or not 0 < count <= _MAX_FRAMES:
+                    raise MessageError("no frames", f"No message begins with {mark!r} and {count:,} frames.")
+                sizes = struct.unpack(f"<{count}Q", read(8 * count))
+                total = sum(sizes)
+                if sizes[0] > MAX_HEADER_BYTES or total > _MAX_BYTES:
+                    raise MessageError("too large", f"A header of {sizes[0]:,} bytes in a message of {total:,} bytes.")
+                if total <= _SMALL_BYTES:
+                    block, ends = memoryview(read(total)), [*itertools.accumulate(sizes, initial=0)]
+                    frames = [*map(block.__getitem__, map(slice, ends, ends[1:]))]
+                else:
+                    frames = [memoryview(read(size)) for size in sizes]
+            except MessageError:
+                raise
+            except (OSError, ValueError, struct.error) as error:
+                # The table is cut off, or the file is closed.
+                raise EOFError("The connection is closed.") from error
+        if sum(map(len, frames)) < total:
+            raise EOFError("The other side of the connection is gone.")
         try:
-            header = json.loads(bytes(frames.pop(0)))
+            header = _from_json(str(frames.pop(0), "utf-8"))
         except (ValueError, RecursionError) as error:
             raise MessageError("no header", f"The header of a message is no JSON: {error}.") from error
         if not isinstance(header, dict):
             raise MessageError("no header", f"The header of a message is an object, not a {type(header).__name__}.")
         return header, frames
-
-    def _read(self, size: int) -> bytes:
-        try:
-            # The reader allocates the bytes without filling them, and reads large ones in place.
-            data = self._reader.read(size)
-        except (OSError, ValueError) as error:
-            raise EOFError("The connection is closed.") from error
-        if len(data) < size:
-            raise EOFError("The other side of the connection is gone.")
-        return data
 
     def close(self) -> None:
         """End both directions, and wake up threads that read or send; may be called twice, from any thread."""
@@ -224,9 +226,9 @@ def buffers_of(header: Mapping[str, Any], frames: Sequence[BytesLike] = ()) -> l
         raise MessageError("too large", f"A header of {len(head):,} bytes; the limit is {MAX_HEADER_BYTES:,}.")
     views = [memoryview(part).cast("B") for part in (head, *frames)]
     sizes = [*map(len, views)]
-    if len(sizes) > LIMITS.frames or sum(sizes) > LIMITS.total_bytes:
-        text = f"{len(sizes):,} frames of {sum(sizes):,} bytes; the limits are {LIMITS.frames:,} and"
-        raise MessageError("too large", f"{text} {LIMITS.total_bytes:,}.")
+    if len(sizes) > _MAX_FRAMES or sum(sizes) > _MAX_BYTES:
+        text = f"{len(sizes):,} frames of {sum(sizes):,} bytes; the limits are {_MAX_FRAMES:,} and"
+        raise MessageError("too large", f"{text} {_MAX_BYTES:,}.")
     table = struct.pack(f"<4sI{len(sizes)}Q", MARK, len(sizes), *sizes)
     return [memoryview(table), *filter(len, views)]
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from epypes.errors import MessageError
-from epypes.service.packing import BlockLimits, count_in, pack, pack_event, sizes_in, table_of, unpack, unpack_event
+from epypes.service.packing import pack, pack_event, unpack, unpack_event
 from epypes.wire import Envelope, encode
 from tests.wire.mutants import mutate_bytes
 
@@ -87,14 +87,8 @@ def test_what_a_block_only_claims_to_hold_is_refused_before_anything_is_allocate
 def test_what_could_not_be_unpacked_is_not_packed():
     with pytest.raises(MessageError, match=r"2,000 frames; the limit is 1,026"):
         pack([b""] * 2_000)
-    with pytest.raises(MessageError, match="the limit is 9"):
-        table_of([b"12345", b"12345"], BlockLimits(total_bytes=9))
-
-
-def test_a_table_is_read_in_two_parts():
-    table = table_of([b"abc", b"", bytes(500)])
-    assert count_in(table[:8]) == 3
-    assert sizes_in(table[8:], 3) == (3, 0, 500)
+    with pytest.raises(MessageError, match="the limit is"):
+        pack([bytes(2**28), b"1"])
 
 
 def test_an_event_comes_back_whole_whether_it_is_an_envelope_or_bytes():

@@ -52,9 +52,9 @@ class Front:
         """Return the header of the next event that is done, and its answers."""
         header, frames = self.receive("done")
         answers, left = [], list(frames)
-        for count in header["answers"]:
-            mine, left = left[:count], left[count:]
-            answers.append(bytes(mine[0]) if count == 1 else decode(mine))
+        for size in header["answers"]:
+            mine, left = left[:size], left[size:]
+            answers.append(bytes(mine[0]) if size == 1 else decode(mine))
         assert not left
         return header, answers
 

@@ -61,29 +61,33 @@ class LatestRun:
     """
 
     def __init__(self) -> None:
-        self._changed = threading.Condition()
+        self._lock = threading.Lock()
+        self._changed, self._waiting = threading.Condition(self._lock), 0
         self.completed: CompletedRun | None = None
         self.again: CompletedRun | None = None
         self._when_s = 0.0
 
     def put(self, completed: CompletedRun) -> None:
         """Make a run the last completed one."""
-        with self._changed:
+        with self._lock:
             self.completed, self.again, self._when_s = completed, None, monotonic()
-            self._changed.notify_all()
+            if self._waiting:
+                self._changed.notify_all()
 
     def keep_again(self, again: CompletedRun, of: CompletedRun | None) -> None:
         """Keep a run of the last payload with other parameters until an event comes."""
-        with self._changed:
+        with self._lock:
             if self.completed is of:
                 self.again = again
 
     def of_revision(self, revision: int) -> CompletedRun | None:
         """Return a run with this revision or a later one, if there is one or it comes within a moment."""
         moment_s = _MOMENT_S if monotonic() - self._when_s < _ALIVE_S else 0.0
-        with self._changed:
-            self._changed.wait_for(lambda: self._is_of(revision), moment_s)
-            return self.completed if self._is_of(revision) else None
+        with self._lock:
+            self._waiting += 1
+            is_there = self._changed.wait_for(lambda: self._is_of(revision), moment_s)
+            self._waiting -= 1
+            return self.completed if is_there else None
 
     def _is_of(self, revision: int) -> bool:
         return self.completed is not None and self.completed.revision >= revision
