@@ -328,7 +328,7 @@ class ResultPublisher:
         # With its id, by which a receiver can run it again.
         more = {"id": kept.id, "kind": kept.kind, "dead_letter": kept.dead_letter, "when_ns": kept.when_ns}
         for answer in result.answers:
-            if isinstance(answer, EncodedEnvelope) and answer.has_failure:
+            if isinstance(answer, EncodedEnvelope) and answer.failure is not None:
                 envelope = answer.decode()
                 envelope = replace(envelope, attributes={**envelope.attributes, **more})
                 self._publish_failure(EncodedEnvelope.encode(envelope, FAILURE_TOPIC))
