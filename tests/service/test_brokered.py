@@ -376,7 +376,6 @@ def test_a_broker_that_is_away_or_has_no_such_queue_is_an_error_at_the_start(act
     [
         ({"mailbox_policy": "fault"}, "A broker keeps what waits"),
         ({"sub": "tcp://127.0.0.1:*", "replica": "a"}, "shares the events of a broker"),
-        ({"sub": "tcp://127.0.0.1:*", "ordered": True}, "shares the events of a broker"),
     ],
 )
 def test_what_does_not_go_with_a_broker_is_refused(acting, options, why):

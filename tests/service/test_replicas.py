@@ -164,22 +164,3 @@ def test_a_change_of_hyperparameters_reaches_all_replicas_with_one_revision(bund
     for answer in reader.answers:
         assert int(answer.parts["result"][1]) == gains[answer.revision]
     assert {answer.revision for answer in reader.answers} == set(gains)
-
-
-@on("nats")
-def test_replicas_that_keep_order_answer_in_the_order_of_the_events(bundle, brokered):
-    sub = brokered.address("ordered.events", create=True)
-    pub = brokered.address("ordered.answers", create=True)
-    outbox = ep.Mailbox("block")
-    with (
-        replicas(bundle, sub, pub, "--ordered", "--threads", "2") as members,
-        Reader(pub) as reader,
-        ep.Publisher(sub, outbox),
-    ):
-        for number in range(300):
-            outbox.put(event(number))
-        until(lambda: reader.look() >= 300, lambda: f"{reader.look()} answers of 300")
-        counts = [stopped(member) for member in members]
-    numbers = [int(answer.parts["result"][0]) for answer in reader.answers]
-    assert numbers == sorted(numbers)
-    assert all(counted["answered"] for counted in counts), counts

@@ -248,36 +248,3 @@ def test_an_event_that_another_has_answered_is_not_worked_on_again(acting, host)
         until(lambda: other.counts()["duplicates"] == 1)
         assert line.left() == 0
         assert other.counts()["received"] == 0
-
-
-@pytest.mark.slow
-def test_answers_of_all_replicas_keep_the_order_of_the_events(acting, host):
-    with line_of(host) as line, group_of(acting, line, ordered=True) as replicas:
-        # More than one of them may have in hand.
-        sent = [line.send(f"sleep:{0.03 if number % 3 == 0 else 0.001}", number) for number in range(1, 151)]
-        answers = line.take(150)
-        assert [answer.correlation_id for answer in answers] == sent
-        until(lambda: sum(replica.counts()["answered"] for replica in replicas) == 150)
-        assert all(replica.counts()["answered"] for replica in replicas)
-        assert [replica.counts()["overtaken"] for replica in replicas] == [0, 0]
-
-
-@pytest.mark.slow
-def test_an_ordered_replica_that_stops_gives_back_what_waits_for_its_turn(acting, host, tmp_path):
-    with line_of(host) as line, group_of(acting, line, ordered=True) as (first, second):
-        line.send(f"hold:{tmp_path}", 1)
-        until((tmp_path / "started").exists)
-        holding, other = (first, second) if first.counts()["in_flight"] else (second, first)
-        # Else it might take all of them, with whom they can't wait.
-        holding.pause()
-        sent = [line.send(number=number) for number in range(2, 12)]
-        until(lambda: other._replicas._group._order.waiting > 0)
-        other.stop(0.5)
-        holding.resume()
-        counts = other.counts()
-        assert (counts["answered"], counts["overtaken"]) == (0, 0)
-        assert counts["given_back"] == counts["received"]
-        (tmp_path / "release").touch()
-        answers = line.take(11)
-        assert [answer.correlation_id for answer in answers][1:] == sent
-        until(lambda: holding.counts()["answered"] == 11)

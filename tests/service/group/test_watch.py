@@ -174,23 +174,3 @@ def test_what_is_odd_is_said_when_it_begins(log):
 
 def test_another_state_of_the_same_bundle_is_nothing_odd():
     assert odds(OWN, peer(digest="d2", revision=7)) == []
-
-
-@pytest.mark.slow
-def test_a_foreign_bundle_and_another_order_are_told_to_both_sides(acting, tmp_path, caplog):
-    foreign = acting_bundle(tmp_path / "foreign")
-    caplog.set_level(logging.INFO, logger="epypes.service")
-    with line_of("odd") as line, replica_of(acting, line, replica="1") as first:
-        with replica_of(foreign, line, replica="2", ordered=True) as second:
-            for replica in (first, second):
-                until(lambda replica=replica: replica.group()["replicas"] == 2)
-                told = replica.group()["members"]
-                assert [each["name"] for each in told] == [first.info()["name"], "foreign"]
-                assert [each["ordered"] for each in told] == [False, True]
-
-            def said(text):
-                return {each.args[0].split(" at ")[0] for each in caplog.records if text in each.getMessage()}
-
-            until(lambda: said("serves another bundle from the same queue") == {"replica 1", "replica 2"})
-            until(lambda: said("the order of events") == {"replica 1", "replica 2"})
-        until(lambda: said("has left the group") == {"replica 2"})
