@@ -6,8 +6,6 @@ import pytest
 
 from epypes.service.group.membership import Heard, Member, Membership
 from epypes.service.group.watch import Watch, odds
-from tests.service.served import acting_bundle, until
-from tests.service.test_brokered import line_of, replica_of
 
 OWN = Member("own", "1", "here", name="edges", digest="d1")
 
