@@ -148,7 +148,7 @@ class Deployer:
         if found.digest != before.digest:
             why = (
                 f"It can't be rolled back to {before.path}, which was changed since it was served: it was "
-                f"{_short(before)}, and is {_short(found)}. If it shall be served: epypes deploy {before.path}."
+                f"{_short(before)}, and is {_short(found)}. To serve it: epypes deploy {before.path}."
             )
             raise DeployRefused(before.path, [why])
         return found

@@ -275,7 +275,7 @@ class Service:
         self._lifecycle.changed()
 
     def _facts(self) -> dict[str, Any]:
-        """Return what the other replicas are told of this one."""
+        """Return what this replica publishes to the others."""
         state, reason = self._lifecycle.state()
         name, replica = self._supervisor.bundle.settings.name, self.options.replica
         about = {"state": state, "reason": reason, "counts": self.counts(), "http": self.http}

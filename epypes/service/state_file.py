@@ -1,7 +1,7 @@
-"""Where does a running service leave its addresses, so that others find it?
+"""State files: where a running service publishes its addresses and its process.
 
-The state file is held locked by its service, so a service that was killed is told from one that runs: the system
-releases the lock of a process that is gone. Replicas, which share the events of a broker, have a file each.
+A service keeps its state file locked, and the system releases the lock of a process that is gone: so the file of a
+killed service is not taken for that of a running one. Replicas, which share the events of a broker, have a file each.
 """
 
 from __future__ import annotations
@@ -23,36 +23,36 @@ from epypes.errors import ServiceError
 
 REPLICA: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,39}")
 _MOST_REPLICAS: Final = 1_000
-# Who only reads the state holds the lock for some microseconds; a lock held longer is a service's.
+# A reader holds the lock for some microseconds; a lock that is held longer is a service's.
 _LOCK_TIMEOUT_S: Final = 1.0
 _LOCK_RETRY_S: Final = 0.02
 _LOCK_TRIES: Final = 3
-# What a state that an earlier version wrote may lack.
+# Fields that an earlier version did not write.
 _MAY_HAVE: Final = ("failures", "http", "token_file", "replica")
 
 
 @dataclass(frozen=True, slots=True)
 class ServiceState:
-    """What a running service says of itself.
+    """The contents of a state file.
 
     Attributes
     ----------
     pid
         Its process.
     sub, pub
-        Where it takes events and where it answers; ``connect:`` in front where it connects.
+        Addresses of events and of answers; ``connect:`` in front where it connects.
     digest
         The bundle's.
     failures
-        Where failures are published.
+        Address of failures.
     http
-        Where it answers over HTTP; empty if it does not.
+        Address of its HTTP control; empty without.
     token_file
-        Where the token for that is kept.
+        The file of the token for that.
     replica
-        What it is called among the services of the bundle; empty for the one that is alone.
+        Name among the services of the bundle; empty for a service that stands alone.
     shows_failures
-        Whether people are told where failures are published.
+        Whether commands show the address of failures.
     """
 
     pid: int
@@ -67,7 +67,7 @@ class ServiceState:
 
 
 def state_file(bundle: str | Path, replica: str = "") -> Path:
-    """Return where the state of a bundle's service is kept: in a folder of this user's, not in the bundle."""
+    """Return the path of a service's state file: in a folder of this user, not in the bundle."""
     name = hashlib.sha256(str(Path(bundle).resolve()).encode()).hexdigest()[:20]
     return _folder() / (f"{name}.{replica}.json" if replica else f"{name}.json")
 
@@ -89,12 +89,12 @@ class StateLock:
     bundle
         Its folder.
     replica
-        What the service is called among several; empty for one that is alone.
+        Name among several services; empty for one that stands alone.
 
     Raises
     ------
     ServiceError
-        The bundle is being served, by one of this name; the process is named. Or that can't be a name.
+        The bundle is being served under this name, by the process in the text; or the name is not valid.
     """
 
     def __init__(self, bundle: str | Path, replica: str = "") -> None:
@@ -116,7 +116,7 @@ class StateLock:
 
     @classmethod
     def of_next(cls, bundle: str | Path) -> Self:
-        """Return the right to be the replica with the first number that no other has.
+        """Return the lock of the replica with the first free number.
 
         Raises
         ------
@@ -137,11 +137,11 @@ class StateLock:
         return True
 
     def publish(self, state: ServiceState) -> None:
-        """Let others find the service."""
+        """Write the state into the file."""
         self._write(json.dumps(asdict(state)))
 
     def _write(self, text: str) -> None:
-        # In one step, over all that was there: who reads meanwhile finds the one or the other, and never nothing.
+        # In one step, over the old text: a reader finds the one or the other, and never nothing.
         data = text.encode()
         os.pwrite(self._file, data.ljust(os.fstat(self._file).st_size), 0)
 
@@ -151,18 +151,18 @@ class StateLock:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        # The file stays: removing it would let a second service lock a new one while a third waits for this.
+        # The file stays: without it a second service could lock a new file while a third waits for this one.
         self._write("")
         os.close(self._file)
 
 
 def read_state(bundle: str | Path, replica: str = "") -> ServiceState | None:
-    """Return the state of the service that runs now, or None if none is ready; of several the first one's."""
+    """Return the state of the running service, or None if none is ready; the first of several replicas."""
     return next(iter(read_states(bundle, replica)), None)
 
 
 def read_states(bundle: str | Path, replica: str = "") -> list[ServiceState]:
-    """Return the states of the services of a bundle that run now: of all replicas, or of one by its name."""
+    """Return the states of the running services of a bundle: of all replicas, or of one by its name."""
     alone = state_file(bundle)
     found = [alone, *sorted(alone.parent.glob(f"{alone.stem}.*.json"), key=_order)]
     files = [state_file(bundle, replica)] if replica else found
@@ -170,20 +170,20 @@ def read_states(bundle: str | Path, replica: str = "") -> list[ServiceState]:
 
 
 def _order(file: Path) -> tuple[int, str]:
-    """Return by what replicas are sorted: 2 before 10."""
+    """Return the sort key of a replica: 2 before 10."""
     name = file.stem.partition(".")[2]
     return (int(name) if name.isdecimal() else _MOST_REPLICAS), name
 
 
 def running_at(http: str) -> ServiceState | None:
-    """Return the state of the service of this user's that answers over HTTP there, or None if none does."""
+    """Return the state of this user's service with this HTTP address, or None if there is none."""
     wanted = http.rstrip("/")
     found = (_read(file) for file in _folder().glob("*.json"))
     return next((state for state in found if state is not None and state.http.rstrip("/") == wanted), None)
 
 
 def _is_free(path: Path) -> bool:
-    """Whether no service holds a state file; who only reads it holds it for a moment."""
+    """Whether no service holds the lock of a state file; a reader holds it for a moment."""
     for _ in range(_LOCK_TRIES):
         try:
             with path.open("a", encoding="utf-8") as file:
@@ -208,7 +208,7 @@ def _read(path: Path) -> ServiceState | None:
 
 
 def _state(entries: object) -> ServiceState:
-    """Return a state; raise TypeError for anything else that somebody may have written into the file."""
+    """Return a state; raise TypeError for other JSON in the file."""
     if not isinstance(entries, dict):
         raise TypeError
     given: dict[str, Any] = {key: entries.get(key) for key in ("sub", "pub", "digest")}

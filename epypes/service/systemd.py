@@ -20,7 +20,7 @@ _TIMEOUT_S: Final = 1.0
 
 
 def notify(*lines: str) -> bool:
-    """Send lines to systemd; return whether it has asked for them.
+    """Send lines to systemd; return whether it expects them.
 
     Examples
     --------

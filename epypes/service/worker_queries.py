@@ -65,7 +65,7 @@ class WorkerQueries:
                 self._cache.move_to_end(key)
                 return self._cache[key]
         with self._lock:
-            # What another bundle has shown is not asked for any more.
+            # Answers about another bundle are of no use any more.
             stale = [known for known in self._cache if known[0] != digest]
             for known in (*stale, *[key] * (key in self._cache)):
                 self._bytes -= _size(self._cache.pop(known))

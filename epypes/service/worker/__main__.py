@@ -108,7 +108,7 @@ class Worker:
         elif kind != "ask":
             raise ValueError(f"The front has sent a message of kind {kind!r:.40}.")
         elif header["what"] == "running":
-            # At once: it is asked when something takes too long, which may be another query.
+            # At once: the front asks when something takes too long, which may be another query.
             slots = [found for slot in self._slots if (found := slot.running)]
             running = [*(name for found in slots for name in found["functions"]), *self._trial.runner.running]
             self._front.send({"kind": "answer", "ask": header["ask"], "running": running, "slots": slots})
