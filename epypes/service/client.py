@@ -21,7 +21,7 @@ from epypes.transport.channels import is_brokered, place_of
 
 if TYPE_CHECKING:
     from epypes.transport import Keys
-    from epypes.transport.keys import PublicKey
+    from epypes.transport.zeromq.curve import PublicKey
     from epypes.wire import Envelope
 
 # How often it is looked, while an answer is awaited, whether the service still lives.

@@ -13,7 +13,7 @@ from epypes.service.ledger import Ledger, Policy
 from epypes.transport.channels import Place, is_brokered, place_of
 
 if TYPE_CHECKING:
-    from epypes.transport.keys import Keys, PublicKey
+    from epypes.transport.zeromq.curve import Keys, PublicKey
 
 ANY_PORT: Final = "tcp://127.0.0.1:*"
 CONNECT: Final = "connect:"

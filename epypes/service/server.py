@@ -31,7 +31,7 @@ from epypes.service.state import ServiceState
 from epypes.service.states import Facts, State
 from epypes.service.supervisor import Supervisor
 from epypes.service.tuning import Tuning
-from epypes.transport.outlet import prepare_lending
+from epypes.transport.zeromq.channel import prepare_lending
 from epypes.wire import Envelope, decode, encode
 
 if TYPE_CHECKING:

@@ -6,6 +6,7 @@ import threading
 import time
 from collections import Counter, deque
 
+from epypes.transport.channel import Delivery
 from epypes.transport.mcapformat import Counts, Frames
 
 _SLOW, _FAILED = "disk too slow", "disk failed"
@@ -34,8 +35,9 @@ class Backlog:
         # The clocks are read together once: later times differ as those of the monotonic one.
         self._offset_ns = time.time_ns() - time.perf_counter_ns()
 
-    def put(self, item: Frames, *, block: bool) -> None:
+    def put(self, delivery: Delivery, *, block: bool) -> None:
         """Take the frames of a message, or count them as dropped."""
+        item = tuple(delivery.frames)
         now_ns = self._offset_ns + time.perf_counter_ns()
         size = sum(map(len, item)) + _BESIDE_BYTES
         with self._changed:

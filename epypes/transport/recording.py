@@ -11,10 +11,10 @@ from typing import Any, Self
 
 from epypes.errors import RecordingError, StillRunning
 from epypes.transport.backlog import Backlog
+from epypes.transport.endpoint import Startable
 from epypes.transport.mcapformat import Counts
 from epypes.transport.mcapwriter import RecordingWriter
 from epypes.transport.subscriber import ZMQSubscriber
-from epypes.transport.within import Within
 
 # What may wait for the disk: some seconds of images, and more than the largest message.
 BACKLOG_BYTES = 512 * 1024**2
@@ -28,7 +28,7 @@ def _nothing() -> None:
     return
 
 
-class Recorder(Within):
+class Recorder(Startable):
     """Writes what is published into an MCAP file: every message as it came, with the time at which it did.
 
     Parameters
