@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from epypes.errors import BrokerError, MessageError
-from epypes.transport.address import Address
+from epypes.transport.address import Address, parse_address
 from epypes.transport.channel import NO_HEADERS, ChannelOptions, Confirmed, Delivery, Frames
 
 log = logging.getLogger("epypes.transport")
@@ -291,3 +291,12 @@ def _tell(message: _Message, error: Exception | None) -> None:
 def make_channel(address: Address, options: ChannelOptions) -> MemoryChannel:
     """Return a channel to an address of a broker in this process."""
     return MemoryChannel(address, options)
+
+
+def queued(address: str | Address) -> list[Delivery]:
+    """Return copies of the messages that wait in a queue, and are not delivered; the oldest first."""
+    place = parse_address(address)
+    broker = _brokers.setdefault(place.host, _Broker())
+    with broker.changed:
+        waiting = [*broker.queues.get(place.name, ())]
+    return [Delivery(message.frames, message.id, message.attempt, message.headers) for message in waiting]
