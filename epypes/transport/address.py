@@ -1,6 +1,7 @@
 """Addresses: where messages are sent to and received from, for every scheme.
 
-`parse_address` reads the text that users write. Neither the text of an `Address` nor an error has the password in it.
+`parse_address` reads the text that users write. Neither the text of an `Address` nor an error has
+the password in it.
 """
 
 from __future__ import annotations

@@ -1,302 +1,204 @@
 """A broker within this process, for tests: ``memory://BROKER/NAME``.
 
-It keeps what the other brokers promise: a message of a queue goes to one consumer, is delivered again when that one
-disconnects before it has acknowledged it, counts its deliveries, and can be rejected into the dead-letter queue.
-`away` has all connections to it break, until it is over.
+It keeps what the others promise: a message of a queue goes to one consumer, is delivered again when that is closed
+before it has acknowledged it, has a count of its deliveries, and can be rejected. `away` has every channel lose its
+connection.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
-import logging
-import os
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
-from epypes.errors import BrokerError, MessageError
+from epypes.errors import BrokerError
 from epypes.transport.address import Address, parse_address
-from epypes.transport.channel import NO_HEADERS, ChannelOptions, Confirmed, Delivery, Frames
-
-log = logging.getLogger("epypes.transport")
-
-# The headers of a dead letter: why it was rejected, the queue it comes from, and how often it was delivered.
-REASON, FROM, ATTEMPTS = "epypes-reason", "epypes-from", "epypes-attempts"
-_RECONNECT_S: Final = 0.02
-_TICK_S: Final = 0.25
+from epypes.transport.brokers.channel import BrokerChannel
+from epypes.transport.brokers.message import IncomingMessage, OutgoingMessage, unpacked
+from epypes.transport.channel import ChannelOptions, Delivery
 
 
 @dataclass(slots=True, eq=False)
-class _Message:
-    frames: tuple[bytes, ...]
+class _StoredMessage:
+    body: bytes
     id: str
     headers: dict[str, str]
-    confirmed: Confirmed | None = None
-    attempt: int = 0
+    deliveries: int = 0
 
 
-@dataclass(slots=True, eq=False)
-class _Broker:
-    """All queues, logs and listeners of one name in this process; ``changed`` is held to use them."""
+@dataclass(slots=True)
+class _MemoryBroker:
+    """The queues, logs and sessions of one name; used on the asyncio thread, but for ``is_away``."""
 
-    changed: threading.Condition = field(default_factory=lambda: threading.Condition(threading.RLock()))
-    queues: dict[str, deque[_Message]] = field(default_factory=dict)
-    logs: dict[str, list[_Message]] = field(default_factory=dict)
-    listeners: dict[str, list[deque[_Message]]] = field(default_factory=dict)
+    queues: dict[str, deque[_StoredMessage]] = field(default_factory=dict)
+    logs: dict[str, list[_StoredMessage]] = field(default_factory=dict)
+    sessions: list[MemorySession] = field(default_factory=list)
     is_away: bool = False
-    # The number of outages, by which a channel notices one that is over again.
-    outages: int = 0
-
-    def put(self, address: Address, message: _Message) -> None:
-        if address.kind == "queue":
-            self.queues.setdefault(address.name, deque()).append(message)
-        elif address.kind == "log":
-            self.logs.setdefault(address.name, []).append(message)
-        else:
-            for listener in self.listeners.get(address.name, ()):
-                listener.append(message)
-        self.changed.notify_all()
 
 
-_brokers: Final[dict[str, _Broker]] = {}
+_brokers: Final[dict[str, _MemoryBroker]] = {}
+_lock: Final = threading.Lock()
+
+
+def _broker(name: str) -> _MemoryBroker:
+    with _lock:
+        return _brokers.setdefault(name, _MemoryBroker())
 
 
 @contextlib.contextmanager
 def away(host: str) -> Iterator[None]:
-    """Have a broker be away for the time of a ``with`` block; what it keeps is there again afterwards."""
-    broker = _brokers.setdefault(host, _Broker())
-    with broker.changed:
-        broker.is_away = True
-        broker.outages += 1
-        broker.changed.notify_all()
+    """Have a broker be gone for the time of a ``with`` block; what it keeps is there again afterwards."""
+    broker = _broker(host)
+    broker.is_away = True
+    for session in list(broker.sessions):
+        session.lose_from_outside()
     try:
         yield
     finally:
-        with broker.changed:
-            broker.is_away = False
-            broker.changed.notify_all()
+        broker.is_away = False
 
 
-class MemoryChannel:
-    """A connection to one address of a broker in this process; see `epypes.transport.channel.Channel`."""
+class MemorySession:
+    """A connection to a broker in this process; see `epypes.transport.brokers.channel.BrokerSession`."""
 
-    def __init__(self, address: Address, options: ChannelOptions) -> None:
-        self._place, self._options = address, options
-        self.address = str(address)
-        self.keeps_messages = address.kind == "queue"
-        self.is_connected, self.trouble, self.reconnects = False, "", 0
-        self.prefetch = options.prefetch
-        self._process = os.getpid()
-        self._broker = _brokers.setdefault(address.host, _Broker())
-        self._on_delivery: Callable[[Delivery], object] | None = None
-        self._thread: threading.Thread | None = None
-        self._is_over = self._is_paused = self._is_handling = False
-        self._outages = 0
-        self._accepted: deque[_Message] = deque()
-        self._unsettled: list[_Message] = []
-        # What it reads: a queue, or what it has heard or is to hear of a broadcast or a log.
-        self._source: deque[_Message] = deque()
-        self._read = 0
+    most_header_bytes = 65_536
+    lost: asyncio.Future[str]
 
-    @property
-    def waiting(self) -> int:
-        """How many messages were accepted for sending and are not confirmed."""
-        return len(self._accepted)
+    def __init__(self, address: Address, timeout_s: float) -> None:
+        self.address, self.timeout_s = address, timeout_s
+        self._broker = _broker(address.host)
+        self._deliver: Callable[[IncomingMessage], object] | None = None
+        self._window = self._read = 0
+        self._unsettled: set[IncomingMessage] = set()
 
-    def open(self, on_delivery: Callable[[Delivery], object] | None) -> None:
-        """Connect for the first time; see `Channel.open`."""
-        self._on_delivery = on_delivery
-        with self._broker.changed:
-            self._connect()
-        name = f"epypes memory {self._place.name}"
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-        self._thread.start()
+    def check(self, message: OutgoingMessage) -> None:
+        """Take every message."""
 
-    def send(
-        self,
-        frames: Frames,
-        *,
-        id: str = "",  # noqa: A002 - that is its name in every protocol
-        headers: Mapping[str, str] = NO_HEADERS,
-        confirmed: Confirmed | None = None,
-    ) -> None:
-        """Accept a message for sending; see `Channel.send`."""
-        if not frames:
-            raise MessageError("bad frames", "A message has at least one frame.")
-        if self._is_over or self._thread is None or self._process != os.getpid():
-            raise BrokerError(self.address, f"A message to {self.address} was not sent: the channel is closed.")
-        message = _Message(tuple(bytes(frame) for frame in frames), id, dict(headers), confirmed)
-        with self._broker.changed:
-            self._accepted.append(message)
-            self._broker.changed.notify_all()
+    def hint(self, address: Address) -> str:
+        """Return nothing: it always answers."""
+        return ""
 
-    def pause(self) -> None:
-        """Take no further messages; see `Channel.pause`."""
-        self._is_paused = True
+    def lose_from_outside(self) -> None:
+        """Have the connection break; from any thread."""
+        loop = self.lost.get_loop()
+        with contextlib.suppress(RuntimeError):
+            loop.call_soon_threadsafe(self._lose)
 
-    def resume(self) -> None:
-        """Take messages again."""
-        with self._broker.changed:
-            self._is_paused = False
-            self._broker.changed.notify_all()
+    def _lose(self) -> None:
+        if not self.lost.done():
+            self.lost.set_result("the broker has gone away")
 
-    def close(self, timeout_s: float = 5.0) -> None:
-        """Send what was accepted and disconnect; see `Channel.close`."""
-        if self._process != os.getpid() or self._thread is None:
-            return
-        is_own = threading.current_thread() is self._thread
-        with self._broker.changed:
-            if not is_own:
-                self._broker.changed.wait_for(lambda: self._is_over or not self._accepted, timeout_s)
-            self._is_over = True
-            self._disconnect()
-            self._broker.changed.notify_all()
-        self._drop_accepted()
-        if not is_own:
-            self._thread.join(0.0 if self._is_handling else timeout_s)
-
-    def abandon(self) -> None:
-        """Close without waiting and without a lock; its thread notices."""
-        self._is_over = True
-
-    def _run(self) -> None:
-        while not self._is_over:
-            with self._broker.changed:
-                self._check_connection()
-                delivery = self._next_delivery()
-                sent = self._accepted[0] if self._accepted and self.is_connected else None
-                if sent is not None:
-                    self._broker.put(self._place, sent)
-                    self._accepted.popleft()
-                elif delivery is None and not self._is_over:
-                    self._broker.changed.wait(_TICK_S if self.is_connected else _RECONNECT_S)
-            if sent is not None:
-                _tell(sent, None)
-            if delivery is not None and self._on_delivery is not None:
-                self._is_handling = True
-                try:
-                    self._on_delivery(delivery)
-                except BaseException:
-                    log.exception("%s: a message could not be handled", self.address)
-                finally:
-                    self._is_handling = False
-        with self._broker.changed:
-            self._disconnect()
-        self._drop_accepted()
-
-    def _connect(self) -> None:
-        broker, place = self._broker, self._place
+    async def connect(self, *, receives: bool) -> None:
+        """Connect; the queue is made if the address says so."""
+        address, broker = self.address, self._broker
+        self.lost = asyncio.get_running_loop().create_future()
         if broker.is_away:
-            raise BrokerError(self.address, f"{place} can't be reached: the broker is away.")
-        if place.kind == "queue" and place.name not in broker.queues:
-            if not place.create:
-                text = f"There is no queue {place.name!r} at {place}. Make it, or add ?create=true to the address."
-                raise BrokerError(self.address, text)
-            broker.queues[place.name] = deque()
-        if place.kind == "queue":
-            self._source = broker.queues[place.name]
-        elif place.kind == "broadcast" and self._on_delivery is not None:
-            self._source = deque()
-            broker.listeners.setdefault(place.name, []).append(self._source)
-        self._outages = broker.outages
-        self._report("")
+            raise BrokerError(str(address), f"{address} can't be reached: the broker is away.")
+        if address.kind == "queue" and address.name not in broker.queues:
+            if not address.create:
+                text = f"There is no queue {address.name!r} at {address}. Make it, or add ?create=true to the address."
+                raise BrokerError(str(address), text)
+            broker.queues[address.name] = deque()
+        self._read = 0
+        broker.sessions.append(self)
 
-    def _check_connection(self) -> None:
-        if self.is_connected and self._outages != self._broker.outages:
-            self._disconnect()
-            self._report("the broker has gone away")
-            log.warning("lost %s, which is tried again until it is connected: the broker has gone away", self.address)
-        if not self.is_connected:
-            try:
-                self._connect()
-            except BrokerError as error:
-                self._report(str(error))
-            else:
-                self.reconnects += 1
-                log.warning("%s is connected again", self.address)
+    async def publish(self, message: OutgoingMessage) -> None:
+        """Keep a message, or hand it to those that are connected."""
+        address, broker = message.address, self._broker
+        if broker.is_away:
+            raise BrokerError(str(address), f"{address} can't be reached: the broker is away.")
+        stored = _StoredMessage(message.body, message.id, dict(message.headers))
+        if address.kind == "queue":
+            broker.queues.setdefault(address.name, deque()).append(stored)
+        elif address.kind == "log":
+            broker.logs.setdefault(address.name, []).append(stored)
+        else:
+            for session in broker.sessions:
+                if session.address.name == address.name:
+                    session.hear(stored)
+        self._hand_out()
 
-    def _report(self, trouble: str) -> None:
-        was_connected, self.is_connected, self.trouble = self.is_connected, not trouble, trouble
-        if was_connected != self.is_connected and self._options.on_connection is not None:
-            self._options.on_connection(self.is_connected, trouble)
+    def hear(self, stored: _StoredMessage) -> None:
+        """Deliver a broadcast."""
+        if self._deliver is not None:
+            self._deliver(IncomingMessage(stored.body, stored.id, dict(stored.headers)))
 
-    def _next_delivery(self) -> Delivery | None:
-        if self._on_delivery is None or self._is_paused or self._is_over or not self.is_connected:
-            return None
-        if self._place.kind == "log":
-            entries = self._broker.logs.setdefault(self._place.name, [])
-            self._source.extend(entries[self._read :])
-            self._read = len(entries)
-        if not self._source or len(self._unsettled) >= self.prefetch:
-            return None
-        message = self._source.popleft()
-        views = tuple(memoryview(frame) for frame in message.frames)
-        if not self.keeps_messages:
-            return Delivery(views, message.id, 0, message.headers)
-        message.attempt += 1
-        self._unsettled.append(message)
-        return Delivery(
-            views,
-            message.id,
-            message.attempt,
-            message.headers,
-            lambda verdict, reason: self._settle(message, verdict, reason),
-        )
+    async def consume(self, deliver: Callable[[IncomingMessage], object], window: int) -> None:
+        """Have a function called with what comes."""
+        self._deliver, self._window = deliver, window
+        self._hand_out()
 
-    def _settle(self, message: _Message, verdict: str, reason: str) -> None:
-        with self._broker.changed:
-            # What was delivered over an earlier connection is none of this one's.
-            if message not in self._unsettled or self._outages != self._broker.outages:
-                return
-            self._unsettled.remove(message)
-            if verdict == "reject":
-                line = " ".join(reason.encode("utf-8", "replace").decode().split())
-                more = {REASON: line, FROM: self._place.name, ATTEMPTS: str(message.attempt)}
-                dead = _Message(message.frames, message.id, {**message.headers, **more})
-                self._broker.put(self._place.dead_letters, dead)
-            elif verdict == "nack":
-                self._source.append(message)
-            self._broker.changed.notify_all()
+    async def set_window(self, window: int) -> None:
+        """Change how many may be unsettled."""
+        self._window = window
+        self._hand_out()
 
-    def _disconnect(self) -> None:
-        """Return what is unsettled to the broker; its lock is held."""
-        self.is_connected = self.is_connected and not self._is_over
-        if self._place.kind == "queue":
-            self._source.extendleft(reversed(self._unsettled))
-        elif self._place.kind == "broadcast":
-            # By identity: two that have nothing to hear are equal.
-            known = self._broker.listeners.get(self._place.name, [])
-            self._broker.listeners[self._place.name] = [each for each in known if each is not self._source]
+    async def settle(self, message: IncomingMessage, *, requeue: bool) -> None:
+        """Forget a message, or put it back."""
+        if message in self._unsettled:
+            self._unsettled.discard(message)
+            if requeue:
+                self._broker.queues[self.address.name].appendleft(message.receipt)
+            self._hand_out()
+
+    def _hand_out(self) -> None:
+        """Deliver what waits, in turn to those that have room."""
+        is_given = True
+        while is_given:
+            is_given = False
+            for session in list(self._broker.sessions):
+                is_given |= session.take_one()
+            # The next one begins.
+            if self._broker.sessions:
+                self._broker.sessions.append(self._broker.sessions.pop(0))
+
+    def take_one(self) -> bool:
+        """Deliver one message that waits, if there is room for it."""
+        address, broker = self.address, self._broker
+        if self._deliver is None or self.lost.done():
+            return False
+        if address.kind == "log":
+            stored_log = broker.logs.get(address.name, [])
+            if self._read >= len(stored_log):
+                return False
+            self.hear(stored_log[self._read])
+            self._read += 1
+            return True
+        waiting = broker.queues.get(address.name)
+        if address.kind != "queue" or not waiting or len(self._unsettled) >= self._window:
+            return False
+        stored = waiting.popleft()
+        stored.deliveries += 1
+        message = IncomingMessage(stored.body, stored.id, dict(stored.headers), stored.deliveries, receipt=stored)
+        self._unsettled.add(message)
+        self._deliver(message)
+        return True
+
+    async def close(self) -> None:
+        """Disconnect; what is unsettled is delivered again."""
+        broker, self._deliver = self._broker, None
+        if self in broker.sessions:
+            broker.sessions.remove(self)
+        for message in self._unsettled:
+            broker.queues[self.address.name].appendleft(message.receipt)
         self._unsettled.clear()
-
-    def _drop_accepted(self) -> None:
-        why = self.trouble or "the channel was closed before the broker had confirmed it"
-        error = BrokerError(self.address, f"A message to {self.address} was not sent: {why.rstrip('.')}.")
-        while self._accepted:
-            with contextlib.suppress(IndexError):
-                _tell(self._accepted.popleft(), error)
+        self._hand_out()
 
 
-def _tell(message: _Message, error: Exception | None) -> None:
-    if message.confirmed is not None:
-        try:
-            message.confirmed(error)
-        except BaseException:
-            # It is the sender's; the other messages go on.
-            log.exception("the confirmation of a message itself failed")
-
-
-def make_channel(address: Address, options: ChannelOptions) -> MemoryChannel:
-    """Return a channel to an address of a broker in this process."""
-    return MemoryChannel(address, options)
+def make_channel(address: Address, options: ChannelOptions) -> BrokerChannel:
+    """Return a channel to a broker in this process."""
+    return BrokerChannel(MemorySession(address, options.timeout_s), options)
 
 
 def queued(address: str | Address) -> list[Delivery]:
-    """Return copies of the messages that wait in a queue, and are not delivered; the oldest first."""
+    """Return copies of the messages that wait in a queue and are not delivered, the oldest first; for tests."""
     place = parse_address(address)
-    broker = _brokers.setdefault(place.host, _Broker())
-    with broker.changed:
-        waiting = [*broker.queues.get(place.name, ())]
-    return [Delivery(message.frames, message.id, message.attempt, message.headers) for message in waiting]
+    found = []
+    for stored in [*_broker(place.host).queues.get(place.name, ())]:
+        frames, headers = unpacked(IncomingMessage(stored.body, stored.id, dict(stored.headers)))
+        found.append(Delivery(frames, stored.id, stored.deliveries, headers))
+    return found
