@@ -109,7 +109,7 @@ class MemorySession:
     async def publish(self, message: OutgoingMessage) -> None:
         """Keep a message, or hand it to those that are connected."""
         address, broker = message.address, self._broker
-        if broker.is_away:
+        if broker.is_away or self.lost.done():
             raise BrokerError(str(address), f"{address} can't be reached: the broker is away.")
         stored = _StoredMessage(message.body, message.id, dict(message.headers))
         if address.kind == "queue":

@@ -41,7 +41,11 @@ def bodies(address):
 
 
 def threads():
-    return [thread for thread in threading.enumerate() if thread.name.startswith(("epypes memory", "epypes-publisher"))]
+    return [
+        thread
+        for thread in threading.enumerate()
+        if thread.name.startswith(("epypes from", "epypes brokers", "epypes-publisher"))
+    ]
 
 
 def take(q):
@@ -352,11 +356,10 @@ def test_an_answer_that_is_not_confirmed_leaves_its_event_to_be_delivered_again(
     pub = Publisher(answers, q_out).start()
     pipe = ep.FullPipeline("same", graph, q_in, q_out, lambda event: {"x": bytes(event)}, lambda view: view["y"])
     pipe.on_error = lambda failure: None
-    with Subscriber(requests, q_in) as sub, Publisher(requests) as robot, pipe:
-        with away(f"{broker}b"):
-            robot.send(b"x", id="a")
-            wait_until(lambda: pub.waiting)
-            sub.pause()
-            pub.stop(0.0)
-            wait_until(lambda: pipe.failed == 1)
-        wait_until(lambda: ids(requests) == ["a"])
+    with Subscriber(requests, q_in) as sub, Publisher(requests) as robot, pipe, away(f"{broker}b"):
+        robot.send(b"x", id="a")
+        wait_until(lambda: pub.waiting)
+        sub.pause()
+        pub.stop(0.0)
+        wait_until(lambda: pipe.failed == 1)
+    assert ids(requests) == ["a"]

@@ -21,8 +21,9 @@ import pytest
 import epypes as ep
 from epypes.errors import AddressError, BrokerError, StillRunning
 from epypes.transport.address import open_channel, parse_address
+from epypes.transport.brokers.message import ATTEMPTS, REASON
 from epypes.transport.channel import ChannelOptions, Delivery
-from epypes.transport.memory import ATTEMPTS, REASON, away, queued
+from epypes.transport.memory import away, queued
 from epypes.transport.subscriber import Subscriber
 from epypes.wire import Envelope, encode
 from tests.transport.peers import WAIT_S, wait_until
@@ -65,7 +66,7 @@ def left(address):
 
 
 def threads():
-    return [thread for thread in threading.enumerate() if thread.name.startswith("epypes memory")]
+    return [thread for thread in threading.enumerate() if thread.name.startswith(("epypes from", "epypes brokers"))]
 
 
 def take(q):
@@ -483,7 +484,7 @@ def test_a_paused_subscriber_takes_nothing_and_can_acknowledge(broker, address, 
         with away(broker):
             wait_until(lambda: not sub.is_connected)
         assert sub.wait_connected(WAIT_S)
-        assert (left(address), q.empty()) == (["b"], True)
+        assert q.empty()
         sub.resume()
         assert take(q).id == "b"
 
@@ -506,7 +507,7 @@ def test_a_start_fails_with_a_reason_when_the_broker_is_away_or_has_no_such_queu
         sub.start()
     with pytest.raises(BrokerError, match="no queue 'nowhere'"):
         Subscriber(f"memory://{broker}/nowhere", queue.Queue()).start()
-    assert threads() == []
+    wait_until(lambda: threads() == [])
     with sub:
         assert sub.is_connected
 
@@ -543,7 +544,8 @@ def test_a_subscriber_is_stopped_before_it_was_started_and_twice_and_from_any_th
     for thread in stopping:
         thread.join(WAIT_S)
     sub.stop()
-    assert ("stopped" in repr(sub), sub.is_connected, threads()) == (True, False, [])
+    assert ("stopped" in repr(sub), sub.is_connected) == (True, False)
+    wait_until(lambda: threads() == [])
     with sub:
         assert sub.wait_connected(WAIT_S)
     assert not sub.wait_connected(0.0)
