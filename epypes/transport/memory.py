@@ -73,7 +73,8 @@ class MemorySession:
         self._broker = _broker(address.host)
         self._deliver: Callable[[IncomingMessage], object] | None = None
         self._window = self._read = 0
-        self._unsettled: set[IncomingMessage] = set()
+        # In the order of delivery.
+        self._unsettled: dict[IncomingMessage, None] = {}
 
     def check(self, message: OutgoingMessage) -> None:
         """Take every message."""
@@ -140,7 +141,7 @@ class MemorySession:
     async def settle(self, message: IncomingMessage, *, requeue: bool) -> None:
         """Forget a message, or put it back."""
         if message in self._unsettled:
-            self._unsettled.discard(message)
+            del self._unsettled[message]
             if requeue:
                 self._broker.queues[self.address.name].appendleft(message.receipt)
             self._hand_out()
@@ -174,7 +175,7 @@ class MemorySession:
         stored = waiting.popleft()
         stored.deliveries += 1
         message = IncomingMessage(stored.body, stored.id, dict(stored.headers), stored.deliveries, receipt=stored)
-        self._unsettled.add(message)
+        self._unsettled[message] = None
         self._deliver(message)
         return True
 
@@ -183,7 +184,7 @@ class MemorySession:
         broker, self._deliver = self._broker, None
         if self in broker.sessions:
             broker.sessions.remove(self)
-        for message in self._unsettled:
+        for message in reversed(self._unsettled):
             broker.queues[self.address.name].appendleft(message.receipt)
         self._unsettled.clear()
         self._hand_out()

@@ -557,17 +557,17 @@ def test_a_subscriber_is_stopped_by_its_own_queue_and_by_its_listener(broker, ad
             sub.stop()
             super().put(item, block, timeout)
 
-    q, others = Stops(), len(threads())
+    q = Stops()
     sub = Subscriber(address, q).start()
     send(id="a")
     assert take(q).id == "a"
-    wait_until(lambda: len(threads()) == others)
+    wait_until(lambda: not [thread for thread in threads() if thread.name.startswith("epypes from")])
 
     other = Subscriber(address, queue.Queue())
     other.on_connection = lambda is_connected, reason: is_connected or other.stop()
     other.start()
     with away(broker):
-        wait_until(lambda: len(threads()) == others)
+        wait_until(lambda: not [thread for thread in threads() if thread.name.startswith("epypes from")])
     other.stop()
 
 

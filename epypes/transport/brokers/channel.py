@@ -347,6 +347,7 @@ class BrokerChannel:
             async with asyncio.timeout(timeout_s):
                 await session.connect(self._window if self._handler is not None else 0)
                 self._connection += 1
+                self.reconnects = self._connection - 1
                 self._unsettled.clear()
                 self._postponed.clear()
                 self._changed_s = monotonic()
@@ -373,7 +374,6 @@ class BrokerChannel:
             opened_s = monotonic()
             if lost_s:
                 log.warning("%s is connected again after %.1f s", self.address, monotonic() - lost_s)
-                self.reconnects += 1
             reason = await self._use()
             await self._disconnect()
             log.warning("lost %s, which is tried again until it is connected: %s", self.address, reason)
@@ -416,15 +416,16 @@ class BrokerChannel:
         except BaseException:
             log.exception("on_connection itself failed")
 
-    def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
+    def _spawn(self, work: Callable[..., Coroutine[Any, Any, None]], *args: Any) -> None:
         """Run something beside the rest; the connection is lost if it fails."""
-        task = asyncio.ensure_future(self._guarded(work))
+        task = asyncio.ensure_future(self._guarded(work, *args))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _guarded(self, work: Coroutine[Any, Any, None]) -> None:
+    async def _guarded(self, work: Callable[..., Coroutine[Any, Any, None]], *args: Any) -> None:
         try:
-            await work
+            # Called here: a task may be cancelled before it begins.
+            await work(*args)
         except Exception as error:
             self._lose(str(error) or repr(error))
 
@@ -449,7 +450,7 @@ class BrokerChannel:
                         self._unconfirmed[number] = message
                 self._in_flight += 1
                 self._in_flight_bytes += len(message.body)
-                self._spawn(self._publish(number, message))
+                self._spawn(self._publish, number, message)
             await self._wake.wait()
 
     async def _publish(self, number: int, message: OutgoingMessage) -> None:
@@ -487,7 +488,7 @@ class BrokerChannel:
 
     def _update_window(self) -> None:
         if self.is_connected and self._handler is not None:
-            self._spawn(self._session.set_window(self._window))
+            self._spawn(self._session.set_window, self._window)
 
     def _deliver(self, message: IncomingMessage) -> None:
         message.connection = self._connection
@@ -513,14 +514,14 @@ class BrokerChannel:
             return
         self._changed_s = monotonic()
         if verdict != "reject":
-            self._spawn(self._settled(message, requeue=verdict == "nack"))
+            self._spawn(self._settled, message, verdict == "nack")
         elif self._address.dead_letters.name == self._address.name:
             # A dead-letter queue has none of its own: the message stays where it is.
             self._postpone(message)
         else:
-            self._spawn(self._reject(message, reason))
+            self._spawn(self._reject, message, reason)
 
-    async def _settled(self, message: IncomingMessage, *, requeue: bool) -> None:
+    async def _settled(self, message: IncomingMessage, requeue: bool) -> None:
         self._unsettled.discard(message)
         await self._session.settle(message, requeue=requeue)
 
@@ -533,7 +534,7 @@ class BrokerChannel:
                 log.warning(text, self.address, REDELIVERY_S, error)
                 self._postpone(message)
         else:
-            await self._settled(message, requeue=False)
+            await self._settled(message, False)
 
     def _postpone(self, message: IncomingMessage) -> None:
         self._postponed.add(message)
@@ -543,7 +544,7 @@ class BrokerChannel:
     def _redeliver(self, message: IncomingMessage) -> None:
         if message in self._postponed:
             self._postponed.discard(message)
-            self._spawn(self._settled(message, requeue=True))
+            self._spawn(self._settled, message, True)
             self._update_window()
 
     async def _warn_if_stalled(self) -> None:
