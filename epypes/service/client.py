@@ -16,8 +16,10 @@ from epypes.bundle.ports import REQUEST, in_order
 from epypes.bundle.settings import read_settings
 from epypes.errors import RemoteFailure, ServiceError
 from epypes.service.state import ServiceState, read_state
-from epypes.transport import Publisher, Subscriber, ZMQPublisher, ZMQSubscriber
+from epypes.transport import ZMQPublisher, ZMQSubscriber
 from epypes.transport.channels import is_brokered, place_of
+from epypes.transport.receiving import Subscriber
+from epypes.transport.sending import Publisher
 
 if TYPE_CHECKING:
     from epypes.transport import Keys

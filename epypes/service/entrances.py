@@ -8,8 +8,9 @@ from typing import Any, Final, Protocol
 
 from epypes.errors import BrokerError
 from epypes.service.options import CONNECT, Options, bare
-from epypes.transport import Subscriber, ZMQSubscriber
+from epypes.transport import ZMQSubscriber
 from epypes.transport.channels import open_channel, place_of
+from epypes.transport.receiving import Subscriber
 
 _FIRST_PAUSE_S: Final = 0.1
 _LONGEST_PAUSE_S: Final = 5.0

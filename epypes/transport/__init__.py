@@ -11,11 +11,9 @@ if TYPE_CHECKING:
     from epypes.transport.address import check_bind, is_loopback, is_loopback_host
     from epypes.transport.mcapreader import RecordingInfo, recording_info
     from epypes.transport.player import Player
-    from epypes.transport.publisher import ZMQPublisher
-    from epypes.transport.receiving import Subscriber
+    from epypes.transport.publisher import Publisher, ZMQPublisher
     from epypes.transport.recording import Recorder
-    from epypes.transport.sending import Publisher
-    from epypes.transport.subscriber import ZMQSubscriber
+    from epypes.transport.subscriber import Subscriber, ZMQSubscriber
     from epypes.transport.zeromq.curve import Keys, make_keys, read_keys
 
 __all__ = [
@@ -38,10 +36,10 @@ __all__ = [
 _HOME = {
     "Keys": "zeromq.curve",
     "Player": "player",
-    "Publisher": "sending",
+    "Publisher": "publisher",
     "Recorder": "recording",
     "RecordingInfo": "mcapreader",
-    "Subscriber": "receiving",
+    "Subscriber": "subscriber",
     "ZMQPublisher": "publisher",
     "ZMQSubscriber": "subscriber",
     "check_bind": "address",

@@ -10,7 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
+
+if TYPE_CHECKING:
+    from epypes.wire import EncodedEnvelope
 
 Frames = Sequence[bytes | memoryview]
 NO_HEADERS: Final[Mapping[str, str]] = MappingProxyType({})
@@ -44,12 +47,14 @@ class Delivery:
         How often it was delivered, from 1; 0 where the broker does not count.
     headers
         Text that came beside the frames, by name.
+    envelope
+        Set by a Subscriber that puts deliveries: the header of the frames; None if they are no envelope.
     settle
         Of the channel; called at most once: ``("ack", "")``, ``("reject", reason)`` or ``("nack", "")``. It
         returns at once and raises nothing, from any thread.
     """
 
-    __slots__ = ("attempt", "frames", "headers", "id", "is_settled", "settle")
+    __slots__ = ("attempt", "envelope", "frames", "headers", "id", "is_settled", "settle")
 
     def __init__(
         self,
@@ -60,6 +65,7 @@ class Delivery:
         settle: Callable[[str, str], object] = _ignore,
     ) -> None:
         self.frames, self.id, self.attempt, self.headers, self.settle = frames, id, attempt, headers, settle
+        self.envelope: EncodedEnvelope | None = None
         self.is_settled = False
 
     def ack(self) -> None:

@@ -97,7 +97,8 @@ class Subscriber(Endpoint):
     high_water_mark
         Messages kept by ZeroMQ until the I/O thread has read them.
     undecoded
-        True to put every message as a `epypes.transport.channel.Delivery`, with its frames as they came.
+        True to put every message as a `epypes.transport.channel.Delivery`: with its frames as they came, and with its
+        header (``envelope``) if they are an envelope.
     heartbeat_s
         After so many seconds of silence ZeroMQ publishers of EPypes 1.0 are asked whether they live; after three times
         as many without an answer the input is stale.
@@ -461,7 +462,7 @@ class Inbox:
 
     def accept(self, delivery: Delivery) -> None:
         """Take a delivery; called by the channel."""
-        if self._is_zeromq and not self._undecoded:
+        if self._is_zeromq:
             frames = delivery.frames
             is_large = len(frames) > 1 and len(frames[1]) > _LARGE_HEADER_BYTES
             if is_large or self._large.is_busy:
@@ -515,12 +516,14 @@ class Inbox:
             if not self._undecoded:
                 envelope = decode(frames, self._limits)
                 check_source(envelope.source)
-            elif self._ordering is not None or (self._keeps and not delivery.id):
+            else:
                 # What is no envelope is put as well.
                 with contextlib.suppress(MessageError):
                     envelope = EncodedEnvelope.read(frames, self._limits)
+                    check_source(envelope.source)
         if not self._keeps:
             if self._undecoded:
+                delivery.envelope = envelope if isinstance(envelope, EncodedEnvelope) else None
                 return delivery, envelope
             return bytes(frames[0]) if envelope is None else envelope, envelope
         reconnects = 0 if self._channel is None else self._channel.reconnects
@@ -529,7 +532,9 @@ class Inbox:
         if kept is None:
             return None, None
         item: Any = kept
-        if isinstance(envelope, Envelope):
+        if isinstance(envelope, EncodedEnvelope):
+            kept.envelope = envelope
+        elif envelope is not None:
             item = DeliveredEnvelope.of(envelope, kept)
         elif not self._undecoded:
             item = DeliveredBytes.of(kept)
