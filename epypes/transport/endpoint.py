@@ -20,6 +20,7 @@ from epypes.transport.address import Address, open_channel, parse_address
 from epypes.transport.channel import Channel, ChannelOptions
 
 if TYPE_CHECKING:
+    from epypes.transport.zeromq.channel import ZeroMQChannel
     from epypes.transport.zeromq.curve import CurveOptions, Keys, PublicKey
 
 log = logging.getLogger("epypes.transport")
@@ -143,6 +144,10 @@ class Endpoint(Startable):
     def _running(self) -> Channel | None:
         """The channel; None in a forked child, which has neither its parent's threads nor its connections."""
         return self._channel if self._process == os.getpid() else None
+
+    @property
+    def _zeromq_channel(self) -> ZeroMQChannel | None:
+        return None if self._security is None else self._channel  # type: ignore[return-value]
 
     def _new_channel(self, prefetch: int, **zeromq_options: Any) -> Channel:
         if self._security is not None:

@@ -21,10 +21,10 @@ from epypes.transport.channel import NO_HEADERS, Channel, Confirmed, Frames
 from epypes.transport.endpoint import Connection, Endpoint
 from epypes.transport.sequences import check_source
 from epypes.transport.throttle import Throttle
-from epypes.wire import EncodedEnvelope, Envelope, Limits, failure_event, new_id, serialized, topic_frame
+from epypes.wire import EncodedEnvelope, Envelope, Limits, encode, failure_event, new_id, serialized, topic_frame
+from epypes.wire.encoded_envelope import stamped_frames
 
 if TYPE_CHECKING:
-    from epypes.transport.zeromq.channel import ZeroMQChannel
     from epypes.transport.zeromq.curve import Keys, PublicKey
 
 log = logging.getLogger("epypes.transport")
@@ -105,8 +105,8 @@ class Publisher(Endpoint):
         address: str | Address,
         queue: TakeQueue | None = None,
         topic: str = "",
-        *,
         bind: bool = True,
+        *,
         insecure: bool = False,
         keys: Keys | str | Path | None = None,
         allow: PublicKey | Collection[PublicKey] | None = None,
@@ -123,7 +123,6 @@ class Publisher(Endpoint):
             max_message_bytes=max_message_bytes,
             timeout_s=timeout_s,
         )
-        topic_frame(topic)
         self._queue, self._high_water_mark = queue, high_water_mark
         self._taker: HandOver | Bridge | None = None
         self._slow_subscribers = 0
@@ -156,10 +155,6 @@ class Publisher(Endpoint):
         """
         channel = self._zeromq_channel
         return self._slow_subscribers + (0 if channel is None else channel.slow_subscribers)
-
-    @property
-    def _zeromq_channel(self) -> ZeroMQChannel | None:
-        return None if self._security is None else self._channel  # type: ignore[return-value]
 
     def start(self) -> Self:
         """Connect and begin to send; nothing happens if it runs already.
@@ -278,34 +273,9 @@ class Publisher(Endpoint):
 
 
 class ZMQPublisher(Publisher):
-    """A `Publisher` over ZeroMQ; it takes the options of that which have a meaning there."""
+    """A `Publisher` over ZeroMQ, for addresses of ZeroMQ alone."""
 
     takes_brokers: ClassVar[bool] = False
-
-    def __init__(
-        self,
-        address: str,
-        queue: TakeQueue | None = None,
-        topic: str = "",
-        bind: bool = True,
-        *,
-        insecure: bool = False,
-        keys: Keys | str | Path | None = None,
-        allow: PublicKey | Collection[PublicKey] | None = None,
-        max_message_bytes: int = Limits().total_bytes,
-        high_water_mark: int = 1_000,
-    ) -> None:
-        super().__init__(
-            address,
-            queue,
-            topic,
-            bind=bind,
-            insecure=insecure,
-            keys=keys,
-            allow=allow,
-            max_message_bytes=max_message_bytes,
-            high_water_mark=high_water_mark,
-        )
 
 
 class Outbox:
@@ -327,6 +297,7 @@ class Outbox:
 
     def __init__(self, name: str, topic: str, limits: Limits, is_confirmed_later: bool, connection: Connection) -> None:
         self._name, self._topic, self._limits = name, topic, limits
+        self._topic_frame = topic_frame(topic)
         self.is_confirmed_later, self._connection = is_confirmed_later, connection
         self.sent = 0
         self.rejected: Counter[str] = Counter()
@@ -476,9 +447,9 @@ class Outbox:
             It can't be sent. What code of the item itself raises comes as it is.
         """
         if isinstance(item, Envelope):
-            return self._stamped(EncodedEnvelope.encode(item, self._topic, limits=self._limits), None)
+            return self._stamped(item.source, encode(item, self._topic, limits=self._limits))
         if isinstance(item, EncodedEnvelope):
-            return self._stamped(item, self._topic)
+            return self._stamped(item.source, (self._topic_frame, *item.frames[1:]))
         frames: tuple[Any, ...]
         if isinstance(item, bytes):
             frames = (item,)
@@ -504,14 +475,14 @@ class Outbox:
             raise MessageError("too large", f"A message of {size:,} bytes; the limit is {self._limits.total_bytes:,}.")
         return frames
 
-    def _stamped(self, envelope: EncodedEnvelope, topic: str | None) -> Frames:
+    def _stamped(self, source: str, frames: Frames) -> Frames:
         """Return the frames of an envelope with the next number of its source."""
-        check_source(envelope.source)
-        number = self._sequences[envelope.source] + 1
-        frames = envelope.stamped(self._epoch, number, time.time_ns(), topic).frames
+        check_source(source)
+        number = self._sequences[source] + 1
+        stamped = stamped_frames(frames, self._epoch, number, time.time_ns(), self._limits)
         # Counted when it can be sent: a rejected item is no loss on the way.
-        self._sequences[envelope.source] = number
-        return frames
+        self._sequences[source] = number
+        return stamped
 
 
 def _call(confirmed: Confirmed, error: Exception | None) -> None:

@@ -25,7 +25,6 @@ from epypes.transport.throttle import Throttle
 from epypes.wire import EncodedEnvelope, Envelope, Limits, decode, topic_frame
 
 if TYPE_CHECKING:
-    from epypes.transport.zeromq.channel import ZeroMQChannel
     from epypes.transport.zeromq.curve import Keys, PublicKey
 
 log = logging.getLogger("epypes.transport")
@@ -132,8 +131,8 @@ class Subscriber(Endpoint):
         address: str | Address,
         queue: PutQueue,
         topic: str = "",
-        *,
         bind: bool = False,
+        *,
         acknowledge: Acknowledge = "done",
         prefetch: int = 8,
         exhausted: Callable[[Any], object] | None = None,
@@ -225,10 +224,6 @@ class Subscriber(Endpoint):
         """How many seconds ago anything came from a ZeroMQ publisher; None before that, and when it is stopped."""
         channel = self._zeromq_channel
         return None if channel is None else channel.publishers.last_heard_s
-
-    @property
-    def _zeromq_channel(self) -> ZeroMQChannel | None:
-        return None if self._security is None else self._channel  # type: ignore[return-value]
 
     def start(self) -> Self:
         """Connect and begin to receive; nothing happens if it runs already.
@@ -328,40 +323,9 @@ class Subscriber(Endpoint):
 
 
 class ZMQSubscriber(Subscriber):
-    """A `Subscriber` over ZeroMQ; it takes the options of that which have a meaning there."""
+    """A `Subscriber` over ZeroMQ, for addresses of ZeroMQ alone."""
 
     takes_brokers: ClassVar[bool] = False
-
-    def __init__(
-        self,
-        address: str,
-        queue: PutQueue,
-        topic: str = "",
-        bind: bool = False,
-        *,
-        ordered: bool = False,
-        insecure: bool = False,
-        keys: Keys | str | Path | None = None,
-        allow: PublicKey | Collection[PublicKey] | None = None,
-        max_message_bytes: int = Limits().total_bytes,
-        high_water_mark: int = 1_000,
-        undecoded: bool = False,
-        heartbeat_s: float = 1.0,
-    ) -> None:
-        super().__init__(
-            address,
-            queue,
-            topic,
-            bind=bind,
-            ordered=ordered,
-            insecure=insecure,
-            keys=keys,
-            allow=allow,
-            max_message_bytes=max_message_bytes,
-            high_water_mark=high_water_mark,
-            undecoded=undecoded,
-            heartbeat_s=heartbeat_s,
-        )
 
 
 def _checked(prefetch: int) -> int:
