@@ -9,7 +9,7 @@ from epypes.optional import optional_import
 
 if TYPE_CHECKING:
     from epypes.transport.address import check_bind, is_loopback, is_loopback_host
-    from epypes.transport.mcapreader import RecordingInfo, recording_info
+    from epypes.transport.mcap import RecordingInfo, recording_info
     from epypes.transport.player import Player
     from epypes.transport.publisher import Publisher, ZMQPublisher
     from epypes.transport.recording import Recorder
@@ -38,7 +38,7 @@ _HOME = {
     "Player": "player",
     "Publisher": "publisher",
     "Recorder": "recording",
-    "RecordingInfo": "mcapreader",
+    "RecordingInfo": "mcap",
     "Subscriber": "subscriber",
     "ZMQPublisher": "publisher",
     "ZMQSubscriber": "subscriber",
@@ -47,7 +47,7 @@ _HOME = {
     "is_loopback_host": "address",
     "make_keys": "zeromq.curve",
     "read_keys": "zeromq.curve",
-    "recording_info": "mcapreader",
+    "recording_info": "mcap",
 }
 
 

@@ -15,7 +15,7 @@ from typing import Any, Self
 
 from epypes.errors import BrokerError, RecordingError, StillRunning
 from epypes.transport.endpoint import Startable, warn_left_running
-from epypes.transport.mcapreader import BrokenOff, Recorded, messages
+from epypes.transport.mcap import BrokenOff, Recorded, messages
 from epypes.transport.zeromq.channel import ZeroMQChannel
 from epypes.transport.zeromq.curve import CurveOptions, Keys, PublicKey
 

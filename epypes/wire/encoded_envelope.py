@@ -84,7 +84,7 @@ class EncodedEnvelope:
         frames
             Topic, header, payloads. They are kept, not copied.
         limits
-            Sizes and counts that are accepted.
+            Sizes and number of frames that are accepted.
 
         Raises
         ------

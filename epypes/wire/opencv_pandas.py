@@ -148,7 +148,7 @@ def write_table(writer: ValueWriter, message: Any, value: Any, path: Path) -> No
         text = f"{format_path(path)} is a table with attrs, which have no codec. Set attrs = {{}}."
         raise MessageError("no codec", text)
     table = message.table
-    writer.counter.enter(path, 1 if value.ndim == 1 else value.shape[1])
+    writer.counter.enter(path, 1 + (1 if value.ndim == 1 else value.shape[1]))
     _write_column(writer, table.index, value.index, (*path, "index"))
     table.series = value.ndim == 1
     if table.series:
@@ -225,7 +225,7 @@ def read_table(reader: ValueReader, content: Any, path: Path) -> Any:
         name = reader.read(column.name, (*path, part, "name"))
         return pd.RangeIndex(values, name=name) if column.dtype == "range" else pd.Index(values, dtype, name=name)
 
-    reader.counter.enter(path, len(content.data))
+    reader.counter.enter(path, 1 + len(content.data))
     try:
         index = index_of(content.index, "index")
         labels = [0] if content.series else index_of(content.columns, "columns")

@@ -80,11 +80,7 @@ def attributes(message: Message) -> dict[str, str | float]:
 def _entries(message: Any) -> Any:
     # Without hasattr(), which would take as long as adding an attribute does.
     try:
-        return message.attributes.entries
-    except AttributeError:
-        pass
-    try:
-        return message.entries
+        return getattr(message, "attributes", message).entries
     except AttributeError:
         text = f"A {type(message).__name__} has no attributes. Give an AttributeList, Event, JustBytes, Image or "
         raise MessageError("no attributes", f"{text}ImagePair.") from None

@@ -1,4 +1,4 @@
-"""Do ``epypes record`` and ``epypes play`` say what they did, and what is wrong in one line?"""
+"""``epypes record`` and ``epypes play`` report what they did, and each error in one line."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import time
 import pytest
 
 from epypes.transport import ZMQPublisher, ZMQSubscriber, recording_info
-from epypes.transport.mcapformat import Counts
-from epypes.transport.mcapwriter import RecordingWriter
+from epypes.transport.mcap import RecordingCounts, RecordingWriter
 from epypes.wire import Envelope
 
 LOCAL = "tcp://127.0.0.1:*"
@@ -28,19 +27,19 @@ def recording(tmp_path):
         writer.append(10**18 + number * 10**6, [b"cam1/", b"%d" % number])
     writer.append(10**18 + 25 * 10**8, [b"2019"])
     writer.flush()
-    writer.finish(Counts(5, 4, {"disk too slow": 1}))
+    writer.finish(RecordingCounts(5, 4, {"disk too slow": 1}))
     return path
 
 
 def one_line(done) -> str:
-    """Return what a failing command says: one line, no traceback, exit status 1."""
+    """Return the output of a failing command: one line, no traceback, exit status 1."""
     assert done.returncode == 1, done
     assert done.stderr.startswith("epypes: ")
     assert len(done.stderr.strip().splitlines()) == 1
     return done.stderr
 
 
-def test_record_takes_as_many_messages_as_it_is_told_and_says_what_became_of_them(epypes, tmp_path):
+def test_record_takes_the_given_number_of_messages_and_reports_the_counts(epypes, tmp_path):
     out, path = queue.SimpleQueue(), tmp_path / "[a].mcap"
 
     def publish() -> None:
@@ -63,7 +62,7 @@ def test_record_takes_as_many_messages_as_it_is_told_and_says_what_became_of_the
 
 
 @pytest.mark.slow
-def test_record_ends_after_the_time_it_is_told(epypes, tmp_path):
+def test_record_ends_after_the_given_time(epypes, tmp_path):
     before = time.monotonic()
     done = epypes("record", f"bind:{LOCAL}", tmp_path / "a.mcap", "--seconds", 0.1)
     assert done.returncode == 0, done.stderr
@@ -72,7 +71,7 @@ def test_record_ends_after_the_time_it_is_told(epypes, tmp_path):
     assert recording_info(tmp_path / "a.mcap").messages == 0
 
 
-def test_play_sends_and_says_how_many(epypes, recording):
+def test_play_sends_and_reports_how_many(epypes, recording):
     into = queue.SimpleQueue()
     with ZMQSubscriber(LOCAL, into, bind=True, undecoded=True) as sub:
         done = epypes("play", recording, f"connect:{sub.address}", "--speed", 0, "--loop", 2)
@@ -82,14 +81,14 @@ def test_play_sends_and_says_how_many(epypes, recording):
     assert frames == [[b"cam1/", b"0"], [b"cam1/", b"1"], [b"cam1/", b"2"], [b"2019"]] * 2
 
 
-def test_play_to_nobody_can_be_asked_for(epypes, recording):
+def test_play_can_send_without_a_subscriber(epypes, recording):
     done = epypes("play", recording, "--no-wait", "--speed", 0)
     assert done.returncode == 0, done.stderr
     assert re.search(r"PLAYING .* at tcp://127\.0\.0\.1:\d+\. Ctrl\+C ends it", done.stdout)
     assert done.stdout.endswith("sent 4.\n")
 
 
-def test_info_says_what_is_in_the_file_and_sends_nothing(epypes, recording, monkeypatch):
+def test_info_prints_the_content_of_the_file_and_sends_nothing(epypes, recording, monkeypatch):
     monkeypatch.setenv("TZ", "UTC")
     time.tzset()
     done = epypes("play", "--info", recording)
@@ -103,7 +102,7 @@ def test_info_says_what_is_in_the_file_and_sends_nothing(epypes, recording, monk
     ]
 
 
-def test_a_recording_that_breaks_off_is_played_and_then_named(epypes, recording):
+def test_a_recording_that_breaks_off_is_played_and_then_reported(epypes, recording):
     os.truncate(recording, recording.read_bytes().index(b"epypes.counts"))
     assert "did not finish it" in epypes("play", "--info", recording).stdout
     done = epypes("play", recording, "--no-wait", "--speed", 0)

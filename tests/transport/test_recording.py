@@ -1,4 +1,4 @@
-"""Is what is recorded what was published, and what is played what was recorded, whatever happens to disk and process?"""
+"""A recording holds what was published, and a player sends what was recorded, whatever happens to disk and process."""
 
 from __future__ import annotations
 
@@ -20,9 +20,7 @@ import zmq
 
 from epypes.errors import AddressError, RecordingError, StillRunning
 from epypes.transport import Player, Recorder, ZMQPublisher, ZMQSubscriber, make_keys, recording_info
-from epypes.transport.mcapformat import Counts
-from epypes.transport.mcapreader import messages
-from epypes.transport.mcapwriter import RecordingWriter
+from epypes.transport.mcap import RecordingCounts, RecordingWriter, messages
 from epypes.wire import Envelope, JustBytes, decode, encode
 from tests.transport.peers import wait_until
 
@@ -37,7 +35,7 @@ def written(path, recorded) -> None:
     for time_ns, frames in recorded:
         writer.append(time_ns, frames)
     writer.flush()
-    writer.finish(Counts(len(recorded), len(recorded)))
+    writer.finish(RecordingCounts(len(recorded), len(recorded)))
 
 
 def read_until_error(path) -> tuple[list[list[bytes]], str]:
@@ -140,7 +138,7 @@ def test_the_times_and_topics_of_the_messages_are_kept(tmp_path):
     assert found.topics == {"cam1": 3, "": 3}
     assert (found.first_ns, found.last_ns) == (times[0], times[-1])
     assert found.about == {"address": address, "topic": ""}
-    assert found.counts == Counts(6, 6)
+    assert found.counts == RecordingCounts(6, 6)
 
 
 def test_any_reader_of_mcap_finds_topics_times_and_messages(tmp_path):
@@ -185,10 +183,10 @@ def test_topics_that_are_invented_without_end_do_not_use_up_the_channels(tmp_pat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("speed", "least_s"), [(1.0, 0.4), (2.0, 0.2), (0.5, 0.8)])
+@pytest.mark.parametrize(("speed", "least_s"), [(1.0, 0.08), (2.0, 0.04), (0.5, 0.16)])
 def test_the_distances_in_time_are_kept_and_can_be_changed(tmp_path, speed, least_s):
     start = time.time_ns()
-    written(tmp_path / "a.mcap", [(start + number * 10**8, [b"%d" % number]) for number in range(5)])
+    written(tmp_path / "a.mcap", [(start + number * 2 * 10**7, [b"%d" % number]) for number in range(5)])
     into = queue.SimpleQueue()
     before = time.monotonic()
     with Player(tmp_path / "a.mcap", speed=speed) as player, ZMQSubscriber(player.address, into):
@@ -203,7 +201,7 @@ def test_speed_0_does_not_wait_for_the_times(tmp_path):
         assert [into.get(timeout=WAIT_S) for _ in range(10)] == [b"x"] * 10
 
 
-def test_it_plays_as_often_as_it_is_told(tmp_path):
+def test_it_plays_as_often_as_loop_says(tmp_path):
     written(tmp_path / "a.mcap", [(1, [b"a"]), (2, [b"b"])])
     into = queue.SimpleQueue()
     with Player(tmp_path / "a.mcap", loop=3) as player, ZMQSubscriber(player.address, into):
@@ -229,7 +227,7 @@ def test_another_subscriber_may_join_while_it_plays(tmp_path):
 
 
 @pytest.mark.slow
-def test_nothing_is_sent_before_somebody_listens_unless_it_is_told_so(tmp_path):
+def test_nothing_is_sent_before_there_is_a_subscriber_unless_wait_is_false(tmp_path):
     written(tmp_path / "a.mcap", [(1, [b"x"])])
     with Player(tmp_path / "a.mcap") as player:
         assert not player.wait(0.1)
@@ -278,7 +276,7 @@ def test_a_subscriber_that_does_not_read_does_not_keep_a_player_from_stopping(pe
     assert time.perf_counter() - before < WAIT_S
 
 
-def test_a_recorder_ends_by_itself_after_as_many_messages_as_it_is_told(tmp_path):
+def test_a_recorder_ends_by_itself_after_the_given_number_of_messages(tmp_path):
     out, ended = queue.SimpleQueue(), threading.Event()
     with ZMQPublisher(LOCAL, out) as pub:
         recorder = Recorder(pub.address, tmp_path / "a.mcap", messages=3, on_end=ended.set).start()
@@ -287,7 +285,7 @@ def test_a_recorder_ends_by_itself_after_as_many_messages_as_it_is_told(tmp_path
             out.put(b"%d" % number)
         assert ended.wait(WAIT_S)
         assert recorder.wait(0.0)
-        assert recorder.counts == Counts(3, 3)
+        assert recorder.counts == RecordingCounts(3, 3)
         recorder.stop()
     assert frames_of(tmp_path / "a.mcap") == [[b"0"], [b"1"], [b"2"]]
 
@@ -330,10 +328,10 @@ def test_a_signal_finishes_the_file(tmp_path, number):
         wait_until(lambda: still_there(path) > 0)
         pub.stop()
         process.send_signal(number)
-        said, complaints = process.communicate(timeout=60)
-    assert (process.returncode, complaints) == (0, "")
-    assert said == f"RECORDED {path}: received 50, written 50, dropped 0.\n"
-    assert recording_info(path).counts == Counts(50, 50)
+        output, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (0, "")
+    assert output == f"RECORDED {path}: received 50, written 50, dropped 0.\n"
+    assert recording_info(path).counts == RecordingCounts(50, 50)
     assert recording_info(path).messages == 50
 
 
@@ -367,10 +365,10 @@ def test_a_full_disk_ends_the_recording_and_keeps_what_was_written(tmp_path):
         process = record(pub.address, path, code=limit)
         for number in range(300):
             out.put(Envelope("x", {"n": number, "image": IMAGE}))
-        said, complaints = process.communicate(timeout=60)
+        output, errors = process.communicate(timeout=60)
     assert process.returncode == 1
-    assert complaints == f"epypes: {path} can't be written: File too large.\n"
-    received, kept, dropped = map(int, re.findall(r"(?:received|written|disk failed) (\d+)", said))
+    assert errors == f"epypes: {path} can't be written: File too large.\n"
+    received, kept, dropped = map(int, re.findall(r"(?:received|written|disk failed) (\d+)", output))
     assert received == kept + dropped
     found = recording_info(path)
     assert found.counts is None
@@ -378,7 +376,7 @@ def test_a_full_disk_ends_the_recording_and_keeps_what_was_written(tmp_path):
     readable, text = read_until_error(path)
     assert [decode(frames).parts["n"] for frames in readable] == list(range(kept))
     assert "breaks off" in text
-    assert path.stat().st_size < 5_000_000, "what the disk took of the rest is cut off"
+    assert path.stat().st_size < 5_000_000, "the part of a chunk that the disk took is cut off"
 
 
 class SlowDisk:
@@ -432,7 +430,7 @@ def test_a_write_that_never_returns_is_named(tmp_path):
             recorder.stop(timeout_s=0.1)
         disk.read_all()
         recorder.stop()
-    assert recorder.counts == Counts(2, 1, Counter({"disk too slow": 1})), "the time for what waited was over"
+    assert recorder.counts == RecordingCounts(2, 1, Counter({"disk too slow": 1})), "the time for what waited was over"
 
 
 def threads_of_recording() -> list[str]:
@@ -482,7 +480,7 @@ def test_on_end_may_stop_what_has_ended(tmp_path):
 
 
 @pytest.mark.slow
-def test_one_that_is_forgotten_gives_a_warning_and_ends(tmp_path):
+def test_a_player_or_recorder_that_becomes_garbage_gives_a_warning_and_ends(tmp_path):
     written(tmp_path / "a.mcap", [(1, [b"x"])])
     player = Player(tmp_path / "a.mcap").start()
     with pytest.warns(ResourceWarning, match="Player .* left running"):  # noqa: PT031  the last reference goes inside
@@ -493,13 +491,13 @@ def test_one_that_is_forgotten_gives_a_warning_and_ends(tmp_path):
         del recorder
         gc.collect()
     wait_until(lambda: threads_of_recording() == [])
-    assert recording_info(tmp_path / "b.mcap").counts == Counts()
+    assert recording_info(tmp_path / "b.mcap").counts == RecordingCounts()
 
 
 # -- what is refused --------------------------------------------------------------------------------------------------
 
 
-def test_a_file_that_is_there_is_kept_unless_it_is_to_be_replaced(tmp_path):
+def test_an_existing_file_is_kept_unless_force_is_given(tmp_path):
     path = tmp_path / "a.mcap"
     path.write_bytes(b"precious")
     with pytest.raises(RecordingError, match="is there already.*--force"):
@@ -571,7 +569,7 @@ def test_a_file_cut_anywhere_gives_what_is_whole_and_one_error(tmp_path):
     for number in range(10):
         writer.append(number, [b"t/", b"%d" % number, bytes(50)])
         writer.flush()
-    writer.finish(Counts(10, 10))
+    writer.finish(RecordingCounts(10, 10))
     content, counts = whole.read_bytes(), set()
     for length in range(0, content.index(b"epypes.counts"), 7):
         part.write_bytes(content[:length])
@@ -584,7 +582,7 @@ def test_a_file_cut_anywhere_gives_what_is_whole_and_one_error(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [400, pytest.param(20_000, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("count", [150, pytest.param(20_000, marks=pytest.mark.soak)])
 def test_a_damaged_file_never_gives_anything_but_a_recording_error(tmp_path, count):
     path = tmp_path / "a.mcap"
     written(path, [(number, [b"t/", b"%d" % number]) for number in range(20)])
@@ -611,7 +609,7 @@ def test_a_speed_that_makes_no_sense_is_refused(tmp_path, options):
         Player(tmp_path / "a.mcap", **options)
 
 
-def test_other_machines_are_let_in_only_when_that_is_said(tmp_path):
+def test_other_machines_get_access_only_with_insecure(tmp_path):
     with pytest.raises(AddressError, match="insecure=True"):
         Player(tmp_path / "a.mcap", "tcp://*:5555")
     with pytest.raises(AddressError, match="insecure=True"):

@@ -188,6 +188,17 @@ def test_more_objects_than_values_may_be_are_refused_before_one_is_made():
     assert caught.value.reason == "too many values"
 
 
+def test_tables_within_the_labels_of_tables_are_refused_beyond_the_depth():
+    message = message_class("epypes.v1.Envelope")()
+    value = message.parts.add(name="v").value
+    for _ in range(Limits().depth + 2):
+        value = value.table.index.values
+    value.none = True
+    with pytest.raises(MessageError) as caught:
+        decode([b"/", message.SerializeToString()])
+    assert caught.value.reason == "too deep"
+
+
 def test_a_set_with_an_item_twice_or_a_list_in_it_is_refused():
     for items in ([1, 1], [[]]):
         message = message_class("epypes.v1.Envelope")()

@@ -64,11 +64,12 @@ VALUES = st.recursive(
     ),
     max_leaves=8,
 )
-QUICK = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+RANDOM = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
+@pytest.mark.fuzz
 @pytest.mark.slow
-@QUICK
+@RANDOM
 @given(value=VALUES, inline_below=st.sampled_from([0, 16, 8192]))
 def test_any_value_comes_back_as_it_was(value, inline_below):
     frames = encode(Envelope("test", {"value": value}), "topic", inline_below)
@@ -76,8 +77,9 @@ def test_any_value_comes_back_as_it_was(value, inline_below):
     assert same(back, value)
 
 
+@pytest.mark.fuzz
 @pytest.mark.slow
-@QUICK
+@RANDOM
 @given(value=VALUES)
 def test_any_value_comes_back_from_a_sample(value, tmp_path_factory):
     path = tmp_path_factory.mktemp("sample") / "s.npz"
