@@ -54,7 +54,7 @@ def _show(folder: Path, name: str) -> None:
     """Print the public keys in a folder, or the one of a name; whether the secret one is there, too."""
     from rich.table import Table
 
-    from epypes.transport.keys import public_keys
+    from epypes.transport.zeromq.curve import public_keys
 
     files = [folder / f"{name}.key"] if name else sorted(folder.glob("*.key"))
     if not files:

@@ -16,7 +16,7 @@ from epypes.experiment.layouts import LAYOUTS, running
 from epypes.experiment.results import Results, row_of, table_of
 from epypes.experiment.robot import Robot
 from epypes.transport import read_keys
-from epypes.transport.keys import public_keys
+from epypes.transport.zeromq.curve import public_keys
 
 # Requests that come first and are not counted: they fill caches, and from its fourth run on a graph is compiled.
 _WARM_UP: Final = 5

@@ -20,7 +20,7 @@ def settle(event: Any, error: BaseException | None = None, text: str = "") -> No
         Any object.
     error
         Why it failed; None if it did not. After a BrokerError nobody knows whether its answer has arrived: it is left
-        alone, to be delivered again, which its ``give_back`` is told if it has one.
+        alone, to be delivered again, which its ``nack`` is told if it has one.
     text
         The reason it is rejected with; that of the error without.
     """
@@ -30,8 +30,8 @@ def settle(event: Any, error: BaseException | None = None, text: str = "") -> No
     if error is None:
         _say(kind.ack, event)
     elif issubclass(type(error), BrokerError):
-        if hasattr(kind, "give_back"):
-            _say(kind.give_back, event)
+        if hasattr(kind, "nack"):
+            _say(kind.nack, event)
     else:
         reject(event, text or _text_of(error))
 

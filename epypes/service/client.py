@@ -15,13 +15,15 @@ from epypes.bundle.load import SETTINGS
 from epypes.bundle.ports import REQUEST, in_order
 from epypes.bundle.settings import read_settings
 from epypes.errors import RemoteFailure, ServiceError
-from epypes.service.state_file import ServiceState, read_state
-from epypes.transport import Publisher, Subscriber, ZMQPublisher, ZMQSubscriber
+from epypes.service.state import ServiceState, read_state
+from epypes.transport import ZMQPublisher, ZMQSubscriber
 from epypes.transport.channels import is_brokered, place_of
+from epypes.transport.receiving import Subscriber
+from epypes.transport.sending import Publisher
 
 if TYPE_CHECKING:
     from epypes.transport import Keys
-    from epypes.transport.keys import PublicKey
+    from epypes.transport.zeromq.curve import PublicKey
     from epypes.wire import Envelope
 
 # How often it is looked, while an answer is awaited, whether the service still lives.

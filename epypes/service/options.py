@@ -12,7 +12,7 @@ from epypes.errors import ServiceError
 from epypes.transport.channels import Place, is_brokered, place_of
 
 if TYPE_CHECKING:
-    from epypes.transport.keys import Keys, PublicKey
+    from epypes.transport.zeromq.curve import Keys, PublicKey
 
 MailboxPolicy = Literal["latest", "drop_oldest", "fault"]
 POLICIES: Final = get_args(MailboxPolicy)

@@ -8,15 +8,13 @@ from typing import TYPE_CHECKING, Any
 from epypes.optional import optional_import
 
 if TYPE_CHECKING:
-    from epypes.transport.addresses import check_bind, is_loopback, is_loopback_host
-    from epypes.transport.keys import Keys, make_keys, read_keys
+    from epypes.transport.address import check_bind, is_loopback, is_loopback_host
     from epypes.transport.mcap import RecordingInfo, recording_info
-    from epypes.transport.playing import Player
-    from epypes.transport.publisher import ZMQPublisher
-    from epypes.transport.receiving import Subscriber
+    from epypes.transport.player import Player
+    from epypes.transport.publisher import Publisher, ZMQPublisher
     from epypes.transport.recording import Recorder
-    from epypes.transport.sending import Publisher
-    from epypes.transport.subscriber import ZMQSubscriber
+    from epypes.transport.subscriber import Subscriber, ZMQSubscriber
+    from epypes.transport.zeromq.curve import Keys, make_keys, read_keys
 
 __all__ = [
     "Keys",
@@ -36,19 +34,19 @@ __all__ = [
 ]
 
 _HOME = {
-    "Keys": "keys",
-    "Player": "playing",
-    "Publisher": "sending",
+    "Keys": "zeromq.curve",
+    "Player": "player",
+    "Publisher": "publisher",
     "Recorder": "recording",
     "RecordingInfo": "mcap",
-    "Subscriber": "receiving",
+    "Subscriber": "subscriber",
     "ZMQPublisher": "publisher",
     "ZMQSubscriber": "subscriber",
-    "check_bind": "addresses",
-    "is_loopback": "addresses",
-    "is_loopback_host": "addresses",
-    "make_keys": "keys",
-    "read_keys": "keys",
+    "check_bind": "address",
+    "is_loopback": "address",
+    "is_loopback_host": "address",
+    "make_keys": "zeromq.curve",
+    "read_keys": "zeromq.curve",
     "recording_info": "mcap",
 }
 

@@ -14,15 +14,14 @@ import contextlib
 import os
 import struct
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Self
 
 from epypes.errors import RecordingError
 from epypes.optional import optional_import
-
-Frames = Sequence[bytes | memoryview]
+from epypes.transport.channel import Frames
 
 _ENCODING: Final = "epypes-multipart"
 # Names of the metadata records: one at the start, one at the end of a recording that was finished.

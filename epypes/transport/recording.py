@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from epypes.errors import RecordingError, StillRunning
-from epypes.transport.mcap import Frames, RecordingCounts, RecordingWriter
+from epypes.transport.channel import Delivery, Frames
+from epypes.transport.endpoint import Startable
+from epypes.transport.mcap import RecordingCounts, RecordingWriter
 from epypes.transport.subscriber import ZMQSubscriber
-from epypes.transport.within import Within
 
 # What may wait for the disk: some seconds of images, and more than the largest message.
 BACKLOG_BYTES: Final = 512 * 1024**2
@@ -30,7 +31,7 @@ def _nothing() -> None:
     return
 
 
-class Recorder(Within):
+class Recorder(Startable):
     """Writes published messages into an MCAP file, each as it arrived, with the time of its arrival.
 
     Parameters
@@ -194,10 +195,11 @@ class _Recording:
         self._offset_ns = time.time_ns() - time.perf_counter_ns()
         self.ended = threading.Event()
 
-    def put(self, item: Frames, *, block: bool) -> None:
+    def put(self, delivery: Delivery, *, block: bool) -> None:
         """Accept the frames of a message, or count them as dropped; called by the subscriber."""
         now_ns = self._offset_ns + time.perf_counter_ns()
-        size = sum(map(len, item)) + _OVERHEAD_BYTES
+        frames = delivery.frames
+        size = sum(map(len, frames)) + _OVERHEAD_BYTES
         with self._changed:
             if self._is_closed and not self._has_failed:
                 return
@@ -207,7 +209,7 @@ class _Recording:
             elif self._waiting and self._waiting_bytes + size > self._backlog_bytes:
                 self._counts.dropped[_SLOW] += 1
             else:
-                self._waiting.append((now_ns, item, size))
+                self._waiting.append((now_ns, frames, size))
                 self._waiting_bytes += size
                 if self._remaining is not None:
                     self._remaining -= 1

@@ -1,72 +1,108 @@
-"""How does what is published come into a queue? Through a subscriber, read by the I/O thread."""
+"""Subscribers: what arrives at an address, over ZeroMQ or from a broker, is put into a queue."""
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import logging
 import os
+import queue as queues
 import threading
-import warnings
 import weakref
-from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from time import monotonic
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, Protocol, Self, get_args
 
-import zmq
+from epypes.errors import BrokerError, MessageError, StillRunning
+from epypes.transport.address import Address
+from epypes.transport.channel import ERROR, ERROR_REASON, Channel, Delivery
+from epypes.transport.deduplication import Deduplication
+from epypes.transport.endpoint import Endpoint
+from epypes.transport.sequences import LossCounter, ReorderBuffer, Source, check_source
+from epypes.transport.throttle import Throttle
+from epypes.wire import EncodedEnvelope, Envelope, Limits, decode, topic_frame
 
-from epypes.errors import StillRunning
-from epypes.transport import io
-from epypes.transport.gathering import Gatherer
-from epypes.transport.guard import Watch
-from epypes.transport.heartbeat import Pulse
-from epypes.transport.inbox import Inbox, PutQueue, Source
-from epypes.transport.joining import Guest
-from epypes.transport.keys import Keys, PublicKey
-from epypes.transport.security import Security, security
-from epypes.transport.within import Within
-from epypes.wire import Limits, topic_frame
+if TYPE_CHECKING:
+    from epypes.transport.zeromq.curve import Keys, PublicKey
 
 log = logging.getLogger("epypes.transport")
 
-HIGH_WATER_MARK = 1_000
-# Two small messages in this time cost no CPU to speak of.
-HEARTBEAT_S = 1.0
+Acknowledge = Literal["done", "received"]
+# A queue that has ended takes nothing, whatever it is: that is no fault of the message, which other consumers get.
+_ENDED: Final = (BrokerError, getattr(queues, "ShutDown", BrokerError))
+# How long a full queue of the user is waited for before it is checked whether the subscriber stops.
+_TICK_S: Final = 0.05
+_FIELDS: Final = tuple(field.name for field in dataclasses.fields(Envelope))
+# A header of this size holds some 10,000 values, which take about 20 ms to decode: too long for the I/O thread.
+_LARGE_HEADER_BYTES: Final = 32 * 1024
+_MOST_LARGE: Final = 256
 
 
-class ZMQSubscriber(Within):
-    """Puts what arrives on a ZeroMQ SUB socket into a queue.
+class PutQueue(Protocol):
+    """What a subscriber puts into: queue.Queue, queue.SimpleQueue, ep.Mailbox."""
+
+    def put(self, item: Any, *, block: bool) -> object:
+        """Take an item, or raise queue.Full.
+
+        It is called with ``block=False``, by one thread at a time. If messages come from a broker and it was full, it
+        is called with ``block=True`` and a ``timeout``.
+        """
+
+
+class Subscriber(Endpoint):
+    """Puts the messages of an address, of ZeroMQ or of a broker, into a queue.
 
     Parameters
     ----------
     address
-        Where the publisher is: ``"tcp://127.0.0.1:5555"``.
+        ``"tcp://127.0.0.1:5555"`` or ``"amqp://user:password@127.0.0.1/events"``; see
+        `epypes.transport.address.parse_address`.
     queue
-        Any object with ``put(item, block=False)``. A message of one frame is put as bytes (2019 mode), one of more
-        frames as an Envelope, whose arrays are read-only. It is called on the I/O thread, and must be quick; behind a
-        message with more than 32 kB in its header, on the thread that decodes such messages.
+        Any object with ``put(item, block=False)``, as queue.Queue and ep.Mailbox have it. A message of one frame is put
+        as bytes (2019 mode), one of more frames as an Envelope, whose arrays are read-only. From a broker both have
+        ``ack()``, ``reject(reason)``, ``nack()`` and ``attempt``. From ZeroMQ it is called on the I/O thread, and must
+        be quick; what a full queue does not take is dropped and counted. From a broker it is called on a thread of the
+        channel, and a full queue is waited for.
     topic
         Topic of the envelopes: ``"cam1"`` gets ``cam1`` and ``cam1/left``, not ``cam10``; ``""`` gets everything.
-        Messages of 2019 have no topic: with one given, only those come whose own bytes begin with it and a slash.
+        Messages of 2019 have no topic: with one given, only those come whose own bytes begin with it and a slash. At a
+        queue of a broker, a message of another topic is a dead letter.
     bind
-        True to bind, for publishers that connect.
+        True to bind a ZeroMQ address, for publishers that connect.
+    acknowledge
+        ``"done"``: the broker keeps a message until its ``ack`` or ``reject`` was called, which a pipeline does when it
+        has answered; so none is lost, and one may be delivered again. ``"received"``: until it is in the queue.
+    prefetch
+        How many messages of a broker may be unacknowledged at once: then delivery pauses.
+    exhausted
+        None, or called with a message that was delivered more often than the address allows, in place of rejecting it;
+        on the channel's thread.
+    ordered
+        True to put envelopes in the order of their sequence numbers, by source and epoch. What comes too early waits
+        for what is missing, for a second at most; a line in the log then says what is missing.
     insecure
-        True to bind an address that other machines can reach, without keys.
+        True to bind a ZeroMQ address that other machines can reach, without keys.
     keys
         Its own pair of CURVE keys, from `make_keys` or `read_keys`, or the path of its .key_secret file.
     allow
         With keys: the public keys of the peers that may connect, as text, .key files or a folder of these; where it
         connects itself, the one of the peer that is bound there.
     max_message_bytes
-        A peer that sends a larger frame is disconnected; a larger message of several frames is counted in `rejected`.
-        ZeroMQ keeps such a message in memory until its last frame has come. Where a TCP port is bound, a peer that has
-        sent 64 MB more than this without ending its message is disconnected.
+        Larger messages are rejected. A ZeroMQ peer that sends a larger frame is disconnected. ZeroMQ keeps a message of
+        several frames in memory until its last frame has come: a peer that has sent 64 MB more than this to a bound TCP
+        port without ending its message is disconnected.
     high_water_mark
         Messages kept by ZeroMQ until the I/O thread has read them.
     undecoded
-        True to put every message as the tuple of its frames, read-only memoryviews of what came.
+        True to put every message as a `epypes.transport.channel.Delivery`: with its frames as they came, and with its
+        header (``envelope``) if they are an envelope.
     heartbeat_s
-        After so many seconds of silence publishers of EPypes 1.0 are asked whether they live; after three times as
-        many without an answer the input is stale.
+        After so many seconds of silence ZeroMQ publishers of EPypes 1.0 are asked whether they live; after three times
+        as many without an answer the input is stale.
+    timeout_s
+        Longest wait for the broker's answer, in seconds.
 
     Attributes
     ----------
@@ -77,49 +113,75 @@ class ZMQSubscriber(Within):
     Raises
     ------
     AddressError
-        If ``bind`` is asked for an address that is not loopback, with neither keys nor ``insecure``.
+        The address can't be understood, or ``bind`` is asked for an address that is not loopback, with neither keys nor
+        ``insecure``.
     KeysError
-        If keys can't be read, or it is not said which are allowed.
+        Keys can't be read, or there is no list of allowed keys.
     MessageError
-        If ``topic`` can't be one.
+        ``topic`` can't be one.
 
     Notes
     -----
-    Start it, or use ``with``. Semeniuta and Falkman 2019, "Reactive pipelines".
+    Start it, or use ``with``. What is not acknowledged when it stops is delivered again, to any consumer. Semeniuta and
+    Falkman 2019, "Reactive pipelines".
     """
 
     def __init__(
         self,
-        address: str,
+        address: str | Address,
         queue: PutQueue,
         topic: str = "",
         bind: bool = False,
         *,
+        acknowledge: Acknowledge = "done",
+        prefetch: int = 8,
+        exhausted: Callable[[Any], object] | None = None,
+        ordered: bool = False,
         insecure: bool = False,
         keys: Keys | str | Path | None = None,
         allow: PublicKey | Collection[PublicKey] | None = None,
         max_message_bytes: int = Limits().total_bytes,
-        high_water_mark: int = HIGH_WATER_MARK,
+        high_water_mark: int = 1_000,
         undecoded: bool = False,
-        heartbeat_s: float = HEARTBEAT_S,
+        heartbeat_s: float = 1.0,
+        timeout_s: float = 10.0,
     ) -> None:
-        self._security = security(address, bind, insecure, keys, allow)
-        self._given = address
-        self._subscription = topic_frame(topic) if topic else b""
-        self._limits = Limits(total_bytes=max_message_bytes)
-        self._high_water_mark = high_water_mark
-        self._inbox = Inbox(queue, self._limits, undecoded)
-        self._heartbeat_s = heartbeat_s
+        if acknowledge not in get_args(Acknowledge):
+            raise ValueError(f"acknowledge is {' or '.join(map(repr, get_args(Acknowledge)))}, not {acknowledge!r}.")
+        self._prefetch = _checked(prefetch)
+        super().__init__(
+            address,
+            bind=bind,
+            insecure=insecure,
+            keys=keys,
+            allow=allow,
+            max_message_bytes=max_message_bytes,
+            timeout_s=timeout_s,
+        )
+        self._high_water_mark, self._heartbeat_s = high_water_mark, heartbeat_s
+        self._topic = topic_frame(topic) if topic else b""
         self.on_stale: Callable[[bool], None] | None = None
-        self._lock = threading.Lock()
-        self._opened: _Opened | None = None
-        self._finalizer: weakref.finalize[Any, Any] | None = None
+        self._inbox = Inbox(
+            queue,
+            self._topic,
+            self.place,
+            Limits(total_bytes=max_message_bytes),
+            acknowledge=acknowledge,
+            exhausted=exhausted,
+            ordered=ordered,
+            undecoded=undecoded,
+        )
 
     @property
-    def address(self) -> str:
-        """The endpoint that is bound, once it is started; otherwise the address that was given."""
-        opened = self._opened
-        return self._given if opened is None else opened.address
+    def prefetch(self) -> int:
+        """How many messages may be unacknowledged at once; it may be set while the subscriber runs."""
+        return self._prefetch
+
+    @prefetch.setter
+    def prefetch(self, count: int) -> None:
+        self._prefetch = _checked(count)
+        if self._channel is not None:
+            self._channel.prefetch = count
 
     @property
     def received(self) -> int:
@@ -128,76 +190,117 @@ class ZMQSubscriber(Within):
 
     @property
     def rejected(self) -> Counter[str]:
-        """How many messages could not be understood, by reason; a copy."""
+        """How many messages could not be understood, or were delivered too often, by reason; a copy."""
         return Counter(self._inbox.rejected)
 
     @property
     def dropped(self) -> Counter[str]:
-        """How many messages the queue did not take, by reason (``"queue full"``); a copy."""
+        """How many messages the queue did not take, by reason (``"queue full"``, or what it raised); a copy."""
         return Counter(self._inbox.dropped)
 
     @property
     def lost(self) -> Mapping[Source, int]:
-        """How many envelopes never arrived, by (source, epoch): gaps in their sequence numbers; a copy."""
-        return dict(self._inbox.lost)
+        """How many envelopes never arrived over ZeroMQ, by (source, epoch): gaps in their numbers; a copy."""
+        return dict(self._inbox.losses.lost)
 
     @property
-    def refused(self) -> Counter[str]:
-        """How often peers were refused because their key is not allowed, by public key; a copy."""
-        return Counter(self._security.refused)
+    def duplicates(self) -> int:
+        """How many deliveries of a broker were of a message that was in flight or answered."""
+        return self._inbox.deduplication.duplicates
+
+    @property
+    def dead_letters(self) -> int:
+        """How many messages went into the dead-letter queue, because this subscriber or the user rejected them."""
+        return self._inbox.dead_letters
 
     @property
     def is_stale(self) -> bool:
-        """Whether a publisher that had joined is silent: it does not even answer. One that is idle does."""
-        opened = self._opened
-        return opened is not None and opened.pulse.is_stale
+        """Whether a ZeroMQ publisher that had joined is silent: it does not even answer. One that is idle does."""
+        channel = self._zeromq_channel
+        return channel is not None and channel.publishers.is_stale
 
     @property
     def last_heard_s(self) -> float | None:
-        """How many seconds ago anything came from a publisher; None before that, and when it is stopped."""
-        opened = self._opened
-        return None if opened is None else opened.pulse.last_heard_s
+        """How many seconds ago anything came from a ZeroMQ publisher; None before that, and when it is stopped."""
+        channel = self._zeromq_channel
+        return None if channel is None else channel.publishers.last_heard_s
 
     def start(self) -> Self:
-        """Open the socket and begin to receive; nothing happens if it runs already.
+        """Connect and begin to receive; nothing happens if it runs already.
 
         Raises
         ------
         AddressError
-            If the address can't be bound, or can't be understood.
+            The address can't be bound, or can't be understood.
+        BrokerError
+            The broker can't be reached, refuses, or has no such queue.
         """
         with self._lock:
-            if self._opened is None or self._opened.is_gone():
-                pulse = Pulse(self._heartbeat_s, _reporter(self))
-                self._opened = opened = _Opened(self._inbox, pulse, self._limits)
-                try:
-                    opened.open(self._given, self._security, self._options(opened.guest), self._heartbeat_s)
-                except BaseException:
-                    self._opened = None
-                    raise
-                self._finalizer = weakref.finalize(self, _abandon, opened, self._given)
+            if self._running is not None:
+                return self
+            options: dict[str, Any] = {}
+            if self._security is not None:
+                options = {
+                    "subscription": self._topic,
+                    "high_water_mark": self._high_water_mark,
+                    "heartbeat_s": self._heartbeat_s,
+                    "on_stale": _reporter(self),
+                }
+            channel = self._new_channel(self._prefetch, **options)
+            self._inbox.begin(channel)
+            try:
+                channel.open(self._inbox.accept)
+            except BaseException:
+                self._inbox.end()
+                raise
+            inbox = self._inbox
+
+            def on_forgotten() -> None:
+                inbox.is_over = True
+                channel.abandon()
+
+            self._opened(channel, on_forgotten)
         return self
 
     def stop(self, timeout_s: float = 5.0) -> None:
-        """Close the socket; from any thread, as often as you like.
+        """Disconnect, or close the socket; from any thread, as often as you like.
 
         Parameters
         ----------
         timeout_s
-            Longest wait, in seconds.
+            Longest wait, in seconds. If a broker does not answer by then, the rest happens in the background.
 
         Raises
         ------
         StillRunning
-            If the I/O thread is held up for so long, which a slow ``put`` of some queue can do. The socket is
-            closed as soon as it returns.
+            A ``put`` of the queue, or of another one on the I/O thread, does not return in time. The channel is closed
+            as soon as it does.
         """
-        with self._lock:
-            opened, self._opened = self._opened, None
-            if self._finalizer is not None:
-                self._finalizer.detach()
-        if opened is not None:
-            opened.close(timeout_s)
+        channel = self._taken_to_stop()
+        if channel is None:
+            return
+        until_s = monotonic() + timeout_s
+        self._inbox.end()
+        channel.close(timeout_s)
+        if not self._inbox.wait_returned(until_s - monotonic()):
+            raise StillRunning(f"{type(self).__name__} {self._given}", ["put"], timeout_s)
+
+    def pause(self) -> None:
+        """Take no further messages from the broker and stay connected: messages can be acknowledged.
+
+        What arrives over ZeroMQ meanwhile is dropped.
+        """
+        if self._channel is not None:
+            self._channel.pause()
+
+    def resume(self) -> None:
+        """Take messages again after `pause`."""
+        if self._channel is not None:
+            self._channel.resume()
+
+    def answered(self, ids: Iterable[str]) -> None:
+        """Take note that other consumers have answered these: if they are delivered later they are duplicates."""
+        self._inbox.deduplication.answered(ids)
 
     def wait_joined(self, timeout_s: float = 5.0, publishers: int = 1) -> bool:
         """Return whether publishers have confirmed the subscription: what they send from then on is not lost.
@@ -207,104 +310,31 @@ class ZMQSubscriber(Within):
         timeout_s
             Longest wait, in seconds.
         publishers
-            How many must have confirmed it since the start. Only publishers of EPypes 1.0 do; one of 2019 never will.
+            How many ZeroMQ publishers must have confirmed it since the start. Only those of EPypes 1.0 do; one of 2019
+            never will. A broker keeps messages, so that there the connection is enough.
         """
-        opened = self._opened
-        return opened is not None and opened.guest.wait(timeout_s, publishers)
-
-    def _options(self, guest: Guest) -> list[tuple[int, int | bytes]]:
-        return [
-            (zmq.RCVHWM, self._high_water_mark),
-            (zmq.MAXMSGSIZE, self._limits.total_bytes),
-            # A subscriber has nothing to send but its subscriptions.
-            (zmq.LINGER, 0),
-            (zmq.SUBSCRIBE, self._subscription),
-            (zmq.SUBSCRIBE, guest.topic),
-        ]
+        if self._security is None:
+            return self.wait_connected(timeout_s)
+        channel = self._zeromq_channel
+        return channel is not None and channel.publishers.wait(timeout_s, publishers)
 
     def __repr__(self) -> str:
-        state = "stopped" if self._opened is None else "running"
-        return f"<ZMQSubscriber {self.address[:40]} {state}: {self.received} received>"
+        return self._repr(f"{self.received} received")
 
 
-class _Opened:
-    """From a start to its stop: the socket, and who has confirmed its subscription."""
+class ZMQSubscriber(Subscriber):
+    """A `Subscriber` over ZeroMQ, for addresses of ZeroMQ alone."""
 
-    def __init__(self, inbox: Inbox, pulse: Pulse, limits: Limits) -> None:
-        self._inbox, self.pulse = inbox, pulse
-        self._gatherer, self._limits = Gatherer(limits), limits
-        self._watch: Watch | None = None
-        self._process = os.getpid()
-        self._socket: io.Socket | None = None
-        self.guest = Guest()
-        self.address = ""
-
-    def open(
-        self, address: str, security: Security, options: Sequence[tuple[int, int | bytes]], heartbeat_s: float
-    ) -> None:
-        self._inbox.begin()
-        gate = security.gate()
-        more = security.options(gate)
-
-        def open_socket(thread: io.IOThread) -> str:
-            self._socket = opened = thread.open(
-                zmq.SUB,
-                address,
-                security.bind,
-                self._read,
-                [*options, *more],
-                gate=gate,
-                max_message_bytes=self._limits.total_bytes,
-            )
-            self._watch = thread.watch_of(opened)
-            thread.every(heartbeat_s, opened, self._look)
-            return thread.address_of(self._socket, address)
-
-        self.address = io.call(open_socket, start=True)
-
-    def close(self, timeout_s: float) -> None:
-        if self._socket is not None and not self.is_gone():
-            try:
-                io.close(self._socket, timeout_s)
-            except TimeoutError as error:
-                raise StillRunning(f"ZMQSubscriber {self.address}", ["put"], timeout_s) from error
-            if not self._inbox.end(timeout_s):
-                raise StillRunning(f"ZMQSubscriber {self.address}", ["put"], timeout_s)
-
-    def close_soon(self) -> None:
-        if self._socket is not None:
-            io.close_soon(self._socket)
-
-    def is_gone(self) -> bool:
-        """Return whether this is a forked child, where there is neither thread nor socket."""
-        return self._process != os.getpid()
-
-    def _look(self) -> None:
-        if self.pulse.look(self.guest.has_joined) and self._socket is not None:
-            self._socket.setsockopt(zmq.UNSUBSCRIBE, self.guest.topic)
-            self._socket.setsockopt(zmq.SUBSCRIBE, self.guest.topic)
-
-    def _read(self) -> bool:
-        socket = self._socket
-        if socket is None or socket.closed:
-            return False
-        try:
-            frames = self._gatherer.read(socket, self._watch)
-        except zmq.Again:
-            return False
-        if frames is None:
-            return True
-        if frames:
-            self._inbox.accept(frames, self.guest)
-        else:
-            self._inbox.reject(self._gatherer.refused(), "it is larger than the limits")
-        # After it, since the thread that waits for the message is woken up by now. Whether there are more the poller
-        # finds out: to ask here would keep the interpreter's lock from that thread.
-        self.pulse.heard()
-        return False
+    takes_brokers: ClassVar[bool] = False
 
 
-def _reporter(subscriber: ZMQSubscriber) -> Callable[[bool], None]:
+def _checked(prefetch: int) -> int:
+    if prefetch < 1:
+        raise ValueError(f"prefetch is a whole number from 1, not {prefetch!r}.")
+    return prefetch
+
+
+def _reporter(subscriber: Subscriber) -> Callable[[bool], None]:
     """Return what calls a subscriber's on_stale, and does not keep the subscriber alive."""
     known = weakref.ref(subscriber)
 
@@ -316,10 +346,417 @@ def _reporter(subscriber: ZMQSubscriber) -> Callable[[bool], None]:
     return report
 
 
-def _abandon(opened: _Opened, address: str) -> None:
-    # By the garbage collector or at exit: so no waiting, no locks.
-    if not opened.is_gone():
-        opened.close_soon()
-        warnings.warn(
-            f"ZMQSubscriber {address} was left running. Call stop(), or use with.", ResourceWarning, stacklevel=2
-        )
+class Inbox:
+    """What a subscriber does with deliveries: decode, deduplicate, order, put and count; over all its starts.
+
+    Attributes
+    ----------
+    is_over
+        Set when the subscriber stops: nothing is put from then on.
+    """
+
+    def __init__(
+        self,
+        queue: PutQueue,
+        topic: bytes,
+        place: Address,
+        limits: Limits,
+        *,
+        acknowledge: Acknowledge,
+        exhausted: Callable[[Any], object] | None,
+        ordered: bool,
+        undecoded: bool,
+    ) -> None:
+        self._queue, self._topic, self._place, self._limits = queue, topic, place, limits
+        self._acknowledge, self._exhausted, self._undecoded = acknowledge, exhausted, undecoded
+        self._is_zeromq = not place.is_broker
+        self._ordering = ReorderBuffer() if ordered else None
+        self._timer: threading.Timer | None = None
+        self.is_over = True
+        self.received = self._refused = self._starts = 0
+        self.rejected: Counter[str] = Counter()
+        self.dropped: Counter[str] = Counter()
+        self.losses = LossCounter()
+        self.deduplication = Deduplication()
+        self._log = Throttle(log)
+        self._process = os.getpid()
+        self._channel: Channel | None = None
+        # Held while a message is handled: on the thread of the channel, the one of large messages, or a timer's.
+        # Re-entrant, since the queue of the user may stop the subscriber.
+        self._handling = threading.RLock()
+        self._large = _LargeMessages(self._handle, limits.total_bytes)
+
+    @property
+    def dead_letters(self) -> int:
+        """How many messages were rejected."""
+        return self._refused + self.deduplication.rejected
+
+    def begin(self, channel: Channel) -> None:
+        """Take the deliveries of a channel from now on."""
+        if self._process != os.getpid():
+            # A thread of the parent may hold the locks, and what is in flight is the parent's.
+            self._process, self._handling, self.deduplication = os.getpid(), threading.RLock(), Deduplication()
+        self._channel, self._keeps = channel, channel.keeps_messages
+        self._starts += 1
+        self.losses.begin()
+        self._large = _LargeMessages(self._handle, self._limits.total_bytes)
+        self.is_over = False
+
+    def end(self) -> None:
+        """Put nothing from now on."""
+        self.is_over = True
+        self._large.end()
+        timer = self._timer
+        if timer is not None:
+            timer.cancel()
+
+    def wait_returned(self, timeout_s: float) -> bool:
+        """After `end`: return whether the queue's ``put`` has returned within ``timeout_s`` seconds."""
+        if not self._handling.acquire(timeout=max(timeout_s, 0.0)):
+            return False
+        try:
+            if self._ordering is not None and (rest := self._ordering.rest()) and not self._keeps:
+                self.dropped["stopped"] += len(rest)
+        finally:
+            self._handling.release()
+        timer = self._timer
+        if timer is not None and timer is not threading.current_thread():
+            timer.join(max(timeout_s, 0.0))
+        return self._large.join(timeout_s)
+
+    def accept(self, delivery: Delivery) -> None:
+        """Take a delivery; called by the channel."""
+        if self._is_zeromq:
+            frames = delivery.frames
+            is_large = len(frames) > 1 and len(frames[1]) > _LARGE_HEADER_BYTES
+            if is_large or self._large.is_busy:
+                if not self._large.put(delivery):
+                    self._count_rejected("too many at once", "Large messages come faster than they are decoded.")
+                return
+        self._handle(delivery)
+
+    def _handle(self, delivery: Delivery) -> None:
+        with self._handling:
+            if self.is_over:
+                return
+            try:
+                item, envelope = self._read(delivery)
+            except Exception as error:
+                # Also if memory is short: the message is gone, and is counted.
+                reason = error.reason if isinstance(error, MessageError) else type(error).__name__
+                self._count_rejected(reason, f"{error!s:.1000}", delivery)
+                if self._keeps:
+                    self._refused += 1
+                    delivery.reject(str(error) or reason)
+                return
+            if item is None:
+                return
+            if envelope is not None and not self._keeps:
+                self.losses.add(envelope.source, envelope.epoch, envelope.sequence)
+            if self._ordering is None or envelope is None:
+                self._put(item)
+                return
+            source = (envelope.source, envelope.epoch)
+            self._put_all(self._ordering, self._ordering.add(source, envelope.sequence, item))
+
+    def _read(self, delivery: Delivery) -> tuple[Any, Envelope | EncodedEnvelope | None]:
+        """Return what is put for a delivery, if anything, and the envelope that it is.
+
+        Raises
+        ------
+        MessageError
+            It can't be understood.
+        """
+        frames = delivery.frames
+        if not frames:
+            raise MessageError(
+                delivery.headers.get(ERROR_REASON, "bad frames"),
+                delivery.headers.get(ERROR, "The message has no frames."),
+            )
+        if not self._is_zeromq and not self._is_wanted(delivery):
+            return None, None
+        envelope: Envelope | EncodedEnvelope | None = None
+        if len(frames) > 1:
+            if not self._undecoded:
+                envelope = decode(frames, self._limits)
+                check_source(envelope.source)
+            else:
+                # What is no envelope is put as well.
+                with contextlib.suppress(MessageError):
+                    envelope = EncodedEnvelope.read(frames, self._limits)
+                    check_source(envelope.source)
+        if not self._keeps:
+            if self._undecoded:
+                delivery.envelope = envelope if isinstance(envelope, EncodedEnvelope) else None
+                return delivery, envelope
+            return bytes(frames[0]) if envelope is None else envelope, envelope
+        reconnects = 0 if self._channel is None else self._channel.reconnects
+        known_as = delivery.id or ("" if envelope is None else envelope.id)
+        kept = self.deduplication.first(known_as, delivery, (self._starts, reconnects))
+        if kept is None:
+            return None, None
+        item: Any = kept
+        if isinstance(envelope, EncodedEnvelope):
+            kept.envelope = envelope
+        elif envelope is not None:
+            item = DeliveredEnvelope.of(envelope, kept)
+        elif not self._undecoded:
+            item = DeliveredBytes.of(kept)
+        if kept.attempt > self._place.attempts:
+            self._exhaust(item, kept)
+            return None, None
+        return item, envelope
+
+    def _is_wanted(self, delivery: Delivery) -> bool:
+        """Check what a broker has delivered; return False if it is of another topic and not kept by a queue."""
+        frames = delivery.frames
+        size = sum(map(len, frames))
+        if size > self._limits.total_bytes:
+            raise MessageError("too large", f"A message of {size:,} bytes; the limit is {self._limits.total_bytes:,}.")
+        if not self._topic or bytes(frames[0][: len(self._topic)]) == self._topic:
+            return True
+        if self._place.kind == "queue":
+            raise MessageError("other topic", f"The message is not of topic {self._topic.decode()}.")
+        delivery.ack()
+        return False
+
+    def _exhaust(self, item: Any, kept: Delivery) -> None:
+        self.rejected["exhausted"] += 1
+        text = f"delivered {kept.attempt} times, and no consumer has answered it"
+        if self._exhausted is None:
+            way_out = (
+                "Its consumers crashed, or took it and called neither ack() nor reject(). It is in the dead-letter "
+                "queue %s; attempts=N in the address allows more."
+            )
+            log.warning(
+                f"rejected message %r of %s: %s. {way_out}", kept.id, self._place, text, self._place.dead_letters
+            )
+            kept.reject(text)
+            return
+        try:
+            self._exhausted(item)
+        except BaseException:
+            log.exception("exhausted itself failed")
+            kept.reject(text)
+
+    def _put_all(self, ordering: ReorderBuffer, items: Iterator[Any]) -> None:
+        for item in items:
+            self._put(item)
+        due_s = ordering.due_s
+        if due_s is not None and self._timer is None and not self.is_over:
+            self._timer = threading.Timer(max(due_s - monotonic(), 0.0) + 0.001, self._put_overdue)
+            self._timer.name, self._timer.daemon = "epypes-ordering", True
+            self._timer.start()
+
+    def _put_overdue(self) -> None:
+        with self._handling:
+            self._timer = None
+            if self._ordering is not None and not self.is_over:
+                self._put_all(self._ordering, self._ordering.overdue())
+
+    def _put(self, item: Any) -> None:
+        """Put an item into the queue of the user, and settle it if that is to be done now."""
+        # Counted before: a thread that has the item must find it counted.
+        self.received += 1
+        try:
+            if self._is_zeromq:
+                self._queue.put(item, block=False)
+                return
+            is_put = self._put_when_there_is_room(item)
+        except queues.Full:
+            self.received -= 1
+            self.dropped["queue full"] += 1
+            return
+        except BaseException as error:
+            # The user's queue may raise anything, as a Mailbox of policy "fault" does; other messages go on.
+            self.received -= 1
+            self.dropped[type(error).__name__] += 1
+            self._log.warning("refused", f"the queue refused a message: {error!r}")
+            if not self._keeps:
+                return
+            if isinstance(error, _ENDED):
+                item.nack()
+            else:
+                item.reject(f"the queue refused it: {error!r}")
+            return
+        if not is_put:
+            self.received -= 1
+        if not self._keeps:
+            return
+        if not is_put:
+            item.nack()
+        elif self._acknowledge == "received":
+            item.ack()
+
+    def _put_when_there_is_room(self, item: Any) -> bool:
+        """Put an item; return False if the subscriber stops before there is room."""
+        with contextlib.suppress(queues.Full):
+            self._queue.put(item, block=False)
+            return True
+        while not self.is_over:
+            with contextlib.suppress(queues.Full):
+                self._queue.put(item, block=True, timeout=_TICK_S)  # type: ignore[call-arg]  # see PutQueue
+                return True
+        return False
+
+    def _count_rejected(self, reason: str, text: str, delivery: Delivery | None = None) -> None:
+        self.rejected[reason] += 1
+        name = f" {delivery.id!r} of {self._place}" if delivery is not None and delivery.id else ""
+        self._log.warning(reason, f"rejected a message{name} ({reason}): {text}")
+
+
+class _LargeMessages:
+    """Messages with large headers, decoded in order on a thread of their own; it lives while messages wait.
+
+    Parameters
+    ----------
+    handle
+        Called with each.
+    most_bytes
+        Of all messages that wait.
+    """
+
+    def __init__(self, handle: Callable[[Delivery], None], most_bytes: int) -> None:
+        self._handle, self._most_bytes = handle, most_bytes
+        self._lock = threading.Lock()
+        self._waiting: deque[Delivery] = deque()
+        self._bytes = 0
+        self._thread: threading.Thread | None = None
+        self._is_over = False
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a message waits or is being decoded: what comes after it must wait for its turn."""
+        return self._thread is not None
+
+    def put(self, delivery: Delivery) -> bool:
+        """Hand over a message; return False if too many wait already."""
+        size = _size(delivery.frames)
+        with self._lock:
+            # One of the largest that are allowed can always wait.
+            if len(self._waiting) >= _MOST_LARGE or (self._waiting and self._bytes + size > self._most_bytes):
+                return False
+            self._waiting.append(delivery)
+            self._bytes += size
+            if self._thread is None:
+                thread = threading.Thread(target=self._run, name="epypes-decoding", daemon=True)
+                try:
+                    thread.start()
+                except RuntimeError:
+                    # The system has no thread to give just now.
+                    self._waiting.clear()
+                    self._bytes = 0
+                    return False
+                self._thread = thread
+        return True
+
+    def end(self) -> None:
+        """Forget what waits."""
+        with self._lock:
+            self._is_over = True
+            self._waiting.clear()
+
+    def join(self, timeout_s: float) -> bool:
+        """Return whether the thread has ended in time."""
+        thread = self._thread
+        if thread is None or thread is threading.current_thread():
+            return True
+        thread.join(max(timeout_s, 0.0))
+        return not thread.is_alive()
+
+    def _run(self) -> None:
+        while True:
+            with self._lock:
+                if self._is_over or not self._waiting:
+                    self._thread = None
+                    return
+                delivery = self._waiting.popleft()
+                self._bytes -= _size(delivery.frames)
+            try:
+                self._handle(delivery)
+            except BaseException:
+                # What can't be read is counted; this is a bug of ours, and must not stop the others.
+                log.exception("a message could not be handled")
+            del delivery
+
+
+def _size(frames: Sequence[bytes | memoryview]) -> int:
+    return sum(map(len, frames))
+
+
+class _Delivered:
+    """What `DeliveredEnvelope` and `DeliveredBytes` have in common.
+
+    A copy that was made of one with other fields is not delivered: its `ack`, `reject` and `nack` do nothing.
+    """
+
+    __slots__ = ()
+
+    @property
+    def delivery(self) -> Delivery | None:
+        """The delivery, without its frames; None for a copy."""
+        return getattr(self, "_delivery", None)
+
+    @property
+    def attempt(self) -> int:
+        """How often it was delivered, from 1; 0 where the broker does not count."""
+        return 0 if self.delivery is None else self.delivery.attempt
+
+    def ack(self) -> None:
+        """Tell the broker that it is done. The first of ack, reject and nack counts; it raises nothing."""
+        if self.delivery is not None:
+            self.delivery.ack()
+
+    def reject(self, reason: str) -> None:
+        """Have the broker put it into the dead-letter queue, with the reason. Otherwise as `ack`."""
+        if self.delivery is not None:
+            self.delivery.reject(reason)
+
+    def nack(self) -> None:
+        """Return it to the broker, which delivers it again, to any consumer. Otherwise as `ack`."""
+        if self.delivery is not None:
+            self.delivery.nack()
+
+
+class DeliveredEnvelope(_Delivered, Envelope):
+    """An Envelope that a broker keeps until its `ack` or `reject` was called."""
+
+    __slots__ = ("_delivery",)
+    _delivery: Delivery
+
+    @classmethod
+    def of(cls, envelope: Envelope, delivery: Delivery) -> Self:
+        """Return an envelope as one that was delivered."""
+        made = object.__new__(cls)
+        # As it was decoded, so nothing is checked or copied again.
+        for name in _FIELDS:
+            object.__setattr__(made, name, getattr(envelope, name))
+        delivery.frames = ()
+        object.__setattr__(made, "_delivery", delivery)
+        return made
+
+
+class DeliveredBytes(_Delivered, bytes):
+    """Bytes that a broker keeps until their `ack` or `reject` was called."""
+
+    _delivery: Delivery
+
+    @property
+    def id(self) -> str:
+        """The id of the message; empty if it came without."""
+        return "" if self.delivery is None else self.delivery.id
+
+    @classmethod
+    def of(cls, delivery: Delivery) -> Self:
+        """Return the only frame of a delivery; it is copied."""
+        frame: Any = delivery.frames[0]
+        whole = frame.obj if isinstance(frame, memoryview) else frame
+        # If the frame is all of some bytes: a view would be copied twice.
+        made = cls(whole if type(whole) is bytes and len(whole) == len(frame) else frame)
+        delivery.frames = ()
+        made._delivery = delivery
+        return made
+
+    def __reduce__(self) -> tuple[type[bytes], tuple[bytes]]:
+        # In another process, as in a copy, there is no channel to settle it.
+        return bytes, (bytes(self),)

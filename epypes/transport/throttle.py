@@ -1,4 +1,4 @@
-"""Log lines that a peer can cause as often as it likes, and that are written once in a while."""
+"""Throttled log warnings, for lines that a peer can cause as often as it likes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _MOST_CHARACTERS: Final = 1_000
 
 
 class Throttle:
-    """Writes at most one warning per cause in `PAUSE_S`; the next one says how many were left out.
+    """Writes at most one warning per cause in `PAUSE_S`; the next one has the number of those that were left out.
 
     From any thread: two threads at once may write one line more, or miscount by one.
 

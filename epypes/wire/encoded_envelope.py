@@ -17,6 +17,29 @@ from epypes.wire.limits import DEFAULT_LIMITS, Limits
 from epypes.wire.protobuf import message_class
 
 
+def stamped_frames(
+    frames: Sequence[bytes | memoryview], epoch: int, sequence: int, published_ns: int, limits: Limits
+) -> tuple[bytes | memoryview, ...]:
+    """Return the frames of an envelope with other values of three fields of its header; see `EncodedEnvelope.stamped`.
+
+    protobuf merges concatenated messages, so that nothing is parsed or encoded again.
+
+    Raises
+    ------
+    MessageError
+        Of reason ``"bad field"`` or ``"too large"``.
+    """
+    try:
+        message = message_class("epypes.v1.Stamp")(epoch=epoch, sequence=sequence, published_ns=published_ns)
+        stamp: bytes = message.SerializeToString()
+    except REFUSALS as error:
+        raise MessageError("bad field", f"A stamp has a field that can't be sent: {error}") from error
+    topic, header, *payloads = frames
+    stamped = (topic, b"".join((header, stamp)), *payloads)
+    limits.check_sizes([len(frame) for frame in stamped])
+    return stamped
+
+
 # Not frozen: that would triple the time of making one, which is a part of every message's time.
 @dataclass(slots=True, eq=False, repr=False)
 class EncodedEnvelope:
@@ -120,15 +143,9 @@ class EncodedEnvelope:
         MessageError
             Of reason ``"bad field"`` for a number that the field can't hold, ``"too large"`` or ``"bad topic"``.
         """
-        numbers = {"epoch": epoch, "sequence": sequence, "published_ns": published_ns}
-        try:
-            stamp: bytes = message_class("epypes.v1.Stamp")(**numbers).SerializeToString()
-        except REFUSALS as error:
-            raise MessageError("bad field", f"A stamp has a field that can't be sent: {error}") from error
-        old_topic, header, *payloads = self.frames
-        frames = (old_topic if topic is None else topic_frame(topic), b"".join((header, stamp)), *payloads)
-        self.limits.check_sizes([len(frame) for frame in frames])
-        fields = scalar_fields(self) | numbers
+        topic_, *rest = stamped_frames(self.frames, epoch, sequence, published_ns, self.limits)
+        frames = (topic_ if topic is None else topic_frame(topic), *rest)
+        fields = scalar_fields(self) | {"epoch": epoch, "sequence": sequence, "published_ns": published_ns}
         return type(self)(
             frames, **fields, has_attributes=self.has_attributes, failure=self.failure, limits=self.limits
         )

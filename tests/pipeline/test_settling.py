@@ -25,7 +25,7 @@ class Kept:
     def reject(self, reason):
         self._tell(reason)
 
-    def give_back(self):
+    def nack(self):
         self._tell("given back")
 
     def _tell(self, word):

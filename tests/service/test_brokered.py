@@ -12,6 +12,8 @@ from epypes.errors import AddressError, BrokerError, BundleError, ServiceError
 from epypes.service import Service
 from epypes.store import Store
 from epypes.transport.channels import memory, open_channel, place_of
+from epypes.transport.receiving import Subscriber
+from epypes.transport.sending import Publisher
 from epypes.wire import Envelope
 from tests.service.served import TIMEOUT_S, acting_bundle, event, until
 
@@ -70,7 +72,7 @@ class Line:
 @contextmanager
 def line_of(host):
     line = Line(host)
-    with ep.Publisher(line.sub, line.requests), ep.Subscriber(line.pub, line.answers, prefetch=1_000):
+    with Publisher(line.sub, line.requests), Subscriber(line.pub, line.answers, prefetch=1_000):
         yield line
 
 

@@ -14,7 +14,7 @@ import pytest
 import zmq
 
 from epypes.errors import AddressError, StillRunning
-from epypes.transport import ZMQPublisher, ZMQSubscriber, io
+from epypes.transport import ZMQPublisher, ZMQSubscriber
 from tests.transport.peers import wait_until
 
 LOCAL = "tcp://127.0.0.1:*"
@@ -266,15 +266,6 @@ def test_one_io_thread_serves_every_socket_and_ends_with_the_last():
         for one in made:
             one.stop()
     assert io_threads() == []
-
-
-def test_commands_return_results_and_exceptions_to_the_thread_that_asked():
-    with ZMQPublisher(LOCAL, queue.Queue()):
-        assert io.call(lambda _: threading.current_thread().name) == "epypes-io"
-        with pytest.raises(ZeroDivisionError):
-            io.call(lambda _: 1 / 0)
-    with pytest.raises(zmq.ZMQError):
-        io.call(lambda _: None)
 
 
 @pytest.mark.slow

@@ -13,8 +13,7 @@ import zmq
 from epypes.errors import MessageError
 from epypes.pipeline import Mailbox
 from epypes.transport import ZMQPublisher, ZMQSubscriber
-from epypes.transport.gathering import Gatherer
-from epypes.wire import Envelope, Limits, decode, encode
+from epypes.wire import Envelope, decode, encode
 from tests.wire.mutants import mutate_description, mutate_frames
 
 WAIT_S = 60.0
@@ -107,21 +106,8 @@ def test_of_a_message_of_too_many_or_too_large_frames_none_is_kept_and_the_next_
         socket.send_multipart([b"/", *[b""] * 5_000])
         socket.send_multipart(encode(Envelope("good")))
         item = into.get(timeout=WAIT_S)
-        assert len(item) == 2 if undecoded else item.type == "good"
+        assert len(item.frames) == 2 if undecoded else item.type == "good"
         assert sub.rejected == {"too large": 1, "too many frames": 1}
-
-
-def test_a_message_of_very_many_frames_is_read_a_part_at_a_time_so_that_other_sockets_get_their_turn():
-    with zmq.Context() as context, context.socket(zmq.PULL) as socket, context.socket(zmq.PUSH) as peer:
-        socket.bind("inproc://long")
-        peer.connect("inproc://long")
-        peer.send_multipart([b"/", *[b""] * 5_000])
-        gatherer, parts = Gatherer(Limits()), 1
-        while (frames := gatherer.read(socket)) is None:
-            parts += 1
-        assert parts > 10
-        assert len(frames) == 0
-        assert gatherer.refused() == "too many frames"
 
 
 def test_false_answers_to_a_join_are_counted_if_they_are_none_and_bounded_if_they_are(poisoner):

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import queue
+from time import monotonic
 
 import numpy as np
 import pytest
 import zmq
 
-from epypes.errors import AddressError, MessageError
-from epypes.transport import ZMQPublisher, ZMQSubscriber
-from epypes.wire import Envelope, JustBytes, encode
+from epypes.errors import AddressError, BrokerError, MessageError
+from epypes.pipeline import Mailbox
+from epypes.transport import Publisher, Subscriber, ZMQPublisher, ZMQSubscriber
+from epypes.wire import EncodedEnvelope, Envelope, JustBytes, encode
 from tests.transport.peers import wait_until
 
 LOCAL = "tcp://127.0.0.1:*"
@@ -256,3 +258,86 @@ def test_a_topic_that_is_none_is_refused_at_once():
     for kind in (ZMQPublisher, ZMQSubscriber):
         with pytest.raises(MessageError):
             kind(LOCAL, queue.Queue(), "t" * 2_000)
+
+
+def test_send_needs_no_queue_and_confirms_at_once():
+    into, confirmed = queue.Queue(), []
+    with ZMQPublisher(LOCAL) as pub, ZMQSubscriber(pub.address, into) as sub:
+        assert sub.wait_joined(WAIT_S)
+        pub.send(Envelope("x", {"n": 1}), confirmed=confirmed.append)
+        assert confirmed == [None]
+        assert into.get(timeout=WAIT_S).parts["n"] == 1
+        with pytest.raises(MessageError, match="not int"):
+            pub.send(42, confirmed=confirmed.append)
+    with pytest.raises(BrokerError, match="not sent"):
+        pub.send(b"late")
+    assert confirmed == [None]
+    assert pub.rejected == {"no codec": 1, "not sent": 1}
+
+
+def test_an_address_says_which_side_binds():
+    out, into = queue.Queue(), queue.Queue()
+    with Subscriber(f"bind:{LOCAL}", into) as sub, Publisher(f"connect:{sub.address}", out) as pub:
+        assert sub.wait_joined(WAIT_S)
+        assert pub.is_connected
+        out.put(b"x")
+        assert into.get(timeout=WAIT_S) == b"x"
+
+
+def test_encoded_envelopes_get_the_publishers_topic_and_numbers_and_their_values_are_not_touched():
+    out, into = queue.Queue(), queue.Queue()
+    encoded = EncodedEnvelope.encode(Envelope("x", {"n": 1}, source="worker", id="a"), "elsewhere")
+    with ZMQPublisher(LOCAL, out, "cam1") as pub, ZMQSubscriber(pub.address, into, "cam1", undecoded=True) as sub:
+        assert sub.wait_joined(WAIT_S)
+        for _ in range(2):
+            out.put(encoded)
+        deliveries = [into.get(timeout=WAIT_S) for _ in range(2)]
+    assert [each.envelope.sequence for each in deliveries] == [1, 2]
+    assert bytes(deliveries[0].frames[0]) == b"cam1/"
+    assert deliveries[0].envelope.decode().parts["n"] == 1
+
+
+def test_undecoded_messages_are_put_as_they_came_and_their_losses_are_counted(peer):
+    into = queue.Queue()
+    with ZMQSubscriber(LOCAL, into, bind=True, undecoded=True) as sub:
+        socket = peer(zmq.XPUB)
+        socket.connect(sub.address)
+        assert socket.recv() == b"\x01"
+        socket.send_multipart([b"no", b"envelope"])
+        for sequence in (5, 7):
+            socket.send_multipart(encode(Envelope("x", source="a", epoch=1, sequence=sequence)))
+        garbage, first, second = (into.get(timeout=WAIT_S) for _ in range(3))
+        assert (garbage.envelope, [*map(bytes, garbage.frames)]) == (None, [b"no", b"envelope"])
+        assert [first.envelope.sequence, second.envelope.sequence] == [5, 7]
+        assert sub.lost == {("a", 1): 1}
+        first.ack()
+
+
+def test_an_ordered_subscriber_puts_envelopes_by_their_numbers(peer):
+    into = queue.Queue()
+    with ZMQSubscriber(LOCAL, into, bind=True, ordered=True) as sub:
+        socket = peer(zmq.XPUB)
+        socket.connect(sub.address)
+        assert socket.recv() == b"\x01"
+        for sequence in (2, 4, 1, 3):
+            socket.send_multipart(encode(Envelope("x", source="a", epoch=1, sequence=sequence)))
+        socket.send_multipart([b"2019"])
+        found = [into.get(timeout=WAIT_S) for _ in range(5)]
+    assert [item.sequence for item in found if isinstance(item, Envelope)] == [1, 2, 3, 4]
+
+
+def test_what_arrives_while_a_subscriber_is_paused_is_dropped_and_shows_as_a_gap():
+    out, into = Mailbox(), queue.Queue()
+    with ZMQPublisher(LOCAL, out) as pub, ZMQSubscriber(pub.address, into, heartbeat_s=3_600) as sub:
+        assert sub.wait_joined(WAIT_S)
+        out.put(Envelope("x", source="a"))
+        assert into.get(timeout=WAIT_S).sequence == 1
+        sub.pause()
+        paused_s = monotonic()
+        out.put(Envelope("x", source="a"))
+        wait_until(lambda: sub.last_heard_s < monotonic() - paused_s)
+        sub.resume()
+        out.put(Envelope("x", source="a"))
+        item = into.get(timeout=WAIT_S)
+        assert item.sequence == 3
+        assert list(sub.lost.values()) == [1]

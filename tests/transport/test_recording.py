@@ -223,7 +223,7 @@ def test_another_subscriber_may_join_while_it_plays(tmp_path):
         for _ in range(3):
             with ZMQSubscriber(player.address, second, "t", undecoded=True) as other:
                 assert other.wait_joined(WAIT_S)
-                assert bytes(second.get(timeout=WAIT_S)[0]) == b"t/"
+                assert bytes(second.get(timeout=WAIT_S).frames[0]) == b"t/"
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from epypes.wire import Envelope
 
 if TYPE_CHECKING:
     from epypes.transport import Keys
-    from epypes.transport.keys import PublicKey
+    from epypes.transport.zeromq.curve import PublicKey
 
 # How often it is looked whether the service still runs.
 _LOOK_S: Final = 0.5

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.transport.guard import connection_limit
+from epypes.transport.zeromq.connection_guard import connection_limit
 
 if TYPE_CHECKING:
     from uvicorn.protocols.http.h11_impl import H11Protocol

@@ -10,7 +10,7 @@ from typing import Final, Literal, get_args
 from urllib.parse import SplitResult, parse_qsl, quote, unquote, urlsplit
 
 from epypes.errors import AddressError
-from epypes.transport.addresses import is_loopback_host
+from epypes.transport.address import is_loopback_host
 
 Kind = Literal["queue", "broadcast", "log"]
 KINDS: Final = get_args(Kind)

@@ -15,6 +15,7 @@ from typing import Final
 
 from epypes.errors import AddressError, BrokerError, MessageError
 from epypes.pipeline import Mailbox
+from epypes.transport.channel import Delivery
 from epypes.transport.channels.place import Place
 from epypes.transport.channels.seam import Frames, Received
 from epypes.transport.publisher import ZMQPublisher
@@ -33,7 +34,7 @@ class ZeroMQChannel:
         self._lock = threading.Lock()
         self._is_closed = False
         self._leaving = Mailbox("block")
-        self._arrived: queues.Queue[tuple[memoryview, ...] | None] = queues.Queue(max(prefetch, _KEPT))
+        self._arrived: queues.Queue[Delivery | None] = queues.Queue(max(prefetch, _KEPT))
         self._publisher: ZMQPublisher | None = None
         self._subscriber: ZMQSubscriber | None = None
 
@@ -64,7 +65,7 @@ class ZeroMQChannel:
         except queues.Empty:
             frames = None
         self._check()
-        return None if frames is None else Received(frames)
+        return None if frames is None else Received(frames.frames)
 
     def _connected(self) -> ZMQSubscriber:
         bind = self._place.name.startswith(_BIND)

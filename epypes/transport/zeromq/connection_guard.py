@@ -38,7 +38,8 @@ HANDSHAKE_MS: Final = 10_000
 _SHARE: Final = 5
 # A topic has 1,024 bytes at most; a peer that sends larger frames to a publisher is no subscriber.
 _MAX_SUBSCRIPTION_FRAME_BYTES: Final = 2_048
-# What waits in libzmq and in the kernel of a peer that is dropped is still taken in, 0.3 ms for 1 kB.
+# For sockets that receive subscriptions only. What waits in libzmq and in the kernel of a peer that is dropped is still
+# taken in, 0.3 ms for 1 kB.
 SUBSCRIPTION_OPTIONS: Final = (
     (int(zmq.MAXMSGSIZE), _MAX_SUBSCRIPTION_FRAME_BYTES),
     (int(zmq.RCVHWM), 100),
@@ -68,8 +69,8 @@ def connection_limit(most: int, share: int) -> int:
 
 
 @dataclass(slots=True, eq=False)
-class _Connection:
-    """What is known of one accepted connection.
+class _Peer:
+    """One accepted connection.
 
     Attributes
     ----------
@@ -95,76 +96,73 @@ class _Connection:
     is_dropped: bool = False
 
 
-class Watch:
+class ConnectionGuard:
     """The connections of one bound socket.
 
     Parameters
     ----------
-    owned
-        The socket, before it is bound; this is called on the thread that owns it.
+    socket
+        The socket, before it is bound; called on the I/O thread.
     max_message_bytes
-        Of one message with all its parts; 0 for a socket that receives nothing but subscriptions, None without bounds
-        on what comes.
+        Of one message with all its parts; 0 for a socket that receives subscriptions only.
     ask
-        Has a function called on the thread that reads the socket, with whether nothing is left to be read.
+        Has a function called on the I/O thread, with whether nothing is left to be read.
 
     Attributes
     ----------
     descriptor
-        Readable when there is something for `follow`.
+        Readable when there is something for `update`.
     endpoint
         Where the socket is bound.
     """
 
     def __init__(
-        self,
-        owned: zmq.Socket[bytes],
-        max_message_bytes: int | None,
-        ask: Callable[[Callable[[bool], None]], object],
+        self, socket: zmq.Socket[bytes], max_message_bytes: int, ask: Callable[[Callable[[bool], None]], object]
     ) -> None:
-        address = f"inproc://connections-{int(owned.get(zmq.FD))}"
-        owned.monitor(address, _EVENTS)
-        self._owned = owned
-        self._monitor: zmq.Socket[bytes] = owned.context.socket(zmq.PAIR)
+        address = f"inproc://connections-{int(socket.get(zmq.FD))}"
+        socket.monitor(address, _EVENTS)
+        self._socket = socket
+        self._monitor: zmq.Socket[bytes] = socket.context.socket(zmq.PAIR)
         # ZeroMQ's own thread would wait for room.
         self._monitor.setsockopt(zmq.RCVHWM, 0)
         self._monitor.connect(address)
         self.descriptor = int(self._monitor.get(zmq.FD))
         self._most = connection_limit(MOST_CONNECTIONS, _SHARE)
         self._max_message_bytes, self._ask = max_message_bytes, ask
-        # Held by whoever touches the monitor or the connections.
+        # Held by every thread that touches the monitor or the peers.
         self._lock = threading.Lock()
-        self._connections: dict[int, _Connection] = {}
-        self._seen: set[int] = set()
+        self._peers: dict[int, _Peer] = {}
+        # Descriptors that messages came from since the last `check`, and how many messages were read.
+        self._senders: set[int] = set()
         self._read = 0
-        self._is_over = False
+        self._is_closed = False
         self._log = Throttle(log)
         self.endpoint = ""
 
-    def end(self) -> None:
-        """Watch no more; on the thread that owns the socket, while it is open."""
+    def close(self) -> None:
+        """Watch no more; on the I/O thread, while the socket is open."""
         with self._lock:
-            self._is_over = True
-            # First: ZeroMQ's own thread would wait for ever to tell of a connection that comes or goes meanwhile.
-            self._owned.disable_monitor()
+            self._is_closed = True
+            # First: ZeroMQ's own thread would wait for ever to report a connection that comes or goes meanwhile.
+            self._socket.disable_monitor()
             self._monitor.close(linger=0)
-            self._connections.clear()
+            self._peers.clear()
 
-    def follow(self) -> bool:
-        """Take note of connections that came and went, and refuse those beyond the limit; there is no more then."""
+    def update(self) -> bool:
+        """Take note of connections that came and went, and refuse those beyond the limit; return False: all are."""
         with self._lock:
-            self._follow()
+            self._update()
         return False
 
-    def has_read(self, frame: zmq.Frame) -> None:
-        """Take note that a whole message was read, of which this is a frame; on the thread that reads."""
+    def message_read(self, frame: zmq.Frame) -> None:
+        """Take note that a whole message was read, of which this is a frame; on the I/O thread."""
         try:
-            self._seen.add(int(frame.get(_SRCFD)))
+            self._senders.add(int(frame.get(_SRCFD)))
         except zmq.ZMQError:
             self._drop_old()
         self._read += 1
 
-    def may_subscribe(self, frame: zmq.Frame, change: int) -> bool:
+    def allows_subscription(self, frame: zmq.Frame, change: int) -> bool:
         """Count a subscription (``change`` 1) or its end (-1); return whether the peer is within its bounds.
 
         A peer that is not is dropped.
@@ -172,96 +170,96 @@ class Watch:
         try:
             fd = int(frame.get(_SRCFD))
         except zmq.ZMQError:
-            # The end of what a peer had that is gone has no descriptor either.
+            # The end of a subscription of a peer that is gone has no descriptor either.
             if change > 0:
                 self._drop_old()
             return change < 0
         with self._lock:
-            # That the connection came is told before anything that it sends.
-            self._follow()
-            found = self._connections.get(fd)
-            if found is None:
+            # A connection is reported before anything that it sends.
+            self._update()
+            peer = self._peers.get(fd)
+            if peer is None:
                 # It has gone meanwhile.
                 return False
-            found.is_known = True
-            found.subscriptions += change
-            found.subscription_bytes += change * len(frame)
-            if found.subscriptions <= MAX_SUBSCRIPTIONS and found.subscription_bytes <= MAX_SUBSCRIPTION_BYTES:
+            peer.is_known = True
+            peer.subscriptions += change
+            peer.subscription_bytes += change * len(frame)
+            if peer.subscriptions <= MAX_SUBSCRIPTIONS and peer.subscription_bytes <= MAX_SUBSCRIPTION_BYTES:
                 return True
-            self._drop(found, "it holds too many subscriptions")
+            self._drop(peer, "it holds too many subscriptions")
             return False
 
-    def look(self, passed_s: float) -> None:
-        """Drop what exceeds its bounds; ``passed_s`` seconds after the last look."""
+    def check(self, passed_s: float) -> None:
+        """Drop the peers that exceed their bounds; ``passed_s`` seconds after the last check."""
         with self._lock:
-            if self._is_over:
+            if self._is_closed:
                 return
-            self._follow()
-            seen, self._seen = self._seen, set()
-            for connection in [*self._connections.values()]:
-                connection.is_known |= connection.fd in seen
-                if self._max_message_bytes is None or connection.is_dropped:
+            self._update()
+            senders, self._senders = self._senders, set()
+            for peer in [*self._peers.values()]:
+                peer.is_known |= peer.fd in senders
+                received = None if peer.is_dropped else _received_bytes(peer.fd)
+                if received is None:
                     continue
-                received = _received_bytes(connection.fd)
-                if received is not None and self._max_message_bytes:
-                    self._look_at_message(connection, received, connection.fd in seen)
-                elif received is not None:
-                    self._look_at_rate(connection, received, passed_s)
+                if self._max_message_bytes:
+                    self._check_message(peer, received, peer.fd in senders)
+                else:
+                    self._check_rate(peer, received, passed_s)
 
-    def _look_at_rate(self, connection: _Connection, received: int, passed_s: float) -> None:
-        credit = connection.credit + passed_s * _BYTES_PER_S - (received - connection.received)
-        connection.credit, connection.received = min(credit, _BURST_BYTES), received
+    def _check_rate(self, peer: _Peer, received: int, passed_s: float) -> None:
+        credit = peer.credit + passed_s * _BYTES_PER_S - (received - peer.received)
+        peer.credit, peer.received = min(credit, _BURST_BYTES), received
         if credit < 0:
-            self._drop(connection, "it sends subscriptions too fast")
+            self._drop(peer, "it sends subscriptions too fast")
 
-    def _look_at_message(self, connection: _Connection, received: int, is_seen: bool) -> None:
-        if is_seen:
-            connection.received, connection.read = received, self._read
-        elif received - connection.received > (self._max_message_bytes or 0) + _SLACK_BYTES:
-            self._ask(lambda is_drained: self._judge(connection, is_drained))
+    def _check_message(self, peer: _Peer, received: int, has_sent: bool) -> None:
+        if has_sent:
+            peer.received, peer.read = received, self._read
+        elif received - peer.received > self._max_message_bytes + _SLACK_BYTES:
+            self._ask(lambda is_drained: self._judge(peer, is_drained))
 
-    def _judge(self, connection: _Connection, is_drained: bool) -> None:
-        """Drop a connection that has received more than a message, if there was no whole message in it.
+    def _judge(self, peer: _Peer, is_drained: bool) -> None:
+        """Drop a peer that has sent more than a message, if there was no whole message in it.
 
         ZeroMQ reads from connections in turns. So one that had a whole message has been read if nothing is left to be
         read, or if more messages were read meanwhile than there are connections.
         """
         with self._lock:
-            had_its_turn = is_drained or self._read - connection.read > len(self._connections)
-            if had_its_turn and connection.fd not in self._seen:
-                self._drop(connection, "it sends a message without an end")
+            had_its_turn = is_drained or self._read - peer.read > len(self._peers)
+            if had_its_turn and peer.fd not in self._senders:
+                self._drop(peer, "it sends a message without an end")
 
     def _drop_old(self) -> None:
-        """Drop the connections that nothing is known to be from, since something came that is from none of the others.
+        """Drop the peers that nothing is known to be from, since something came that is from none of the others.
 
         libzmq names the connection of what comes over ZMTP 3.0 (libzmq 4.0 of 2013) and later.
         """
         with self._lock:
-            self._follow()
-            for connection in self._connections.values():
-                if not connection.is_known and connection.fd not in self._seen:
-                    self._drop(connection, "it speaks a ZeroMQ protocol older than ZMTP 3.0")
+            self._update()
+            for peer in self._peers.values():
+                if not peer.is_known and peer.fd not in self._senders:
+                    self._drop(peer, "it speaks a ZeroMQ protocol older than ZMTP 3.0")
 
-    def _follow(self) -> None:
-        """See `follow`; the lock is held."""
-        while not self._is_over and int(self._monitor.get(_HAS)) & _POLLIN:
+    def _update(self) -> None:
+        """See `update`; the lock is held."""
+        while not self._is_closed and int(self._monitor.get(_HAS)) & _POLLIN:
             event = parse_monitor_message(self._monitor.recv_multipart())
             fd = int(event["value"])
-            self._connections.pop(fd, None)
-            self._seen.discard(fd)
+            self._peers.pop(fd, None)
+            self._senders.discard(fd)
             if event["event"] == zmq.EVENT_ACCEPTED:
-                self._connections[fd] = connection = _Connection(fd, read=self._read)
-                if len(self._connections) > self._most:
-                    self._drop(connection, f"connection limit reached: {self._most} peers are connected")
+                self._peers[fd] = peer = _Peer(fd, read=self._read)
+                if len(self._peers) > self._most:
+                    self._drop(peer, f"connection limit reached: {self._most} peers are connected")
 
-    def _drop(self, connection: _Connection, why: str) -> None:
-        if connection.is_dropped:
+    def _drop(self, peer: _Peer, why: str) -> None:
+        if peer.is_dropped:
             return
-        connection.is_dropped = True
+        peer.is_dropped = True
         text = f"{self.endpoint} dropped a peer: {why}. With keys= and allow= only known peers can connect."
         self._log.warning(why, text)
         with contextlib.suppress(OSError):  # it has gone by itself
-            borrowed = sockets.socket(fileno=connection.fd)
+            borrowed = sockets.socket(fileno=peer.fd)
             try:
                 # The number may be that of another file by now.
                 if _is_at(borrowed, self.endpoint):
@@ -272,31 +270,31 @@ class Watch:
                 borrowed.detach()
 
 
-class Guard:
-    """The thread that looks at all watched sockets of one I/O thread; it runs while there are any."""
+class GuardThread:
+    """The thread that checks all guarded sockets of one I/O thread; it runs while there are any."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._watches: list[Watch] = []
+        self._guards: list[ConnectionGuard] = []
         self._thread: threading.Thread | None = None
-        self._idle = threading.Event()
+        self._is_idle = threading.Event()
 
-    def add(self, watch: Watch) -> None:
-        """Begin to look at a socket's connections."""
+    def add(self, guard: ConnectionGuard) -> None:
+        """Begin to check a socket's connections."""
         with self._lock:
-            self._watches.append(watch)
-            self._idle.clear()
+            self._guards.append(guard)
+            self._is_idle.clear()
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="epypes-guard", daemon=True)
                 self._thread.start()
 
-    def remove(self, watch: Watch) -> None:
-        """Look no more at a socket's connections."""
+    def remove(self, guard: ConnectionGuard) -> None:
+        """Stop checking a socket's connections."""
         with self._lock:
-            if watch in self._watches:
-                self._watches.remove(watch)
-            if not self._watches:
-                self._idle.set()
+            if guard in self._guards:
+                self._guards.remove(guard)
+            if not self._guards:
+                self._is_idle.set()
 
     def join(self) -> None:
         """Wait until the thread has ended, after the last `remove`."""
@@ -305,18 +303,18 @@ class Guard:
             thread.join()
 
     def _run(self) -> None:
-        looked_s = monotonic()
+        checked_s = monotonic()
         while True:
-            self._idle.wait(_TICK_S)
+            self._is_idle.wait(_TICK_S)
             with self._lock:
-                watches = [*self._watches]
-                if not watches:
+                guards = [*self._guards]
+                if not guards:
                     self._thread = None
                     return
             now_s = monotonic()
-            for watch in watches:
-                watch.look(now_s - looked_s)
-            looked_s = now_s
+            for guard in guards:
+                guard.check(now_s - checked_s)
+            checked_s = now_s
 
 
 def _received_bytes(fd: int) -> int | None:

@@ -1,0 +1,160 @@
+"""Deduplication: a message that is delivered again is not handled again, and is settled as the first one was.
+
+A broker delivers a message again when it has heard nothing of it: of a consumer that died, of one whose connection
+broke just as it acknowledged, or because its sender was not sure that it had arrived. The id is the same each time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import threading
+import weakref
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+from epypes.transport.channel import Delivery
+
+MOST_ANSWERED: Final = 100_000
+# Other programs give messages any ids; so many long ones would fill the memory.
+_LONGEST: Final = 128
+
+
+@dataclass(frozen=True, slots=True)
+class _Outcome:
+    """How a message was settled: why it was rejected, None if it was not, and over which connection."""
+
+    reason: str | None = None
+    connection: object = None
+
+
+class _InFlight:
+    """A message that is delivered and not settled. It lives as long as its Delivery: a lost one can't be answered."""
+
+    __slots__ = ("__weakref__", "_owner", "connection", "deliveries", "is_settled", "key")
+
+    def __init__(self, owner: Deduplication, key: str, delivery: Delivery, connection: object) -> None:
+        self._owner, self.key = owner, key
+        self.connection = connection
+        # Of the channel, the newest one last.
+        self.deliveries = [delivery]
+        self.is_settled = False
+
+    def settle(self, verdict: str, reason: str) -> None:
+        self._owner.settle(self, verdict, reason)
+
+
+class Deduplication:
+    """The ids of the messages that are in flight, and of those that were settled last, with the outcome.
+
+    Any thread may call it.
+
+    Parameters
+    ----------
+    most_answered
+        How many ids of settled messages are remembered; the oldest are forgotten.
+
+    Attributes
+    ----------
+    duplicates
+        How many deliveries were of a message that was known.
+    rejected
+        How many messages were rejected.
+    """
+
+    def __init__(self, most_answered: int = MOST_ANSWERED) -> None:
+        # Re-entrant, since a signal's handler may settle anywhere.
+        self._lock = threading.RLock()
+        self._process = os.getpid()
+        self._most_answered = most_answered
+        self._in_flight: weakref.WeakValueDictionary[str, _InFlight] = weakref.WeakValueDictionary()
+        # In the order of time.
+        self._answered: dict[str, _Outcome] = {}
+        self.duplicates = self.rejected = 0
+
+    def first(self, id: str, delivery: Delivery, connection: object) -> Delivery | None:  # noqa: A002
+        """Return what the user gets for a delivery: one that settles its duplicates too; None for a duplicate.
+
+        Parameters
+        ----------
+        id
+            Of the message; a message without is never a duplicate.
+        delivery
+            Of the channel.
+        connection
+            What is equal as long as the channel has the same connection to the broker.
+        """
+        with self._lock:
+            key = _key(id)
+            outcome = self._answered.get(key) if key else None
+            known = self._in_flight.get(key) if key else None
+            if known is not None:
+                self.duplicates += 1
+                # The older one is kept over the same connection: to acknowledge it now would acknowledge the message,
+                # where a broker counts by message.
+                if connection != known.connection:
+                    known.deliveries.clear()
+                    known.connection = connection
+                known.deliveries.append(delivery)
+                return None
+            if outcome is None:
+                new = _InFlight(self, key, delivery, connection)
+                if key:
+                    self._in_flight[key] = new
+                return Delivery(delivery.frames, id, delivery.attempt, delivery.headers, new.settle)
+            self.duplicates += 1
+            # An acknowledgement over a connection that broke may be lost, and so may one of a message that the same
+            # connection delivers again. That does no harm to an answered message; a rejected one would be missing in
+            # the dead-letter queue. One that is delivered for the first time was sent twice.
+            was_heard = outcome.connection == connection and delivery.attempt <= 1
+            if outcome.reason is not None and not was_heard:
+                self._remember(key, _Outcome(outcome.reason, connection))
+                delivery.reject(outcome.reason)
+            else:
+                delivery.ack()
+            return None
+
+    def settle(self, message: _InFlight, verdict: str, reason: str) -> None:
+        """Settle all deliveries of a message: the newest by the verdict, older copies by acknowledging them."""
+        if self._process != os.getpid():
+            # The connection is that of the parent, and so is the message.
+            return
+        with self._lock:
+            if message.is_settled:
+                return
+            message.is_settled = True
+            self._in_flight.pop(message.key, None)
+            if verdict != "nack":
+                # Before the broker hears it: what it delivers meanwhile is a duplicate.
+                self._remember(message.key, _Outcome(reason if verdict == "reject" else None, message.connection))
+            self.rejected += verdict == "reject"
+            *older, newest = message.deliveries
+        if verdict == "reject":
+            newest.reject(reason)
+        elif verdict == "nack":
+            newest.nack()
+        else:
+            newest.ack()
+        for delivery in older:
+            delivery.ack()
+
+    def answered(self, ids: Iterable[str]) -> None:
+        """Take note that other consumers have answered these; what is in flight or was settled here stays that."""
+        with self._lock:
+            for key in map(_key, ids):
+                if key not in self._in_flight and key not in self._answered:
+                    self._remember(key, _Outcome())
+
+    def _remember(self, key: str, outcome: _Outcome) -> None:
+        if not key:
+            return
+        self._answered.pop(key, None)
+        self._answered[key] = outcome
+        if len(self._answered) > self._most_answered:
+            del self._answered[next(iter(self._answered))]
+
+
+def _key(id: str) -> str:  # noqa: A002
+    """Return what an id is remembered by: itself, unless it is long."""
+    return id if len(id) <= _LONGEST else hashlib.sha256(id.encode(errors="surrogatepass")).hexdigest()

@@ -1,0 +1,227 @@
+"""What a Subscriber and a Publisher have in common: an address, a channel from start to stop, and its connection."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import warnings
+import weakref
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Collection
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+from epypes.errors import AddressError
+from epypes.optional import optional_import
+from epypes.transport.address import Address, open_channel, parse_address
+from epypes.transport.channel import Channel, ChannelOptions
+
+if TYPE_CHECKING:
+    from epypes.transport.zeromq.channel import ZeroMQChannel
+    from epypes.transport.zeromq.curve import CurveOptions, Keys, PublicKey
+
+log = logging.getLogger("epypes.transport")
+
+
+class Startable(ABC):
+    """Is started at the beginning of a ``with`` block, and stopped at its end, whatever happens in it."""
+
+    @abstractmethod
+    def start(self) -> Self:
+        """Begin; nothing happens if it runs already."""
+
+    @abstractmethod
+    def stop(self, timeout_s: float = 5.0) -> None:
+        """End; as often as you like."""
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+
+def warn_left_running(name: str) -> None:
+    """Give a ResourceWarning for an object that the garbage collector ends."""
+    warnings.warn(f"{name} was left running. Call stop(), or use with.", ResourceWarning, stacklevel=3)
+
+
+class Endpoint(Startable):
+    """A Subscriber or a Publisher; it has a channel while it runs.
+
+    Attributes
+    ----------
+    place
+        The parsed address.
+    on_connection
+        None, or called with whether the broker is connected, and why not, when that changes; on the thread of the
+        channel, and at the start perhaps on the caller's. It is not called for ZeroMQ, which connects by itself.
+    """
+
+    takes_brokers: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        address: str | Address,
+        *,
+        bind: bool,
+        insecure: bool,
+        keys: Keys | str | Path | None,
+        allow: PublicKey | Collection[PublicKey] | None,
+        max_message_bytes: int,
+        timeout_s: float,
+    ) -> None:
+        self.place = parse_address(address)
+        self.on_connection: Callable[[bool, str], object] | None = None
+        self._max_message_bytes, self._timeout_s = max_message_bytes, timeout_s
+        self._connection = Connection(self)
+        self._lock = threading.Lock()
+        self._channel: Channel | None = None
+        self._process = os.getpid()
+        self._reconnects = 0
+        self._finalizer: weakref.finalize[Any, Any] | None = None
+        self._security: CurveOptions | None = None
+        if not self.place.is_broker:
+            with optional_import():
+                from epypes.transport.zeromq.curve import CurveOptions
+            side, _, rest = self.place.name.partition(":")
+            bind = {"bind": True, "connect": False}.get(side, bind)
+            self._given = rest if side in ("bind", "connect") else self.place.name
+            self._security = CurveOptions.checked(self._given, bind, insecure, keys, allow)
+        else:
+            self._given = str(self.place)
+            if not self.takes_brokers:
+                other = type(self).__name__.removeprefix("ZMQ")
+                text = (
+                    f"{self._given} is no address of ZeroMQ. Give it to a {other} in place of a {type(self).__name__}."
+                )
+                raise AddressError(self._given, text)
+            if keys is not None or allow is not None:
+                text = f"{self._given} takes no keys= and allow=, which are for ZeroMQ. Write the encrypted scheme."
+                raise AddressError(self._given, text)
+
+    @property
+    def address(self) -> str:
+        """The address, without a password; of ZeroMQ, the endpoint that is bound once it is started."""
+        channel = self._channel
+        return self._given if channel is None else channel.address
+
+    @property
+    def refused(self) -> Counter[str]:
+        """How often ZeroMQ peers were refused because their key is not allowed, by public key; a copy."""
+        return Counter() if self._security is None else Counter(self._security.refused)
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether the broker is connected, as far as is known; of ZeroMQ, whether the socket is open."""
+        channel = self._running
+        return channel is not None and channel.is_connected
+
+    @property
+    def trouble(self) -> str:
+        """Why the broker is not connected; empty if it is, and when this is stopped."""
+        channel = self._running
+        return "" if channel is None else channel.trouble
+
+    @property
+    def reconnects(self) -> int:
+        """How often the broker was connected again, over all starts."""
+        channel = self._channel
+        return self._reconnects + (0 if channel is None else channel.reconnects)
+
+    def wait_connected(self, timeout_s: float = 5.0) -> bool:
+        """Return whether the broker is connected within ``timeout_s`` seconds."""
+        if self._running is None:
+            return False
+        return self.is_connected or (self._connection.established.wait(timeout_s) and self.is_connected)
+
+    @property
+    def _running(self) -> Channel | None:
+        """The channel; None in a forked child, which has neither its parent's threads nor its connections."""
+        return self._channel if self._process == os.getpid() else None
+
+    @property
+    def _zeromq_channel(self) -> ZeroMQChannel | None:
+        return None if self._security is None else self._channel  # type: ignore[return-value]
+
+    def _new_channel(self, prefetch: int, **zeromq_options: Any) -> Channel:
+        if self._security is not None:
+            from epypes.transport.zeromq.channel import ZeroMQChannel
+
+            return ZeroMQChannel(
+                self._given, self._security, max_message_bytes=self._max_message_bytes, **zeromq_options
+            )
+        options = ChannelOptions(
+            prefetch=prefetch,
+            timeout_s=self._timeout_s,
+            max_message_bytes=self._max_message_bytes,
+            on_connection=self._connection,
+        )
+        return open_channel(self.place, options)
+
+    def _opened(self, channel: Channel, on_forgotten: Callable[[], object]) -> None:
+        """Take note of a channel that was opened; ``on_forgotten`` is called by the garbage collector."""
+        self._channel, self._process = channel, os.getpid()
+        name = f"{type(self).__name__} {self._given}"
+        self._finalizer = weakref.finalize(self, _abandon, os.getpid(), name, on_forgotten)
+
+    def _taken_to_stop(self) -> Channel | None:
+        """Return the channel, which belongs to the caller then; None if there is none to close here."""
+        with self._lock:
+            running, channel, self._channel = self._running, self._channel, None
+            if channel is not None:
+                self._reconnects += channel.reconnects
+            if self._finalizer is not None:
+                self._finalizer.detach()
+        return running
+
+    def _repr(self, count: str) -> str:
+        state = "stopped" if self._running is None else "running"
+        return f"<{type(self).__name__} {self.address[:50]} {state}: {count}>"
+
+
+class Connection:
+    """Hears from a channel whether it is connected, and does not keep the Endpoint alive.
+
+    Attributes
+    ----------
+    established
+        Set while there is a connection.
+    callback_threads
+        The threads that run a callback of the user just now: they must not wait for the channel.
+    """
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        self._endpoint = weakref.ref(endpoint)
+        self.established = threading.Event()
+        self.callback_threads: set[int] = set()
+
+    def __call__(self, is_connected: bool, reason: str) -> None:
+        """Take note of a change, and call the user's listener."""
+        if is_connected:
+            self.established.set()
+        else:
+            self.established.clear()
+        endpoint = self._endpoint()
+        if endpoint is None or endpoint.on_connection is None:
+            return
+        self.callback_threads.add(threading.get_ident())
+        try:
+            endpoint.on_connection(is_connected, reason)
+        except BaseException:
+            # It is the user's; the connection goes on.
+            log.exception("on_connection itself failed")
+        finally:
+            self.callback_threads.discard(threading.get_ident())
+
+
+def _abandon(process: int, name: str, on_forgotten: Callable[[], object]) -> None:
+    # By the garbage collector or at exit: so no waiting, no locks.
+    if process == os.getpid():
+        on_forgotten()
+        warn_left_running(name)

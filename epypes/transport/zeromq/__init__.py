@@ -1,0 +1,1 @@
+"""ZeroMQ: sockets on one I/O thread, as channels; joining without loss, heartbeats, CURVE keys, bounded connections."""

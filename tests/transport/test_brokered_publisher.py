@@ -1,0 +1,365 @@
+"""A publisher to a broker sends everything once and in order, or says what it has not sent."""
+
+from __future__ import annotations
+
+import itertools
+import queue
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+import epypes as ep
+from epypes.errors import BrokerError, MessageError
+from epypes.transport.memory import away, queued
+from epypes.transport.publisher import Publisher
+from epypes.transport.subscriber import Subscriber
+from epypes.wire import EncodedEnvelope, Envelope, decode
+from tests.transport.peers import WAIT_S, wait_until
+
+_numbers = itertools.count()
+
+
+@pytest.fixture
+def broker():
+    return f"publisher{next(_numbers)}"
+
+
+@pytest.fixture
+def address(broker):
+    return f"memory://{broker}/events?create=true"
+
+
+def ids(address):
+    return [message.id for message in queued(address)]
+
+
+def bodies(address):
+    return [b"".join(message.frames) for message in queued(address)]
+
+
+def threads():
+    return [
+        thread
+        for thread in threading.enumerate()
+        if thread.name.startswith(("epypes from", "epypes brokers", "epypes-publisher"))
+    ]
+
+
+def take(q):
+    return q.get(timeout=WAIT_S)
+
+
+def test_items_get_the_ids_of_their_envelopes_or_new_ones(address):
+    out = queue.Queue()
+    with Publisher(address, out, "cam1") as pub:
+        out.put(Envelope("vision", {"x": 1}, id="a"))
+        out.put(b"2019")
+        wait_until(lambda: pub.sent == 2)
+        assert (pub.is_connected, pub.trouble, pub.waiting) == (True, "", 0)
+    first, second = queued(address)
+    envelope = decode(first.frames)
+    assert (first.id, envelope.sequence, envelope.parts["x"]) == ("a", 1, 1)
+    assert len(second.id) == 32
+
+
+def test_encoded_envelopes_are_stamped_and_their_values_are_not_touched(address):
+    encoded = EncodedEnvelope.encode(Envelope("e", {"x": 1}, id="a", source="cam"), "elsewhere")
+    with Publisher(address, None, "cam1") as pub:
+        pub.send(encoded)
+        pub.send(encoded, id="b")
+    first, second = queued(address)
+    assert [first.id, second.id] == ["a", "b"]
+    assert (first.frames[0], decode(first.frames).parts["x"]) == (b"cam1/", 1)
+    assert [decode(each.frames).sequence for each in (first, second)] == [1, 2]
+    assert decode(first.frames).epoch > 0
+
+
+def test_send_carries_id_and_headers_and_reports_the_confirmation(address):
+    errors = queue.Queue()
+    with Publisher(address) as pub:
+        pub.send((b"a", b"b"), id="1", headers={"h": "v"}, confirmed=errors.put)
+        assert take(errors) is None
+        with pytest.raises(MessageError, match="not object"):
+            pub.send(object(), confirmed=errors.put)
+    (message,) = queued(address)
+    assert (message.frames, message.id, message.headers) == ((b"a", b"b"), "1", {"h": "v"})
+    with pytest.raises(BrokerError):
+        pub.send(b"late", confirmed=errors.put)
+    assert errors.empty()
+    assert pub.rejected == {"no codec": 1, "not sent": 1}
+
+
+def test_what_is_sent_is_what_it_was_when_it_was_put(broker, address):
+    np = pytest.importorskip("numpy")
+    image = np.zeros((100, 100), np.uint8)
+    with Publisher(address) as pub:
+        with away(broker):
+            wait_until(lambda: not pub.is_connected)
+            pub.send(Envelope("e", {"image": image}))
+            image[:] = 1
+        wait_until(lambda: pub.sent == 1)
+    assert not decode(queued(address)[0].frames).parts["image"].any()
+
+
+@pytest.mark.slow
+def test_what_is_put_during_an_outage_is_sent_in_order_afterwards(broker, address):
+    out = queue.Queue()
+    with Publisher(address, out) as pub:
+        out.put(Envelope("e", id="a"))
+        wait_until(lambda: pub.sent == 1)
+        with away(broker):
+            for known_as in "bcd":
+                out.put(Envelope("e", id=known_as))
+            wait_until(lambda: "can't be reached" in pub.trouble)
+            assert not pub.is_connected
+        wait_until(lambda: pub.sent == 4)
+        assert (pub.reconnects, pub.rejected, pub.trouble) == (1, {}, "")
+    assert ids(address) == list("abcd")
+
+
+def test_a_put_into_a_mailbox_returns_when_the_broker_has_confirmed(broker, address):
+    out = ep.Mailbox("latest")
+    with Publisher(address, out) as pub:
+        out.put(b"first")
+        assert pub.sent == 1
+        putting = threading.Thread(target=out.put, args=(b"second",))
+        with away(broker):
+            putting.start()
+            wait_until(lambda: pub.waiting == 1)
+            assert (putting.is_alive(), pub.sent) == (True, 1)
+        putting.join(WAIT_S)
+        assert (putting.is_alive(), pub.sent) == (False, 2)
+
+
+def test_what_many_threads_put_at_once_is_sent_once_each_in_the_order_of_the_thread(address):
+    mailbox = ep.Mailbox("block", 8)
+    with Publisher(address, mailbox) as pub:
+        begin = threading.Barrier(4)
+
+        def put(name):
+            begin.wait(WAIT_S)
+            for number in range(50):
+                mailbox.put(b"%d %d" % (name, number))
+
+        putting = [threading.Thread(target=put, args=(name,)) for name in range(4)]
+        for thread in putting:
+            thread.start()
+        for thread in putting:
+            thread.join(WAIT_S)
+        assert pub.sent == 200
+    found = bodies(address)
+    for name in range(4):
+        mine = [body for body in found if body.startswith(b"%d " % name)]
+        assert mine == [b"%d %d" % (name, number) for number in range(50)]
+
+
+@pytest.mark.parametrize("make", [lambda: ep.Mailbox("block", 8), queue.Queue])
+def test_a_publisher_that_is_stopped_during_an_outage_counts_what_it_has_not_sent(broker, address, make):
+    out, raised = make(), []
+
+    def put():
+        try:
+            out.put(b"lost")
+        except BrokerError as error:
+            raised.append(error)
+
+    pub = Publisher(address, out).start()
+    putting = threading.Thread(target=put)
+    with away(broker):
+        putting.start()
+        wait_until(lambda: pub.waiting)
+        begin_s = time.monotonic()
+        pub.stop(0.2)
+        assert time.monotonic() - begin_s < WAIT_S / 2
+        putting.join(WAIT_S)
+        assert not putting.is_alive()
+    assert pub.rejected == {"not sent": 1}
+    assert len(raised) == isinstance(out, ep.Mailbox)
+    assert "memory://" in str(raised or "memory://")
+    wait_until(lambda: threads() == [])
+
+
+def test_what_can_not_be_sent_raises_from_a_mailbox_and_is_counted(address):
+    out = ep.Mailbox("block", 8)
+    with Publisher(address, out, max_message_bytes=100) as pub:
+        with pytest.raises(MessageError, match="1,000 bytes"):
+            out.put(b"x" * 1_000)
+        with pytest.raises(MessageError, match="not int"):
+            out.put(1)
+        out.put(b"good")
+        assert (pub.sent, pub.rejected) == (1, {"too large": 1, "no codec": 1})
+
+
+def test_what_a_mailbox_has_kept_is_sent_at_the_start_whatever_it_is(address):
+    out = ep.Mailbox("block", 8)
+    out.put(1)
+    out.put(b"good")
+    with Publisher(address, out) as pub:
+        wait_until(lambda: (pub.sent, pub.rejected) == (1, {"no codec": 1}))
+
+
+def test_an_item_that_puts_another_from_its_own_code_does_not_wait_for_itself(address):
+    out = ep.Mailbox("block", 8)
+
+    class Item:
+        def SerializeToString(self):
+            out.put(b"second")
+            return b"first"
+
+    with Publisher(address, out) as pub:
+        out.put(Item())
+        wait_until(lambda: pub.sent == 2)
+    assert bodies(address) == [b"first", b"second"]
+
+
+def test_a_confirmation_that_puts_more_does_not_wait_for_itself(address):
+    out, is_put = ep.Mailbox("block", 8), threading.Event()
+
+    def confirmed(error):
+        out.put(b"second")
+        is_put.set()
+
+    with Publisher(address, out) as pub:
+        pub.send(b"first", confirmed=confirmed)
+        assert is_put.wait(WAIT_S)
+        wait_until(lambda: pub.sent == 2)
+    assert bodies(address) == [b"first", b"second"]
+
+
+def test_a_publisher_that_has_nothing_to_do_notices_an_outage_and_can_be_stopped_by_its_listener(broker, address):
+    pub, changes = Publisher(address, queue.Queue()), []
+    pub.on_connection = lambda *change: changes.append(change)
+    with pub:
+        with away(broker):
+            wait_until(lambda: not pub.is_connected)
+            wait_until(lambda: "the broker" in pub.trouble)
+        assert pub.wait_connected(WAIT_S)
+        assert (pub.trouble, pub.reconnects) == ("", 1)
+        pub.on_connection = lambda is_connected, reason: pub.stop()
+        with away(broker):
+            wait_until(lambda: "stopped" in repr(pub))
+    assert (pub.is_connected, pub.trouble) == (False, "")
+    assert [is_connected for is_connected, _ in changes] == [True, False, True]
+
+
+def test_a_publisher_sends_what_is_queued_before_it_stops(address):
+    out = queue.Queue()
+    with Publisher(address, out) as pub:
+        for _ in range(50):
+            out.put(b"x")
+    assert (pub.sent, len(bodies(address))) == (50, 50)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [queue.Queue, lambda: ep.Mailbox("block", 8)])
+def test_a_publisher_that_is_left_running_is_warned_of_and_ended(make, address):
+    pubs = [Publisher(address, make()).start()]
+    with pytest.warns(ResourceWarning, match=r"Publisher memory://.* was left running"):
+        pubs.clear()
+    wait_until(lambda: threads() == [])
+
+
+def test_no_put_waits_for_a_publisher_that_was_forgotten(broker, address):
+    out, raised = ep.Mailbox("block", 8), queue.Queue()
+
+    def put():
+        try:
+            out.put(b"x")
+        except BrokerError as error:
+            raised.put(error)
+
+    pubs = [Publisher(address, out).start()]
+    putting = threading.Thread(target=put)
+    with away(broker):
+        putting.start()
+        wait_until(lambda: pubs[0].waiting)
+        with pytest.warns(ResourceWarning, match="left running"):
+            pubs.clear()
+        assert isinstance(take(raised), BrokerError)
+    putting.join(WAIT_S)
+
+
+SCRIPT = """
+import queue, epypes as ep
+from epypes.transport.publisher import Publisher
+from epypes.transport.subscriber import Subscriber
+out, q = ep.Mailbox("block", 8), queue.Queue()
+pub = Publisher("memory://b/q?create=true", out).start()
+sub = Subscriber("memory://b/q", q).start()
+out.put(b"x")
+q.get(timeout=60)
+print("end", flush=True)
+"""
+
+
+@pytest.mark.slow
+def test_the_interpreter_ends_with_endpoints_that_run():
+    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout) == (0, "end\n"), done.stderr
+
+
+# The paper's pipelines between them
+
+
+def halves(x):
+    if x % 10 == 7:
+        raise ValueError(f"{x} is odd")
+    return x / 2
+
+
+@pytest.mark.slow
+def test_every_event_is_answered_once_or_a_dead_letter_though_the_broker_goes_away(broker):
+    requests, answers = f"memory://{broker}/requests?create=true", f"memory://{broker}/answers?create=true"
+    out, q_in, q_out, collected = queue.Queue(), queue.Queue(), ep.Mailbox("block", 8), queue.Queue()
+
+    def f_out(view):
+        return Envelope("half", {"half": view["halves"]}, id=view.event.id, correlation_id=view.event.id)
+
+    graph = ep.CompGraph.from_functions(halves)
+    pipe = ep.FullPipeline("half", graph, q_in, q_out, lambda event: {"x": event.parts["x"]}, f_out)
+    pipe.on_error = lambda failure: None
+    found = {}
+    with (
+        Publisher(requests, out) as robot,
+        Subscriber(requests, q_in) as sub,
+        Publisher(answers, q_out) as pub,
+        Subscriber(answers, collected) as collector,
+        pipe,
+    ):
+        for number in range(200):
+            out.put(Envelope("request", {"x": number}, id=f"event {number}"))
+        for wanted in (60, 120):
+            while len(found) < wanted:
+                answer = take(collected)
+                found[answer.correlation_id] = answer.parts["half"]
+                answer.ack()
+            with away(broker):
+                wait_until(lambda: not (sub.is_connected or collector.is_connected))
+        while len(found) < 180:
+            answer = take(collected)
+            assert answer.correlation_id not in found
+            found[answer.correlation_id] = answer.parts["half"]
+            answer.ack()
+        wait_until(lambda: sub.dead_letters == 20)
+        assert (robot.sent, sub.received, pub.sent, pipe.failed) == (200, 200, 180, 20)
+    assert found == {f"event {number}": number / 2 for number in range(200) if number % 10 != 7}
+    assert queued(requests) == queued(answers) == []
+
+
+def test_an_answer_that_is_not_confirmed_leaves_its_event_to_be_delivered_again(broker):
+    requests, answers = f"memory://{broker}a/requests?create=true", f"memory://{broker}b/answers?create=true"
+    q_in, q_out = queue.Queue(), ep.Mailbox("block", 8)
+    graph = ep.CompGraph({"same": lambda x: x}, {"same": ("x", "y")})
+    pub = Publisher(answers, q_out).start()
+    pipe = ep.FullPipeline("same", graph, q_in, q_out, lambda event: {"x": bytes(event)}, lambda view: view["y"])
+    pipe.on_error = lambda failure: None
+    with Subscriber(requests, q_in) as sub, Publisher(requests) as robot, pipe, away(f"{broker}b"):
+        robot.send(b"x", id="a")
+        wait_until(lambda: pub.waiting)
+        sub.pause()
+        pub.stop(0.0)
+        wait_until(lambda: pipe.failed == 1)
+    assert ids(requests) == ["a"]
