@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from epypes.optional import optional_import
 
 if TYPE_CHECKING:
-    from epypes.service.client import Answer, Client, call
+    from epypes.service.ops.client import Answer, Client, call
     from epypes.service.parameters import Parameters
     from epypes.service.server import Service
     from epypes.service.serving import serve
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 __all__ = ["Answer", "Client", "Parameters", "Service", "call", "serve"]
 
 _HOME = {
-    "Answer": "client",
-    "Client": "client",
+    "Answer": "ops.client",
+    "Client": "ops.client",
     "Parameters": "parameters",
     "Service": "server",
-    "call": "client",
+    "call": "ops.client",
     "serve": "serving",
 }
 

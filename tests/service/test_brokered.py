@@ -463,7 +463,7 @@ def test_a_service_that_can_no_longer_work_leaves_its_events_to_others_until_ano
 
 
 def test_the_doctor_looks_whether_a_broker_has_a_place_and_shows_no_password(host):
-    from epypes.service.doctor import examine
+    from epypes.service.ops.doctor import examine
 
     given = [f"memory://robot:hush@{name}" for name in ("gone/events", f"{host}/events", f"{host}/events?create=true")]
     with memory.away("gone"):

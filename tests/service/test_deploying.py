@@ -12,7 +12,7 @@ import pytest
 from epypes.bundle.seal import check_seal, seal
 from epypes.errors import DeployRefused, ServiceError, UnknownName
 from epypes.service import Service
-from epypes.service.failures.source import failures_of, found_by
+from epypes.service.failures.source import failures_of, find_failure
 from epypes.service.state import read_state
 from tests.service.processes import run_cli, running
 from tests.service.served import SOURCE, acting_bundle, serving, until
@@ -37,17 +37,17 @@ def test_values_that_a_deploy_replaces_are_told(acting, better):
         assert service.rollback()["changed"] == ["k 3 -> 2"]
 
 
-def test_failures_of_a_bundle_that_was_deployed_are_found_by_its_path_and_by_the_event(acting, better):
+def test_failures_of_a_bundle_that_was_deployed_are_find_failure_its_path_and_by_the_event(acting, better):
     with serving(acting) as (service, peer):
         service.deploy(better)
         failure = peer.ask("fail:here").failure
         assert service.failure_store.flush()
     (record,) = failures_of(better).records()
     assert record.message == "here"
-    assert found_by(failures_of(better), failure.input_id) == record
+    assert find_failure(failures_of(better), failure.input_id) == record
     assert failures_of(better).event(record.id).id == failure.input_id
     with pytest.raises(UnknownName):
-        found_by(failures_of(better), "0" * 32)
+        find_failure(failures_of(better), "0" * 32)
 
 
 def test_values_that_were_written_back_are_those_of_the_bundle_that_is_served(own, better, caplog):

@@ -9,7 +9,7 @@ from importlib import metadata
 import pytest
 
 from epypes.cli import main
-from epypes.service.doctor import examine
+from epypes.service.ops.doctor import examine
 from epypes.transport import make_keys
 
 pytestmark = pytest.mark.slow

@@ -12,7 +12,7 @@ import epypes as ep
 from epypes.bundle.seal import check_seal
 from epypes.cli import main
 from epypes.errors import BundleError, ServiceError
-from epypes.service.export import systemd_unit, unit_name, write_container
+from epypes.service.ops.export import systemd_unit, unit_name, write_container
 
 SYSTEMD = shutil.which("systemd-analyze")
 

@@ -14,7 +14,7 @@ from urllib.parse import quote
 from epypes.bundle.entries import plain, written
 from epypes.bundle.ports import in_order
 from epypes.errors import EpypesError, ServiceError
-from epypes.service.failures.record import FailureRecord, record_of
+from epypes.service.failures.record import FailureRecord, read_record
 from epypes.service.parameters import Parameters
 from epypes.service.remote.control import Control, Event, read_parameters, split_url
 
@@ -355,6 +355,6 @@ class Connection:
 
     def _record(self, entries: Any) -> FailureRecord:
         try:
-            return record_of(entries)
+            return read_record(entries)
         except ValueError as error:
             raise ServiceError(self.url, f"A failure at {self.url} can't be read: {error}.") from error
