@@ -37,7 +37,7 @@ def test_values_that_a_deploy_replaces_are_told(acting, better):
         assert service.rollback()["changed"] == ["k 3 -> 2"]
 
 
-def test_failures_of_a_bundle_that_was_deployed_are_find_failure_its_path_and_by_the_event(acting, better):
+def test_failures_of_a_bundle_that_was_deployed_are_found_by_its_path_and_by_the_event(acting, better):
     with serving(acting) as (service, peer):
         service.deploy(better)
         failure = peer.ask("fail:here").failure
@@ -85,12 +85,17 @@ def test_values_that_were_written_back_are_those_of_the_bundle_that_is_served(ow
         assert any(line.startswith(begin) for line in lines), begin
 
 
-def test_the_state_file_has_the_digest_of_what_is_served(acting, better):
+def test_a_service_is_found_by_the_bundle_it_was_started_with_and_by_the_one_that_was_deployed(acting, better):
     with running(acting, "--http", "127.0.0.1:0"):
         state = read_state(acting)
+        assert "No service of yours runs" in run_cli("status", better).stderr
         done = run_cli("deploy", better, "--http", state.http)
         assert "k 2 -> 3" in done.stdout
         until(lambda: read_state(acting).digest == check_seal(better))
+        for bundle in (acting, better):
+            assert run_cli("status", bundle).stdout.startswith(f"READY {better}")
+            answered = run_cli("call", bundle, 'what="plain"', "number=5")
+            assert answered.stdout.startswith("out = 15"), answered.stderr
 
 
 def test_the_child_of_a_function_that_forks_does_not_go_on_as_a_worker(tmp_path):

@@ -1,4 +1,4 @@
-"""Does the doctor see what is wrong, and say what helps?"""
+"""The doctor sees what is wrong, and says what helps."""
 
 from __future__ import annotations
 

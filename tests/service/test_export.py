@@ -1,4 +1,4 @@
-"""Do the unit and the container say what a machine needs?"""
+"""Systemd units and container folders have what a machine needs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Does an event that failed in a service open again, at the function that failed, and does it fail again?"""
+"""An event that failed in a service opens again at the function that failed, and is run again in a process of its own."""
 
 from __future__ import annotations
 

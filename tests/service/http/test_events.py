@@ -1,4 +1,4 @@
-"""What are listeners told, and what do those cost who do not listen?"""
+"""Server-sent events: what clients receive, and what they cost."""
 
 from __future__ import annotations
 
