@@ -270,23 +270,3 @@ def test_a_failure_is_opened_from_a_running_service_by_its_url_or_connection(bri
         with pytest.raises(UnknownName, match="zzz"):
             ep.load_failure("zzz", connection)
         connection.close()
-
-
-@pytest.mark.slow
-@pytest.mark.notebook
-def test_in_a_notebook_a_failure_shows_itself_and_the_next_cell_goes_on_from_it(bright_bundle):
-    import nbclient  # takes seconds
-    import nbformat
-
-    failure = keep(bright_bundle, request(RAISES))
-    cells = [
-        f"import epypes as ep\nrunner = ep.load_failure({failure!r}, {str(bright_bundle)!r})\nrunner",
-        "runner.rerun(most=99)",
-        f"ep.load_failure({failure[-6:]!r})['bright'].max()",
-    ]
-    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in cells])
-    nbclient.NotebookClient(notebook, timeout=60, kernel_name="python3").execute()
-    stopped, gone_on, again = (cell.outputs[-1].data for cell in notebook.cells)
-    assert "too bright: 95" in stopped["text/html"]
-    assert "too bright: 95" not in gone_on["text/html"]
-    assert again["text/plain"] == "np.uint8(95)"

@@ -21,37 +21,12 @@ from starlette.staticfiles import StaticFiles
 import epypes
 from epypes.bundle.seal import check_seal
 from epypes.errors import BundleError, DeployRefused
-from epypes.service.http import events, previews
+from epypes.service import Service
+from epypes.service.http import events, models, previews
 from epypes.service.http.metrics import exposed, registry_of
-from epypes.service.http.models import (
-    BINARY,
-    CHANGE_REFUSALS,
-    INVALID,
-    REFUSALS,
-    Access,
-    Alive,
-    Change,
-    Conflict,
-    Deploy,
-    DeployRefusal,
-    Drain,
-    Failure,
-    Failures,
-    Group,
-    Info,
-    Invalid,
-    Parameters,
-    Ready,
-    Refusal,
-    Responses,
-    ServiceOf,
-    WriteBack,
-    WrittenBack,
-    refused,
-)
+from epypes.service.http.models import CHANGE_REFUSALS, INVALID, REFUSALS, Responses, ServiceOf, refused
 from epypes.service.http.responses import add_error_handlers, json_response, parameters_body
 from epypes.service.http.security import NEEDS_TOKEN
-from epypes.service.server import Service
 
 _DESCRIPTION: Final = """
 Watches and controls a running service of EPypes.
@@ -109,7 +84,7 @@ def create_app(service: Service) -> FastAPI:
 # -- health -----------------------------------------------------------------------------------------------------------
 
 
-@health.get("/livez", response_model=Alive, responses={**REFUSALS, 503: refused("It does not.", Alive)})
+@health.get("/livez", response_model=models.Alive, responses={**REFUSALS, 503: refused("It does not.", models.Alive)})
 async def livez(service: ServiceOf) -> Response:
     """Say whether the service works: 503 means that it should be restarted.
 
@@ -119,7 +94,7 @@ async def livez(service: ServiceOf) -> Response:
     return json_response({"alive": not reason, "reason": reason}, 503 if reason else 200)
 
 
-@health.get("/readyz", response_model=Ready, responses={**REFUSALS, 503: refused("They are not.", Ready)})
+@health.get("/readyz", response_model=models.Ready, responses={**REFUSALS, 503: refused("They are not.", models.Ready)})
 async def readyz(service: ServiceOf) -> Response:
     """Say whether events are answered: the bundle computes what was recorded, and the sockets are bound."""
     reason = service.ready()
@@ -143,13 +118,13 @@ def metrics(request: Request) -> Response:
     return Response(text, headers={"Content-Type": media_type})
 
 
-@health.get("/v1/info", response_model=Info, responses=REFUSALS, tags=["service"])
+@health.get("/v1/info", response_model=models.Info, responses=REFUSALS, tags=["service"])
 def info(service: ServiceOf) -> Response:
     """Say what is served, by which processes, at which addresses."""
     return json_response(service.info())
 
 
-@health.get("/v1/group", response_model=Group, responses=REFUSALS)
+@health.get("/v1/group", response_model=models.Group, responses=REFUSALS)
 def group(service: ServiceOf) -> Response:
     """Name the replicas that answer events from the same queue, and say whether all have the same parameters.
 
@@ -161,7 +136,7 @@ def group(service: ServiceOf) -> Response:
 # -- parameters -------------------------------------------------------------------------------------------------------
 
 
-@parameters.get("/v1/parameters", response_model=Parameters, responses=REFUSALS)
+@parameters.get("/v1/parameters", response_model=models.Parameters, responses=REFUSALS)
 def read_parameters(service: ServiceOf) -> Response:
     """Return the parameters, their ranges and their revision."""
     return json_response(parameters_body(service.parameters()))
@@ -169,15 +144,15 @@ def read_parameters(service: ServiceOf) -> Response:
 
 @parameters.patch(
     "/v1/parameters",
-    response_model=Parameters,
+    response_model=models.Parameters,
     dependencies=[NEEDS_TOKEN],
     responses={
         **CHANGE_REFUSALS,
-        409: refused("They were changed concurrently; nothing is changed now.", Conflict),
-        422: refused("A value is refused; nothing is changed.", Invalid),
+        409: refused("They were changed concurrently; nothing is changed now.", models.Conflict),
+        422: refused("A value is refused; nothing is changed.", models.Invalid),
     },
 )
-def change_parameters(service: ServiceOf, wanted: Change) -> Response:
+def change_parameters(service: ServiceOf, wanted: models.Change) -> Response:
     """Change parameters, all or none, between two events; outputs carry the revision they were computed with."""
     entries = service.parameters().entries
     values = {token: _number(value, entries.get(token, {})) for token, value in wanted.values.items()}
@@ -186,15 +161,15 @@ def change_parameters(service: ServiceOf, wanted: Change) -> Response:
 
 @parameters.post(
     "/v1/parameters/write-back",
-    response_model=WrittenBack,
+    response_model=models.WrittenBack,
     dependencies=[NEEDS_TOKEN],
     responses={
         **CHANGE_REFUSALS,
         409: refused("Another bundle is being deployed."),
-        422: refused("The bundle can't be written.", Invalid),
+        422: refused("The bundle can't be written.", models.Invalid),
     },
 )
-def write_back(request: Request, service: ServiceOf, wanted: WriteBack) -> Response:
+def write_back(request: Request, service: ServiceOf, wanted: models.WriteBack) -> Response:
     """Write the parameters into pipeline.toml, or say what would change there; the bundle is replayed and sealed."""
     done = _alone(request, lambda: service.write_back(dry_run=wanted.dry_run))
     return json_response({"diff": done.diff, "digest": done.digest})
@@ -217,7 +192,7 @@ _FAILURE_REFUSALS: Final[Responses] = {
 }
 
 
-@failures.get("", response_model=Failures, responses={**REFUSALS, 422: INVALID})
+@failures.get("", response_model=models.Failures, responses={**REFUSALS, 422: INVALID})
 def list_failures(
     service: ServiceOf, limit: Annotated[int, Query(ge=1, le=1_000, description="How many at most.")] = 100
 ) -> Response:
@@ -225,7 +200,7 @@ def list_failures(
     return json_response({"failures": [asdict(record) for record in service.failure_records(limit)]})
 
 
-@failures.get("/{id}", response_model=Failure, responses=_FAILURE_REFUSALS)
+@failures.get("/{id}", response_model=models.Failure, responses=_FAILURE_REFUSALS)
 def failure(service: ServiceOf, id: _FailureId) -> Response:  # noqa: A002 - as in the path
     """Say what failed, where, and with which parameters."""
     return json_response(asdict(service.failure_store.record(id)))
@@ -234,7 +209,7 @@ def failure(service: ServiceOf, id: _FailureId) -> Response:  # noqa: A002 - as 
 @failures.get(
     "/{id}/event",
     response_class=Response,
-    responses={**_FAILURE_REFUSALS, 200: {"description": "The event, packed.", "content": {_EVENT: BINARY}}},
+    responses={**_FAILURE_REFUSALS, 200: {"description": "The event, packed.", "content": {_EVENT: models.BINARY}}},
 )
 def failed_event(service: ServiceOf, id: _FailureId) -> Response:  # noqa: A002 - as in the path
     """Return the event itself, so that it can be computed again elsewhere."""
@@ -244,19 +219,19 @@ def failed_event(service: ServiceOf, id: _FailureId) -> Response:  # noqa: A002 
 # -- operation --------------------------------------------------------------------------------------------------------
 
 _DEPLOY_REFUSALS: Final[Responses] = CHANGE_REFUSALS | {
-    409: refused("It is not served, for these reasons; the bundle before goes on.", DeployRefusal),
-    422: refused("There is no bundle at this path.", Refusal),
+    409: refused("It is not served, for these reasons; the bundle before goes on.", models.DeployRefusal),
+    422: refused("There is no bundle at this path.", models.Refusal),
 }
 
 
-@operation.post("/access", response_model=Access, responses=CHANGE_REFUSALS)
+@operation.post("/access", response_model=models.Access, responses=CHANGE_REFUSALS)
 async def access() -> Response:
     """Say whether the token is the service's, and change nothing."""
     return json_response({"allowed": True})
 
 
-@operation.post("/deploy", response_model=Info, responses=_DEPLOY_REFUSALS)
-def deploy(request: Request, service: ServiceOf, wanted: Deploy) -> Response:
+@operation.post("/deploy", response_model=models.Info, responses=_DEPLOY_REFUSALS)
+def deploy(request: Request, service: ServiceOf, wanted: models.Deploy) -> Response:
     """Replay another bundle beside the one that is served, and serve it from the next event on."""
 
     def check_and_deploy() -> dict[str, Any]:
@@ -270,30 +245,30 @@ def deploy(request: Request, service: ServiceOf, wanted: Deploy) -> Response:
     return json_response(_alone(request, check_and_deploy))
 
 
-@operation.post("/rollback", response_model=Info, responses=_DEPLOY_REFUSALS)
+@operation.post("/rollback", response_model=models.Info, responses=_DEPLOY_REFUSALS)
 def rollback(request: Request, service: ServiceOf) -> Response:
     """Serve the bundle again that was served before this one."""
     return json_response(_alone(request, service.rollback))
 
 
-@operation.post("/pause", response_model=Info, responses=CHANGE_REFUSALS)
+@operation.post("/pause", response_model=models.Info, responses=CHANGE_REFUSALS)
 def pause(service: ServiceOf) -> Response:
     """Begin no more events; those that come wait, as many as the mailbox holds."""
     service.pause()
     return json_response(service.info())
 
 
-@operation.post("/resume", response_model=Info, responses=CHANGE_REFUSALS)
+@operation.post("/resume", response_model=models.Info, responses=CHANGE_REFUSALS)
 def resume(service: ServiceOf) -> Response:
     """Go on after a pause."""
     service.resume()
     return json_response(service.info())
 
 
-@operation.post("/drain", response_model=Info, responses={**CHANGE_REFUSALS, 422: INVALID})
-def drain(service: ServiceOf, wanted: Annotated[Drain | None, Body()] = None) -> Response:
+@operation.post("/drain", response_model=models.Info, responses={**CHANGE_REFUSALS, 422: INVALID})
+def drain(service: ServiceOf, wanted: Annotated[models.Drain | None, Body()] = None) -> Response:
     """Take no more events, and work off those that wait."""
-    service.drain((wanted or Drain()).timeout_s)
+    service.drain((wanted or models.Drain()).timeout_s)
     return json_response(service.info())
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final
 from fastapi import Depends, Request
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
-from epypes.service.server import Service
+from epypes.service import Service
 
 Sentence = Annotated[str, Field(description="What is wrong, and the way out.")]
 Revision = Annotated[int, Field(ge=0, description="It rises with every change of the parameters.", examples=[3])]

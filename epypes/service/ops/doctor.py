@@ -83,7 +83,6 @@ def examine(
         ("Graphviz", _graphviz),
         ("browser", _browser),
         ("state folder", _state_folder),
-        ("loopback ports", _loopback),
         *((f"address {_shown(address)}", lambda address=address: _address(address)) for address in addresses),
         *((f"keys {path}", lambda path=path: _keys(Path(path))) for path in keys),
         ("round trip", _round_trip),
@@ -204,19 +203,6 @@ def _state_folder() -> Check:
         return Check("state folder", "warning", f"{folder} is open to others", f"chmod 700 {folder}")
     free_mb = shutil.disk_usage(folder).free >> 20
     return Check("state folder", "ok", f"{folder}, {free_mb:,} MB free")
-
-
-def _loopback() -> Check:
-    with socket.socket() as server, socket.socket() as client:
-        server.bind(("127.0.0.1", 0))
-        server.listen(1)
-        client.settimeout(_ROUND_TRIP_TIMEOUT_S)
-        try:
-            client.connect(server.getsockname())
-        except OSError as error:
-            way_out = "A firewall or container forbids connections within this machine: allow 127.0.0.1."
-            return Check("loopback ports", "failed", str(error), way_out)
-    return Check("loopback ports", "ok", "127.0.0.1 can be bound and reached")
 
 
 def _address(address: str) -> Check:

@@ -44,12 +44,12 @@ def test_a_change_without_the_token_is_refused_and_says_where_it_is(client, http
 
 
 @pytest.mark.parametrize(("method", "path"), CHANGES)
-@pytest.mark.parametrize("given", ["Bearer wrong", "Basic {token}", "{token}", "Bearer {token}x", "bearer é"])
-def test_a_change_with_another_token_is_refused(client, http, method, path, given):
-    headers = {"Authorization": given.format(token=http.token).encode()}
-    answer = client.request(method, path, json={}, headers=headers)
-    assert answer.status_code == 403
-    assert "not the service's token" in sentence(answer)
+def test_a_change_with_another_token_is_refused(client, http, method, path):
+    for given in ("Bearer wrong", "Basic {token}", "{token}", "Bearer {token}x", "bearer é"):
+        headers = {"Authorization": given.format(token=http.token).encode()}
+        answer = client.request(method, path, json={}, headers=headers)
+        assert answer.status_code == 403
+        assert "not the service's token" in sentence(answer)
 
 
 def test_who_still_sends_a_body_has_the_refusal_of_its_token_all_the_same(http):
@@ -249,8 +249,8 @@ def test_a_path_that_is_not_there_says_where_to_look(client):
 
 @pytest.fixture
 def impatient(service):
-    """A server that waits a second for what takes ten otherwise."""
-    with HttpServer(service, "127.0.0.1:*", timeout_s=1.0) as server:
+    """A server that waits 0.3 s for what takes ten otherwise."""
+    with HttpServer(service, "127.0.0.1:*", timeout_s=0.3) as server:
         server.token = server.token_file.read_text().strip()
         yield server
 
