@@ -23,7 +23,7 @@ from epypes.service.http.models import EVENT_REFUSALS
 from epypes.service.http.responses import json_text, parameters_body, with_types
 
 if TYPE_CHECKING:
-    from epypes.service.server import Service
+    from epypes.service import Service
 
 router = APIRouter(tags=["service"])
 

@@ -13,7 +13,7 @@ from prometheus_client.exposition import choose_encoder
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
 
-    from epypes.service.server import Service
+    from epypes.service import Service
 
 _NS_PER_S: Final = 1e9
 _STATES: Final = ("LOADING", "READY", "PAUSED", "DEGRADED", "DRAINING", "FAULTED", "STOPPED")

@@ -229,7 +229,7 @@ REFUSALS: Final[Responses] = {
     400: refused("The body is not JSON, or is not whole."),
     408: refused("The body took too long."),
     413: refused("The body has more than 64 KB."),
-    415: refused("The body is not said to be JSON."),
+    415: refused("The Content-Type of the body is not JSON."),
     431: refused("The address or the headers are too long."),
     503: {
         **refused("The service can't answer now."),

@@ -121,7 +121,7 @@ def secured(app: ASGIApp, token: str, token_file: Path, hosts: Collection[str], 
 
 
 class _SafeHeaders:
-    """Adds headers to every response; tells the connection when a request begins and ends."""
+    """Adds headers to every response; reports to the connection when a request begins and ends."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app

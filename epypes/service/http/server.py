@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
     from uvicorn.protocols.http.h11_impl import H11Protocol
 
-    from epypes.service.server import Service
+    from epypes.service import Service
 
 _log = logging.getLogger("epypes.service")
 
