@@ -7,6 +7,7 @@ annotation: ``Annotated[int, Param(1, 31, odd=True)]``.
 from __future__ import annotations
 
 import enum
+import inspect
 import math
 import numbers
 from collections.abc import Callable, Sequence
@@ -213,8 +214,12 @@ def annotated_param(function: Callable[..., Any], position: int) -> Param | Roi 
     ``Literal``, an ``Enum`` and ``bool`` are understood.
     """
     hints = hints_of(function)
+    declared = getattr(function, "__signature__", None)
     try:
-        name = tuple(function.__code__.co_varnames[: function.__code__.co_argcount])[position]
+        if isinstance(declared, inspect.Signature):
+            name = tuple(declared.parameters)[position]
+        else:
+            name = tuple(function.__code__.co_varnames[: function.__code__.co_argcount])[position]
     except (AttributeError, IndexError):
         return None  # a C function: the value must do
     return _from_annotation(hints.get(name))

@@ -1,9 +1,10 @@
-"""``epypes call``: one image to a running service, and its answer to a file."""
+"""``epypes call``: one event to a running service, and its answer to files or the terminal."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,7 +21,9 @@ if TYPE_CHECKING:
 
 def call(
     bundle: Annotated[Path, typer.Argument(help="The folder of the bundle that is being served.")],
-    images: Annotated[list[str], typer.Argument(help="An image file, or TOKEN=FILE for each input token.")],
+    images: Annotated[
+        list[str], typer.Argument(help="An image file or a number; or TOKEN=FILE, TOKEN=NUMBER for each input token.")
+    ],
     out_file: Annotated[
         list[str] | None, typer.Option("--out", help="The file for the output token, or TOKEN=FILE; an image or .npy.")
     ] = None,
@@ -32,8 +35,7 @@ def call(
     sub: Annotated[str, typer.Option(help="As of epypes serve, where a broker asks for a password.")] = "",
     pub: Annotated[str, typer.Option(help="As of epypes serve, likewise.")] = "",
 ) -> None:
-    """Send one image to the service of a bundle, write what comes back to files and print the rest."""
-    from epypes.acquisition import read_image
+    """Send one image, or other values, to the service of a bundle; write the answer to files and print the rest."""
     from epypes.bundle.load import SETTINGS
     from epypes.bundle.seal import check_seal
     from epypes.bundle.settings import read_settings
@@ -42,9 +44,9 @@ def call(
 
     check_seal(bundle)
     settings = read_settings(bundle / SETTINGS)
-    files = by_token(images, settings.inputs, "input")
+    given = by_token(images, settings.inputs, "input")
     targets = by_token(out_file or [], settings.outputs, "output")
-    payload = {token: read_image(file, settings.order(token)) for token, file in files.items()}
+    payload = {token: _read(text, settings.order(token)) for token, text in given.items()}
     with Client(bundle, timeout_s=timeout, keys=keys, allow=allow, sub=sub, pub=pub) as client:
         answers = [client.call(payload) for _ in range(count)]
     answer = min(answers, key=lambda answer: answer.round_trip_ns)
@@ -86,6 +88,16 @@ def by_token(given: Sequence[str], tokens: Sequence[str], kind: str) -> dict[str
     if missing:
         raise ServiceError(missing, f"Missing {kind}: {', '.join(f'{token}=FILE' for token in missing)}")
     return found
+
+
+def _read(text: str, order: Order) -> Any:
+    """Return the image of a file; or the value of JSON: a number, true, false, null, a list or a quoted text."""
+    from epypes.acquisition import read_image
+
+    if not Path(text).exists():
+        with suppress(ValueError):
+            return json.loads(text)
+    return read_image(text, order)
 
 
 def _write(file: str, value: Any, order: Order) -> None:

@@ -25,7 +25,7 @@ def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Print the checks as JSON.")] = False,
 ) -> None:
     """Look at versions, ports, Graphviz, browser, keys and round-trip time; exit 1 if something failed."""
-    from epypes.service.doctor import examine
+    from epypes.service.ops.doctor import examine
 
     checks = []
     for check in examine(bundle, addresses=address or (), keys=keys or ()):

@@ -30,7 +30,7 @@ def systemd(
     user: Annotated[str | None, typer.Option(help="Whom the service runs as; you without.")] = None,
 ) -> None:
     """Write a unit by which systemd starts the service at boot, and again when it ends."""
-    from epypes.service.export import systemd_unit, unit_name
+    from epypes.service.ops.export import systemd_unit, unit_name
 
     _check_serve_options(bundle, options or ())
     unit = systemd_unit(bundle, options or (), user=user or getpass.getuser())
@@ -52,7 +52,7 @@ def docker(
     options: _Options = None,
 ) -> None:
     """Write a folder from which docker or podman builds the service: container file, requirements, bundle."""
-    from epypes.service.export import write_container
+    from epypes.service.ops.export import write_container
 
     _check_serve_options(bundle, options or ())
     path = write_container(bundle, to, options or ())

@@ -54,12 +54,12 @@ def failures(
 
 def _follow(source: str | None, as_json: bool, keys: Path | None, allow: list[Path] | None) -> None:
     """Print a line for each failure as it happens."""
-    from epypes.service.failures.news import failures_from_now_on
+    from epypes.service.failures.source import follow_failures
 
     if source is None:
         raise ServiceError("", "Whose failures? Say: epypes failures --follow BUNDLE, or the http URL of its service.")
     try:
-        for record in failures_from_now_on(source, keys=keys, allow=allow):
+        for record in follow_failures(source, keys=keys, allow=allow):
             if record is None:
                 err.print(f"Listening for failures of {source}. Ctrl+C ends it.")
             elif as_json:

@@ -30,10 +30,10 @@ def replay(
 ) -> None:
     """Run an event that failed again, in a process of its own; exit 0 only if it is fine now."""
     from epypes.service.failures.reproduce import reproduce
-    from epypes.service.failures.source import bundle_of, failures_of, found_by, path_of
+    from epypes.service.failures.source import bundle_of, failures_of, find_failure, path_of
 
     failures = failures_of(source)
-    record = found_by(failures, failure)
+    record = find_failure(failures, failure)
     event = failures.event(record.id)
     folder, changed = bundle_of(record, bundle or path_of(source))
     if changed:

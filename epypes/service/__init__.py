@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from epypes.optional import optional_import
 
 if TYPE_CHECKING:
-    from epypes.service.client import Answer, Client, call
+    from epypes.service.ops.client import Answer, Client, call
     from epypes.service.parameters import Parameters
     from epypes.service.service import Service
     from epypes.service.serving import serve
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
 __all__ = ["Answer", "Client", "Parameters", "Service", "call", "serve"]
 
 _HOME = {
-    "Answer": "client",
-    "Client": "client",
+    "Answer": "ops.client",
+    "Client": "ops.client",
     "Parameters": "parameters",
     "Service": "service",
-    "call": "client",
+    "call": "ops.client",
     "serve": "serving",
 }
 
 
 def __getattr__(name: str) -> Any:
-    # The worker process, whose modules are in this package too, needs none of them.
+    # A worker, which is in this room too, needs none of them.
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     with optional_import():

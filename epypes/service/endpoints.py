@@ -8,27 +8,23 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from time import monotonic
 from typing import Any, Final
 
-from epypes.errors import BrokerError, MessageError
-from epypes.pipeline import Mailbox
+from epypes.errors import BrokerError, EpypesError, MessageError
 from epypes.service.options import CONNECT, Options, bare
-from epypes.transport import Subscriber, ZMQPublisher, ZMQSubscriber
-from epypes.transport.channels import is_brokered, open_channel, place_of
-from epypes.transport.framing import check_source
-from epypes.transport.outbox import Outbox
-from epypes.transport.outlet import prepare_lending
+from epypes.transport.address import Address, open_channel, parse_address
+from epypes.transport.channel import Confirmed, Delivery
+from epypes.transport.publisher import Publisher
+from epypes.transport.sequences import LossCounter, check_source
+from epypes.transport.subscriber import Subscriber
 from epypes.transport.throttle import Throttle
+from epypes.transport.zeromq.channel import prepare_lending
 from epypes.wire import EncodedEnvelope
 
 FAILURE_TOPIC: Final = "failure"
-# Called once when a message is confirmed, with None, or will never be sent: with the reason.
-Confirmed = Callable[[Exception | None], object]
 
 # Answers kept for a subscriber that does not read; images are large, so this bounds the memory that one can cost.
 _MAX_KEPT_ANSWERS: Final = 256
@@ -38,8 +34,6 @@ _FIRST_RETRY_S: Final = 0.1
 _LONGEST_RETRY_S: Final = 5.0
 # The least time for closing one endpoint, however late it is.
 _MIN_CLOSE_S: Final = 0.5
-# Sources whose sequence numbers are followed; a peer that invents sources must not fill the memory.
-_MAX_SOURCES: Final = 1_024
 # A Subscriber counts among its rejected messages the events that it hands over as delivered too often.
 _EXHAUSTED: Final = "exhausted"
 
@@ -47,7 +41,7 @@ _log = logging.getLogger("epypes.service")
 
 
 class ReceivedEvent:
-    """An event as it was received: its frames, and the broker's delivery if there is one.
+    """An event as it was received: its frames, and the delivery of a broker.
 
     Attributes
     ----------
@@ -57,48 +51,36 @@ class ReceivedEvent:
         The header of the frames, with values that are not decoded; None for a message of 2019.
     id
         Of the envelope, or of the broker's message; empty if there is none.
+    attempt
+        How often a broker has delivered it, from 1; 0 if the broker does not count; None without a broker.
+    ack, reject, nack
+        Settle the delivery: the event is done, is a dead letter, or is delivered again.
     """
 
-    __slots__ = ("_delivery", "envelope", "frames", "id")
+    __slots__ = ("_delivery", "_is_broker", "ack", "envelope", "frames", "id", "nack", "reject")
 
-    def __init__(
-        self,
-        frames: Sequence[bytes | memoryview],
-        envelope: EncodedEnvelope | None,
-        id: str,  # noqa: A002 - its name everywhere
-        delivery: Any = None,
-    ) -> None:
-        self.frames, self.envelope, self.id, self._delivery = frames, envelope, id, delivery
+    def __init__(self, delivery: Delivery, envelope: EncodedEnvelope | None, is_broker: bool) -> None:
+        self.frames, self.envelope = delivery.frames, envelope
+        self.id = (envelope.id if envelope is not None else "") or delivery.id
+        self.ack, self.reject, self.nack = delivery.ack, delivery.reject, delivery.nack
+        self._delivery, self._is_broker = delivery, is_broker
+
+    @property
+    def attempt(self) -> int | None:
+        """Read anew, since a broker may deliver the event again meanwhile."""
+        return self._delivery.attempt if self._is_broker else None
 
     @property
     def stored(self) -> EncodedEnvelope | bytes:
         """What the failure store keeps of it."""
         return self.envelope or bytes(self.frames[0])
 
-    @property
-    def attempt(self) -> int | None:
-        """How often a broker has delivered it, from 1; 0 if the broker does not count; None without a broker."""
-        return None if self._delivery is None else int(self._delivery.attempt)
 
-    def ack(self) -> None:
-        """Tell the broker that the event is done."""
-        if self._delivery is not None:
-            self._delivery.ack()
-
-    def reject(self, reason: str) -> None:
-        """Have the broker make it a dead letter."""
-        if self._delivery is not None:
-            self._delivery.reject(reason)
-
-    def nack(self) -> None:
-        """Return it to the broker, which delivers it again."""
-        if self._delivery is not None:
-            self._delivery.give_back()
-
-
-def group_address(options: Options) -> Any:
+def group_address(options: Options) -> Address | None:
     """Return the broadcast address of the replicas that share a broker's queue; None without a broker."""
-    return place_of(bare(options.sub)) if options.has_broker else None
+    if not options.has_broker:
+        return None
+    return parse_address(bare(options.sub)).beside("group", "broadcast", create=True)
 
 
 class EventInput:
@@ -125,26 +107,31 @@ class EventInput:
     ) -> None:
         self._options, self._accept, self._on_exhausted, self._on_change = options, accept, on_exhausted, on_change
         self.is_broker = options.has_broker
-        self._losses, self._log = _LossCounter(), Throttle(_log)
+        self._losses, self._log = LossCounter(), Throttle(_log)
         self._rejected = 0
         # Where a bound socket was, while events are not taken.
         self._closed_at = ""
         self._not_open = ""
         self._is_retry_over = threading.Event()
-        self._subscriber: Any = self._make_subscriber(options.sub)
+        self._subscriber = self._make_subscriber(options.sub)
 
-    def _make_subscriber(self, address: str) -> Any:
+    def _make_subscriber(self, address: str) -> Subscriber:
         options = self._options
-        if self.is_broker:
-            subscriber = Subscriber(bare(address), self, prefetch=options.prefetch, exhausted=self._exhausted)
-            subscriber.on_connection = lambda is_connected, reason: self._on_change()
-            return subscriber
-        bind = not options.sub.startswith(CONNECT)
-        return ZMQSubscriber(bare(address), self, "", bind, undecoded=True, **_secured(options))
+        subscriber = Subscriber(
+            bare(address),
+            self,
+            bind=not options.sub.startswith(CONNECT),
+            prefetch=options.prefetch,
+            exhausted=self._exhausted,
+            undecoded=True,
+            **({} if self.is_broker else _secured(options)),
+        )
+        subscriber.on_connection = lambda is_connected, reason: self._on_change()
+        return subscriber
 
     # -- as the subscriber's queue ------------------------------------------------------------------------------------
 
-    def put(self, item: Any, *, block: bool = False, timeout: float | None = 0.0) -> None:
+    def put(self, item: Delivery, *, block: bool = False, timeout: float | None = 0.0) -> None:
         """Accept a message; called on the subscriber's thread.
 
         Raises
@@ -152,24 +139,30 @@ class EventInput:
         queue.Full
             There is no room for a broker's event.
         """
-        if self.is_broker:
-            self._accept(_delivered(item), block, timeout)
-            return
-        if len(item) == 1:
-            self._accept(ReceivedEvent(item, None, ""), False, None)
-            return
+        received = self._read(item)
+        if received is not None:
+            self._accept(received, block, timeout)
+
+    def _exhausted(self, item: Delivery) -> None:
+        received = self._read(item)
+        if received is not None:
+            self._on_exhausted(received)
+
+    def _read(self, delivery: Delivery) -> ReceivedEvent | None:
+        """Return the event of a delivery; None if it is no message, which is counted."""
+        if len(delivery.frames) == 1:
+            return ReceivedEvent(delivery, None, self.is_broker)
         try:
-            envelope = EncodedEnvelope.read(item)
+            envelope = EncodedEnvelope.read(delivery.frames)
             check_source(envelope.source)
         except MessageError as error:
             self._rejected += 1
             self._log.warning(error.reason, f"rejected a message ({error.reason}): {error}")
-            return
-        self._losses.follow(envelope)
-        self._accept(ReceivedEvent(envelope.frames, envelope, envelope.id), False, None)
-
-    def _exhausted(self, item: Any) -> None:
-        self._on_exhausted(_delivered(item))
+            delivery.reject(str(error))
+            return None
+        if not self.is_broker:
+            self._losses.add(envelope.source, envelope.epoch, envelope.sequence)
+        return ReceivedEvent(delivery, envelope, self.is_broker)
 
     # -- start and stop -----------------------------------------------------------------------------------------------
 
@@ -183,7 +176,9 @@ class EventInput:
         """
         if self.is_broker:
             # Until this service is ready, other replicas can take the events.
-            open_channel(place_of(bare(self._options.sub))).close()
+            channel = open_channel(bare(self._options.sub))
+            channel.open(None)
+            channel.close()
         else:
             self.start()
 
@@ -204,7 +199,7 @@ class EventInput:
         if self._closed_at:
             self._rejected += sum(self._subscriber.rejected.values())
             self._subscriber, self._closed_at = self._make_subscriber(self._closed_at), ""
-        self._losses.reopen()
+        self._losses.begin()
         self._subscriber.start()
 
     def _retry(self, is_over: threading.Event) -> None:
@@ -259,63 +254,19 @@ class EventInput:
     @property
     def trouble(self) -> str:
         """Why the broker is not connected; empty if it is."""
-        return (self._not_open or self._subscriber.trouble) if self.is_broker else ""
+        return self._not_open or _named(self.address, self._subscriber.trouble) if self.is_broker else ""
 
     def answered(self, ids: Iterable[str]) -> None:
         """Note that other replicas have answered events: they are duplicates if they are delivered again."""
-        self._subscriber.seen(ids)
+        self._subscriber.answered(ids)
 
     def counts(self) -> dict[str, int]:
         """Return ``rejected``, and ``lost`` for a socket, ``duplicates`` and ``reconnects`` for a broker."""
-        rejected = self._subscriber.rejected
+        subscriber, rejected = self._subscriber, self._subscriber.rejected
+        counts = {"rejected": self._rejected + sum(rejected.values()) - rejected[_EXHAUSTED]}
         if self.is_broker:
-            subscriber = self._subscriber
-            own = {"duplicates": subscriber.duplicates, "reconnects": subscriber.reconnects}
-            return {"rejected": sum(rejected.values()) - rejected[_EXHAUSTED], **own}
-        return {"rejected": self._rejected + sum(rejected.values()), "lost": self._losses.total}
-
-
-def _delivered(item: Any) -> ReceivedEvent:
-    """Return an event of a broker."""
-    frames = item.received.frames
-    envelope = EncodedEnvelope.read(frames) if len(frames) > 1 else None
-    return ReceivedEvent(frames, envelope, (envelope.id if envelope else "") or item.received.id, item)
-
-
-class _LossCounter:
-    """Counts the events that were sent and never arrived, by gaps in the sequence numbers of their senders."""
-
-    def __init__(self) -> None:
-        self.total = 0
-        self._opened_ns = 0
-        self._epochs: dict[str, int] = {}
-        self._last: dict[tuple[str, int], int] = {}
-
-    def reopen(self) -> None:
-        """Note that the socket is opened: what was sent before is not lost."""
-        self._opened_ns = time.time_ns()
-        self._epochs.clear()
-        self._last.clear()
-
-    def follow(self, envelope: EncodedEnvelope) -> None:
-        """Count the numbers that are missing before this one."""
-        number = envelope.sequence
-        if number == 0:
-            return
-        source = (envelope.source, envelope.epoch)
-        last = self._last.pop(source, None)
-        if last is None:
-            # A source that is known and has begun anew while this end listened has sent from number 1 on.
-            known = self._epochs.get(envelope.source)
-            self._epochs[envelope.source] = max(envelope.epoch, known or 0)
-            has_restarted = known is not None and envelope.epoch > max(known, self._opened_ns)
-            last = 0 if has_restarted else number - 1
-        self.total += max(number - last - 1, 0)
-        self._last[source] = max(last, number)
-        if len(self._last) > _MAX_SOURCES:
-            oldest = next(iter(self._last))
-            del self._last[oldest]
-            self._epochs.pop(oldest[0], None)
+            return {**counts, "duplicates": subscriber.duplicates, "reconnects": subscriber.reconnects}
+        return {**counts, "lost": sum(self._losses.lost.values())}
 
 
 class AnswerOutput:
@@ -332,19 +283,13 @@ class AnswerOutput:
     """
 
     def __init__(self, address: str, options: Options, on_change: Callable[[], object]) -> None:
-        self._address, self._options, self._on_change = address, options, on_change
-        self.is_broker = is_brokered(bare(address))
-        self._epoch, self._sequences, self._rejected = time.time_ns(), Counter[str](), Counter[str]()
-        self._items = Mailbox("drop_oldest", _MAX_KEPT_ANSWERS)
-        self._publisher: Any = self._make_publisher()
-
-    def _make_publisher(self) -> Any:
-        if self.is_broker:
-            place = place_of(bare(self._address))
-            return Outbox(place, tell=lambda is_connected, reason: self._on_change())
-        bind, mark = not self._address.startswith(CONNECT), _MAX_KEPT_ANSWERS
-        secured = _secured(self._options)
-        return ZMQPublisher(bare(self._address), self._items, "", bind, high_water_mark=mark, **secured)
+        self._address = address
+        bind, mark = not address.startswith(CONNECT), _MAX_KEPT_ANSWERS
+        self._publisher = Publisher(bare(address), bind=bind, high_water_mark=mark)
+        self.is_broker = self._publisher.place.is_broker
+        if not self.is_broker:
+            self._publisher = Publisher(bare(address), bind=bind, high_water_mark=mark, **_secured(options))
+        self._publisher.on_connection = lambda is_connected, reason: on_change()
 
     def start(self) -> None:
         """Open it.
@@ -354,10 +299,6 @@ class AnswerOutput:
         AddressError, BrokerError
             The address can't be bound; the broker can't be reached, refuses, or has no such queue.
         """
-        if self.is_broker and not self._publisher.is_alive():
-            self._publisher = self._make_publisher()
-        self._epoch = time.time_ns()
-        self._sequences.clear()
         self._publisher.start()
 
     def stop(self, timeout_s: float) -> None:
@@ -366,54 +307,25 @@ class AnswerOutput:
 
     def publish(self, answer: EncodedEnvelope | bytes, id: str, confirmed: Confirmed) -> None:  # noqa: A002
         """Publish an answer under an id; returns at once. A ZeroMQ socket confirms what it has taken."""
-        frames: tuple[bytes | memoryview, ...]
-        if isinstance(answer, EncodedEnvelope):
-            try:
-                check_source(answer.source)
-            except MessageError as error:
-                confirmed(error)
-                return
-            number = self._sequences[answer.source] + 1
-            frames = answer.stamped(self._epoch, number, time.time_ns()).frames
-        else:
-            frames = (answer,)
-        refusal = self._send(frames, id, confirmed)
-        if refusal is None and isinstance(answer, EncodedEnvelope):
-            # Counted when it can be sent: what is refused here is no loss on the way.
-            self._sequences[answer.source] = number
-        if refusal is not None or not self.is_broker:
-            confirmed(refusal)
-
-    def _send(self, frames: tuple[bytes | memoryview, ...], id: str, confirmed: Confirmed) -> Exception | None:  # noqa: A002
-        """Send frames; return why they can't be sent."""
-        publisher = self._publisher
-        if self.is_broker:
-            if publisher.waiting < _MAX_UNCONFIRMED:
-                publisher.put(frames, id=id, then=confirmed)
-                return None
+        if self.is_broker and self._publisher.waiting >= _MAX_UNCONFIRMED:
             # Events that no broker keeps may be any number.
             text = f"{self.address} has not taken {_MAX_UNCONFIRMED} messages before this one. {self.trouble}"
-            return BrokerError(self.address, text)
-        sent = publisher.sent
-        # Sent within put, on this thread.
-        self._items.put(frames)
-        if publisher.sent > sent:
-            return None
-        rejected, before = publisher.rejected, self._rejected
-        self._rejected = rejected
-        return MessageError("not sent", f"The answer could not be sent: {', '.join(rejected - before)}.")
+            confirmed(BrokerError(self.address, text))
+            return
+        try:
+            self._publisher.send(answer, id=id, confirmed=confirmed)
+        except EpypesError as error:
+            confirmed(error)
 
     @property
     def address(self) -> str:
         """Where it publishes, without a password; ``connect:`` in front where it connects."""
-        if self.is_broker:
-            return str(self._publisher.place)
         return self._address if self._address.startswith(CONNECT) else str(self._publisher.address)
 
     @property
     def trouble(self) -> str:
         """Why the broker is not connected; empty if it is."""
-        return str(self._publisher.trouble) if self.is_broker else ""
+        return _named(self.address, self._publisher.trouble) if self.is_broker else ""
 
     @property
     def slow_subscribers(self) -> int:
@@ -488,6 +400,11 @@ class Endpoints:
 
 def _stop(endpoint: EventInput | AnswerOutput, until_s: float, shares: int) -> None:
     endpoint.stop(max((until_s - monotonic()) / shares, _MIN_CLOSE_S))
+
+
+def _named(address: str, trouble: str) -> str:
+    """Return why a broker is not connected, with its address."""
+    return trouble if not trouble or address in trouble else f"{address}: {trouble}"
 
 
 def _secured(options: Options) -> Mapping[str, Any]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
 from epypes.errors import ServiceError
-from epypes.transport.channels import Place, is_brokered, place_of
+from epypes.transport.address import Address, is_broker, parse_address
 
 if TYPE_CHECKING:
     from epypes.transport.zeromq.curve import Keys, PublicKey
@@ -68,12 +68,12 @@ class Options:
     @property
     def has_broker(self) -> bool:
         """Whether events come from a broker, which keeps each until it is answered."""
-        return is_brokered(bare(self.sub))
+        return is_broker(bare(self.sub))
 
     @property
     def is_confirmed(self) -> bool:
         """Whether a broker confirms an answer, or the end of an event."""
-        return self.has_broker or is_brokered(bare(self.pub))
+        return self.has_broker or is_broker(bare(self.pub))
 
     @property
     def shows_failures(self) -> bool:
@@ -118,11 +118,11 @@ class Options:
             text = f"A broker keeps what waits, so mailbox {self.mailbox_policy!r} drops nothing. Leave that out."
             raise ServiceError(path, text)
         # ZeroMQ would show an address that it does not know, with the password in it.
-        known_places = [place_of(bare(each)) for each in (self.sub, self.pub, self.failures) if _is_checked(each)]
-        if self.has_broker and any(_is_same(known_places[0], place) for place in known_places[1:]):
+        addresses = [parse_address(bare(each)) for each in (self.sub, self.pub, self.failures) if _is_checked(each)]
+        if self.has_broker and any(_is_same(addresses[0], place) for place in addresses[1:]):
             text = (
                 f"The answers of a service would be its next events: --sub and another address are the same, "
-                f"{known_places[0]}. Give answers and failures addresses of their own."
+                f"{addresses[0]}. Give answers and failures addresses of their own."
             )
             raise ServiceError(path, text)
 
@@ -131,7 +131,7 @@ def _is_checked(address: str) -> bool:
     return "://" in address and not bare(address).startswith("inproc:")
 
 
-def _is_same(one: Place, other: Place) -> bool:
+def _is_same(one: Address, other: Address) -> bool:
     """Whether what is sent to one address of a broker comes out of another."""
     return all(getattr(one, name) == getattr(other, name) for name in ("scheme", "host", "port", "vhost", "name"))
 

@@ -15,7 +15,7 @@ import epypes as ep
 from epypes.acquisition import write_image
 from epypes.errors import KeysError, ServiceError
 from epypes.service import Service, call
-from epypes.service.failures.news import failures_from_now_on
+from epypes.service.failures.source import follow_failures
 from epypes.service.state_file import StateLock
 from epypes.transport import make_keys, read_keys, recording_info
 from tests.transport.peers import wait_until
@@ -144,7 +144,7 @@ def test_an_address_that_other_machines_reach_needs_keys(epypes, bundle, option)
 @pytest.mark.slow
 def test_the_failures_socket_is_guarded_too(guarded, bundle, keys):
     own = {"keys": keys / "known" / "caller", "allow": keys / "service.key"}
-    heard = failures_from_now_on(bundle, **own)
+    heard = follow_failures(bundle, **own)
     assert next(heard) is None
     requests = queue.SimpleQueue()
     with ep.ZMQPublisher(guarded.service_state.sub, requests, bind=False, **own) as publisher:
@@ -210,7 +210,7 @@ def test_a_stranger_that_knocks_is_counted_by_its_key(guarded, keys):
     own = {"keys": keys / "stranger", "allow": keys / "service.key"}
     stranger = read_keys(keys / "stranger").public
     with ep.ZMQSubscriber(guarded.service_state.pub, queue.SimpleQueue(), **own):
-        wait_until(lambda: guarded._endpoints.answers._publisher.refused[stranger], WAIT_S)
+        wait_until(lambda: guarded._sockets.answers.publisher.refused[stranger], WAIT_S)
 
 
 def test_a_key_file_that_is_none_is_named(bundle, keys, tmp_path):

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import queue
 from contextlib import contextmanager
 
@@ -11,9 +10,10 @@ import epypes as ep
 from epypes.errors import AddressError, BrokerError, BundleError, ServiceError
 from epypes.service import Service
 from epypes.store import Store
-from epypes.transport.channels import memory, open_channel, place_of
-from epypes.transport.receiving import Subscriber
-from epypes.transport.sending import Publisher
+from epypes.transport import memory
+from epypes.transport.address import parse_address
+from epypes.transport.publisher import Publisher
+from epypes.transport.subscriber import Subscriber
 from epypes.wire import Envelope
 from tests.service.served import TIMEOUT_S, acting_bundle, event, until
 
@@ -50,23 +50,25 @@ class Line:
         return found
 
     def left(self, name="events"):
-        """How many messages the broker has in a queue, that nobody has in hand."""
-        broker = memory._broker(self.host)
-        return len(broker.queues.get(name, ()))
-
-    def held(self):
-        """How many messages somebody has in hand."""
-        channels = memory._broker(self.host).channels
-        return sum(len(channel._held) for channel in channels if channel._place.name == "events")
+        """How many messages wait in a queue of the broker and are not delivered."""
+        return len(memory.queued(f"memory://{self.host}/{name}"))
 
     def dead(self):
-        channel = open_channel(place_of(self.sub).dead_letters)
-        try:
-            letter = channel.receive(TIMEOUT_S)
-            letter.ack()
-            return letter
-        finally:
-            channel.close()
+        return delivered(parse_address(self.sub).dead_letters, lambda letter: letter.ack())
+
+
+def delivered(address, settle=lambda delivery: None):
+    """Take one message of an address; without being settled it is delivered again."""
+    found = queue.Queue()
+    with Subscriber(address, found, undecoded=True, prefetch=1):
+        delivery = found.get(timeout=TIMEOUT_S)
+        settle(delivery)
+    return delivery
+
+
+def send_raw(address, frames, known_as):
+    with Publisher(address) as publisher:
+        publisher.send(frames, id=known_as)
 
 
 @contextmanager
@@ -109,29 +111,29 @@ def check(counts):
 
 
 def test_an_event_is_acknowledged_when_its_answer_has_arrived(lasting, more):
-    line, _ = lasting
+    line, service = lasting
     sent = [line.send(number=number) for number in range(20)]
     answers = line.take(20)
     assert [answer.correlation_id for answer in answers] == sent
     assert [answer.parts["out"] for answer in answers] == [2 * number for number in range(20)]
-    assert [answer.received.id for answer in answers] == sent, "so that one that comes twice is told"
+    assert [answer.delivery.id for answer in answers] == sent, "so that a duplicate is detected"
     until(lambda: more("answered") == 20)
-    until(lambda: line.held() == 0)
+    until(lambda: service.counts()["in_flight"] == 0)
     assert (line.left(), more("redelivered"), more("given_back")) == (0, 0, 0)
 
 
 def test_a_failed_event_is_answered_and_done(lasting, more):
-    line, _ = lasting
+    line, service = lasting
     line.send("fail:no", 1)
     (answer,) = line.take()
     assert (answer.failure.function, answer.failure.message.partition(" | ")[0]) == ("act", "no")
     until(lambda: more("failed") == 1)
-    until(lambda: line.held() == 0)
+    until(lambda: service.counts()["in_flight"] == 0)
     assert (line.left(), line.left("events.dead")) == (0, 0)
 
 
 def test_an_event_that_kills_the_worker_again_and_again_is_a_dead_letter_of_the_broker_too(lasting, more):
-    line, _ = lasting
+    line, service = lasting
     sent = line.send("exit", 1)
     (answer,) = line.take()
     assert answer.failure.input_id == sent
@@ -139,26 +141,25 @@ def test_an_event_that_kills_the_worker_again_and_again_is_a_dead_letter_of_the_
     dead = line.dead()
     assert "It is put aside" in dead.headers["epypes-reason"]
     assert dead.id == sent
-    until(lambda: line.held() == 0)
+    until(lambda: service.counts()["in_flight"] == 0)
     assert line.left() == 0
 
 
 def test_no_replica_takes_a_dead_letter_of_another_for_done(lasting, more):
     """The broker may not have heard of it: whoever is delivered it again must put it aside, and not acknowledge it."""
     line, _ = lasting
-    channel = open_channel(place_of(line.sub).beside("group", "broadcast"))
-    assert channel.receive(0) is None
-    dead = line.send("exit", 1)
-    line.take()
-    until(lambda: more("dead_letters") == 1)
-    assert line.dead().id == dead
-    done = line.send()
-    line.take()
-    said = []
-    while not any(done in ids for ids in said):
-        said.append(json.loads(b"".join(channel.receive(TIMEOUT_S).frames)).get("ids", ()))
-    channel.close()
-    assert not any(dead in ids for ids in said)
+    heard = queue.Queue()
+    with Subscriber(parse_address(line.sub).beside("group", "broadcast"), heard, undecoded=True):
+        dead = line.send("exit", 1)
+        line.take()
+        until(lambda: more("dead_letters") == 1)
+        assert line.dead().id == dead
+        done = line.send()
+        line.take()
+        texts = []
+        while not any(done in text for text in texts):
+            texts.append(b"".join(heard.get(timeout=TIMEOUT_S).frames).decode())
+    assert not any(dead in text for text in texts)
 
 
 def test_an_event_that_was_delivered_too_often_is_put_aside_and_can_be_opened(acting, host):
@@ -166,9 +167,7 @@ def test_an_event_that_was_delivered_too_often_is_put_aside_and_can_be_opened(ac
         sent = line.send("plain", 7)
         for _ in range(3):
             # As a replica that dies of it.
-            channel = open_channel(line.sub)
-            assert channel.receive(TIMEOUT_S).id == sent
-            channel.close()
+            assert delivered(line.sub).id == sent
         with replica_of(acting, line) as service:
             (answer,) = line.take()
             assert "delivered 3 times before, and never answered" in answer.failure.message
@@ -326,31 +325,26 @@ def test_an_answer_that_its_broker_never_took_is_no_answered_event(acting, host,
 def test_an_answer_that_can_never_be_sent_is_answered_as_a_failure(lasting, more, monkeypatch):
     from epypes.errors import MessageError
 
-    send = memory.MemoryChannel.send
-
-    def refusing(channel, frames, *, id="", headers=None):  # noqa: A002
-        if "answers" in str(channel._place) and not refused:
-            refused.append(id)
+    def refusing(session, message):
+        if "answers" in str(session.address) and not refused:
+            refused.append(message.id)
             raise MessageError("too large", "The broker takes no message of that size.")
-        send(channel, frames, id=id, headers=headers)
 
     refused = []
-    monkeypatch.setattr(memory.MemoryChannel, "send", refusing)
-    line, _ = lasting
+    monkeypatch.setattr(memory.MemorySession, "check", refusing)
+    line, service = lasting
     sent = line.send()
     (answer,) = line.take()
     assert (answer.failure.function, answer.failure.input_id) == ("f_out", sent)
     assert "no message of that size" in answer.failure.message
     until(lambda: more("failed") == 1)
-    until(lambda: line.held() == 0)
+    until(lambda: service.counts()["in_flight"] == 0)
     assert line.left() == 0
 
 
 def test_an_event_of_another_program_is_said_to_be_unreadable(lasting, more, caplog):
     line, _ = lasting
-    channel = open_channel(line.sub)
-    channel.send([b"no envelope"], id="foreign")
-    channel.close()
+    send_raw(line.sub, (b"no envelope",), "foreign")
     line.take()
     until(lambda: more("failed") == 1)
     assert "event foreign could not be read (f_in): " in caplog.text
@@ -358,9 +352,7 @@ def test_an_event_of_another_program_is_said_to_be_unreadable(lasting, more, cap
 
 def test_what_is_no_event_is_rejected_and_counted(lasting, more):
     line, _ = lasting
-    channel = open_channel(line.sub)
-    channel.send([b"a", b"b", b"c"], id="odd")
-    channel.close()
+    send_raw(line.sub, (b"a", b"b", b"c"), "odd")
     until(lambda: more("rejected") == 1)
     assert line.dead().id == "odd"
     assert more("received") == 0
@@ -413,12 +405,10 @@ def test_passwords_are_in_nothing_that_a_service_says(acting, host, caplog):
 
 def test_bytes_are_answered_under_the_id_of_their_message(lasting, more):
     line, _ = lasting
-    channel = open_channel(line.sub)
-    channel.send([b"what is this?"], id="of-2019")
-    channel.close()
+    send_raw(line.sub, (b"what is this?",), "of-2019")
     answer = line.answers.get(timeout=TIMEOUT_S)
     assert isinstance(answer, Envelope)
-    assert answer.received.id == "of-2019"
+    assert answer.delivery.id == "of-2019"
     answer.ack()
     until(lambda: more("failed") == 1)
 
@@ -464,7 +454,7 @@ def test_a_service_that_can_no_longer_work_leaves_its_events_to_others_until_ano
 
 
 def test_the_doctor_looks_whether_a_broker_has_a_place_and_shows_no_password(host):
-    from epypes.service.doctor import examine
+    from epypes.service.ops.doctor import examine
 
     given = [f"memory://robot:hush@{name}" for name in ("gone/events", f"{host}/events", f"{host}/events?create=true")]
     with memory.away("gone"):
@@ -495,9 +485,7 @@ def test_rows_of_events_say_who_had_them_and_how_often_they_were_delivered(actin
     database = tmp_path / "rows.db"
     with line_of(host) as line:
         line.send(number=1)
-        channel = open_channel(line.sub)
-        channel.receive(TIMEOUT_S)
-        channel.close()
+        delivered(line.sub)
         with replica_of(acting, line, replica="left", store=str(database)) as service:
             line.take()
             until(lambda: service.counts()["answered"] == 1)

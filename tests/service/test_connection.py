@@ -1,17 +1,22 @@
-"""Is a running service found, looked at and changed from a notebook, and is every reason why not a sentence?"""
+"""A running service is found, read and changed from a notebook; every refusal is a sentence with a way out."""
 
 from __future__ import annotations
 
 import http.server
+import json
 import threading
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
 import epypes as ep
 from epypes.errors import NotComputed, ParametersRefused, RevisionConflict, ServiceError
+from epypes.graph import colour_order
+from epypes.graph.hinted import annotated_params
 from epypes.service.state_file import StateLock
 from tests.conftest import EDGE_FUNCTIONS, EDGE_HPARAMS, EDGE_IO
+from tests.service.served import until
 from tests.service.standing import Standing, standing
 
 TIMEOUT_S = 60.0
@@ -33,6 +38,16 @@ def server(service):
 def connection(server):
     with ep.connect(server.url, token=server.token) as connection:
         yield connection
+
+
+@contextmanager
+def runner_following(runner):
+    """Have a remote runner follow the events of its service."""
+    heard = threading.Event()
+    forget = runner.watch(heard.set)
+    assert heard.wait(TIMEOUT_S)
+    yield
+    forget()
 
 
 @pytest.mark.parametrize(
@@ -143,6 +158,45 @@ def test_values_of_the_last_run_come_as_they_are(connection, service, photograph
 def test_the_addresses_of_the_line_are_told(connection, service):
     assert (connection.addresses.sub, connection.addresses.pub) == ("tcp://127.0.0.1:1", "tcp://127.0.0.1:2")
     assert connection.addresses.failures == ""
+
+
+def test_the_graph_to_tune_has_the_ranges_of_the_service_and_its_functions_refuse_to_be_called(connection):
+    cg = connection.to_tune().cg
+    assert cg.func_inputs("canny") == ("image_blurred", "canny_lo", "canny_hi")
+    (param,) = annotated_params(cg, "blur_kernel")
+    assert (param.low, param.high, param.odd) == (1, 31, True)
+    assert colour_order(cg, "image") == "bgr"
+    with pytest.raises(ServiceError, match="'canny' runs in the service at http://.*, not here"):
+        cg.functions["canny"](1, 2, 3)
+
+
+@pytest.mark.slow
+def test_colours_of_the_service_are_those_of_the_graph_to_tune(service, server):
+    view = json.loads(service.view())
+    for token in view["tokens"]:
+        token["order"] = "rgb" if token["name"] == "image" else token.get("order")
+    service.view = lambda: json.dumps(view).encode()
+    with ep.connect(server.url) as connection:
+        assert colour_order(connection.to_tune().cg, "image") == "rgb"
+
+
+@pytest.mark.slow
+def test_runs_of_the_service_are_runs_with_its_values_times_and_revision(connection, service, photograph):
+    service.event(image=photograph)
+    runner = connection.to_tune()
+    assert np.array_equal(runner.last["edges"], service.completed[0]["edges"])
+    run = runner.trial({"canny_lo": 60}, "edges")
+    assert (run.revision, run.hyperparameters["canny_lo"], run.first_hyperparameters["canny_lo"]) == (1, 60, 70)
+    assert set(run.report.durations_ns) == set(runner.cg.functions)
+    assert runner.adopt(run)
+    assert runner.last is run
+    service.event(image="no image")
+    with runner_following(runner):
+        service.event(image="no image")
+        until(lambda: runner.trial({}, "edges").failure is not None)
+    failed = runner.trial({}, "edges")
+    assert failed.failure.function == "grayscale"
+    assert set(failed) & {"image_gray", "edges"} == set()
 
 
 def test_what_happens_is_told_as_it_happens(connection, service, photograph):

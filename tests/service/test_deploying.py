@@ -12,7 +12,7 @@ import pytest
 from epypes.bundle.seal import check_seal, seal
 from epypes.errors import DeployRefused, ServiceError, UnknownName
 from epypes.service import Service
-from epypes.service.failures.source import failures_of, found_by
+from epypes.service.failures.source import failures_of, find_failure
 from epypes.service.state_file import read_state
 from tests.service.processes import run_cli, running
 from tests.service.served import SOURCE, acting_bundle, serving, until
@@ -44,10 +44,10 @@ def test_failures_of_a_bundle_that_was_deployed_are_found_by_its_path_and_by_the
         assert service.failure_store.flush()
     (record,) = failures_of(better).records()
     assert record.message == "here"
-    assert found_by(failures_of(better), failure.input_id) == record
+    assert find_failure(failures_of(better), failure.input_id) == record
     assert failures_of(better).event(record.id).id == failure.input_id
     with pytest.raises(UnknownName):
-        found_by(failures_of(better), "0" * 32)
+        find_failure(failures_of(better), "0" * 32)
 
 
 def test_values_that_were_written_back_are_those_of_the_bundle_that_is_served(own, better, caplog):
@@ -85,12 +85,17 @@ def test_values_that_were_written_back_are_those_of_the_bundle_that_is_served(ow
         assert any(line.startswith(begin) for line in lines), begin
 
 
-def test_the_state_file_has_the_digest_of_what_is_served(acting, better):
+def test_a_service_is_found_by_the_bundle_it_was_started_with_and_by_the_one_that_was_deployed(acting, better):
     with running(acting, "--http", "127.0.0.1:0"):
         state = read_state(acting)
+        assert "No service of yours runs" in run_cli("status", better).stderr
         done = run_cli("deploy", better, "--http", state.http)
         assert "k 2 -> 3" in done.stdout
         until(lambda: read_state(acting).digest == check_seal(better))
+        for bundle in (acting, better):
+            assert run_cli("status", bundle).stdout.startswith(f"READY {better}")
+            answered = run_cli("call", bundle, 'what="plain"', "number=5")
+            assert answered.stdout.startswith("out = 15"), answered.stderr
 
 
 def test_the_child_of_a_function_that_forks_does_not_go_on_as_a_worker(tmp_path):

@@ -1,4 +1,4 @@
-"""Does the doctor see what is wrong, and say what helps?"""
+"""The doctor sees what is wrong, and says what helps."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from importlib import metadata
 import pytest
 
 from epypes.cli import main
-from epypes.service.doctor import examine
+from epypes.service.ops.doctor import examine
 from epypes.transport import make_keys
 
 pytestmark = pytest.mark.slow
@@ -49,13 +49,13 @@ def test_what_is_no_address_is_told():
 def test_keys_that_others_can_read_and_keys_that_are_not_there_are_told(tmp_path):
     make_keys(tmp_path / "camera")
     secret = tmp_path / "camera.key_secret"
-    assert found(f"keys {secret}", keys=[secret]).outcome == "ok"
-    secret.chmod(0o644)
-    check = found(f"keys {secret}", keys=[secret])
-    assert check.outcome == "failed"
-    assert "chmod 600" in check.way_out + check.found or "others" in check.found
-    missing = tmp_path / "none.key_secret"
-    assert found(f"keys {missing}", keys=[missing]).outcome == "failed"
+    make_keys(tmp_path / "robot")
+    opened, missing = tmp_path / "robot.key_secret", tmp_path / "none.key_secret"
+    opened.chmod(0o644)
+    checks = {check.name: check for check in examine(keys=[secret, opened, missing])}
+    assert checks[f"keys {secret}"].outcome == "ok"
+    assert (checks[f"keys {opened}"].outcome, checks[f"keys {missing}"].outcome) == ("failed", "failed")
+    assert "chmod 600" in checks[f"keys {opened}"].way_out + checks[f"keys {opened}"].found
 
 
 def test_a_missing_or_old_package_is_named_with_the_extra_that_brings_it(monkeypatch):

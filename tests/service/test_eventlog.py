@@ -1,4 +1,4 @@
-"""Is there a row of each event that a service has resolved, and does the service go on without its database?"""
+"""A row of each event that a service has resolved, also while its database is away."""
 
 from __future__ import annotations
 

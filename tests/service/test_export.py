@@ -1,4 +1,4 @@
-"""Do the unit and the container say what a machine needs?"""
+"""Systemd units and container folders have what a machine needs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import epypes as ep
 from epypes.bundle.seal import check_seal
 from epypes.cli import main
 from epypes.errors import BundleError, ServiceError
-from epypes.service.export import systemd_unit, unit_name, write_container
+from epypes.service.ops.export import systemd_unit, unit_name, write_container
 
 SYSTEMD = shutil.which("systemd-analyze")
 

@@ -1,4 +1,4 @@
-"""Are failures kept, whatever the disk, the storm or the neighbour does, and can they be had again?"""
+"""Failures are kept and read again, whatever the disk, a storm of failures or another service does."""
 
 from __future__ import annotations
 
@@ -15,9 +15,7 @@ import numpy as np
 import pytest
 
 from epypes.errors import FailureNotKept, UnknownName
-from epypes.service.failures.files import Entry, to_remove
-from epypes.service.failures.pace import Waiting
-from epypes.service.failures.record import ID, FailureRecord, record_of, with_id
+from epypes.service.failures.record import FailureRecord
 from epypes.service.failures.store import FailureStore, failures_folder
 from epypes.wire import Envelope
 
@@ -68,34 +66,28 @@ def test_records_come_newest_first_and_as_many_as_asked_for(store):
     assert [record.id for record in store.records()] == ids[::-1]
     assert [record.id for record in store.records(2)] == ids[:2:-1]
     assert sorted(ids) == ids
-    assert all(ID.fullmatch(found) for found in ids)
 
 
-def test_ids_of_many_threads_are_unique_and_rise_when_the_clock_goes_back():
-    with ThreadPoolExecutor(8) as pool:
-        found = list(pool.map(lambda _: with_id(FAILED).id, range(4_000)))
-    assert len(set(found)) == 4_000
-    later, earlier = with_id(replace(FAILED, when_ns=time_ns())).id, with_id(replace(FAILED, when_ns=1)).id
-    assert later < earlier
-
-
-def test_handing_over_waits_for_no_disk(store):
-    store.folder.parent.mkdir(parents=True, exist_ok=True)
-    # A named pipe in the place of the part of a file: to open it for writing waits until somebody reads.
-    store.folder.mkdir()
-    first = with_id(FAILED)
+@pytest.fixture
+def held_disk(store):
+    """A disk that writes nothing until the returned function is called: the part of the first file is a named pipe."""
+    first = FailureStore(store.folder.parent / "ids").keep(FAILED)
+    store.folder.mkdir(parents=True)
+    # To open a named pipe for writing waits until it is read.
     pipe = store.folder / f".{first.id}.event.{os.getpid()}.part"
     os.mkfifo(pipe)
-    began = monotonic()
     store.keep(first, b"held")
-    store.keep(FAILED, b"waits")
-    assert monotonic() - began < 60
-    assert not store.flush(0.2), "the disk answers nobody"
-    reader = os.open(pipe, os.O_RDONLY)
-    try:
-        assert store.flush(10)
-    finally:
+    readers = []
+    yield lambda: readers.append(os.open(pipe, os.O_RDONLY))
+    for reader in readers:
         os.close(reader)
+
+
+def test_handing_over_waits_for_no_disk(store, held_disk):
+    store.keep(FAILED, b"waits")
+    assert not store.flush(0.2), "the disk answers nobody"
+    held_disk()
+    assert store.flush(60)
 
 
 def test_a_storm_keeps_its_first_failures_and_the_newest_and_counts_the_others(store):
@@ -108,30 +100,6 @@ def test_a_storm_keeps_its_first_failures_and_the_newest_and_counts_the_others(s
     counts = store.counts()
     assert counts["kept"] == len(found)
     assert counts["kept"] + counts["skipped"] == 501
-
-
-def test_what_waits_is_bounded_for_any_number_of_causes():
-    waiting, given_way = Waiting(), 0
-    for number in range(1_000):
-        given_way += waiting.add(number % 40, number, 0.0)
-    assert len(waiting) <= 36
-    taken = []
-    while (item := waiting.take(0.0, at_once=True)) is not None:
-        taken.append(item)
-    assert len(taken) + given_way == 1_000
-    assert taken[0] == 0
-    assert 999 in taken
-
-
-def test_the_newest_of_a_storm_is_due_within_a_second():
-    waiting = Waiting(burst=2)
-    for number in range(5):
-        waiting.add("x", number, 0.0)
-    assert [waiting.take(0.0) for _ in range(3)] == [0, 1, None]
-    assert waiting.due_in_s(0.25) == pytest.approx(0.75)
-    assert waiting.take(0.5) is None
-    assert waiting.take(1.01) == 4
-    assert waiting.due_in_s(1.01) is None
 
 
 def test_no_more_are_kept_than_asked_for_and_how_a_storm_began_can_be_seen(tmp_path):
@@ -221,15 +189,14 @@ def test_files_of_others_are_left_alone_and_damaged_ones_are_counted_and_told(tm
     (good,) = kept(store, b"good")
     (tmp_path / "notes.json").write_text("mine")
     (tmp_path / "sub").mkdir()
-    names = [with_id(FAILED).id for _ in range(6)]
-    bad = [
-        b"", b"{", b"[" * 100_000, b"null", b'{"record": {"id": 3}}',
-        json.dumps({"record": asdict(replace(FAILED, id=good.id))}).encode(),
-    ]  # fmt: skip
+    wrong = [{"id": good.id}, {"attempt": "1"}, {"tokens": "image"}, {"hyperparameters": []}, {"id": "../../etc"}]
+    bad = [b"", b"{", b"[" * 100_000, b"null"]
+    bad += [json.dumps({"record": asdict(FAILED) | each}).encode() for each in wrong]
+    names = [good.id[:-2] + f"{number:02}" for number in range(len(bad))]
     for name, text in zip(names, bad, strict=True):
         (tmp_path / f"{name}.json").write_bytes(text)
     assert [record.id for record in store.records()] == [good.id]
-    assert store.counts()["unreadable"] == 6
+    assert store.counts()["unreadable"] == len(bad)
     for name in names:
         with pytest.raises(FailureNotKept, match=f"{name}.json can't be read"):
             store.record(name)
@@ -279,7 +246,7 @@ def test_two_services_share_a_folder(tmp_path):
 
 def test_what_a_killed_service_has_begun_is_removed_when_it_is_old(store):
     kept(store, b"x")
-    name = with_id(FAILED).id
+    name = "0" * 14
     old = [store.folder / f".{name}.json.1.part", store.folder / f"{name}.event"]
     young = store.folder / f".{name}.event.2.part"
     for path in (*old, young):
@@ -300,31 +267,53 @@ def test_no_thread_stays_when_nothing_waits(store):
         never.wait(0.005)
 
 
-def test_the_failures_that_go_first_are_damaged_ones_then_the_middle_of_a_storm_then_the_oldest():
-    present = [Entry(str(number), True, 10) for number in range(8)]
-    causes = dict.fromkeys("0123456", "storm") | {"0": None, "6": "other", "7": "third"}
-    assert list(to_remove(present, causes, 3, 1_000)) == ["0", "4", "5", "1", "2"]
-    assert list(to_remove(present, causes, 10, 65)) == ["0", "4"]
-    assert list(to_remove(present, causes, 10, 0)) == ["0", "4", "5", "1", "2", "3", "6", "7"]
-
-
-def test_a_record_survives_json_and_anything_else_is_refused():
-    record = with_id(replace(FAILED, message="\ud800 half of a pair", trace=("\x00",)))
-    assert record_of(json.loads(json.dumps(asdict(record)))) == record
-    assert record_of({**asdict(record), "of a later version": 1}) == record
-    for wrong in ({"attempt": "1"}, {"tokens": "image"}, {"hyperparameters": []}, {"id": "../../etc"}, {"id": ""}):
-        with pytest.raises(ValueError, match="is"):
-            record_of({**asdict(record), **wrong})
-
-
-def test_long_texts_are_cut():
-    record = with_id(replace(FAILED, message="x" * 10**6, trace=("y" * 10**5,) * 1_000))
-    assert len(json.dumps(asdict(record))) < 500_000
-    assert len(record.trace) == 200
-
-
 def test_each_bundle_has_a_folder_in_the_users_state(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     one, other = failures_folder(tmp_path / "a"), failures_folder(tmp_path / "b")
     assert one.parent == other.parent == tmp_path / "epypes" / "failures"
     assert one != other == failures_folder(tmp_path / "a" / ".." / "b")
+
+
+def test_ids_of_many_threads_are_unique_and_rise_when_the_clock_goes_back(store):
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda _: store.keep(FAILED).id, range(400)))
+    assert len(set(found)) == 400
+    later = store.keep(replace(FAILED, when_ns=time_ns())).id
+    assert later < store.keep(replace(FAILED, when_ns=1)).id
+    assert store.flush(60)
+
+
+def test_what_waits_in_memory_is_bounded_for_any_number_of_causes(store, held_disk):
+    records = [store.keep(replace(FAILED, function=str(number % 40)), b"x") for number in range(400)]
+    held_disk()
+    assert store.flush(60)
+    counts = store.counts()
+    assert counts["kept"] + counts["skipped"] == 401
+    assert counts["kept"] <= 40
+    assert store.records()[0].id == records[-1].id
+
+
+def test_a_full_disk_writes_one_line_to_the_log_whatever_fails(tmp_path, caplog):
+    (tmp_path / "taken").write_text("a file")
+    store = FailureStore(tmp_path / "taken" / "failures")
+    for _ in range(20):
+        store.keep(FAILED, b"x")
+        assert store.flush(60)
+    assert store.counts()["unwritten"] == 20
+    assert caplog.text.count("can't be written") == 1
+
+
+def test_a_record_is_read_as_it_was_written_and_keys_of_later_versions_are_left_out(store):
+    odd = replace(FAILED, message="\ud800 half of a pair", trace=("\x00",))
+    (record,) = kept(store, b"x", record=odd)
+    path = store.folder / f"{record.id}.json"
+    document = json.loads(path.read_text())
+    document["record"]["of a later version"] = 1
+    path.write_text(json.dumps(document))
+    assert store.record(record.id) == replace(record, has_event=True)
+
+
+def test_long_texts_are_cut(store):
+    (record,) = kept(store, b"x", record=replace(FAILED, message="x" * 10**6, trace=("y" * 10**5,) * 1_000))
+    assert (store.folder / f"{record.id}.json").stat().st_size < 500_000
+    assert len(store.record(record.id).trace) == 200

@@ -1,4 +1,4 @@
-"""Does an event that failed in a service open again, at the function that failed, and does it fail again?"""
+"""An event that failed in a service opens again at the function that failed, and is run again in a process of its own."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from epypes.errors import BundleError, FailureNotKept, NotComputed, RemoteFailur
 from epypes.service import Service
 from epypes.service.failures.record import FailureRecord
 from epypes.service.failures.reproduce import reproduce
-from epypes.service.failures.source import failures_of, found_by
+from epypes.service.failures.source import failures_of, find_failure
 from epypes.service.failures.store import FailureStore, failures_folder
 from epypes.service.http import HttpServer
 from epypes.wire import Envelope
@@ -147,17 +147,17 @@ def test_the_bundle_that_failed_is_taken_from_where_it_was_served(copy, bright_b
         ep.load_failure(failure, copy)
 
 
-def test_failures_are_found_by_how_their_id_begins_or_ends_and_by_latest(bright_bundle):
+def test_failures_are_find_failure_how_their_id_begins_or_ends_and_by_latest(bright_bundle):
     first, second = (keep(bright_bundle, request(RAISES)) for _ in range(2))
     failures = failures_of(bright_bundle)
-    assert found_by(failures, first).id == first
-    assert found_by(failures, second[-5:]).id == second
-    assert found_by(failures, "latest").id == second
+    assert find_failure(failures, first).id == first
+    assert find_failure(failures, second[-5:]).id == second
+    assert find_failure(failures, "latest").id == second
     with pytest.raises(UnknownName, match=first):
-        found_by(failures, first[:4])
+        find_failure(failures, first[:4])
     with pytest.raises(UnknownName, match=f"Did you mean '{first}'"):
-        found_by(failures, first[:-2] + "00")
-    assert found_by(failures_of(), first).id == first
+        find_failure(failures, first[:-2] + "00")
+    assert find_failure(failures_of(), first).id == first
     assert failures_of().event(first).id == "77"
 
 
@@ -165,7 +165,7 @@ def test_an_event_that_failed_in_two_replicas_opens_by_its_id_as_it_failed_last(
     event = request(RAISES)
     first, last = (keep(bright_bundle, event, message=message) for message in ("in one", "in another"))
     assert first != last
-    assert found_by(failures_of(bright_bundle), event.id).id == last
+    assert find_failure(failures_of(bright_bundle), event.id).id == last
     assert ep.load_failure(event.id, bright_bundle).last.failure.function == "check"
 
 
@@ -173,7 +173,7 @@ def test_what_is_no_bundle_and_a_bundle_without_failures_are_told_apart(bright_b
     with pytest.raises(BundleError, match="does not exist"):
         failures_of(tmp_path / "nothing")
     with pytest.raises(UnknownName, match="There is none"):
-        found_by(failures_of(bright_bundle), "latest")
+        find_failure(failures_of(bright_bundle), "latest")
 
 
 ENDINGS = [
@@ -270,23 +270,3 @@ def test_a_failure_is_opened_from_a_running_service_by_its_url_or_connection(bri
         with pytest.raises(UnknownName, match="zzz"):
             ep.load_failure("zzz", connection)
         connection.close()
-
-
-@pytest.mark.slow
-@pytest.mark.notebook
-def test_in_a_notebook_a_failure_shows_itself_and_the_next_cell_goes_on_from_it(bright_bundle):
-    import nbclient  # takes seconds
-    import nbformat
-
-    failure = keep(bright_bundle, request(RAISES))
-    cells = [
-        f"import epypes as ep\nrunner = ep.load_failure({failure!r}, {str(bright_bundle)!r})\nrunner",
-        "runner.rerun(most=99)",
-        f"ep.load_failure({failure[-6:]!r})['bright'].max()",
-    ]
-    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in cells])
-    nbclient.NotebookClient(notebook, timeout=60, kernel_name="python3").execute()
-    stopped, gone_on, again = (cell.outputs[-1].data for cell in notebook.cells)
-    assert "too bright: 95" in stopped["text/html"]
-    assert "too bright: 95" not in gone_on["text/html"]
-    assert again["text/plain"] == "np.uint8(95)"

@@ -1,1 +1,1 @@
-"""What becomes of an event that failed: it is kept, listed, run again, and opened in a notebook."""
+"""Events that failed in a service: kept, listed, run again, and opened in a notebook."""

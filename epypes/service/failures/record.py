@@ -1,9 +1,9 @@
-"""What is known of an event that failed in a service, and under which id?"""
+"""The record of an event that failed in a service, and its id."""
 
 from __future__ import annotations
 
-import os
 import re
+import secrets
 import threading
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -12,11 +12,11 @@ from typing import Any, Final
 
 from epypes.bundle.entries import read
 
-# What a person reads of it; more would make a list of failures slow.
-_MOST_CHARACTERS: Final = 2_000
-_MOST_LINES: Final = 200
+# Longer texts would make a list of failures slow.
+_MAX_CHARACTERS: Final = 2_000
+_MAX_LINES: Final = 200
 
-# Without i, l, o and u, which are taken for others or make words.
+# Crockford's digits: without i, l, o and u, which are read as others or make words.
 _DIGITS: Final = "0123456789abcdefghjkmnpqrstvwxyz"
 _TIME_DIGITS, _RANDOM_DIGITS = 11, 3
 ID: Final = re.compile(f"[{_DIGITS}]{{{_TIME_DIGITS + _RANDOM_DIGITS}}}")
@@ -34,7 +34,7 @@ class FailureRecord:
         Id of the event; empty if it has none.
     function
         What failed: a function of the graph, ``"f_in"``, ``"f_out"`` or ``"compute"``; where a worker was killed or
-        stuck, the function that was running as far as that is known.
+        stuck, the function that was running, if that is known.
     tokens
         Its input and output tokens.
     exception, message
@@ -43,11 +43,11 @@ class FailureRecord:
         The lines of the traceback.
     kind
         ``"raised"``, ``"killed"`` (the worker with it), ``"stuck"`` (it took too long), ``"dropped"``, or
-        ``"exhausted"`` (a broker has delivered it so often, and nobody has answered it).
+        ``"exhausted"`` (a broker has delivered it as often as it may, and no replica has answered it).
     attempt
         Which try of the event it was, from 1.
     dead_letter
-        Whether the event was put aside since it killed the worker again.
+        Whether the event is a dead letter: it killed the worker again.
     when_ns
         Unix time in nanoseconds.
     bundle, digest
@@ -80,63 +80,50 @@ class FailureRecord:
 
     @property
     def cause(self) -> tuple[str, str, str]:
-        """What failures have in common that come of one thing."""
+        """What failures with the same cause have in common."""
         return self.kind, self.function, self.exception
 
     @property
     def summary(self) -> str:
-        """What failed, in one line that every log and terminal can write."""
+        """Exception and message in one line of printable characters."""
         return f"{self.exception}: {self.text}" if self.text else self.exception
 
     @property
     def text(self) -> str:
-        """The message in one line that every log and terminal can write."""
-        return "".join(map(_shown, " ".join(self.message.split())))
+        """The message in one line of printable characters."""
+        line = " ".join(self.message.split())
+        return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)
 
 
-def _shown(character: str) -> str:
-    return character if character.isprintable() else character.encode("unicode_escape").decode("ascii")
+_ids_lock: Final = threading.Lock()
+_last_us = 0
 
 
-class _Ids:
-    """Makes ids that rise within a process, whatever its clock does."""
-
-    def __init__(self) -> None:
-        self._lock, self._last_us = threading.Lock(), 0
-
-    def new(self, when_ns: int) -> str:
-        """Return an id for this moment."""
-        with self._lock:
-            self._last_us = when_us = max(when_ns // 1_000, self._last_us + 1)
-        return _digits(when_us, _TIME_DIGITS) + _digits(int.from_bytes(os.urandom(2)), _RANDOM_DIGITS)
-
-
-def _digits(number: int, count: int) -> str:
-    found = ""
-    for _ in range(count):
-        number, digit = divmod(number, len(_DIGITS))
-        found = _DIGITS[digit] + found
-    return found
-
-
-_ids: Final = _Ids()
+def _new_id(when_ns: int) -> str:
+    """Return an id that is later than all others of this process, whatever its clock does."""
+    global _last_us
+    with _ids_lock:
+        number = _last_us = max(when_ns // 1_000, _last_us + 1)
+    number = (number << 5 * _RANDOM_DIGITS) | secrets.randbits(5 * _RANDOM_DIGITS)
+    digits = (_DIGITS[(number >> 5 * place) % 32] for place in reversed(range(_TIME_DIGITS + _RANDOM_DIGITS)))
+    return "".join(digits)
 
 
 def with_id(record: FailureRecord) -> FailureRecord:
-    """Return a record with an id and a time, and with texts no longer than they are read."""
+    """Return a record with an id and a time, and with long texts cut."""
     when_ns = record.when_ns or time_ns()
     return replace(
         record,
-        id=record.id if ID.fullmatch(record.id) else _ids.new(when_ns),
+        id=record.id if ID.fullmatch(record.id) else _new_id(when_ns),
         when_ns=when_ns,
-        message=record.message[:_MOST_CHARACTERS],
-        trace=tuple(line[:_MOST_CHARACTERS] for line in record.trace[-_MOST_LINES:]),
+        message=record.message[:_MAX_CHARACTERS],
+        trace=tuple(line[:_MAX_CHARACTERS] for line in record.trace[-_MAX_LINES:]),
         tokens=tuple(record.tokens),
     )
 
 
-def record_of(entries: Any) -> FailureRecord:
-    """Return the record that was written as JSON; what a later version adds is left out.
+def read_record(entries: Any) -> FailureRecord:
+    """Return the record in an object of JSON; keys that a later version adds are left out.
 
     Raises
     ------
@@ -160,7 +147,7 @@ def record_of(entries: Any) -> FailureRecord:
 def values_of(
     record: FailureRecord, known: Collection[str], enums: Mapping[str, Any] | None = None
 ) -> tuple[dict[str, Any], str]:
-    """Return the values of a record's hyperparameters, and what is to be said of those that can't be taken over.
+    """Return the values of a record's hyperparameters, and a note on those that the bundle can't take.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""How does an event that failed in a service open again, at the function that failed?"""
+"""`load_failure`: an event that failed in a service, in a notebook, stopped at the function that failed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from epypes.bundle.load import Bundle, pipeline_of, read_bundle
 from epypes.errors import RemoteFailure
@@ -15,9 +15,10 @@ from epypes.run import CompGraphRunner
 from epypes.run.stopped import stop_at
 from epypes.service.failures.record import FailureRecord, values_of
 from epypes.service.failures.reproduce import reproduce
-from epypes.service.failures.source import bundle_of, failures_of, found_by, path_of
+from epypes.service.failures.source import bundle_of, failures_of, find_failure, path_of
 
-_NOT_AGAIN = ("killed", "stuck", "exhausted")
+# The functions of these failures are not called here: they would end this process, or never return.
+_NOT_CALLED: Final = ("killed", "stuck", "exhausted")
 
 
 def load_failure(id: str, source: Any = None, *, bundle: str | Path | None = None) -> CompGraphRunner:  # noqa: A002
@@ -62,38 +63,17 @@ def load_failure(id: str, source: Any = None, *, bundle: str | Path | None = Non
         If the bundle has changed since, or the event does not fail here as it did there.
     """
     failures = failures_of(source)
-    record = found_by(failures, id)
+    record = find_failure(failures, id)
     event = failures.event(record.id)
     folder, changed = bundle_of(record, bundle or path_of(source))
     opened = read_bundle(folder)
-    runner, left_out = runner_of(opened, record)
-    notes = [changed, left_out, _run(runner, opened, record, event)]
-    for note in filter(None, notes):
+    runner = CompGraphRunner(opened.cg, opened.settings.hyperparameters)
+    values, left_out = values_of(record, runner.hyperparameters, opened.enums)
+    runner.set(**values)
+    run = _stop if record.kind in _NOT_CALLED else _run
+    for note in filter(None, [changed, left_out, run(runner, opened, record, event)]):
         warnings.warn(f"Failure {record.id}: {note}.", stacklevel=2)
     return runner
-
-
-def runner_of(bundle: Bundle, record: FailureRecord) -> tuple[CompGraphRunner, str]:
-    """Return a runner with the hyperparameters that failed, and what is to be said of those that are gone."""
-    runner = CompGraphRunner(bundle.cg, bundle.settings.hyperparameters)
-    values, left_out = values_of(record, runner.hyperparameters, bundle.enums)
-    runner.set(**values)
-    return runner, left_out
-
-
-def _run(runner: CompGraphRunner, bundle: Bundle, record: FailureRecord, event: Any) -> str:
-    """Run the event as far as it came; return what is to be said if that is not as far as in the service."""
-    if record.kind in _NOT_AGAIN:
-        return _stop(runner, bundle, record, event)
-    payload = _payload(bundle, event)
-    try:
-        runner.run_on(payload)
-    except KeyboardInterrupt:
-        raise
-    except BaseException:  # whatever the user's function raises is in the failed run
-        if runner.last is None:
-            raise
-    return _told(runner, record)
 
 
 def _payload(bundle: Bundle, event: Any) -> Mapping[str, Any]:
@@ -106,41 +86,46 @@ def _payload(bundle: Bundle, event: Any) -> Mapping[str, Any]:
     return payload
 
 
+def _run(runner: CompGraphRunner, bundle: Bundle, record: FailureRecord, event: Any) -> str:
+    """Run the event; return what differs from the record, nothing if the same function failed in the same way."""
+    payload = _payload(bundle, event)
+    try:
+        runner.run_on(payload)
+    except KeyboardInterrupt:
+        raise
+    except BaseException:  # the failed run has the exception of the user's function
+        if runner.last is None:
+            raise
+    failure = runner.last.failure if runner.last is not None else None
+    there = f"there it was {record.function!r} ({record.summary})"
+    if record.kind == "dropped":
+        return "this event was dropped before any function was called"
+    if failure is None:
+        is_function = record.function in runner.cg.functions
+        return f"nothing fails here; {there}" if is_function else f"no function fails; {there}"
+    if (failure.function, failure.kind) != (record.function, record.exception):
+        return f"here {failure.function!r} fails ({failure.kind}); {there}"
+    return ""
+
+
 def _stop(runner: CompGraphRunner, bundle: Bundle, record: FailureRecord, event: Any) -> str:
+    """Run the event up to the function that failed, which is not called; return a note if that is not possible."""
     if record.kind == "exhausted":
-        # What it does is not known: it may end each process that works on it, and this one's too.
         stop_at(runner, _payload(bundle, event))
-        told = f"it is not known which function it is, so none was run ({record.message})"
-        return f"{told}. rerun('token') goes on to a token"
+        text = f"it is not known which function it is, so none was run ({record.message})"
+        return f"{text}. rerun('token') goes on to a token"
     if record.function not in (*runner.cg.functions, "f_in"):
-        # The service could not tell where its worker was; another process that may be lost can.
+        # The service could not say where its worker was. Another process, which may be lost, finds out.
         record = replace(record, function=reproduce(record, event, bundle.path).function)
     if record.function == "f_in":
         return f"f_in was {record.kind} by this event, so it is not called here, and no function was run"
     payload = _payload(bundle, event)
     if record.function not in runner.cg.functions:
         stop_at(runner, payload)
-        return (
-            f"the worker was {record.kind}, and it is not known in which function, so none was run. "
-            "rerun('token') goes on to a token"
-        )
+        text = f"the worker was {record.kind}, and it is not known in which function, so none was run"
+        return f"{text}. rerun('token') goes on to a token"
     why = RemoteFailure(bundle.path, record.function, record.kind, f"not called here. {record.message}")
     run = stop_at(runner, payload, record.function, why)
     if run.failure is not None and run.failure.exception is not why:
         return f"before {record.function!r}, which was {record.kind}, {run.failure.function!r} fails here"
-    return ""
-
-
-def _told(runner: CompGraphRunner, record: FailureRecord) -> str:
-    """Return what differs from what was recorded; nothing if the same function failed in the same way."""
-    failure = runner.last.failure if runner.last is not None else None
-    there = f"there it was {record.function!r} ({record.summary})"
-    if record.kind == "dropped":
-        return "this event was dropped before any function was called"
-    if failure is None and record.function not in runner.cg.functions:
-        return f"no function fails; {there}"
-    if failure is None:
-        return f"nothing fails here; {there}"
-    if (failure.function, failure.kind) != (record.function, record.exception):
-        return f"here {failure.function!r} fails ({failure.kind}); {there}"
     return ""

@@ -1,4 +1,4 @@
-"""Does an event that failed in a service fail again, in a fresh process that may be killed or stuck?
+"""Running an event that failed once more, in a fresh process that may be killed or stuck.
 
 Run as a program (``python -I -m epypes.service.failures.reproduce BUNDLE FOLDER SECONDS``) it is that process.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import faulthandler
 import json
+import linecache
 import os
 import queue
 import re
@@ -22,7 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.errors import BundleError, EpypesError
-from epypes.service.failures.record import FailureRecord, record_of, values_of, with_id
+from epypes.service.failures.record import FailureRecord, read_record, values_of, with_id
 
 if TYPE_CHECKING:
     from epypes.pipeline import FullPipeline
@@ -31,10 +32,10 @@ if TYPE_CHECKING:
 
 TIMEOUT_S: Final = 30.0
 # To start Python, to import what the bundle imports, and to end.
-_BESIDE_S: Final = 60.0
+_START_AND_END_S: Final = 60.0
 _RECORD, _EVENT, _OUTCOME, _CALLS, _DUMP = "record.json", "event", "outcome.json", "calls", "dump"
 # What functions print comes before the lines of a process that ends.
-_MOST_DUMP_BYTES: Final = 256 * 1024
+_MAX_DUMP_BYTES: Final = 256 * 1024
 _DUMP_LINE: Final = re.compile(r'^  File "([^"\n]*)", line (\d+) in (\S+)', re.MULTILINE)
 
 Ending = Literal["failed", "fine", "killed", "stuck"]
@@ -42,7 +43,7 @@ Ending = Literal["failed", "fine", "killed", "stuck"]
 
 @dataclass(frozen=True, slots=True)
 class Reproduction:
-    """What became of an event that was run again.
+    """The result of running an event again.
 
     Attributes
     ----------
@@ -50,11 +51,11 @@ class Reproduction:
         ``"failed"``: it was raised again, or something else was; ``"fine"``; ``"killed"``: the process ended with it;
         ``"stuck"``: it took longer than it was given.
     function
-        Where that was: a function of the graph, f_in, f_out, compute; empty if it is not known.
+        A function of the graph, f_in, f_out or compute; empty if it is not known.
     exception, message, trace
         What was raised; or how the process ended.
     line, code
-        The last line of the bundle's module that was come to: its number, from 1, 0 if it is not known; and its text.
+        The last line of the bundle's module that was executed: its number from 1, 0 if it is not known; and its text.
     """
 
     ending: Ending
@@ -67,7 +68,7 @@ class Reproduction:
 
     @property
     def place(self) -> str:
-        """Where it failed, as a part of a sentence."""
+        """Function and line, as a part of a sentence."""
         where = f"in {self.function!r}" if self.function else "in a function that is not known"
         return f"{where}, pipeline.py, line {self.line}: {self.code}" if self.line else where
 
@@ -97,33 +98,26 @@ def reproduce(
         scratch = Path(name)
         (scratch / _RECORD).write_text(json.dumps(asdict(with_id(record)), default=str), encoding="utf-8")
         (scratch / _EVENT).write_bytes(pack_event(event))
-        status = _run_apart(Path(bundle).resolve(), scratch, timeout_s)
-        return _what_became(Path(bundle).resolve(), scratch, status, timeout_s)
+        folder = Path(bundle).resolve()
+        status = _run_process(folder, scratch, timeout_s)
+        return _read_result(folder, scratch, status, timeout_s)
 
 
-def _run_apart(folder: Path, scratch: Path, timeout_s: float) -> int | None:
+def _run_process(folder: Path, scratch: Path, timeout_s: float) -> int | None:
     """Return the exit status of the process; None if it had to be killed."""
-    command = [
-        sys.executable,
-        "-I",
-        "-m",
-        "epypes.service.failures.reproduce",
-        str(folder),
-        str(scratch),
-        f"{timeout_s:g}",
-    ]
+    arguments = [str(folder), str(scratch), f"{timeout_s:g}"]
     with (scratch / _DUMP).open("wb") as dump:
         process = subprocess.Popen(  # noqa: S603 - this interpreter, this module
-            command,
+            [sys.executable, "-I", "-m", __spec__.name, *arguments],
             cwd=scratch,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=dump,
-            # All that a function has started can be ended with its group; and Ctrl+C does not reach it.
+            # All processes that a function has started can be ended with their group; and Ctrl+C does not reach it.
             start_new_session=True,
         )
         try:
-            return process.wait(timeout_s + _BESIDE_S)
+            return process.wait(timeout_s + _START_AND_END_S)
         except subprocess.TimeoutExpired:
             return None
         finally:
@@ -132,22 +126,25 @@ def _run_apart(folder: Path, scratch: Path, timeout_s: float) -> int | None:
             process.wait()
 
 
-def _what_became(folder: Path, scratch: Path, status: int | None, timeout_s: float) -> Reproduction:
+def _read_result(folder: Path, scratch: Path, status: int | None, timeout_s: float) -> Reproduction:
     """Read what the process has left."""
     with (scratch / _DUMP).open("rb") as file:
-        file.seek(max(0, file.seek(0, os.SEEK_END) - _MOST_DUMP_BYTES))
+        file.seek(max(0, file.seek(0, os.SEEK_END) - _MAX_DUMP_BYTES))
         dump = file.read().decode(errors="replace")
     if (scratch / _OUTCOME).is_file():
-        told = json.loads((scratch / _OUTCOME).read_text(encoding="utf-8"))
-        if "refused" in told:
-            raise BundleError(folder, told["refused"])
-        return Reproduction(**{**told, "trace": tuple(told["trace"])})
+        outcome = json.loads((scratch / _OUTCOME).read_text(encoding="utf-8"))
+        if "refused" in outcome:
+            raise BundleError(folder, outcome["refused"])
+        return Reproduction(**{**outcome, "trace": tuple(outcome["trace"])})
     if not (scratch / _CALLS).is_file():
         last = dump.strip().splitlines()[-1:] or ["no message"]
         raise BundleError(folder, f"{folder} can't be loaded for a replay: {last[0]}")
     calls = (scratch / _CALLS).read_text(encoding="utf-8").splitlines()
     function = calls[-1] if calls else ""
-    line, code = _line_in(dump, folder)
+    # The dump of all threads begins with the innermost frame of each.
+    own = (match for match in _DUMP_LINE.finditer(dump) if Path(match[1]).parent == folder)
+    frame = next(own, None)
+    line, code = (int(frame[2]), linecache.getline(frame[1], int(frame[2])).strip()) if frame else (0, "")
     if status is None or (status == 1 and "Timeout (" in dump):
         return Reproduction("stuck", function, "TimeoutError", f"more than {timeout_s:g} s", (), line, code)
     ended = f"status {status}" if status >= 0 else _signal_name(-status)
@@ -161,79 +158,61 @@ def _signal_name(number: int) -> str:
         return f"signal {number}"
 
 
-def _line_in(dump: str, folder: Path) -> tuple[int, str]:
-    """Return the innermost line of the bundle that a dump of all threads names, and its text."""
-    for file, line, _ in _DUMP_LINE.findall(dump):
-        if Path(file).parent == folder:
-            return int(line), _text_of(Path(file), int(line))
-    return 0, ""
-
-
-def _text_of(file: Path, line: int) -> str:
-    with suppress(OSError, UnicodeDecodeError, IndexError):
-        return file.read_text(encoding="utf-8").splitlines()[line - 1].strip()
-    return ""
-
-
 # -- in the process of its own ----------------------------------------------------------------------------------------
 
 
 def main(arguments: list[str]) -> int:
-    """Run the event in the folder that is named second on the bundle that is named first; leave there what became."""
+    """Run the event in a scratch folder on a bundle, and write the outcome into the scratch folder."""
     folder, scratch, timeout_s = Path(arguments[0]), Path(arguments[1]), float(arguments[2])
     faulthandler.enable()
     try:
         pipeline, failures = _pipeline(folder, scratch)
     except Exception as error:
-        told = str(error) if isinstance(error, EpypesError) else f"{folder} fails: {type(error).__name__}: {error}"
-        _leave(scratch, {"refused": told})
+        text = str(error) if isinstance(error, EpypesError) else f"{folder} fails: {type(error).__name__}: {error}"
+        _write_outcome(scratch, {"refused": text})
         return 1
-    event = _event(scratch)
-    # Its thread needs no lock of the interpreter: it tells the line also of a C function that holds that.
+    from epypes.service.packing import unpack_event
+
+    event = unpack_event((scratch / _EVENT).read_bytes())
+    # Its thread does not need the GIL: it shows the line also while a C function holds that.
     faulthandler.dump_traceback_later(timeout_s, exit=True)
     pipeline.handle(event)
     faulthandler.cancel_dump_traceback_later()
-    _leave(scratch, asdict(_told(failures[-1], folder) if failures else Reproduction("fine")))
+    _write_outcome(scratch, asdict(_reproduction(failures[-1], folder) if failures else Reproduction("fine")))
     return 0
 
 
 def _pipeline(folder: Path, scratch: Path) -> tuple[FullPipeline, list[Failure]]:
-    """Return the pipeline that the service runs, with the hyperparameters that failed; and where failures will be."""
+    """Return the pipeline that the service runs, with the hyperparameters that failed, and the list of its failures."""
     from epypes.bundle.load import pipeline_of, read_bundle
 
     bundle = read_bundle(folder)
     pipeline = pipeline_of(bundle, queue.SimpleQueue(), queue.SimpleQueue())
-    record = record_of(json.loads((scratch / _RECORD).read_bytes()))
+    record = read_record(json.loads((scratch / _RECORD).read_bytes()))
     pipeline.runner.set(**values_of(record, pipeline.runner.hyperparameters, bundle.enums)[0])
     failures: list[Failure] = []
     pipeline.on_error = failures.append
-    _announce_calls(pipeline, scratch / _CALLS)
+    _log_calls(pipeline, scratch / _CALLS)
     return pipeline, failures
 
 
-def _event(scratch: Path) -> Envelope | bytes:
-    from epypes.service.packing import unpack_event
-
-    return unpack_event((scratch / _EVENT).read_bytes())
-
-
-def _announce_calls(pipeline: FullPipeline, file: Path) -> None:
-    """Have the name of every function written before it is called: what was written outlives the process."""
+def _log_calls(pipeline: FullPipeline, file: Path) -> None:
+    """Write the name of every function to a file before it is called: the file outlives the process."""
     descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
 
-    def announced(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    def logged(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*args: Any) -> Any:
             os.write(descriptor, f"{name}\n".encode())
             return function(*args)
 
         return call
 
-    pipeline.f_in, pipeline.f_out = announced("f_in", pipeline.f_in), announced("f_out", pipeline.f_out)
+    pipeline.f_in, pipeline.f_out = logged("f_in", pipeline.f_in), logged("f_out", pipeline.f_out)
     for name, node in pipeline.network.nodes.items():
-        node.compute = announced(name, node.compute)  # type: ignore[method-assign]
+        node.compute = logged(name, node.compute)  # type: ignore[method-assign]
 
 
-def _told(failure: Failure, folder: Path) -> Reproduction:
+def _reproduction(failure: Failure, folder: Path) -> Reproduction:
     exception = failure.exception
     own = [frame for frame in traceback.extract_tb(exception.__traceback__) if Path(frame.filename).parent == folder]
     trace = "".join(traceback.format_exception(exception)).splitlines()
@@ -248,9 +227,9 @@ def _told(failure: Failure, folder: Path) -> Reproduction:
     )
 
 
-def _leave(scratch: Path, told: dict[str, Any]) -> None:
+def _write_outcome(scratch: Path, outcome: dict[str, Any]) -> None:
     part = scratch / f"{_OUTCOME}.part"
-    part.write_text(json.dumps(told), encoding="utf-8")
+    part.write_text(json.dumps(outcome), encoding="utf-8")
     part.replace(scratch / _OUTCOME)
 
 

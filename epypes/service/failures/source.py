@@ -1,27 +1,33 @@
-"""Whose failures are meant, and which of them? A bundle's, those of a running service, or of all on this machine."""
+"""The failures of a bundle, of a running service, or of this machine: listed, found by id, and followed."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import queue
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from epypes.bundle.seal import check_seal
-from epypes.errors import BundleError, FailureNotKept, UnknownName
-from epypes.service.failures.record import ID, FailureRecord, record_of
+from epypes.errors import BundleError, FailureNotKept, ServiceError, UnknownName
+from epypes.service.failures.record import ID, FailureRecord, read_record
 from epypes.service.failures.store import FailureStore, failures_folder
 
 if TYPE_CHECKING:
     from epypes.service.remote.connection import Connection
     from epypes.wire import Envelope
 
-LATEST: Final = "latest"
+_LATEST: Final = "latest"
 # Ids of one time begin alike: those of a day have six characters in common.
-_LEAST: Final = 3
+_MIN_ID_CHARACTERS: Final = 3
+_FAILURE_TOPIC: Final = "failure"
+# How often a follower looks whether the service still runs.
+_LOOK_S: Final = 0.5
+_JOIN_TIMEOUT_S: Final = 10.0
 
 
-class Failures(Protocol):
-    """What has failures: a store on this machine, or a service."""
+class FailureSource(Protocol):
+    """Failures of a store on this machine, or of a service."""
 
     def records(self, limit: int | None = None) -> Sequence[FailureRecord]:
         """Return the records, the newest first."""
@@ -33,34 +39,33 @@ class Failures(Protocol):
         """Return the event that failed; raise UnknownName or FailureNotKept."""
 
 
-class _ByConnection:
+class _ServiceFailures:
     """The failures of a running service."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
 
     def records(self, limit: int | None = None) -> Sequence[FailureRecord]:
-        return [_record(found) for found in self._connection.failures()][:limit]
+        return self._connection.failures()[:limit]
 
     def record(self, failure_id: str) -> FailureRecord:
-        return _record(self._connection.failure(failure_id)[0])
+        return self._connection.failure(failure_id)[0]
 
     def event(self, failure_id: str) -> Envelope | bytes:
-        found, event = self._connection.failure(failure_id)
+        record, event = self._connection.failure(failure_id)
         if event is None:
-            why = _record(found).no_event or "the service had none to give"
-            raise FailureNotKept(failure_id, "", f"The event of failure {failure_id} was not kept: {why}.")
+            reason = record.no_event or "the service had none to give"
+            raise FailureNotKept(failure_id, "", f"The event of failure {failure_id} was not kept: {reason}.")
         return event
 
 
-class _Everywhere:
-    """The failures of all bundles that were served on this machine by this user, or of one of them.
+class _LocalFailures:
+    """The failures of all bundles that this user has served on this machine, or of one of them.
 
     Parameters
     ----------
     bundle
-        The one: what failed in it is in the folder of the bundle that its service began with; and whatever failed in
-        the service that began with it. All without.
+        Its failures are in the folder of the bundle that the service was started with. All bundles without.
     """
 
     def __init__(self, bundle: Path | None = None) -> None:
@@ -69,13 +74,13 @@ class _Everywhere:
         self._bundle = None if bundle is None else str(bundle.resolve())
         self._own = None if bundle is None else failures_folder(bundle)
 
-    def _of(self, store: FailureStore, limit: int | None) -> Sequence[FailureRecord]:
-        if self._bundle is None or store.folder == self._own:
-            return store.records(limit)
-        return [record for record in store.records() if record.bundle == self._bundle]
-
     def records(self, limit: int | None = None) -> Sequence[FailureRecord]:
-        found = [record for store in self._stores for record in self._of(store, limit)]
+        found: list[FailureRecord] = []
+        for store in self._stores:
+            if self._bundle is None or store.folder == self._own:
+                found += store.records(limit)
+            else:
+                found += [record for record in store.records() if record.bundle == self._bundle]
         return sorted(found, key=lambda record: record.id, reverse=True)[:limit]
 
     def record(self, failure_id: str) -> FailureRecord:
@@ -91,11 +96,7 @@ class _Everywhere:
         raise UnknownName("failure", failure_id, [record.id for record in self.records()], "on this machine")
 
 
-def _record(found: Any) -> FailureRecord:
-    return found if isinstance(found, FailureRecord) else record_of(found)
-
-
-def failures_of(source: Any = None) -> Failures:
+def failures_of(source: Any = None) -> FailureSource:
     """Return the failures of a bundle's path, of a service's http URL or Connection, or of this machine without.
 
     Raises
@@ -106,27 +107,24 @@ def failures_of(source: Any = None) -> Failures:
         The service can't be reached.
     """
     if source is None:
-        return _Everywhere()
+        return _LocalFailures()
     path = path_of(source)
-    if path is not None:
-        failures = _Everywhere(path)
-        if not failures_folder(path).is_dir() and not failures.records(1):
-            # A bundle without failures is one all the same; what is no bundle is said.
-            check_seal(path)
-        return failures
-    return _ByConnection(connected(source))
+    if path is None:
+        return _ServiceFailures(_connected(source))
+    failures = _LocalFailures(path)
+    if not failures_folder(path).is_dir() and not failures.records(1):
+        # A bundle without failures is fine; a folder that is no bundle is not.
+        check_seal(path)
+    return failures
 
 
-def connected(source: Any) -> Connection:
-    """Return the Connection that is meant: itself, or one to the service at a URL.
+def path_of(source: Any) -> Path | None:
+    """Return the bundle's path that a source is; None for a URL, a Connection, or nothing."""
+    is_url = isinstance(source, str) and source.startswith(("http://", "https://"))
+    return Path(source) if isinstance(source, str | Path) and not is_url else None
 
-    Raises
-    ------
-    ServiceError
-        The service can't be reached.
-    TypeError
-        It is neither.
-    """
+
+def _connected(source: Any) -> Connection:
     from epypes.service.remote.connection import Connection, connect
 
     if isinstance(source, str):
@@ -137,14 +135,8 @@ def connected(source: Any) -> Connection:
     return source
 
 
-def path_of(source: Any) -> Path | None:
-    """Return the bundle's path that a source is; None for a URL, a Connection, or nothing."""
-    is_url = isinstance(source, str) and source.startswith(("http://", "https://"))
-    return Path(source) if isinstance(source, str | Path) and not is_url else None
-
-
-def found_by(failures: Failures, given: str) -> FailureRecord:
-    """Return the failure that is meant by its id, the first or last characters of it, its event's id, or ``latest``.
+def find_failure(failures: FailureSource, given: str) -> FailureRecord:
+    """Return a failure by its id, the first or last characters of it, its event's id, or ``latest``.
 
     Of several failures of one event it is the last one.
 
@@ -157,23 +149,16 @@ def found_by(failures: Failures, given: str) -> FailureRecord:
     """
     records = failures.records()
     # An event fails more than once if a broker has delivered it again: the last time, which comes first, is meant.
-    exact = [record for record in records if given in (record.id, record.event_id)]
-    meant = exact[:1] or _meant(records, given)
-    if len(meant) == 1:
-        return meant[0]
-    if meant:
-        raise UnknownName("single failure", given, [record.id for record in meant], "but several that begin or end so")
+    found = [record for record in records if given in (_LATEST, record.id, record.event_id)][:1]
+    if not found and len(given) >= _MIN_ID_CHARACTERS:
+        found = [record for record in records if record.id.startswith(given) or record.id.endswith(given)]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise UnknownName("single failure", given, [record.id for record in found], "but several that begin or end so")
     if not ID.fullmatch(given):
         raise UnknownName("failure", given, [record.id for record in records], "here")
     return failures.record(given)
-
-
-def _meant(records: Sequence[FailureRecord], given: str) -> list[FailureRecord]:
-    if given == LATEST:
-        return list(records[:1])
-    if len(given) < _LEAST:
-        return []
-    return [record for record in records if record.id.startswith(given) or record.id.endswith(given)]
 
 
 def bundle_of(record: FailureRecord, given: str | Path | None = None) -> tuple[Path, str]:
@@ -182,25 +167,22 @@ def bundle_of(record: FailureRecord, given: str | Path | None = None) -> tuple[P
     Parameters
     ----------
     given
-        Where it is looked for first; then where it was served from.
+        The first folder to look at; the second is the one that was served.
 
     Raises
     ------
     BundleError
-        It is in neither place, or not as it was promoted.
+        It is in neither folder, or not as it was promoted.
     """
     digests: dict[Path, str] = {}
     refused: BundleError | None = None
-    for place in (given, record.bundle):
-        if not place:
-            continue
-        folder = Path(place).resolve()
+    for folder in (Path(each).resolve() for each in (given, record.bundle) if each):
         try:
-            digests[folder] = digest = check_seal(folder)
+            digests[folder] = check_seal(folder)
         except BundleError as error:
             refused = refused or error
             continue
-        if digest == record.digest:
+        if digests[folder] == record.digest:
             return folder, ""
     if not digests:
         text = f"The bundle that failed is not on this machine: it was {record.bundle or 'not named'}."
@@ -208,3 +190,98 @@ def bundle_of(record: FailureRecord, given: str | Path | None = None) -> tuple[P
     folder, digest = next(iter(digests.items()))
     changed = f"{folder} has changed since: {record.digest[:12] or 'another bundle'} failed, now it is {digest[:12]}"
     return folder, changed
+
+
+# -- from now on ------------------------------------------------------------------------------------------------------
+
+
+def follow_failures(source: Any, *, keys: Any = None, allow: Any = None) -> Iterator[FailureRecord | None]:
+    """Yield None when the failures are heard, then the record of each failure as it happens; goes on without end.
+
+    Parameters
+    ----------
+    source
+        The path of the bundle that is served: then the failures of all its replicas are heard at their sockets; or the
+        http URL of the service.
+    keys, allow
+        As for ZMQSubscriber, where the service has keys.
+
+    Raises
+    ------
+    ServiceError
+        No service runs, it can't be reached, or it has ended.
+    """
+    path = path_of(source)
+    if path is not None:
+        yield from _follow_sockets(path, keys=keys, allow=allow)
+        return
+    is_first, connection = True, _connected(source)
+    for kind, data in connection.events():
+        # The service reports its state at once: from its first event on nothing is missed.
+        if is_first:
+            is_first = False
+            yield None
+        if kind == "failure":
+            yield read_record(data)
+    raise ServiceError(connection.url, f"The service at {connection.url} has ended.")
+
+
+def _follow_sockets(path: Path, **secured: Any) -> Iterator[FailureRecord | None]:
+    from epypes.service.ops.client import running_services, why_unreachable
+    from epypes.transport import ZMQSubscriber
+    from epypes.wire import Envelope
+
+    states = running_services(path)
+    if not states:
+        raise ServiceError(path, f"No service runs for {path}. Start one: epypes serve {path}")
+    received: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    with ExitStack() as subscribers:
+        for address in sorted({state.failures for state in states}):
+            _check_shared(path, address)
+            subscriber = subscribers.enter_context(ZMQSubscriber(address, received, _FAILURE_TOPIC, **secured))
+            if not subscriber.wait_joined(_JOIN_TIMEOUT_S):
+                text = f"The failures of {path} can't be reached at {address} within {_JOIN_TIMEOUT_S:g} s."
+                raise ServiceError(path, f"{text} {why_unreachable(secured['keys'] is not None)}")
+        yield None
+        while True:
+            try:
+                event = received.get(timeout=_LOOK_S)
+            except queue.Empty:
+                if not running_services(path):
+                    raise ServiceError(path, f"The service of {path} has ended.") from None
+                continue
+            if isinstance(event, Envelope) and event.failure is not None:
+                yield _record_of(event)
+
+
+def _check_shared(path: Path, address: str) -> None:
+    """Raise ServiceError where failures go to one receiver, which would miss what another one hears."""
+    from epypes.transport.channels import is_brokered
+
+    bare = address.removeprefix("connect:")
+    if bare != address or is_brokered(bare):
+        raise ServiceError(
+            path, f"The service of {path} sends its failures to {bare}; listen there, or ask its http URL."
+        )
+
+
+def _record_of(event: Envelope) -> FailureRecord:
+    """Return what a failure event says; the rest of the record is in the store, under its id."""
+    failure, attributes = event.failure, event.attributes
+    if failure is None:
+        return FailureRecord()
+    return FailureRecord(
+        id=str(attributes.get("id", "")),
+        event_id=failure.input_id,
+        function=failure.function,
+        tokens=failure.tokens,
+        exception=failure.exception,
+        # Its notes come after it; they name the function once more.
+        message=failure.message.partition(" | In function ")[0],
+        kind=str(attributes.get("kind", "raised")),
+        attempt=failure.attempt,
+        dead_letter=bool(attributes.get("dead_letter", False)),
+        when_ns=int(attributes.get("when_ns", 0)) or event.published_ns,
+        digest=event.bundle_digest,
+        revision=event.revision,
+    )

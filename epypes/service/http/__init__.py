@@ -1,4 +1,4 @@
-"""How a running service is watched and controlled over HTTP, by programs and in a browser."""
+"""HTTP control of a running service: health, metrics, previews, parameters, failures, deployment and a live page."""
 
 from epypes.service.http.server import HttpServer
 

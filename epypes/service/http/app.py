@@ -1,59 +1,284 @@
-"""Which paths does the server answer, and how are they described?"""
+"""The FastAPI application: routes for health, service, parameters, failures, operation, and the live page at /.
+
+Routes are plain functions where they may block: Starlette runs them on its thread pool, so that a bundle that is being
+replayed for minutes keeps no other request waiting.
+"""
 
 from __future__ import annotations
 
-from typing import Final
+import os
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, Final
 
-from fastapi import FastAPI
-from fastapi.routing import APIRoute
+from fastapi import APIRouter, Body, FastAPI, Query, Request, Response
+from fastapi import Path as PathParameter
+from starlette.responses import FileResponse
+from starlette.staticfiles import StaticFiles
 
 import epypes
-from epypes.service.http import events, failures, group, health, operating, page, parameters, pictures
-from epypes.service.http.answers import answer_errors
-from epypes.service.http.metrics import registry_of
-from epypes.service.http.served import Served
+from epypes.bundle.seal import check_seal
+from epypes.errors import BundleError, DeployRefused
+from epypes.service import Service
+from epypes.service.http import events, models, previews
+from epypes.service.http.metrics import exposed, registry_of
+from epypes.service.http.models import CHANGE_REFUSALS, INVALID, REFUSALS, Responses, ServiceOf, refused
+from epypes.service.http.responses import add_error_handlers, json_response, parameters_body
+from epypes.service.http.security import NEEDS_TOKEN
 
-_ABOUT: Final = """
+_DESCRIPTION: Final = """
 Watches and controls a running service of EPypes.
 
-Whoever reaches the server may read. Changes need the service's token, as `Authorization: Bearer TOKEN`; `epypes serve`
-names the file that holds it. What is refused is answered with a sentence in `detail` that says the way out.
+Reading needs no token. Changes need the service's token, as `Authorization: Bearer TOKEN`; `epypes serve` names the
+file that holds it. A refusal says in `detail` what is wrong, and the way out.
 """
 _TAGS: Final = [
-    {"name": "health", "description": "For what watches many services."},
+    {"name": "health", "description": "For monitoring."},
     {"name": "service", "description": "What is served, and what happens."},
-    {"name": "graph", "description": "The graph, and the values of its latest run."},
+    {"name": "graph", "description": "The graph, and the values of its last run."},
     {"name": "parameters", "description": "The hyperparameters, changed between two events."},
     {"name": "failures", "description": "Events that failed, kept so that they can be computed again."},
     {"name": "operation", "description": "Another bundle, pause and drain."},
 ]
+_PAGE: Final = Path(__file__).parent / "page"
+_EVENT: Final = "application/vnd.epypes.v1+event"
+_NON_FINITE: Final = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
+
+health = APIRouter(tags=["health"])
+parameters = APIRouter(tags=["parameters"])
+failures = APIRouter(prefix="/v1/failures", tags=["failures"])
+operation = APIRouter(prefix="/v1", tags=["operation"], dependencies=[NEEDS_TOKEN])
 
 
-_ROOMS: Final = (health, group, pictures, parameters, events, failures, operating, page)
-
-
-def app_of(served: Served) -> FastAPI:
+def create_app(service: Service) -> FastAPI:
     """Return the application that answers for a service."""
     app = FastAPI(
         title="EPypes service",
-        description=_ABOUT,
+        description=_DESCRIPTION,
         version=epypes.__version__,
         openapi_tags=_TAGS,
-        # They would load scripts from elsewhere; the page at / and any client of OpenAPI do without.
+        # These pages would load scripts from other sites.
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,
     )
-    app.state.served = served
-    app.state.registry = registry_of(served.service)
-    app.state.methods = _methods
-    answer_errors(app)
-    for room in _ROOMS:
-        app.include_router(room.router)
+    app.state.service = service
+    app.state.events = events.EventHub(service)
+    app.state.registry = registry_of(service)
+    app.state.deploying = threading.Lock()
+    routers = (health, previews.router, parameters, events.router, failures, operation)
+    add_error_handlers(app, routers)
+    for router in routers:
+        app.include_router(router)
+
+    @app.get("/", include_in_schema=False)
+    def page() -> Response:
+        return FileResponse(_PAGE / "index.html")
+
+    app.mount("/page", StaticFiles(directory=_PAGE))
     return app
 
 
-def _methods(path: str) -> list[str]:
-    """Return the methods that a path takes."""
-    routes = [route for room in _ROOMS for route in room.router.routes if isinstance(route, APIRoute)]
-    return sorted({method for route in routes if route.path_regex.match(path) for method in route.methods or ()})
+# -- health -----------------------------------------------------------------------------------------------------------
+
+
+@health.get("/livez", response_model=models.Alive, responses={**REFUSALS, 503: refused("It does not.", models.Alive)})
+async def livez(service: ServiceOf) -> Response:
+    """Say whether the service works: 503 means that it should be restarted.
+
+    A long computation is no reason; a function that did not return in time is, and it is named.
+    """
+    reason = service.alive()
+    return json_response({"alive": not reason, "reason": reason}, 503 if reason else 200)
+
+
+@health.get("/readyz", response_model=models.Ready, responses={**REFUSALS, 503: refused("They are not.", models.Ready)})
+async def readyz(service: ServiceOf) -> Response:
+    """Say whether events are answered: the bundle computes what was recorded, and the sockets are bound."""
+    reason = service.ready()
+    return json_response({"ready": not reason, "state": service.state, "reason": reason}, 503 if reason else 200)
+
+
+@health.get(
+    "/metrics",
+    response_class=Response,
+    responses={
+        **REFUSALS,
+        200: {
+            "description": "In the format that the Accept header asks for.",
+            "content": {"text/plain": {"schema": {"type": "string"}}, "application/openmetrics-text": {}},
+        },
+    },
+)
+def metrics(request: Request) -> Response:
+    """Return counts and times for Prometheus."""
+    media_type, text = exposed(request.app.state.registry, request.headers.get("accept", ""))
+    return Response(text, headers={"Content-Type": media_type})
+
+
+@health.get("/v1/info", response_model=models.Info, responses=REFUSALS, tags=["service"])
+def info(service: ServiceOf) -> Response:
+    """Say what is served, by which processes, at which addresses."""
+    return json_response(service.info())
+
+
+@health.get("/v1/group", response_model=models.Group, responses=REFUSALS)
+def group(service: ServiceOf) -> Response:
+    """Name the replicas that answer events from the same queue, and say whether all have the same parameters.
+
+    Any replica answers for all. A service that shares its events with no other is the only member of its group.
+    """
+    return json_response(service.group())
+
+
+# -- parameters -------------------------------------------------------------------------------------------------------
+
+
+@parameters.get("/v1/parameters", response_model=models.Parameters, responses=REFUSALS)
+def read_parameters(service: ServiceOf) -> Response:
+    """Return the parameters, their ranges and their revision."""
+    return json_response(parameters_body(service.parameters()))
+
+
+@parameters.patch(
+    "/v1/parameters",
+    response_model=models.Parameters,
+    dependencies=[NEEDS_TOKEN],
+    responses={
+        **CHANGE_REFUSALS,
+        409: refused("They were changed concurrently; nothing is changed now.", models.Conflict),
+        422: refused("A value is refused; nothing is changed.", models.Invalid),
+    },
+)
+def change_parameters(service: ServiceOf, wanted: models.Change) -> Response:
+    """Change parameters, all or none, between two events; outputs carry the revision they were computed with."""
+    entries = service.parameters().entries
+    values = {token: _number(value, entries.get(token, {})) for token, value in wanted.values.items()}
+    return json_response(parameters_body(service.set_parameters(values, wanted.revision)))
+
+
+@parameters.post(
+    "/v1/parameters/write-back",
+    response_model=models.WrittenBack,
+    dependencies=[NEEDS_TOKEN],
+    responses={
+        **CHANGE_REFUSALS,
+        409: refused("Another bundle is being deployed."),
+        422: refused("The bundle can't be written.", models.Invalid),
+    },
+)
+def write_back(request: Request, service: ServiceOf, wanted: models.WriteBack) -> Response:
+    """Write the parameters into pipeline.toml, or say what would change there; the bundle is replayed and sealed."""
+    done = _alone(request, lambda: service.write_back(dry_run=wanted.dry_run))
+    return json_response({"diff": done.diff, "digest": done.digest})
+
+
+def _number(value: Any, entry: Mapping[str, Any]) -> Any:
+    """Return the number that a text stands for which JSON has no sign for, where the parameter is a number."""
+    return _NON_FINITE.get(value, value) if isinstance(value, str) and isinstance(entry.get("value"), float) else value
+
+
+# -- failures ---------------------------------------------------------------------------------------------------------
+
+_FailureId = Annotated[
+    str, PathParameter(description="Its id.", pattern="^[A-Za-z0-9_-]{1,64}$", examples=["01hx3v5k7m2q8z"])
+]
+_FAILURE_REFUSALS: Final[Responses] = {
+    **REFUSALS,
+    404: refused("No such failure is kept."),
+    422: refused("This is no id."),
+}
+
+
+@failures.get("", response_model=models.Failures, responses={**REFUSALS, 422: INVALID})
+def list_failures(
+    service: ServiceOf, limit: Annotated[int, Query(ge=1, le=1_000, description="How many at most.")] = 100
+) -> Response:
+    """List the events that failed, the newest first."""
+    return json_response({"failures": [asdict(record) for record in service.failure_records(limit)]})
+
+
+@failures.get("/{id}", response_model=models.Failure, responses=_FAILURE_REFUSALS)
+def failure(service: ServiceOf, id: _FailureId) -> Response:  # noqa: A002 - as in the path
+    """Say what failed, where, and with which parameters."""
+    return json_response(asdict(service.failure_store.record(id)))
+
+
+@failures.get(
+    "/{id}/event",
+    response_class=Response,
+    responses={**_FAILURE_REFUSALS, 200: {"description": "The event, packed.", "content": {_EVENT: models.BINARY}}},
+)
+def failed_event(service: ServiceOf, id: _FailureId) -> Response:  # noqa: A002 - as in the path
+    """Return the event itself, so that it can be computed again elsewhere."""
+    return Response(service.failure_store.packed_event(id), media_type=_EVENT)
+
+
+# -- operation --------------------------------------------------------------------------------------------------------
+
+_DEPLOY_REFUSALS: Final[Responses] = CHANGE_REFUSALS | {
+    409: refused("It is not served, for these reasons; the bundle before goes on.", models.DeployRefusal),
+    422: refused("There is no bundle at this path.", models.Refusal),
+}
+
+
+@operation.post("/access", response_model=models.Access, responses=CHANGE_REFUSALS)
+async def access() -> Response:
+    """Say whether the token is the service's, and change nothing."""
+    return json_response({"allowed": True})
+
+
+@operation.post("/deploy", response_model=models.Info, responses=_DEPLOY_REFUSALS)
+def deploy(request: Request, service: ServiceOf, wanted: models.Deploy) -> Response:
+    """Replay another bundle beside the one that is served, and serve it from the next event on."""
+
+    def check_and_deploy() -> dict[str, Any]:
+        # Unlike the methods of Path, these take any text.
+        if not os.path.isabs(wanted.bundle) or not os.path.isdir(wanted.bundle):
+            text = f"{wanted.bundle!r:.300} is no folder on the service's machine. Name a bundle's absolute path."
+            raise BundleError(wanted.bundle, text)
+        check_seal(Path(wanted.bundle))
+        return service.deploy(wanted.bundle)
+
+    return json_response(_alone(request, check_and_deploy))
+
+
+@operation.post("/rollback", response_model=models.Info, responses=_DEPLOY_REFUSALS)
+def rollback(request: Request, service: ServiceOf) -> Response:
+    """Serve the bundle again that was served before this one."""
+    return json_response(_alone(request, service.rollback))
+
+
+@operation.post("/pause", response_model=models.Info, responses=CHANGE_REFUSALS)
+def pause(service: ServiceOf) -> Response:
+    """Begin no more events; those that come wait, as many as the mailbox holds."""
+    service.pause()
+    return json_response(service.info())
+
+
+@operation.post("/resume", response_model=models.Info, responses=CHANGE_REFUSALS)
+def resume(service: ServiceOf) -> Response:
+    """Go on after a pause."""
+    service.resume()
+    return json_response(service.info())
+
+
+@operation.post("/drain", response_model=models.Info, responses={**CHANGE_REFUSALS, 422: INVALID})
+def drain(service: ServiceOf, wanted: Annotated[models.Drain | None, Body()] = None) -> Response:
+    """Take no more events, and work off those that wait."""
+    service.drain((wanted or models.Drain()).timeout_s)
+    return json_response(service.info())
+
+
+def _alone(request: Request, function: Callable[[], Any]) -> Any:
+    """Call what exchanges or changes the bundle, one call at a time; another call is refused at once."""
+    lock: threading.Lock = request.app.state.deploying
+    if not lock.acquire(blocking=False):
+        text = "A bundle is being exchanged already. Wait until that has ended, then look at what is served."
+        raise DeployRefused("The bundle", [text])
+    try:
+        return function()
+    finally:
+        lock.release()

@@ -1,10 +1,13 @@
-"""What do requests and answers look like? These records make up the description at /openapi.json."""
+"""The shapes of requests and responses, from which FastAPI makes the description at /openapi.json."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
+from fastapi import Depends, Request
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
+
+from epypes.service import Service
 
 Sentence = Annotated[str, Field(description="What is wrong, and the way out.")]
 Revision = Annotated[int, Field(ge=0, description="It rises with every change of the parameters.", examples=[3])]
@@ -38,20 +41,20 @@ class Invalid(Refusal):
 
 
 class Conflict(Refusal):
-    """Somebody else changed the parameters meanwhile."""
+    """The parameters were changed concurrently."""
 
     revision: Revision
     parameters: Entries
 
 
 class DeployRefusal(Refusal):
-    """A bundle that is not served; the one before goes on."""
+    """A bundle that was refused; the service goes on with the bundle before."""
 
     reasons: list[str] = Field(default_factory=list, description="What differs, or what else is wrong.")
 
 
 class Alive(BaseModel):
-    """Whether the service does its work; if not, it should be started anew."""
+    """Whether the service works; if not, it should be restarted."""
 
     alive: bool
     reason: str = Field(description="Why not; empty if it is.", examples=[""])
@@ -92,9 +95,9 @@ class Info(BaseModel):
 
 
 class Member(BaseModel):
-    """A replica, as it was heard last."""
+    """A replica, as its last heartbeat described it."""
 
-    replica: str = Field(description="What it is called.", examples=["1"])
+    replica: str = Field(description="Its name.", examples=["1"])
     host: str
     pid: int
     state: str
@@ -102,12 +105,12 @@ class Member(BaseModel):
     name: str = Field(description="Of the bundle that it serves.")
     digest: str = Field(description="SHA-256 of the manifest of what it serves.")
     revision: int = Field(description="Of the parameters that it computes with.")
-    ordered: bool = Field(description="Whether it keeps the order of events; all should, or none.")
+    ordered: bool = Field(description="Whether it keeps the order of events; all replicas should, or none.")
     counts: dict[str, int]
-    http: str = Field(description="Where it is controlled; empty if it is not.")
+    http: str = Field(description="Its HTTP control; empty if it has none.")
     trouble: str = Field(description="Why it does not follow the others; empty if it does.")
-    heard_s: float = Field(description="How many seconds ago it was heard; after 3.5 it is not a member any more.")
-    is_self: bool = Field(description="Whether it is the one that answers.")
+    heard_s: float = Field(description="Seconds since its last heartbeat; after 3.5 it is not a member any more.")
+    is_self: bool = Field(description="Whether it is the replica that answers this request.")
 
 
 class Group(BaseModel):
@@ -118,11 +121,11 @@ class Group(BaseModel):
     ready: int = Field(description="How many of them answer events.")
     agree: bool = Field(description="Whether all serve the same bundle with the same revision of its parameters.")
     counts: dict[str, int] = Field(description="The sums of theirs.")
-    trouble: str = Field(description="Why this one does not hear the others; empty if it does.")
-    rejected: int = Field(description="How many messages among the replicas were none of theirs.")
+    trouble: str = Field(description="Why this replica does not hear the others; empty if it does.")
+    rejected: int = Field(description="Messages between replicas that were rejected.")
     members: list[Member]
     lost: list[Member] = Field(
-        description="Who has gone without a word in the last ten minutes and is not back, as heard last; state LOST."
+        description="Replicas that went away without stopping in the last ten minutes, as last heard; state LOST."
     )
 
 
@@ -134,14 +137,14 @@ class Parameters(BaseModel):
 
 
 class Change(BaseModel):
-    """Values for some parameters; all are taken, or none."""
+    """New values for some parameters; all are applied, or none."""
 
     model_config = ConfigDict(
         extra="forbid", strict=True, json_schema_extra={"example": {"revision": 3, "values": {"canny_lo": 60}}}
     )
     revision: Revision | None = Field(
         default=None,
-        description="The one that was read before; another one now is a conflict. Null to change whatever is.",
+        description="The revision that was read before; another revision now is a conflict. Null to change any.",
     )
     values: dict[str, JsonValue] = Field(min_length=1, max_length=1_000, description="New values by token.")
 
@@ -200,7 +203,60 @@ class Deploy(BaseModel):
 
 
 class Drain(BaseModel):
-    """How long to work off what waits."""
+    """How long the events that wait may take."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     timeout_s: float = Field(default=5.0, gt=0, le=600, description="In seconds.")
+
+
+# -- what each route may answer besides its result --------------------------------------------------------------------
+
+Responses = dict[int | str, dict[str, Any]]
+BINARY: Final = {"schema": {"type": "string", "format": "binary"}}
+
+
+def refused(description: str, model: type[BaseModel] = Refusal) -> dict[str, Any]:
+    """Return the description of a refusal."""
+    return {"model": model, "description": description}
+
+
+def content(media_types: list[str], description: str) -> dict[str, Any]:
+    """Return the description of a response that is bytes of one of these types."""
+    return {"description": description, "content": dict.fromkeys(media_types, BINARY)}
+
+
+REFUSALS: Final[Responses] = {
+    400: refused("The body is not JSON, or is not whole."),
+    408: refused("The body took too long."),
+    413: refused("The body has more than 64 KB."),
+    415: refused("The Content-Type of the body is not JSON."),
+    431: refused("The address or the headers are too long."),
+    503: {
+        **refused("The service can't answer now."),
+        "headers": {"Retry-After": {"schema": {"type": "integer"}, "description": "Seconds until the next try."}},
+    },
+}
+CHANGE_REFUSALS: Final[Responses] = REFUSALS | {
+    401: refused("The token is missing."),
+    403: refused("This is not the service's token."),
+}
+INVALID: Final = refused("The request is not as described here.")
+# FastAPI would put a model into the media type of the events.
+EVENT_REFUSALS: Final[Responses] = {
+    status: {
+        "description": part["description"],
+        "content": {"application/json": {"schema": Refusal.model_json_schema()}},
+    }
+    for status, part in {**REFUSALS, 422: INVALID}.items()
+}
+
+
+# -- what routes take -------------------------------------------------------------------------------------------------
+
+
+def _service(request: Request) -> Service:
+    service: Service = request.app.state.service
+    return service
+
+
+ServiceOf = Annotated[Service, Depends(_service)]

@@ -1,1 +1,1 @@
-"""A running service as a notebook sees it, over HTTP: looked at, changed, tuned."""
+"""A running service in a notebook, over HTTP: shown, changed and tuned."""

@@ -1,11 +1,12 @@
-"""How is a running service looked at and changed from a notebook?"""
+"""A running service as an object: reading it, changing it, and showing it in a notebook."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 from urllib.parse import quote
@@ -13,20 +14,20 @@ from urllib.parse import quote
 from epypes.bundle.entries import plain, written
 from epypes.bundle.ports import in_order
 from epypes.errors import EpypesError, ServiceError
-from epypes.service.failures.record import FailureRecord
+from epypes.service.failures.record import FailureRecord, read_record
 from epypes.service.parameters import Parameters
-from epypes.service.remote.control import Control, address_of, parameters_of
+from epypes.service.remote.control import Control, Event, read_parameters, split_url
 
 if TYPE_CHECKING:
-    from epypes.display.views.graphview import GraphView
+    from epypes.display import GraphView
     from epypes.service.remote.runner import RemoteRunner
     from epypes.wire import Envelope
 
-_TOKEN: Final = "EPYPES_TOKEN"  # noqa: S105 - the name of a variable, not a secret
+_TOKEN_VARIABLE: Final = "EPYPES_TOKEN"  # noqa: S105 - the name of a variable, not a secret
 # A bundle is replayed in a process of its own before it is written or takes another one's place.
 _REPLAY_TIMEOUT_S: Final = 300.0
-_TELLS: Final = ("name", "digest", "state", "func_io", "outputs", "versions")
-_RECORD: Final = frozenset(field.name for field in fields(FailureRecord))
+_INFO_KEYS: Final = ("name", "digest", "state", "func_io", "outputs", "versions")
+_DIGEST_CHARACTERS: Final = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +48,7 @@ class WrittenBack:
 
 @dataclass(frozen=True, slots=True)
 class Addresses:
-    """Where a service takes events and gives answers, as ``ep.ZMQPublisher`` and ``ep.ZMQSubscriber`` take them.
+    """The sockets of a service, as ``ep.ZMQPublisher`` and ``ep.ZMQSubscriber`` take them.
 
     Attributes
     ----------
@@ -70,10 +71,10 @@ def connect(url: str, *, token: str | None = None, timeout_s: float = 5.0) -> Co
     Parameters
     ----------
     url
-        Where it is, as ``http://127.0.0.1:8642``; the address of its page does too.
+        Its address, as ``http://127.0.0.1:8642``; the address of its page does too.
     token
-        What its changes are asked for with. Without: that of the address, that of EPYPES_TOKEN, or, for a service of
-        this user's on this machine, the one in its token file. Looking needs none.
+        The token for changes. Without: that of the address, that of EPYPES_TOKEN, or, for a service of this user on
+        this machine, the one in its token file. Reading needs none.
     timeout_s
         How long an answer may take, in seconds.
 
@@ -85,63 +86,80 @@ def connect(url: str, *, token: str | None = None, timeout_s: float = 5.0) -> Co
     Raises
     ------
     ServiceError
-        The address is none, nothing answers there, it is no EPypes service, or one of another version.
+        This is no address, nothing answers there, it is no EPypes service, or one of another version.
     """
-    address, in_url = address_of(url)
-    given = token or in_url or os.environ.get(_TOKEN) or _token_on_this_machine(address)
-    return Connection(Control(address, given, timeout_s))
+    address, token_in_url = split_url(url)
+    token = token or token_in_url or os.environ.get(_TOKEN_VARIABLE) or _token_on_this_machine(address)
+    return Connection(Control(address, token, timeout_s))
+
+
+def _token_on_this_machine(address: str) -> str:
+    """Return the token of a service of this user; empty if there is none."""
+    from epypes.service import state_file
+
+    try:
+        found = state.running_at(address)
+        return Path(found.token_file).read_text(encoding="ascii").strip() if found and found.token_file else ""
+    except (OSError, UnicodeDecodeError, ServiceError):
+        return ""
 
 
 class Connection:
-    """A running service, as its HTTP control shows it; made by ``ep.connect``. May be used from several threads.
+    """A running service, over its HTTP control; made by ``ep.connect``. May be used from several threads.
 
-    What it shows in a notebook is what it read when it was made, or by the last ``info()``.
+    A notebook shows what was read when the connection was made, or by the last ``info()``.
 
     Parameters
     ----------
     control
-        Asks the service.
+        Sends the requests.
     """
 
     def __init__(self, control: Control) -> None:
+        from epypes import __version__
+
         self._control = control
         self._info: dict[str, Any] = {}
         self._view: GraphView | None = None
         self._runner: RemoteRunner | None = None
         try:
-            _check_version(control.url, self.info())
+            versions = self.info()["versions"]
+            there = str(versions.get("epypes", "")) if isinstance(versions, Mapping) else ""
+            if there.partition(".")[0] != __version__.partition(".")[0]:
+                text = f"The service at {self.url} runs EPypes {there or 'of no version'}, and this is {__version__}."
+                raise ServiceError(self.url, f"{text} Install the same version here.")
         except BaseException:
             control.close()
             raise
 
     @property
     def url(self) -> str:
-        """Where the service's HTTP control is."""
+        """The address of the service's HTTP control."""
         return self._control.url
 
     @property
     def addresses(self) -> Addresses:
-        """Where it takes events, and publishes answers and failures; as of the last ``info()``."""
-        told = self._info.get("addresses")
-        known = told if isinstance(told, Mapping) else {}
+        """The sockets for events, answers and failures; as of the last ``info()``."""
+        known = self._info.get("addresses")
+        known = known if isinstance(known, Mapping) else {}
         return Addresses(*(str(known.get(name, "")) for name in ("sub", "pub", "failures")))
 
-    # -- looking ------------------------------------------------------------------------------------------------
+    # -- reading ------------------------------------------------------------------------------------------------
 
     def info(self) -> dict[str, Any]:
         """Return what is served, in which state, by which processes and at which addresses."""
-        self._info = self._told(self._control.get("/v1/info"))
+        self._set_info(self._control.get("/v1/info"))
         with suppress(EpypesError):
-            self._view = self._seen()
+            self._view = self._read_view()
         return dict(self._info)
 
     def group(self) -> dict[str, Any]:
-        """Return which replicas share its events with it, how each is, and whether all compute with the same."""
+        """Return the replicas that share its events, the state of each, and whether all have the same parameters."""
         return dict(self._control.get("/v1/group"))
 
     def parameters(self) -> Parameters:
         """Return the hyperparameters: their revision, and an entry by token as in pipeline.toml."""
-        return parameters_of(self.url, self._control.get("/v1/parameters"))
+        return read_parameters(self.url, self._control.get("/v1/parameters"))
 
     def run(self, tokens: str | Sequence[str] | None = None, revision: int | None = None) -> dict[str, Any]:
         """Return values of the service's last completed run, by token.
@@ -166,36 +184,35 @@ class Connection:
         from epypes.service.packing import unpack
         from epypes.wire import decode
 
-        asked = [tokens] if isinstance(tokens, str) else list(tokens)
+        names = [tokens] if isinstance(tokens, str) else list(tokens)
         since = {} if revision is None else {"revision": revision}
-        return decode(unpack(self._control.content("/v1/run", tokens=asked, **since)[1]))
+        return decode(unpack(self._control.content("/v1/run", tokens=names, **since)[1]))
 
     def preview(self, token: str, max_side_px: int = 512) -> tuple[str, bytes]:
         """Return a token of the last run as a small picture, or as text: its media type and its bytes."""
         return self._control.content(f"/v1/tokens/{quote(token, safe='')}/preview", max_side_px=max_side_px)
 
     def view(self) -> dict[str, Any]:
-        """Return what is to be seen of the graph, as ``ep.show(...).save("x.json")`` writes it."""
+        """Return what the picture of the graph is drawn from, as ``ep.show(...).save("x.json")`` writes it."""
         found = self._control.get("/v1/view")
         return found if isinstance(found, dict) else {}
 
     def failures(self, limit: int = 100) -> list[FailureRecord]:
-        """Return what is known of the last events that failed."""
-        said = self._control.get("/v1/failures", limit=limit)
-        records = said.get("failures", []) if isinstance(said, dict) else said
-        return [_record(record) for record in records]
+        """Return the records of the last events that failed."""
+        body = self._control.get("/v1/failures", limit=limit)
+        return [self._record(record) for record in (body.get("failures", []) if isinstance(body, dict) else [])]
 
     def failure(self, failure_id: str) -> tuple[FailureRecord, Envelope | bytes | None]:
-        """Return what is known of an event that failed, and the event; None if it was not kept."""
+        """Return the record of an event that failed, and the event; None if it was not kept."""
         from epypes.service.packing import unpack_event
 
         path = f"/v1/failures/{quote(failure_id, safe='')}"
-        record = _record(self._control.get(path))
+        record = self._record(self._control.get(path))
         event = unpack_event(self._control.content(f"{path}/event")[1]) if record.has_event else None
         return record, event
 
-    def events(self) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yield what the service tells of as it happens: ``("run", {...})``, state, failure, parameters and counts.
+    def events(self) -> Iterator[Event]:
+        """Yield what happens in the service as it happens: ``("run", {...})``, state, failure, parameters and counts.
 
         Raises
         ------
@@ -213,21 +230,22 @@ class Connection:
         Parameters
         ----------
         revision
-            That of the values that were looked at; if they have another one now, nothing is set. Any without.
+            Of the values that were read before; if they have another one now, nothing is set. Any without.
         values
             By token.
 
         Raises
         ------
         RevisionConflict
-            Somebody else has changed them meanwhile; ``current`` has what they are.
+            They were changed concurrently; ``current`` has what they are.
         ParametersRefused
-            With a reason for each value that the service does not take.
+            With a reason for each value that the service refuses.
         """
         if not values:
             return self.parameters()
-        body = {"revision": revision, "values": {token: _sent(value) for token, value in values.items()}}
-        return parameters_of(self.url, self._control.change("PATCH", "/v1/parameters", body))
+        entries = {token: written(plain(value)).get("value") for token, value in values.items()}
+        body = {"revision": revision, "values": entries}
+        return read_parameters(self.url, self._control.change("PATCH", "/v1/parameters", body))
 
     def write_back(self, dry_run: bool = False) -> WrittenBack:
         """Write the values of the hyperparameters into the bundle's pipeline.toml, and return what was changed.
@@ -237,39 +255,39 @@ class Connection:
         dry_run
             Whether to return only what would be changed.
         """
-        said = self._control.change("POST", "/v1/parameters/write-back", {"dry_run": dry_run}, _REPLAY_TIMEOUT_S)
-        return WrittenBack(str(said.get("diff", "")), str(said.get("digest", "")))
+        body = self._control.change("POST", "/v1/parameters/write-back", {"dry_run": dry_run}, _REPLAY_TIMEOUT_S)
+        return WrittenBack(str(body.get("diff", "")), str(body.get("digest", "")))
 
     def deploy(self, path: str | Path) -> dict[str, Any]:
-        """Have another bundle on the service's machine take the place of the one that is served.
+        """Serve another bundle on the service's machine from the next event on.
 
         Raises
         ------
         DeployRefused
-            It does not compute what was recorded, or does not fit; the one before goes on.
+            It does not compute what was recorded, or does not fit; the bundle before goes on.
         """
-        return self._asked("deploy", {"bundle": str(Path(path).resolve())})
+        return self._post("deploy", {"bundle": str(Path(path).resolve())})
 
     def rollback(self) -> dict[str, Any]:
-        """Have the bundle that was served before take its place again."""
-        return self._asked("rollback")
+        """Serve the bundle again that was served before."""
+        return self._post("rollback")
 
     def pause(self) -> dict[str, Any]:
         """Let events wait."""
-        return self._asked("pause")
+        return self._post("pause")
 
     def resume(self) -> dict[str, Any]:
         """Go on after a pause."""
-        return self._asked("resume")
+        return self._post("resume")
 
     def drain(self, timeout_s: float = 5.0) -> dict[str, Any]:
         """Take no more events, and work off those that wait."""
-        return self._asked("drain", {"timeout_s": timeout_s})
+        return self._post("drain", {"timeout_s": timeout_s})
 
     # -- itself -------------------------------------------------------------------------------------------------
 
     def to_tune(self) -> RemoteRunner:
-        """Return what ``tune`` moves: the same for all panels of this connection, so that they share a history."""
+        """Return what ``tune`` tunes: the same object for all panels of this connection, which share a history."""
         from epypes.service.remote.runner import RemoteRunner
 
         if self._runner is None:
@@ -293,18 +311,32 @@ class Connection:
         return f"<Connection: {name!r:.24} at {self.url:.36}; {state:.12}, revision {self._info.get('revision', 0)}>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        from epypes.display.mime import bundle_of
-        from epypes.service.remote.shown import painted
+        from epypes.display import Figure
 
-        return bundle_of(self, lambda: painted(self.url, self._info, self._view), lambda: self._seen_or_nothing())
+        table = self._table()
+        if self._view is None:
+            return {"text/plain": repr(self), "text/html": table}
+        shown = Figure(self._view, table)._repr_mimebundle_()
+        # Where no picture can be drawn, the text has the graph and the reason.
+        text = repr(self) if "text/html" in shown else f"{self!r}\n{shown['text/plain']}"
+        return {**shown, "text/plain": text}
 
-    def _seen_or_nothing(self) -> GraphView:
-        from epypes.display.views.graphview import GraphView
+    def _table(self) -> str:
+        info, addresses = self._info, self._info.get("addresses")
+        reason = str(info.get("reason") or "")
+        rows = {
+            "http": self.url,
+            **(addresses if isinstance(addresses, Mapping) else {}),
+            "bundle": info.get("bundle", ""),
+            "digest": str(info["digest"])[:_DIGEST_CHARACTERS],
+            "revision": info.get("revision", 0),
+            "restarts": info.get("restarts", 0),
+        }
+        cells = (f"<tr><td>{escape(name)}</td><td>{escape(str(v))}</td></tr>" for name, v in rows.items() if v != "")
+        state = f"{info['name']} is {info['state']}{f': {reason}' if reason else '.'}"
+        return f"<p>{escape(state)}</p><table>{''.join(cells)}</table>"
 
-        return self._view or GraphView((), (), ())
-
-    def _seen(self) -> GraphView:
-        """Return what is to be seen of the graph now, as the painters take it."""
+    def _read_view(self) -> GraphView:
         from epypes.display.views.jsonview import from_json
 
         try:
@@ -312,42 +344,17 @@ class Connection:
         except (TypeError, ValueError, KeyError) as error:
             raise ServiceError(self.url, f"The view of {self.url} can't be read: {error}.") from error
 
-    def _asked(self, verb: str, body: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        self._info = self._told(self._control.change("POST", f"/v1/{verb}", body, _REPLAY_TIMEOUT_S))
+    def _post(self, verb: str, body: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        self._set_info(self._control.change("POST", f"/v1/{verb}", body, _REPLAY_TIMEOUT_S))
         return dict(self._info)
 
-    def _told(self, said: Any) -> dict[str, Any]:
-        if isinstance(said, dict) and all(key in said for key in _TELLS):
-            return said
-        raise ServiceError(self.url, f"What answers at {self.url} is no EPypes service. Is the address right?")
+    def _set_info(self, body: Any) -> None:
+        if not isinstance(body, dict) or any(key not in body for key in _INFO_KEYS):
+            raise ServiceError(self.url, f"What answers at {self.url} is no EPypes service. Is the address right?")
+        self._info = body
 
-
-def _check_version(url: str, info: Mapping[str, Any]) -> None:
-    """Raise ServiceError for a service of another version, whose answers may mean something else."""
-    from epypes import __version__
-
-    there = str(info["versions"].get("epypes", "")) if isinstance(info["versions"], Mapping) else ""
-    if there.partition(".")[0] != __version__.partition(".")[0]:
-        text = f"The service at {url} runs EPypes {there or 'of no version'}, and this is {__version__}."
-        raise ServiceError(url, f"{text} Install the same version here.")
-
-
-def _token_on_this_machine(address: str) -> str:
-    """Return the token of a service of this user's; empty if there is none."""
-    # It is of no use where no service can run.
-    from epypes.service import state_file
-
-    try:
-        found = state_file.running_at(address)
-        return Path(found.token_file).read_text(encoding="ascii").strip() if found and found.token_file else ""
-    except (OSError, UnicodeDecodeError, ServiceError):
-        return ""
-
-
-def _sent(value: Any) -> Any:
-    """Return a value of a hyperparameter as JSON has it."""
-    return written(plain(value)).get("value")
-
-
-def _record(said: Mapping[str, Any]) -> FailureRecord:
-    return FailureRecord(**{key: value for key, value in said.items() if key in _RECORD})
+    def _record(self, entries: Any) -> FailureRecord:
+        try:
+            return read_record(entries)
+        except ValueError as error:
+            raise ServiceError(self.url, f"A failure at {self.url} can't be read: {error}.") from error

@@ -1,55 +1,72 @@
-"""How is the HTTP control of a service asked, and what does it mean when that fails?"""
+"""HTTP requests to the control of a service, its event stream, and the errors that refusals stand for."""
 
 from __future__ import annotations
 
 import json
+import logging
 import socket
+import threading
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 from urllib.parse import parse_qs, urlsplit
 
-from epypes.errors import DeployRefused, MessageError, NotComputed, ParametersRefused, RevisionConflict, ServiceError
+from epypes.errors import (
+    DeployRefused,
+    EpypesError,
+    MessageError,
+    NotComputed,
+    ParametersRefused,
+    RevisionConflict,
+    ServiceError,
+)
 from epypes.optional import optional_import
 from epypes.service.parameters import Parameters
 
-if TYPE_CHECKING:
+with optional_import():
     import httpx
 
+if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
+_log = logging.getLogger(__name__)
+
 _LOOPBACK: Final = ("localhost", "127.0.0.1", "::1")
-# The service tells its counts each second: who hears nothing for so long hears nothing any more.
-SILENCE_S: Final = 5.0
-_DETAIL_CHARACTERS: Final = 2_000
+# A service sends its counts each second.
+_SILENCE_S: Final = 5.0
+_MAX_DETAIL_CHARACTERS: Final = 2_000
 _HOW_TO_CHANGE: Final = "Give it here: ep.connect(url, token=...), or set EPYPES_TOKEN."
+_FIRST_WAIT_S: Final = 0.25
+_LAST_WAIT_S: Final = 8.0
+_STOP_TIMEOUT_S: Final = 5.0
+
+Event = tuple[str, dict[str, Any]]
 
 
 class Control:
-    """The control of one service; may be used from several threads.
+    """The HTTP control of one service; may be used from several threads.
 
     Parameters
     ----------
     url
-        Where it is, as ``http://127.0.0.1:8642``.
+        Its address, as ``http://127.0.0.1:8642``.
     token
-        What changes are asked for with; empty for none.
+        The token for changes; empty for none.
     timeout_s
-        How long an answer may take.
+        How long an answer may take, in seconds.
 
     Raises
     ------
     ServiceError
-        The address is none.
+        This is no address.
     """
 
     def __init__(self, url: str, token: str, timeout_s: float) -> None:
-        with optional_import():
-            import httpx
-
-        self.url, self.timeout_s, self.has_token = url, timeout_s, bool(token)
+        self.url, self.timeout_s, self._has_token = url, timeout_s, bool(token)
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         try:
-            # A proxy of the environment's has nothing to do with what is on this machine.
+            # A proxy of the environment does not reach this machine's loopback.
             is_here = urlsplit(url).hostname in _LOOPBACK
             self._client = httpx.Client(base_url=url, timeout=timeout_s, headers=headers, trust_env=not is_here)
         except (httpx.InvalidURL, ValueError) as error:
@@ -57,64 +74,57 @@ class Control:
         self.close = weakref.finalize(self, self._client.close)
 
     def get(self, path: str, **params: Any) -> Any:
-        """Return what is read there, from JSON."""
-        return self._json(path, self._answered("GET", path, params=params))
+        """Return JSON from a path."""
+        return self._json(path, self._request("GET", path, params=params))
 
     def content(self, path: str, **params: Any) -> tuple[str, bytes]:
-        """Return what is read there as it is, with its media type."""
-        answer = self._answered("GET", path, params=params)
-        return answer.headers.get("content-type", "").partition(";")[0], answer.content
+        """Return the media type and the bytes from a path."""
+        response = self._request("GET", path, params=params)
+        return response.headers.get("content-type", "").partition(";")[0], response.content
 
-    def change(
-        self, method: str, path: str, body: Mapping[str, Any] | None = None, timeout_s: float | None = None
-    ) -> Any:
-        """Ask for a change, which may take longer than an answer, and return what is answered."""
+    def change(self, method: str, path: str, body: Mapping[str, Any] | None = None, timeout_s: float = 0.0) -> Any:
+        """Request a change, which may take longer than a reading, and return the JSON of the answer."""
         try:
             content = json.dumps(body or {}, allow_nan=False)
         except (TypeError, ValueError) as error:
             raise ServiceError(self.url, f"This can't be sent to the service at {self.url}: {error}.") from error
         headers = {"Content-Type": "application/json"}
-        patience_s = max(timeout_s or 0.0, self.timeout_s)
-        request = {"content": content, "headers": headers, "timeout": patience_s}
-        return self._json(path, self._answered(method, path, **request))
+        timeout_s = max(timeout_s, self.timeout_s)
+        return self._json(path, self._request(method, path, content=content, headers=headers, timeout=timeout_s))
 
     @contextmanager
-    def events(self) -> Iterator[Stream]:
-        """Open the stream of what the service tells of by itself."""
-        with optional_import():
-            import httpx
-
-        timeout = httpx.Timeout(self.timeout_s, read=SILENCE_S)
+    def events(self) -> Iterator[EventStream]:
+        """Open the stream of server-sent events."""
+        timeout = httpx.Timeout(self.timeout_s, read=_SILENCE_S)
         headers = {"Accept": "text/event-stream", "Cache-Control": "no-store"}
         try:
-            with self._client.stream("GET", "/v1/events", timeout=timeout, headers=headers) as answer:
-                if answer.status_code != 200:
-                    answer.read()
-                    self._refuse("/v1/events", answer)
-                yield Stream(self, answer)
+            with self._client.stream("GET", "/v1/events", timeout=timeout, headers=headers) as response:
+                if response.status_code != 200:
+                    response.read()
+                    self._raise_refusal("/v1/events", response)
+                yield EventStream(self.url, response)
         except (httpx.HTTPError, httpx.StreamError) as error:
-            self._fail(error)
+            self._raise_unreachable(error)
 
-    def _answered(self, method: str, path: str, **request: Any) -> httpx.Response:
-        with optional_import():
-            import httpx
-
+    def _request(self, method: str, path: str, **request: Any) -> httpx.Response:
         try:
-            answer = self._client.request(method, path, **request)
+            response = self._client.request(method, path, **request)
         except (httpx.HTTPError, httpx.InvalidURL) as error:
-            self._fail(error)
+            self._raise_unreachable(error)
         except RuntimeError as error:
-            raise ServiceError(
-                self.url, f"The connection to {self.url} is closed. Make one: ep.connect(...)."
-            ) from error
-        if answer.status_code != 200:
-            self._refuse(path, answer)
-        return answer
+            text = f"The connection to {self.url} is closed. Make one: ep.connect(...)."
+            raise ServiceError(self.url, text) from error
+        if response.status_code != 200:
+            self._raise_refusal(path, response)
+        return response
 
-    def _fail(self, error: Exception) -> NoReturn:
-        with optional_import():
-            import httpx
+    def _json(self, path: str, response: httpx.Response) -> Any:
+        try:
+            return response.json()
+        except ValueError as error:
+            raise ServiceError(self.url, f"What answers at {self.url}{path} is no EPypes service.") from error
 
+    def _raise_unreachable(self, error: Exception) -> NoReturn:
         if isinstance(error, httpx.TimeoutException):
             text = f"The service at {self.url} did not answer in time ({self.timeout_s:g} s). Is it stopped, or busy?"
         elif isinstance(error, httpx.ConnectError):
@@ -125,93 +135,166 @@ class Control:
             text = f"The connection to the service at {self.url} broke off: {error or type(error).__name__}."
         raise ServiceError(self.url, text) from error
 
-    def _json(self, path: str, answer: httpx.Response) -> Any:
+    def _raise_refusal(self, path: str, response: httpx.Response) -> NoReturn:
         try:
-            return answer.json()
-        except ValueError as error:
-            raise ServiceError(self.url, f"What answers at {self.url}{path} is no EPypes service.") from error
-
-    def _refuse(self, path: str, answer: httpx.Response) -> NoReturn:
-        """Raise what a refusal means."""
-        said = _object(answer)
-        detail = str(said.get("detail") or f"{path} was answered with status {answer.status_code}.")
-        detail = detail[:_DETAIL_CHARACTERS]
-        if "revision" in said and "parameters" in said:
-            raise RevisionConflict(self.url, parameters_of(self.url, said))
-        if "problems" in said and path == "/v1/parameters":
-            raise ParametersRefused(self.url, said["problems"])
-        if "reasons" in said:
-            raise DeployRefused(self.url, said["reasons"])
-        if answer.status_code in (401, 403) and not self.has_token:
+            body = response.json()
+        except ValueError:
+            body = {}
+        body = body if isinstance(body, dict) else {}
+        detail = str(body.get("detail") or f"{path} was answered with status {response.status_code}.")
+        detail = detail[:_MAX_DETAIL_CHARACTERS]
+        if "revision" in body and "parameters" in body:
+            raise RevisionConflict(self.url, read_parameters(self.url, body))
+        if "problems" in body and path == "/v1/parameters":
+            raise ParametersRefused(self.url, body["problems"])
+        if "reasons" in body:
+            raise DeployRefused(self.url, body["reasons"])
+        if response.status_code in (401, 403) and not self._has_token:
             raise ServiceError(self.url, f"{detail} {_HOW_TO_CHANGE}")
-        if answer.status_code == 409:
+        if response.status_code == 409:
             raise NotComputed("", detail)
-        if answer.status_code == 422:
+        if response.status_code == 422:
             raise MessageError("refused", detail)
         raise ServiceError(self.url, detail)
 
 
-class Stream:
-    """What a service tells of by itself, while it is open."""
-
-    def __init__(self, control: Control, answer: httpx.Response) -> None:
-        self._control, self._answer = control, answer
-
-    def __iter__(self) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yield the name of each event and what it says."""
-        with optional_import():
-            from httpx_sse import EventSource, SSEError
-
-        try:
-            for event in EventSource(self._answer).iter_sse():
-                with suppress(ValueError):
-                    said = event.json()
-                    if isinstance(said, dict):
-                        yield event.event, said
-        except SSEError as error:
-            raise ServiceError(self._control.url, f"{self._control.url} tells of no events: {error}.") from error
-
-    def close(self) -> None:
-        """End it; whoever waits for its next event waits no more. From any thread."""
-        stream = self._answer.extensions.get("network_stream")
-        end = stream.get_extra_info("socket") if stream is not None else None
-        if end is not None:
-            with suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
-
-
-def address_of(url: str) -> tuple[str, str]:
-    """Return an address of a service without what a page's has behind it, and the token that was there.
+def split_url(url: str) -> tuple[str, str]:
+    """Return the address of a service without what its page's address has behind it, and the token that was there.
 
     Raises
     ------
     ServiceError
-        It is none.
+        This is no address.
     """
     try:
         parts = urlsplit(url.strip())
-        is_one = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+        is_address = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
     except (ValueError, AttributeError):
-        is_one = False
-    if not is_one:
+        is_address = False
+    if not is_address:
         text = f"{url!r:.200} is no address of a service. Write it as http://127.0.0.1:8642."
         raise ServiceError(url, text)
     token = parse_qs(parts.fragment).get("token", [""])[0]
     return f"{parts.scheme}://{parts.netloc}{parts.path.rstrip('/')}", token
 
 
-def parameters_of(url: str, said: Any) -> Parameters:
-    """Return the parameters that a service tells of; ServiceError if it tells of none."""
+def read_parameters(url: str, body: Any) -> Parameters:
+    """Return the parameters in a service's answer; ServiceError if it has none."""
     try:
-        entries = {str(token): dict(entry) for token, entry in said["parameters"].items()}
-        return Parameters(int(said["revision"]), entries)
+        entries = {str(token): dict(entry) for token, entry in body["parameters"].items()}
+        return Parameters(int(body["revision"]), entries)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ServiceError(url, f"What answers at {url} is no EPypes service: it has no parameters.") from error
 
 
-def _object(answer: httpx.Response) -> Mapping[str, Any]:
-    try:
-        said = answer.json()
-    except ValueError:
-        return {}
-    return said if isinstance(said, dict) else {}
+# -- events -----------------------------------------------------------------------------------------------------------
+
+
+class EventStream:
+    """The server-sent events of a service, while the stream is open."""
+
+    def __init__(self, url: str, response: httpx.Response) -> None:
+        self._url, self._response = url, response
+
+    def __iter__(self) -> Iterator[Event]:
+        """Yield the name and the data of each event."""
+        with optional_import():
+            from httpx_sse import EventSource, SSEError
+
+        try:
+            for event in EventSource(self._response).iter_sse():
+                with suppress(ValueError):
+                    data = event.json()
+                    if isinstance(data, dict):
+                        yield event.event, data
+        except SSEError as error:
+            raise ServiceError(self._url, f"{self._url} sends no events: {error}.") from error
+
+    def close(self) -> None:
+        """End the stream, and a thread that waits for its next event; from any thread."""
+        stream = self._response.extensions.get("network_stream")
+        connection = stream.get_extra_info("socket") if stream is not None else None
+        if connection is not None:
+            with suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
+
+
+class EventFollower:
+    """Reads the events of a service on a thread of its own, and reconnects when the service is gone.
+
+    Parameters
+    ----------
+    open_stream
+        Opens the stream.
+    on_connected
+        Called when the stream is open, before its first event.
+    on_event
+        Called with the name and the data of each event.
+    on_lost
+        Called with the reason when the stream ends, and when it can't be opened.
+
+    Notes
+    -----
+    All are called on its thread, a daemon. Between two attempts it waits 0.25 s, 0.5 s ... 8 s.
+    """
+
+    def __init__(
+        self,
+        open_stream: Callable[[], AbstractContextManager[EventStream]],
+        on_connected: Callable[[], None],
+        on_event: Callable[[str, Mapping[str, Any]], None],
+        on_lost: Callable[[str], None],
+    ) -> None:
+        self._open_stream, self._on_connected = open_stream, on_connected
+        self._on_event, self._on_lost = on_event, on_lost
+        self._lock = threading.Lock()
+        self._stopped = threading.Event()
+        self._stream: EventStream | None = None
+        self.is_open = False
+        self._thread = threading.Thread(target=self._run, name="epypes-follower", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread; from any thread."""
+        self._stopped.set()
+        with self._lock:
+            if self._stream is not None:
+                self._stream.close()
+        if self._thread is not threading.current_thread() and self._thread.ident is not None:
+            self._thread.join(_STOP_TIMEOUT_S)
+
+    def _run(self) -> None:
+        wait_s = _FIRST_WAIT_S
+        while not self._stopped.is_set():
+            reason = "It ended the connection."
+            try:
+                with self._open_stream() as stream:
+                    self._set_stream(stream)
+                    self._on_connected()
+                    self.is_open = True
+                    wait_s = _FIRST_WAIT_S
+                    for name, data in stream:
+                        if self._stopped.is_set():
+                            break
+                        self._on_event(name, data)
+            except EpypesError as error:
+                reason = str(error)
+            except Exception as error:
+                _log.exception("An event of a service could not be handled")
+                reason = f"{type(error).__name__}: {error}"
+            self._set_stream(None)
+            self.is_open = False
+            if not self._stopped.is_set():
+                with suppress(Exception):
+                    self._on_lost(reason)
+            self._stopped.wait(wait_s)
+            wait_s = min(2 * wait_s, _LAST_WAIT_S)
+
+    def _set_stream(self, stream: EventStream | None) -> None:
+        with self._lock:
+            self._stream = stream
+            if stream is not None and self._stopped.is_set():
+                stream.close()

@@ -1,12 +1,12 @@
-"""How is a running service tuned as a runner is?
+"""A running service as a panel tunes it: its graph, its hyperparameters and its last run.
 
-Everything that a panel asks of a runner is here: the graph, the hyperparameters, the last run. They change when the
-panel asks for it, on its own thread: what the service tells meanwhile waits until then, so that no change of somebody
-else's is taken for seen before it was.
+What the panel has taken over changes only when the panel calls a method, on its own thread. What the service reports in
+between waits until ``catch_up``, so that no concurrent change is taken for seen before the panel has seen it.
 """
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
@@ -24,83 +24,84 @@ from epypes.errors import (
     UnknownName,
 )
 from epypes.run import Run
-from epypes.run.program import Program
-from epypes.run.watchers import Watchers
 from epypes.service.parameters import Parameters
-from epypes.service.remote.control import parameters_of
-from epypes.service.remote.following import Follower
-from epypes.service.remote.runs import RemoteRuns
-from epypes.service.remote.seenruns import SeenRuns
-from epypes.service.remote.standins import graph_of
+from epypes.service.remote.control import EventFollower, EventStream, read_parameters
+from epypes.service.remote.runs import RemoteRuns, ShownRuns, remote_graph
 
 if TYPE_CHECKING:
     from epypes.service.remote.connection import Connection
-    from epypes.service.remote.control import Stream
 
-# Somebody else who changes the parameters all the time must not keep the panel from coming to an end.
-_MOST_TRIES: Final = 5
+_log = logging.getLogger(__name__)
+
+# Tries of a change while the parameters are changed concurrently.
+_MAX_TRIES: Final = 5
 
 
 class RemoteRunner:
-    """A running service that is tuned as a runner is; made by ``Connection.to_tune``.
-
-    Its hyperparameters and its last run are those that the panel has taken over. Nothing runs here.
+    """A running service that is tuned as a runner is; made by ``Connection.to_tune``. Nothing runs here.
 
     Parameters
     ----------
     connection
         To the service.
-    events
-        Opens the stream of what it tells.
+    open_stream
+        Opens the stream of its events.
 
     Attributes
     ----------
     cg
-        Its graph; the functions are stand-ins.
+        Its graph; the functions refuse to be called.
     last
-        The last run that was taken over; None before the first.
+        The last run that the panel has taken over; None before the first.
+    first_hyperparameters
+        The values by token when the connection was made.
     """
 
-    def __init__(self, connection: Connection, events: Callable[[], AbstractContextManager[Stream]]) -> None:
+    def __init__(self, connection: Connection, open_stream: Callable[[], AbstractContextManager[EventStream]]) -> None:
         self.connection = connection
-        info, known = connection.info(), connection.parameters()
-        self.cg = graph_of(connection.url, info["func_io"], known.entries, _rgb(connection, info))
-        self._program = Program(self.cg, True)
-        self._runs = RemoteRuns(connection, self._program, known, info["outputs"])
-        self._seen = SeenRuns()
-        self._events = events
-        self._watchers = Watchers()
+        info, parameters = connection.info(), connection.parameters()
+        self.cg = remote_graph(connection.url, info["func_io"], parameters.entries, _rgb(connection, info))
+        self._runs = RemoteRuns(connection, self.cg, parameters, info["outputs"])
+        self._shown = ShownRuns()
+        self._open_stream = open_stream
+        self._follower: EventFollower | None = None
+        self._callbacks: tuple[Callable[[], object], ...] = ()
         self._lock = threading.Lock()
-        self._follower: Follower | None = None
-        # What the service has; what the panel has been told of; what it will be told of next.
-        self._known = known
-        self._told: Mapping[str, Any] = MappingProxyType(self._runs.values(known))
+        # What the service has, as far as it is known; what the panel has taken over; what it will be shown next.
+        self._parameters = parameters
+        self._taken: Mapping[str, Any] = MappingProxyType(self._runs.values(parameters))
         self._news: Parameters | None = None
-        self._process, self._is_anew = _process(info), False
+        self._process, self._is_another_process = _process(info), False
         self._state: tuple[str, str] = (str(info["state"]), str(info.get("reason") or ""))
-        self._gone = ""
+        self._lost = ""
         self._failed: Mapping[str, Any] | None = None
         self._refused: tuple[object, ParametersRefused] | None = None
-        self._tried: tuple[Run, dict[str, Any], bool] | None = None
-        self.first_hyperparameters: Mapping[str, Any] = self._told
-        self.last: Run | None = self._first_run()
+        # The last trial: its run, its values, and whether the service has all of them.
+        self._trial: tuple[Run, dict[str, Any], bool] | None = None
+        self.first_hyperparameters: Mapping[str, Any] = self._taken
+        self.last: Run | None = None
+        try:
+            self.last = self._runs.fetch((), parameters)
+            self._shown.add(self.last)
+        except EpypesError:  # no event has been completed yet, or there is no worker now
+            pass
 
     # -- what a panel reads -------------------------------------------------------------------------------------
 
     @property
     def hyperparameters(self) -> Mapping[str, Any]:
-        """The values that the panel has been told of, by token: a snapshot."""
-        return self._told
+        """The values that the panel has taken over, by token: a snapshot."""
+        return self._taken
 
     @property
     def revision(self) -> int:
-        """The revision of the hyperparameters, as far as it is known here."""
-        return self._known.revision
+        """The revision of the service's hyperparameters, as far as it is known here."""
+        return self._parameters.revision
 
     @property
     def free_source_tokens(self) -> tuple[str, ...]:
         """The source tokens that an event brings."""
-        return tuple(token for token in self.cg.source_tokens if token not in self._told)
+        return tuple(token for token in self.cg.source_tokens if token not in self._taken)
 
     @property
     def stale(self) -> tuple[str, ...]:
@@ -114,17 +115,17 @@ class RemoteRunner:
 
     @property
     def notice(self) -> str:
-        """What is to be said beside the picture: why it may not be the newest; empty if it is."""
-        if self._gone:
-            return f"The picture is the last one: {self._gone} It is tried again."
+        """Why the picture may not be the newest; empty if it is."""
+        if self._lost:
+            return f"The picture is the last one: {self._lost} It is tried again."
         state, reason = self._state
-        told = f": {reason}" if reason else "."
+        text = f"{state}: {reason}" if reason else f"{state}."
         if state == "READY":
             return ""
         if state == "PAUSED":
-            return f"The service is paused{told} Its events wait."
+            return f"The service is paused{text.removeprefix(state)} Its events wait."
         way_out = "" if state in ("STOPPED", "FAULTED") else " The worker may be starting again; the picture follows."
-        return f"The service is {state}{told}{way_out}"
+        return f"The service is {text}{way_out}"
 
     # -- what a panel does --------------------------------------------------------------------------------------
 
@@ -134,7 +135,7 @@ class RemoteRunner:
         Parameters
         ----------
         values
-            By token. One that somebody else has changed since the panel was told of it is not set.
+            By token. A value that was changed concurrently, which the panel has not seen yet, is not set.
         targets
             The tokens to fetch; everything that can be without.
         payload
@@ -148,7 +149,7 @@ class RemoteRunner:
         Raises
         ------
         ServiceError
-            The service is gone, or does not take the values.
+            The service is gone, or refuses the values.
         NotComputed
             It has not worked on an event yet.
         PayloadError
@@ -156,19 +157,29 @@ class RemoteRunner:
         """
         self._check(values, targets, payload)
         try:
-            return self._tried_there(values, targets)
-        except ServiceError as error:
-            # Why nothing can be had says more than that it can't.
-            if isinstance(error, ParametersRefused) or not self.notice:
-                raise
-            raise ServiceError(self.connection.url, self.notice) from error
-        except NotComputed as error:
+            if self._lost:
+                raise ServiceError(self.connection.url, self.notice)
+            changed = self._set(values)
+            if self._failed is not None and not changed and self.last is not None:
+                run = self._runs.failed(self.last, self._failed, self._parameters)
+            else:
+                run = self._runs.fetch(targets, self._parameters)
+                if run.failure is None:
+                    self._shown.add(run)
+        except ParametersRefused:
+            raise
+        except (ServiceError, NotComputed) as error:
+            # The state of the service says more than that it has no answer.
             if self.notice:
                 raise ServiceError(self.connection.url, self.notice) from error
-            raise NotComputed("", self._waiting()) from error
+            if isinstance(error, NotComputed):
+                raise NotComputed("", self._waiting()) from error
+            raise
+        self._trial = run, dict(values), all(name in changed or self._has(name, values[name]) for name in values)
+        return run
 
     def _waiting(self) -> str:
-        """Return what is waited for where the service has no run to show."""
+        """Return what a panel waits for where the service has no run to show."""
         try:
             answered = self.connection.info().get("counts", {}).get("answered", 0)
         except EpypesError:
@@ -176,41 +187,27 @@ class RemoteRunner:
         address = self.connection.addresses.sub
         if not answered and self.last is None:
             return f"Waiting for the first event at {address}"
-        seen = "; the picture and its values are those before" if self.last is not None else ""
-        return f"No event since the bundle was deployed or its worker started again{seen}. Waiting for one at {address}"
-
-    def _tried_there(self, values: Mapping[str, Any], targets: tuple[str, ...]) -> Run:
-        self._require_there()
-        accepted = self._sent(values)
-        failed = self._failed if not accepted else None
-        if failed is not None and self.last is not None:
-            run = self._runs.failed(self.last, failed, self._known)
-        else:
-            run = self._runs.fetched(targets, self._known)
-            if run.failure is None:
-                self._seen.add(run)
-        self._tried = run, dict(values), all(name in accepted or self._has(name, values[name]) for name in values)
-        return run
+        before = "; the picture and its values are those before" if self.last is not None else ""
+        return (
+            f"No event since the bundle was deployed or its worker started again{before}. Waiting for one at {address}"
+        )
 
     def adopt(self, run: Run, /) -> bool:
-        """Make a run of ``trial`` the last one, and its hyperparameters those that the panel was told of.
-
-        Return False, and do nothing, if somebody else has changed one of those that were set.
+        """Take over a run of ``trial`` and its hyperparameters; return False if one was changed concurrently.
 
         Raises
         ------
         ValueError
-            The run was not tried here, or another one has been since.
+            The run is not that of the last trial.
         """
-        if self._tried is None or self._tried[0] is not run:
+        if self._trial is None or self._trial[0] is not run:
             raise ValueError("Only the run that this runner's trial() returned last can be adopted.")
-        _, values, is_whole = self._tried
-        if not is_whole:
-            return False
-        now = self._runs.values(self._known)
-        self._told = MappingProxyType({**self._told, **{name: now[name] for name in values}})
-        self.last = run
-        return True
+        _, values, is_whole = self._trial
+        if is_whole:
+            now = self._runs.values(self._parameters)
+            self._taken = MappingProxyType({**self._taken, **{name: now[name] for name in values}})
+            self.last = run
+        return is_whole
 
     def remembered(self, values: Mapping[str, Any], /, *targets: str) -> Run:
         """Return the run that the service has shown with these hyperparameters.
@@ -218,9 +215,9 @@ class RemoteRunner:
         Raises
         ------
         LookupError
-            It has shown none since it was connected to.
+            It has shown none since the connection was made.
         """
-        run = self._seen.find({**self._told, **values})
+        run = self._shown.find({**self._taken, **values})
         if run is None or any(target not in run for target in targets):
             names = ", ".join(targets)
             raise LookupError(
@@ -230,41 +227,54 @@ class RemoteRunner:
         return run
 
     def put(self, values: Mapping[str, Any], /) -> None:
-        """Set hyperparameters of the service, but for those that somebody else has changed meanwhile."""
+        """Set hyperparameters of the service, but for those that were changed concurrently."""
         self._check(values, (), None)
-        self._sent(values)
+        self._set(values)
 
     def catch_up(self) -> None:
-        """Let the panel be told of what others have changed meanwhile."""
+        """Take over what was changed concurrently."""
         with self._lock:
             news, self._news = self._news, None
-            is_anew, self._is_anew = self._is_anew, False
-        # What was on its way while a value was set is older than what the service has answered to that.
-        if news is not None and (is_anew or news.revision > self._known.revision):
-            self._learn(news)
+            is_another, self._is_another_process = self._is_another_process, False
+        # What was on its way while a value was set is older than the service's answer to that.
+        if news is not None and (is_another or news.revision > self._parameters.revision):
+            self._take_over(news)
 
     def watch(self, callback: Callable[[], object], /) -> Callable[[], None]:
-        """Call something without arguments when the service has told of something; return what ends that.
+        """Call something without arguments when the service has reported something; return what ends that.
 
-        It is called on a thread of its own, which ends with the last one that watches.
+        It is called on a thread of its own, which ends with the last callback.
         """
-        remove = self._watchers.add(callback)
+
+        # An object of its own for each call, so that one callback may be added twice and removed once.
+        def entry() -> object:
+            return callback()
+
         with self._lock:
+            self._callbacks = (*self._callbacks, entry)
             if self._follower is None:
-                self._follower = Follower(self._events, self._back, self._heard, self._lost)
+                self._follower = EventFollower(self._open_stream, self._on_connected, self._on_event, self._on_lost)
                 self._follower.start()
 
         def forget() -> None:
-            remove()
-            if not self._watchers.callbacks:
-                self._rest()
+            with self._lock:
+                self._callbacks = tuple(each for each in self._callbacks if each is not entry)
+            if not self._callbacks:
+                self._stop_following()
 
         return forget
 
     def close(self) -> None:
-        """Tell nobody any more."""
-        self._watchers = Watchers()
-        self._rest()
+        """Call no callback any more."""
+        self._callbacks = ()
+        self._stop_following()
+
+    def _stop_following(self) -> None:
+        with self._lock:
+            follower, self._follower = self._follower, None
+        if follower is not None:
+            follower.stop()
+        self._lost = ""
 
     def __repr__(self) -> str:
         return f"<RemoteRunner of {self.connection!r:.60}>"
@@ -278,96 +288,86 @@ class RemoteRunner:
         for target in targets:
             self.cg.require_token(target)
         for name in values:
-            if name not in self._told:
+            if name not in self._taken:
                 if self.cg.has_token(name):
                     raise HyperparameterError(name, f"Token {name!r} is no hyperparameter of this service.")
-                raise UnknownName("hyperparameter", name, self._told, "of this service")
+                raise UnknownName("hyperparameter", name, self._taken, "of this service")
 
-    def _sent(self, values: Mapping[str, Any]) -> set[str]:
-        """Set what differs, and return the names; what somebody else has changed meanwhile is left out."""
-        told = self._told
-        if self._refused is not None and self._refused[0] == (self._known.revision, dict(values)):
-            raise self._refused[1]  # who follows the line would ask again at each event
-        for _ in range(_MOST_TRIES):
-            is_theirs = {name for name in values if self._told[name] is not told[name]}
-            left = {n: value for n, value in values.items() if n not in is_theirs and not self._has(n, value)}
-            if not left:
+    def _set(self, values: Mapping[str, Any]) -> set[str]:
+        """Set the values that differ, and return their names; what was changed concurrently is left out."""
+        request = (self._parameters.revision, dict(values))
+        if self._refused is not None and self._refused[0] == request:
+            raise self._refused[1]  # a panel that follows the events would request it at each of them
+        seen = self._taken
+        for _ in range(_MAX_TRIES):
+            wanted = {
+                name: value
+                for name, value in values.items()
+                if self._taken[name] is seen[name] and not self._has(name, value)
+            }
+            if not wanted:
                 return set()
             try:
-                self._known = self.connection.set(self._known.revision, **left)
+                self._parameters = self.connection.set(self._parameters.revision, **wanted)
             except RevisionConflict as conflict:
-                self._learn(conflict.current)
+                self._take_over(conflict.current)
                 continue
             except ParametersRefused as refused:
-                self._refused = (self._known.revision, dict(values)), refused
+                self._refused = (self._parameters.revision, dict(values)), refused
                 raise
             self._failed = None
-            return set(left)
-        raise ServiceError(
-            self.connection.url,
-            f"Nothing was set: somebody else changes the parameters of {self.connection.url} all the time.",
-        )
+            return set(wanted)
+        text = f"Nothing was set: the parameters of {self.connection.url} were changed concurrently. Try again."
+        raise ServiceError(self.connection.url, text)
 
     def _has(self, name: str, value: Any) -> bool:
-        return self._runs.is_same(self._known, name, value)
+        return self._runs.is_same(self._parameters, name, value)
 
-    def _learn(self, news: Parameters) -> None:
-        """Know what the service has, and let the panel be told of what somebody else has changed."""
-        before, now = self._runs.values(self._known), self._runs.values(news)
-        theirs = {name: value for name, value in now.items() if name in before and value is not before[name]}
-        self._known = news
-        self._told = MappingProxyType({**self._told, **theirs})
+    def _take_over(self, news: Parameters) -> None:
+        """Take over what was changed concurrently: it is another object than before."""
+        before, now = self._runs.values(self._parameters), self._runs.values(news)
+        changed = {name: value for name, value in now.items() if name in before and value is not before[name]}
+        self._parameters = news
+        self._taken = MappingProxyType({**self._taken, **changed})
 
-    def _require_there(self) -> None:
-        if self._gone:
-            raise ServiceError(self.connection.url, self.notice)
+    # -- what the service reports, on the follower's thread -----------------------------------------------------
 
-    def _first_run(self) -> Run | None:
-        try:
-            run = self._runs.fetched((), self._known)
-        except EpypesError:
-            return None
-        self._seen.add(run)
-        return run
-
-    # -- what the service tells, on the follower's thread -------------------------------------------------------
-
-    def _back(self) -> None:
+    def _on_connected(self) -> None:
         info, news = self.connection.info(), self.connection.parameters()
         with self._lock:
             self._news = news
             # Another process counts revisions from 0 again.
             process, self._process = self._process, _process(info)
-            self._is_anew = self._is_anew or process != self._process
-        self._state, self._gone = (str(info["state"]), str(info.get("reason") or "")), ""
-        self._watchers.tell()
+            self._is_another_process = self._is_another_process or process != self._process
+        self._state, self._lost = (str(info["state"]), str(info.get("reason") or "")), ""
+        self._notify()
 
-    def _lost(self, reason: str) -> None:
-        self._gone = reason
-        self._watchers.tell()
+    def _on_lost(self, reason: str) -> None:
+        self._lost = reason
+        self._notify()
 
-    def _heard(self, name: str, said: Mapping[str, Any]) -> None:
+    def _on_event(self, name: str, data: Mapping[str, Any]) -> None:
         if name == "run":
             self._failed = None
-        elif name == "failure" and said.get("kind") != "dropped":
-            self._failed = said
+        elif name == "failure" and data.get("kind") != "dropped":
+            self._failed = data
         elif name == "state":
-            self._state = str(said.get("state", "")), str(said.get("reason") or "")
+            self._state = str(data.get("state", "")), str(data.get("reason") or "")
         elif name == "parameters":
-            is_whole = "parameters" in said
-            news = parameters_of(self.connection.url, said) if is_whole else self.connection.parameters()
+            is_whole = "parameters" in data
+            news = read_parameters(self.connection.url, data) if is_whole else self.connection.parameters()
             with self._lock:
                 self._news = news
         else:
             return
-        self._watchers.tell()
+        self._notify()
 
-    def _rest(self) -> None:
-        with self._lock:
-            follower, self._follower = self._follower, None
-        if follower is not None:
-            follower.stop()
-        self._gone = ""
+    def _notify(self) -> None:
+        for callback in self._callbacks:
+            try:
+                callback()
+            except Exception:
+                _log.exception("A callback of a remote runner has failed")
 
 
 def _process(info: Mapping[str, Any]) -> tuple[object, object]:
@@ -375,9 +375,8 @@ def _process(info: Mapping[str, Any]) -> tuple[object, object]:
 
 
 def _rgb(connection: Connection, info: Mapping[str, Any]) -> list[str]:
-    """Return the tokens whose colours are RGB: of all, if the service can tell; else of its ports."""
+    """Return the tokens whose colours are RGB: of the whole graph, or of its ports where the view can't be read."""
     try:
-        tokens = connection.view()["tokens"]
-        return [str(token["name"]) for token in tokens if token.get("order") == "rgb"]
+        return [str(token["name"]) for token in connection.view()["tokens"] if token.get("order") == "rgb"]
     except (EpypesError, KeyError, TypeError, AttributeError):
         return [str(token) for token in info.get("rgb", ())]

@@ -1,30 +1,110 @@
-"""How does what a service sends of a run become a Run here?"""
+"""Values of a service's runs, fetched over HTTP, as Runs that a panel shows."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final
+import inspect
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import fields
+from types import GenericAlias
+from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 
 from epypes.bundle.entries import plain, read
 from epypes.bundle.ports import in_order
-from epypes.errors import EpypesError, RemoteFailure
-from epypes.graph import colour_order
+from epypes.errors import EpypesError, RemoteFailure, ServiceError
+from epypes.graph import CompGraph, colour_order, subgraph
+from epypes.hints import Param
+from epypes.images import Image
 from epypes.run import Failure, Run
-from epypes.run.hyperparameters import Hyperparameters
-from epypes.run.program import Program
-from epypes.run.tokens import NOT_COMPUTED, Freshness
+from epypes.run.imported import RunImporter
 from epypes.service.parameters import Parameters
 
 if TYPE_CHECKING:
     from epypes.service.remote.connection import Connection
     from epypes.wire import Envelope
 
-_MOST_VALUES: Final = 1_000
-_MOST_REVISIONS: Final = 64
-_MOST_REFUSALS: Final = 3
-# An exception's name may be anybody's text.
-_NAME_CHARACTERS: Final = 100
+_MAX_VALUES: Final = 1_000
+_MAX_REVISIONS: Final = 64
+# After so many refusals a token is not requested any more: no codec knows it, or it is too large.
+_MAX_REFUSALS: Final = 3
+_MAX_NAME_CHARACTERS: Final = 100
+_MAX_SHOWN_RUNS: Final = 32
+_MAX_SHOWN_BYTES: Final = 128 * 1024**2
+_PARAM_KEYS: Final = tuple(field.name for field in fields(Param))
+_TUPLES: Final = ("soft", "choices", "labels")
+
+
+# -- the graph --------------------------------------------------------------------------------------------------------
+
+
+def remote_graph(
+    url: str, func_io: Mapping[str, Sequence[Any]], entries: Mapping[str, Mapping[str, Any]], rgb: Iterable[str]
+) -> CompGraph:
+    """Return the graph of a service, whose functions say where they run when they are called here.
+
+    Parameters
+    ----------
+    url
+        The service's address.
+    func_io
+        As JSON has it: lists are tuples.
+    entries
+        Of the hyperparameters, by token: their ranges become annotations.
+    rgb
+        The tokens whose colours are RGB.
+
+    Raises
+    ------
+    GraphError
+        This is no graph.
+    """
+    hints: dict[str, Any] = {token: Annotated[Any, Image(order="rgb")] for token in rgb}
+    for token, entry in entries.items():
+        known: dict[str, Any] = {
+            key: tuple(entry[key]) if key in _TUPLES else entry[key]
+            for key in _PARAM_KEYS
+            if entry.get(key) is not None
+        }
+        with suppress(ValueError, TypeError):  # a range that contradicts itself
+            if known:
+                hints[token] = Annotated[Any, Param(**known)]
+    io: dict[str, Any] = {name: (_as_tuple(taken), _as_tuple(made)) for name, (taken, made) in func_io.items()}
+    functions = {name: _remote_function(url, name, taken, made, hints) for name, (taken, made) in io.items()}
+    return CompGraph(functions, io, types=False)
+
+
+def _as_tuple(side: Any) -> Any:
+    return tuple(side) if isinstance(side, list) else side
+
+
+def _remote_function(url: str, name: str, inputs: Any, outputs: Any, hints: Mapping[str, Any]) -> Callable[..., Any]:
+    """Return a function that refuses to be called, and declares in its signature what is known of its tokens."""
+
+    def refuse(*values: Any) -> NoReturn:
+        text = f"Function {name!r} runs in the service at {url}, not here. Load its bundle to run it: ep.load(...)."
+        raise ServiceError(url, text)
+
+    taken = () if inputs is None else (inputs,) if isinstance(inputs, str) else inputs
+    made: Any = hints.get(outputs, Any)
+    if isinstance(outputs, tuple):
+        made = GenericAlias(tuple, tuple(hints.get(token, Any) for token in outputs)) if outputs else Any
+    kind = inspect.Parameter.POSITIONAL_ONLY
+    parameters = [
+        inspect.Parameter(
+            token if token.isidentifier() and token[0] != "_" and taken.index(token) == place else f"_{place}",
+            kind,
+            annotation=hints.get(token, Any),
+        )
+        for place, token in enumerate(taken)
+    ]
+    refuse.__name__ = refuse.__qualname__ = name
+    refuse.__annotations__ = {each.name: each.annotation for each in parameters} | {"return": made}
+    refuse.__signature__ = inspect.Signature(parameters, return_annotation=made)  # type: ignore[attr-defined]
+    return refuse
+
+
+# -- runs -------------------------------------------------------------------------------------------------------------
 
 
 class RemoteRuns:
@@ -34,32 +114,33 @@ class RemoteRuns:
     ----------
     connection
         To the service.
-    program
+    cg
         Its graph.
     first
-        Its hyperparameters when it was connected to.
+        Its hyperparameters when the connection was made.
     outputs
         The tokens that are fetched in any case.
     """
 
-    def __init__(
-        self, connection: Connection, program: Program, first: Parameters, outputs: Sequence[str] = ()
-    ) -> None:
-        self._connection, self._program, self._outputs = connection, program, tuple(outputs)
+    def __init__(self, connection: Connection, cg: CompGraph, first: Parameters, outputs: Sequence[str] = ()) -> None:
+        self._connection, self._cg, self._outputs = connection, cg, tuple(outputs)
+        self._importer = RunImporter(cg)
         self._values: dict[tuple[str, str], Any] = {}
-        self._by_revision: dict[int, Mapping[str, Any]] = {}
-        # What no codec knows, or is too large, is not asked for all the time.
-        self._refused: Counter[str] = Counter()
+        self._by_revision: dict[int, dict[str, Any]] = {}
+        self._refusals: Counter[str] = Counter()
         self._images: set[str] = set()
-        self._rgb = [token for token in program.cg.tokens if colour_order(program.cg, token) == "rgb"]
+        self._rgb = [token for token in cg.tokens if colour_order(cg, token) == "rgb"]
         self._first = self.values(first)
 
-    # -- hyperparameters ----------------------------------------------------------------------------------------
-
     def values(self, parameters: Parameters) -> dict[str, Any]:
-        """Return the values by token; an equal one is the same object each time, as a panel expects it."""
-        found = {token: self._value(token, entry) for token, entry in parameters.entries.items()}
-        if len(self._by_revision) >= _MOST_REVISIONS:
+        """Return the hyperparameters by token; equal values are one object, by which a panel sees changes."""
+        found = {}
+        for token, entry in parameters.entries.items():
+            value = read(entry)
+            if len(self._values) >= _MAX_VALUES:
+                self._values.clear()
+            found[token] = self._values.setdefault((token, _key(value)), value)
+        if len(self._by_revision) >= _MAX_REVISIONS:
             del self._by_revision[next(iter(self._by_revision))]
         self._by_revision[parameters.revision] = found
         return found
@@ -69,15 +150,7 @@ class RemoteRuns:
         entry = parameters.entries.get(token)
         return entry is not None and _key(read(entry)) == _key(value)
 
-    def _value(self, token: str, entry: Mapping[str, Any]) -> Any:
-        value = read(entry)
-        if len(self._values) >= _MOST_VALUES:
-            self._values.clear()
-        return self._values.setdefault((token, _key(value)), value)
-
-    # -- runs ---------------------------------------------------------------------------------------------------
-
-    def fetched(self, targets: Sequence[str], parameters: Parameters) -> Run:
+    def fetch(self, targets: Sequence[str], parameters: Parameters) -> Run:
         """Return the last run with these hyperparameters or later ones; of the tokens, what the targets need.
 
         Raises
@@ -87,18 +160,25 @@ class RemoteRuns:
         ServiceError
             It is gone.
         """
-        asked = self._needed(targets)
+        tokens = self._needed(targets)
         try:
-            envelopes = [self._connection.envelope(asked, parameters.revision)] if asked else []
+            envelopes = [self._connection.envelope(tokens, parameters.revision)] if tokens else []
         except EpypesError as error:
-            failure = self._failure_told(str(error))
-            if failure is not None:
-                return self._run({}, parameters, failure=failure)
-            envelopes = self._one_by_one(asked, parameters.revision)
-        return self._run(self._parts(envelopes), parameters, envelopes[0] if envelopes else None)
+            # The service names a function that failed as "canny: ValueError: ...".
+            function, _, rest = str(error).partition(": ")
+            exception, _, message = rest.partition(": ")
+            if function in self._cg.functions and exception.isidentifier():
+                record = {"function": function, "exception": exception, "message": message}
+                return self._run({}, parameters, failure=self._failure(record))
+            envelopes = self._fetch_one_by_one(tokens, parameters.revision)
+        from epypes.display import is_image
+
+        parts = {name: value for each in envelopes for name, value in in_order(each, self._rgb).items()}
+        self._images.update(token for token, value in parts.items() if is_image(value))
+        return self._run(parts, parameters, envelopes[0] if envelopes else None)
 
     def failed(self, last: Run, record: Mapping[str, Any], parameters: Parameters) -> Run:
-        """Return what is known of an event that failed: its failure, and the tokens of the last run before it.
+        """Return a run that failed: the failure, and the tokens of the last run that do not depend on it.
 
         Parameters
         ----------
@@ -110,101 +190,99 @@ class RemoteRuns:
             The hyperparameters.
         """
         failure = self._failure(record)
-        places = [step.place for step in self._program.steps if step.name == failure.function]
-        lost = {
-            slot
-            for place in self._program.downstream(places, last.record[0])
-            for slot in self._program.steps[place].outputs
-        }
-        tokens = self._program.tokens
-        parts = {tokens[slot]: value for slot, value in enumerate(last.record[0]) if slot not in lost}
-        return self._run(parts, parameters, failure=failure)
+        lost: set[str] = set()
+        for name in self._cg.digraph.run_order():
+            if name == failure.function or lost.intersection(self._cg.func_inputs(name)):
+                lost.update(self._cg.func_outputs(name))
+        return self._run({token: last[token] for token in last if token not in lost}, parameters, failure=failure)
 
     def _needed(self, targets: Sequence[str]) -> list[str]:
         """Return the tokens to fetch: marks are drawn over the images that they were made from."""
-        wanted = dict.fromkeys((*targets, *self._outputs) if targets else self._program.cg.tokens)
+        wanted = dict.fromkeys((*targets, *self._outputs) if targets else self._cg.tokens)
         for target in targets:
             if target not in self._images:
-                wanted.update(dict.fromkeys(self._ancestors(target)))
-        return [token for token in wanted if self._refused[token] < _MOST_REFUSALS and token not in self._first]
+                wanted.update(dict.fromkeys(subgraph(self._cg, target).tokens))
+        return [token for token in wanted if self._refusals[token] < _MAX_REFUSALS and token not in self._first]
 
-    def _ancestors(self, token: str) -> Iterable[str]:
-        seen, waiting = {token}, [token]
-        digraph = self._program.cg.digraph
-        while waiting:
-            maker = digraph.producer.get(waiting.pop())
-            for name in () if maker is None else (*digraph.inputs[maker], *digraph.outputs[maker]):
-                if name not in seen:
-                    seen.add(name)
-                    waiting.append(name)
-                    yield name
-
-    def _one_by_one(self, tokens: Sequence[str], revision: int) -> list[Envelope]:
-        """Fetch what can be, token by token; raise what the first one is refused with, since that may be the rest's."""
+    def _fetch_one_by_one(self, tokens: Sequence[str], revision: int) -> list[Envelope]:
+        """Fetch what can be, token by token; the refusal of the first one is raised, since it may be that of all."""
         found = [self._connection.envelope(tokens[:1], revision)]
         for token in tokens[1:]:
             try:
                 found.append(self._connection.envelope([token], revision))
             except EpypesError:
-                self._refused[token] += 1
+                self._refusals[token] += 1
         # An event may have come in between, and a run has the values of one.
         return [envelope for envelope in found if envelope.correlation_id == found[-1].correlation_id]
-
-    def _parts(self, envelopes: Iterable[Envelope]) -> dict[str, Any]:
-        from epypes.display import is_image
-
-        parts = {name: value for envelope in envelopes for name, value in in_order(envelope, self._rgb).items()}
-        self._images.update(token for token, value in parts.items() if is_image(value))
-        return parts
 
     def _run(
         self,
         parts: Mapping[str, Any],
         parameters: Parameters,
-        sent: Envelope | None = None,
-        *,
+        envelope: Envelope | None = None,
         failure: Failure | None = None,
     ) -> Run:
-        program = self._program
-        revision = parameters.revision if sent is None else sent.revision
+        revision = parameters.revision if envelope is None else envelope.revision
         values = self._by_revision.get(revision) or self.values(parameters)
-        slots = [NOT_COMPUTED] * len(program.tokens)
-        for token, value in {**parts, **values}.items():
-            if token in program.slots:
-                slots[program.slots[token]] = value
-        entries = {token: (value, self._first.get(token, value)) for token, value in values.items()}
-        # Every function is up to date; but not every token has come, so that a run must not be taken for a whole one.
-        freshness = Freshness(program, bytes(len(program.steps)), False, program.revisions())
-        timings = {} if sent is None else sent.timings
-        durations_ns = {step.place: timings[step.name] for step in program.steps if step.name in timings}
-        total_ns = sum(durations_ns.values())
-        if sent is not None:
-            total_ns = int(sent.attributes.get("total_ns", total_ns))
-        at = next((step.place for step in program.steps if failure and step.name == failure.function), -1)
-        times = (program, None, durations_ns, total_ns, False, at)
-        return Run((slots, freshness, Hyperparameters(program, entries, revision), times, failure))
-
-    # -- failures -----------------------------------------------------------------------------------------------
-
-    def _failure_told(self, text: str) -> Failure | None:
-        """Return the failure that a refusal tells of, as ``"canny: ValueError: ..."``."""
-        function, _, rest = text.partition(": ")
-        exception, _, message = rest.partition(": ")
-        if function not in self._program.cg.functions or not exception.isidentifier():
-            return None
-        return self._failure({"function": function, "exception": exception, "message": message})
+        timings = {} if envelope is None else envelope.timings
+        total_ns = None if envelope is None else envelope.attributes.get("total_ns")
+        return self._importer.run(
+            parts,
+            values,
+            first_hyperparameters=self._first,
+            revision=revision,
+            durations_ns=timings,
+            total_ns=sum(timings.values()) if total_ns is None else int(total_ns),
+            failure=failure,
+        )
 
     def _failure(self, record: Mapping[str, Any]) -> Failure:
         function, message = str(record.get("function", "")), str(record.get("message", ""))
         tokens = tuple(map(str, record.get("tokens") or ()))
-        kind = str(record.get("exception") or record.get("kind") or "failed")[:_NAME_CHARACTERS]
-        # It is shown as if it had been raised here, by the name that it has there.
+        # A service may name an exception with any text.
+        kind = str(record.get("exception") or record.get("kind") or "failed")[:_MAX_NAME_CHARACTERS]
+        # The exception is shown by the name and text that it has in the service.
         raised: type[RemoteFailure] = type(kind, (RemoteFailure,), {"__str__": lambda error: error.message})
         exception = raised(self._connection.url, function, kind, message)
         return Failure(function, tokens, {}, exception, str(record.get("event_id", "")))
 
 
+class ShownRuns:
+    """The last run for each setting of the hyperparameters that was shown; the run with the first one is kept.
+
+    A service does not run on other values on the side: a panel can compare only with what was shown.
+    """
+
+    def __init__(self) -> None:
+        self._runs: OrderedDict[str, tuple[Run, int]] = OrderedDict()
+        self._first = ""
+
+    def add(self, run: Run) -> None:
+        """Add a run, and drop the oldest of too many."""
+        key = _setting(run.hyperparameters)
+        self._first = self._first or key
+        before = self._runs.pop(key, None)
+        # The first picture is what "default" means: later runs with its values are those of other frames.
+        is_kept = before is not None and key == self._first and set(run) <= set(before[0])
+        size = sum(int(getattr(value, "nbytes", 0)) for value in run.values())
+        self._runs[key] = before if before is not None and is_kept else (run, size)
+        while len(self._runs) > _MAX_SHOWN_RUNS or sum(size for _, size in self._runs.values()) > _MAX_SHOWN_BYTES:
+            oldest = next((each for each in self._runs if each not in (self._first, key)), None)
+            if oldest is None:
+                break
+            del self._runs[oldest]
+
+    def find(self, values: Mapping[str, Any]) -> Run | None:
+        """Return the run with these values; None if none was shown."""
+        found = self._runs.get(_setting(values))
+        return None if found is None else found[0]
+
+
+def _setting(values: Mapping[str, Any]) -> str:
+    return repr(sorted(values.items()))
+
+
 def _key(value: Any) -> str:
-    """Return what tells values of hyperparameters apart: 1, 1.0 and True are three."""
+    """Return text that differs for values of hyperparameters that differ: 1, 1.0 and True are three."""
     known = plain(value)
     return f"{type(known).__name__} {known!r}"

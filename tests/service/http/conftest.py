@@ -1,4 +1,4 @@
-"""Which service do the tests of its control over HTTP ask?"""
+"""A running service with its HTTP control, for the tests of this folder."""
 
 from __future__ import annotations
 

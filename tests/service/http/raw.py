@@ -1,4 +1,4 @@
-"""How do tests say to a server what no client would say?"""
+"""Requests that no HTTP client would send."""
 
 from __future__ import annotations
 

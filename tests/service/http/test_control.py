@@ -1,4 +1,4 @@
-"""Does the control over HTTP do with a service what it says, and say what it does?"""
+"""The HTTP control reads and changes a service."""
 
 from __future__ import annotations
 

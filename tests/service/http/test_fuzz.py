@@ -1,4 +1,4 @@
-"""Does the server keep to its own description, whatever it is asked?"""
+"""The server keeps to its own OpenAPI description, whatever a request contains."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ import schemathesis
 from hypothesis import HealthCheck, settings
 from schemathesis.config import SchemathesisConfig
 
-from epypes.service.http.app import app_of
-from epypes.service.http.served import Served
-from epypes.service.http.told import Told
+from epypes.service.http.app import create_app
 
 pytestmark = pytest.mark.slow
 
@@ -23,9 +21,7 @@ CONFIG = {
     },
 }
 
-schema = schemathesis.openapi.from_dict(
-    app_of(Served(None, Told(None))).openapi(), config=SchemathesisConfig.from_dict(CONFIG)
-)
+schema = schemathesis.openapi.from_dict(create_app(None).openapi(), config=SchemathesisConfig.from_dict(CONFIG))
 
 
 @pytest.mark.fuzz

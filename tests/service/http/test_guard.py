@@ -1,15 +1,13 @@
-"""What does the server do with requests that no honest client sends?"""
+"""Requests that no honest client sends are refused, and the server goes on."""
 
 from __future__ import annotations
 
-import json
 import socket
 
 import httpx
 import pytest
 
 from epypes.service.http import HttpServer
-from epypes.service.http.connections import MOST_CONNECTIONS
 from tests.service.http.raw import connection, exchange, received, request, until
 
 CHANGES = [
@@ -46,12 +44,12 @@ def test_a_change_without_the_token_is_refused_and_says_where_it_is(client, http
 
 
 @pytest.mark.parametrize(("method", "path"), CHANGES)
-@pytest.mark.parametrize("given", ["Bearer wrong", "Basic {token}", "{token}", "Bearer {token}x", "bearer é"])
-def test_a_change_with_another_token_is_refused(client, http, method, path, given):
-    headers = {"Authorization": given.format(token=http.token).encode()}
-    answer = client.request(method, path, json={}, headers=headers)
-    assert answer.status_code == 403
-    assert "not the service's token" in sentence(answer)
+def test_a_change_with_another_token_is_refused(client, http, method, path):
+    for given in ("Bearer wrong", "Basic {token}", "{token}", "Bearer {token}x", "bearer é"):
+        headers = {"Authorization": given.format(token=http.token).encode()}
+        answer = client.request(method, path, json={}, headers=headers)
+        assert answer.status_code == 403
+        assert "not the service's token" in sentence(answer)
 
 
 def test_who_still_sends_a_body_has_the_refusal_of_its_token_all_the_same(http):
@@ -80,9 +78,9 @@ def test_all_that_the_description_says_needs_a_token_needs_it_and_nothing_else_c
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:{port}", "127.0.0.1.evil.example", "", "[::2]"])
 def test_a_foreign_name_for_this_machine_is_refused(http, host):
     port = http.url.rpartition(":")[2]
-    status, said = request(http.url, "GET /v1/info HTTP/1.1", f"Host: {host.format(port=port)}")
-    assert status == 421
-    assert "localhost" in json.loads(said)["detail"]
+    status, body = request(http.url, "GET /v1/info HTTP/1.1", f"Host: {host.format(port=port)}")
+    assert status == 400
+    assert "host" in body
 
 
 @pytest.mark.parametrize("host", ["localhost", "127.0.0.1", "LOCALHOST:80", "[::1]:9"])
@@ -250,12 +248,9 @@ def test_a_path_that_is_not_there_says_where_to_look(client):
 
 
 @pytest.fixture
-def impatient(monkeypatch, service):
-    """A server that waits a second for what takes ten otherwise."""
-    monkeypatch.setattr("epypes.service.http.connections.REQUEST_TIMEOUT_S", 1.0)
-    monkeypatch.setattr("epypes.service.http.connections.TAKING_TIMEOUT_S", 1.0)
-    monkeypatch.setattr("epypes.service.http.guard.REQUEST_TIMEOUT_S", 1.0)
-    with HttpServer(service, "127.0.0.1:*") as server:
+def impatient(service):
+    """A server that waits 0.3 s for what takes ten otherwise."""
+    with HttpServer(service, "127.0.0.1:*", timeout_s=0.3) as server:
         server.token = server.token_file.read_text().strip()
         yield server
 
@@ -296,5 +291,5 @@ def test_idle_connections_keep_nobody_out(http):
         for _ in range(300):
             open_ones.enter_context(connection(http.url)).sendall(b"GET / HT")
         assert is_well(http)
-        assert len(http.connections) <= MOST_CONNECTIONS
+        assert len(http.connections) <= 160
     until(lambda: len(http.connections) == 0)

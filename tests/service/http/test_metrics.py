@@ -1,4 +1,4 @@
-"""Can Prometheus read what the service counts?"""
+"""Prometheus reads the counts and times of a service."""
 
 from __future__ import annotations
 

@@ -1,11 +1,13 @@
-"""How is a running service called?"""
+"""Finding the running service of a bundle, and calling it: one event, one answer."""
 
 from __future__ import annotations
 
+import json
 import queue
 import threading
 from collections import Counter
 from collections.abc import Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic, perf_counter_ns
@@ -13,21 +15,52 @@ from typing import TYPE_CHECKING, Any, Self
 
 from epypes.bundle.load import SETTINGS
 from epypes.bundle.ports import REQUEST, in_order
+from epypes.bundle.seal import check_seal
 from epypes.bundle.settings import read_settings
-from epypes.errors import RemoteFailure, ServiceError
-from epypes.service.state import ServiceState, read_state
-from epypes.transport import ZMQPublisher, ZMQSubscriber
+from epypes.errors import BundleError, EpypesError, RemoteFailure, ServiceError
+from epypes.service.state_file import ServiceState, read_states, running_at, state_file
+from epypes.transport import Publisher, Subscriber, ZMQPublisher, ZMQSubscriber
 from epypes.transport.channels import is_brokered, place_of
-from epypes.transport.receiving import Subscriber
-from epypes.transport.sending import Publisher
 
 if TYPE_CHECKING:
     from epypes.transport import Keys
     from epypes.transport.zeromq.curve import PublicKey
     from epypes.wire import Envelope
 
-# How often it is looked, while an answer is awaited, whether the service still lives.
+# How often a call looks, while it waits for an answer, whether the service still runs.
 _LOOK_S = 0.2
+_INFO_TIMEOUT_S = 2.0
+
+
+def running_services(bundle: str | Path, replica: str = "") -> list[ServiceState]:
+    """Return the states of this user's running services of a bundle: all replicas, or one by its name.
+
+    A service is found by the bundle that it was started with; and by the one that it serves now, if that was deployed.
+    """
+    return read_states(bundle, replica) or [
+        state for state in _deployed_services(Path(bundle)) if replica in ("", state.replica)
+    ]
+
+
+def _deployed_services(bundle: Path) -> list[ServiceState]:
+    from epypes.service.remote.control import Control
+
+    try:
+        digest = check_seal(bundle)
+    except BundleError:
+        return []
+    found = []
+    for file in sorted(state_file(bundle).parent.glob("*.json")):
+        # A file that is no state, or that of a service that does not answer, is passed over.
+        with suppress(OSError, ValueError, AttributeError, EpypesError):
+            state = json.loads(file.read_text(encoding="utf-8"))
+            running = running_at(state["http"]) if state.get("digest") == digest and state.get("http") else None
+            if running is not None:
+                control = Control(running.http, "", _INFO_TIMEOUT_S)
+                if control.get("/v1/info").get("bundle") == str(bundle.resolve()):
+                    found.append(running)
+                control.close()
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +100,7 @@ class Client:
     allow
         With keys: the service's public key, or its .key file.
     sub, pub
-        The addresses that the service was given, where a broker asks for a password; nobody writes down that one.
+        The addresses that the service was given, where a broker needs a password: the state file leaves it out.
 
     Raises
     ------
@@ -94,8 +127,8 @@ class Client:
         self._rgb = read_settings(Path(path) / SETTINGS).rgb
         self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        self._subscriber = _heard(path, pub or state.pub, self._answers, keys=keys, allow=allow)
-        self._publisher = _sent(sub or state.sub, self._requests, keys=keys, allow=allow)
+        self._subscriber = _subscriber_to(path, pub or state.pub, self._answers, keys=keys, allow=allow)
+        self._publisher = _publisher_to(sub or state.sub, self._requests, keys=keys, allow=allow)
 
     def __enter__(self) -> Self:
         deadline = monotonic() + self.timeout_s
@@ -115,7 +148,7 @@ class Client:
         self._subscriber.stop()
 
     def _has_joined(self, deadline_s: float) -> bool:
-        """Whether what is sent arrives, and what is answered too; a broker has said so by now."""
+        """Wait until events and answers arrive; a broker has confirmed both by now."""
         subscriber, publisher = self._subscriber, self._publisher
         is_heard = isinstance(subscriber, Subscriber) or subscriber.wait_joined(self.timeout_s)
         left_s = max(deadline_s - monotonic(), 0.0)
@@ -168,7 +201,7 @@ class Client:
         refused = self._publisher.rejected - refused_before
         if refused:
             raise ServiceError(self.path, f"The event could not be sent: {', '.join(refused)}.")
-        if read_state(self.path) is None:
+        if not running_services(self.path):
             raise ServiceError(self.path, f"The service of {self.path} ended before it answered. Look at its log.")
 
 
@@ -186,7 +219,7 @@ def call(
 
 
 def why_unreachable(has_keys: bool) -> str:
-    """Return what may keep a peer from one that runs, since that refuses a key it does not know without a word."""
+    """Return what may keep a peer from a service that runs: a key that it does not know is refused in silence."""
     if has_keys:
         return (
             "It may have been started without this side's .key file under --allow, or without --keys; "
@@ -196,25 +229,19 @@ def why_unreachable(has_keys: bool) -> str:
 
 
 def _running(path: str | Path) -> ServiceState:
-    state = read_state(path)
+    state = next(iter(running_services(path)), None)
     if state is None:
         raise ServiceError(path, f"No service runs for {path}. Start one: epypes serve {path}")
     for address in (state.sub, state.pub):
-        # A broker is connected to by everybody.
+        # The address of a broker has no such prefix: service and callers connect to it alike.
         if address.startswith("connect:"):
             text = f"The service of {path} connects to {address.removeprefix('connect:')}; send your events there."
             raise ServiceError(path, text)
     return state
 
 
-def _heard(path: str | Path, address: str, answers: Any, **secured: Any) -> Subscriber | ZMQSubscriber:
-    """Return what gets the answers of a service, without taking one from whoever they are for.
-
-    Raises
-    ------
-    ServiceError
-        They go to a queue.
-    """
+def _subscriber_to(path: str | Path, address: str, answers: Any, **secured: Any) -> Subscriber | ZMQSubscriber:
+    """Return the subscriber to the answers of a service; ServiceError where it would take them from other readers."""
     if not is_brokered(address):
         return ZMQSubscriber(address, answers, **secured)
     place = place_of(address)
@@ -222,14 +249,14 @@ def _heard(path: str | Path, address: str, answers: Any, **secured: Any) -> Subs
         text = (
             f"The answers of the service of {path} go to the queue {place}, where each is for one reader: a call would "
             "take answers from it. Send the event with ep.Publisher, and read the answers where you read the others; "
-            "or have the service tell everybody who listens: --pub with ?kind=broadcast."
+            "or serve it with --pub ...?kind=broadcast, which every reader hears."
         )
         raise ServiceError(path, text)
     return Subscriber(place, answers, acknowledge="received")
 
 
-def _sent(address: str, requests: Any, **secured: Any) -> Publisher | ZMQPublisher:
-    """Return what sends events to a service."""
+def _publisher_to(address: str, requests: Any, **secured: Any) -> Publisher | ZMQPublisher:
+    """Return the publisher of events to a service."""
     return (
         Publisher(address, requests) if is_brokered(address) else ZMQPublisher(address, requests, bind=False, **secured)
     )

@@ -1,6 +1,6 @@
-"""Is this machine ready for EPypes, and if not, what helps?
+"""Checks of this machine: versions, extras, ports, keys, a broker, a bundle, and the round-trip time.
 
-Every check answers in one line, and one that fails says the way out. Nothing is changed, no other machine is asked.
+Every check answers in one line, and one that fails says the way out. Nothing is changed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.bundle.seal import check_seal
 from epypes.errors import EpypesError
-from epypes.service.state_file import read_states
+from epypes.service.ops.client import running_services
 
 if TYPE_CHECKING:
     from packaging.requirements import Requirement
@@ -30,27 +30,27 @@ if TYPE_CHECKING:
 Outcome = Literal["ok", "warning", "failed"]
 
 _OLDEST_PYTHON: Final = (3, 11)
-# What is not there is missed by a part of EPypes alone, which installing its extra brings.
+# A missing extra disables one part of EPypes.
 _EXTRAS: Final = ("notebook", "vision", "serve", "service", "scale", "store", "rabbitmq", "nats", "mqtt")
 _BROWSERS: Final = ("chromium", "chromium-browser", "google-chrome", "firefox", "safari", "microsoft-edge")
 _ROUND_TRIPS: Final = 100
 _ROUND_TRIP_TIMEOUT_S: Final = 5.0
-# A loopback round trip takes 0.2 ms where the machine is idle; a hundred times that is a machine that does not keep up.
+# A loopback round trip takes 0.2 ms on an idle machine.
 _SLOW_ROUND_TRIP_MS: Final = 20.0
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """What was looked at, and what was found.
+    """One check and its outcome.
 
     Attributes
     ----------
     name
-        What was looked at.
+        The subject.
     outcome
         ``"ok"``, ``"warning"`` for what only some users miss, or ``"failed"``.
     found
-        What is there.
+        The finding.
     way_out
         What helps; empty where nothing needs help.
     """
@@ -64,14 +64,14 @@ class Check:
 def examine(
     bundle: str | Path | None = None, *, addresses: Iterable[str] = (), keys: Iterable[str | Path] = ()
 ) -> Iterator[Check]:
-    """Look at this machine, one check after the other; each is given as soon as it is known.
+    """Yield the checks of this machine, each as soon as it is done.
 
     Parameters
     ----------
     bundle
-        A bundle that is to be served, or is: its seal and its service are looked at too.
+        A bundle that is to be served, or is: its manifest and its service are checked too.
     addresses
-        Where a service is to bind: ``tcp://127.0.0.1:5555``, ``http://127.0.0.1:8642``; or a place of a broker.
+        Addresses that a service is to bind: ``tcp://127.0.0.1:5555``, ``http://127.0.0.1:8642``; or of a broker.
     keys
         Files of keys that are to be used.
     """
@@ -83,7 +83,6 @@ def examine(
         ("Graphviz", _graphviz),
         ("browser", _browser),
         ("state folder", _state_folder),
-        ("loopback ports", _loopback),
         *((f"address {_shown(address)}", lambda address=address: _address(address)) for address in addresses),
         *((f"keys {path}", lambda path=path: _keys(Path(path))) for path in keys),
         ("round trip", _round_trip),
@@ -91,22 +90,18 @@ def examine(
     if bundle is not None:
         checks += [("bundle", lambda: _bundle(Path(bundle))), ("service", lambda: _service(Path(bundle)))]
     for name, look in checks:
-        yield _looked(name, look)
+        try:
+            yield look()
+        except EpypesError as error:
+            yield Check(name, "failed", str(error))
+        except Exception as error:  # a check that fails is a finding, and those after it are still wanted
+            yield Check(name, "failed", f"{type(error).__name__}: {error}", "Report this: the check itself failed.")
 
 
 def _shown(address: str) -> str:
-    """Return an address without the password that it may have."""
+    """Return an address without its password."""
     before, at, host = address.rpartition("@")
     return f"{before.partition('://')[0]}://{host}" if at else address
-
-
-def _looked(name: str, look: Callable[[], Check]) -> Check:
-    try:
-        return look()
-    except EpypesError as error:
-        return Check(name, "failed", str(error), "")
-    except Exception as error:  # a check that fails is a finding, and those after it are still wanted
-        return Check(name, "failed", f"{type(error).__name__}: {error}", "Report this: the check itself failed.")
 
 
 def _python() -> Check:
@@ -124,7 +119,7 @@ def _epypes() -> Check:
 
 
 def _extra(extra: str) -> Check:
-    """Look whether the packages of an extra are installed, at the versions that it asks for."""
+    """Check that the packages of an extra are installed, at the versions that it requires."""
     missing, found = [], []
     for one in _required(extra).values():
         try:
@@ -210,27 +205,14 @@ def _state_folder() -> Check:
     return Check("state folder", "ok", f"{folder}, {free_mb:,} MB free")
 
 
-def _loopback() -> Check:
-    with socket.socket() as server, socket.socket() as client:
-        server.bind(("127.0.0.1", 0))
-        server.listen(1)
-        client.settimeout(_ROUND_TRIP_TIMEOUT_S)
-        try:
-            client.connect(server.getsockname())
-        except OSError as error:
-            way_out = "A firewall or container forbids connections within this machine: allow 127.0.0.1."
-            return Check("loopback ports", "failed", str(error), way_out)
-    return Check("loopback ports", "ok", "127.0.0.1 can be bound and reached")
-
-
 def _address(address: str) -> Check:
-    """Look whether an address can be bound at this moment, or whether a broker has such a place."""
+    """Check that an address can be bound now, or that a broker has it."""
     from urllib.parse import urlsplit
 
     from epypes.transport.channels import is_brokered
 
     if is_brokered(address):
-        return _place(address)
+        return _broker_address(address)
     name = f"address {address}"
     way_out = "Write tcp://127.0.0.1:5555, http://127.0.0.1:8642, or a broker's, as amqp://HOST/QUEUE."
     try:
@@ -248,11 +230,11 @@ def _address(address: str) -> Check:
             taken.bind((host, port))
         except OSError as error:
             reason = error.strerror or str(error)
-            return Check(name, "failed", reason, f"Name another port, or find who has it: ss -ltnp 'sport = :{port}'")
+            return Check(name, "failed", reason, f"Name another port, or find its process: ss -ltnp 'sport = :{port}'")
     return Check(name, "ok", "free")
 
 
-def _place(address: str) -> Check:
+def _broker_address(address: str) -> Check:
     from epypes.transport.channels import open_channel, place_of
 
     place = place_of(address)
@@ -272,7 +254,7 @@ def _keys(path: Path) -> Check:
 
 
 def _round_trip() -> Check:
-    """Send small messages there and back between two pairs of sockets of this process."""
+    """Time small messages there and back between two pairs of sockets of this process."""
     from epypes.transport import ZMQPublisher, ZMQSubscriber
 
     there: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -311,12 +293,12 @@ def _bundle(path: Path) -> Check:
 
 
 def _service(path: Path) -> Check:
-    running = read_states(path)
+    running = running_services(path)
     if not running:
         return Check("service", "warning", "none runs for this bundle", f"epypes serve {path}")
-    told = (
+    services = (
         f"process {state.pid}{f' (replica {state.replica})' if state.replica else ''}: "
         f"events at {state.sub}, answers at {state.pub}"
         for state in running
     )
-    return Check("service", "ok", "; ".join(told))
+    return Check("service", "ok", "; ".join(services))

@@ -1,6 +1,6 @@
-"""What does a machine need so that it starts a service by itself: a systemd unit, or a container?
+"""A systemd unit or a container folder for the service of a bundle.
 
-Both are text that a person reads, changes and keeps beside the bundle; they say how they are used at their top.
+Both are text that a person reads, changes and keeps beside the bundle; their first lines say how to use them.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ After=network{online}.target
 StartLimitBurst=5
 
 [Service]
-# READY is said when the samples have been replayed identical and the sockets are bound.
+# The service is ready when the samples have been replayed identical and the sockets are bound.
 Type=notify
 NotifyAccess=main
 TimeoutStartSec={start_s}
@@ -102,7 +102,7 @@ COPY bundle ./bundle
 USER epypes
 ENV PYTHONUNBUFFERED=1
 STOPSIGNAL SIGTERM
-# What comes behind the image's name at docker run is added to this command.
+# Arguments after the image's name at docker run are added to this command.
 ENTRYPOINT {entrypoint}
 """
 
@@ -117,7 +117,7 @@ def systemd_unit(bundle: str | Path, options: Sequence[str] = (), *, user: str, 
     options
         Further arguments of ``epypes serve``.
     user
-        Whom the service runs as; it must be able to read the bundle and this Python.
+        The user that the service runs as; it must be able to read the bundle and this Python.
     stop_s
         Seconds after SIGTERM until what still runs is killed.
 
@@ -126,7 +126,7 @@ def systemd_unit(bundle: str | Path, options: Sequence[str] = (), *, user: str, 
     BundleError
         The folder is not the bundle that was promoted.
     ServiceError
-        An address has a password in it, which everybody could read.
+        An address has a password in it, which every user could read.
 
     Notes
     -----
@@ -134,7 +134,7 @@ def systemd_unit(bundle: str | Path, options: Sequence[str] = (), *, user: str, 
 
     systemd.service(5), systemd.exec(5); quoting by systemd.syntax(7).
     """
-    folder, name = _checked(bundle)
+    folder, name = _read_bundle(bundle)
     _check_secrets(bundle, options)
     is_template, file = _is_template(options), unit_name(bundle, options)
     command = [sys.executable, "-m", "epypes.cli", "serve", str(folder), *options]
@@ -159,8 +159,8 @@ def systemd_unit(bundle: str | Path, options: Sequence[str] = (), *, user: str, 
 
 
 def unit_name(bundle: str | Path, options: Sequence[str] = ()) -> str:
-    """Return how the unit of a bundle is called: ``epypes-edges.service``; ``epypes-edges@.service`` for replicas."""
-    return f"epypes-{_checked(bundle)[1]}{'@' if _is_template(options) else ''}.service"
+    """Return the name of a bundle's unit: ``epypes-edges.service``; ``epypes-edges@.service`` for replicas."""
+    return f"epypes-{_read_bundle(bundle)[1]}{'@' if _is_template(options) else ''}.service"
 
 
 def _is_template(options: Sequence[str]) -> bool:
@@ -172,7 +172,7 @@ def _is_template(options: Sequence[str]) -> bool:
 
 
 def _check_secrets(bundle: str | Path, options: Sequence[str]) -> None:
-    """Raise ServiceError for an address with a password in it: units, images and lists of processes are read by all."""
+    """Raise ServiceError for an address with a password in it: every user can read units, images and process lists."""
     for option in options:
         found = re.search(r"\b([a-z]+://[^/@\s:]*):[^/@\s]*@", option)
         if found:
@@ -206,7 +206,7 @@ def write_container(bundle: str | Path, to: str | Path, options: Sequence[str] =
     ServiceError
         The folder can't be written, no wheel can be built, or an address has a password in it.
     """
-    folder, name = _checked(bundle)
+    folder, name = _read_bundle(bundle)
     _check_secrets(bundle, options)
     target = Path(to)
     try:
@@ -215,7 +215,7 @@ def write_container(bundle: str | Path, to: str | Path, options: Sequence[str] =
         target.mkdir(parents=True, exist_ok=True)
         shutil.copytree(folder, target / "bundle")
         pinned = (folder / "requirements.txt").read_text(encoding="utf-8")
-        kept = [line for line in pinned.splitlines() if not _is_epypes(line)]
+        kept = [line for line in pinned.splitlines() if re.split(r"[^\w-]", line, maxsplit=1)[0].lower() != "epypes"]
         has_wheel = _add_wheel(target, epypes_source(pins(pinned.splitlines())))
         own = f"epypes[{','.join(sorted(_extras(options)))}]=={metadata.version('epypes')}"
         (target / "requirements.txt").write_text("\n".join([*kept, own]) + "\n", encoding="utf-8")
@@ -226,7 +226,7 @@ def write_container(bundle: str | Path, to: str | Path, options: Sequence[str] =
             python=_PYTHON,
             wheels="COPY wheels ./wheels\n" if has_wheel else "",
             find="--find-links wheels " if has_wheel else "",
-            entrypoint=_json_list(entrypoint),
+            entrypoint=json.dumps(entrypoint, ensure_ascii=False),
         )
         path = target / "Containerfile"
         path.write_text(text, encoding="utf-8")
@@ -249,10 +249,6 @@ def _extras(options: Sequence[str]) -> set[str]:
     return found - {""}
 
 
-def _is_epypes(line: str) -> bool:
-    return re.split(r"[^\w-]", line, maxsplit=1)[0].lower() == "epypes"
-
-
 def _add_wheel(target: Path, source: str) -> bool:
     """Build a wheel of a checkout into the folder ``wheels``; return False where an index has what is wanted."""
     if not Path(source).is_dir():
@@ -265,22 +261,20 @@ def _add_wheel(target: Path, source: str) -> bool:
         command, stdin=subprocess.DEVNULL, capture_output=True, check=False
     )
     if done.returncode != 0:
-        said = " ".join(done.stderr.decode(errors="replace").split())[-300:]
-        raise ServiceError(target, f"No wheel can be built of {source}: {said}. Connect to the network, or install uv.")
+        output = " ".join(done.stderr.decode(errors="replace").split())[-300:]
+        way_out = "Connect to the network, or install uv."
+        raise ServiceError(target, f"No wheel can be built of {source}: {output}. {way_out}")
     # uv leaves one for version control.
     (target / "wheels" / ".gitignore").unlink(missing_ok=True)
     return True
 
 
-def _checked(bundle: str | Path) -> tuple[Path, str]:
-    """Return the folder of a whole bundle, and a word for its name that systemd and containers take."""
+def _read_bundle(bundle: str | Path) -> tuple[Path, str]:
+    """Return the folder of a whole bundle, and its name in the characters that systemd and containers take."""
     folder = Path(bundle).resolve()
     check_seal(folder)
-    return folder, _word(read_settings(folder / SETTINGS).name)
-
-
-def _word(name: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-") or "service"
+    name = read_settings(folder / SETTINGS).name
+    return folder, re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-") or "service"
 
 
 def _one_line(text: str) -> str:
@@ -298,7 +292,3 @@ def _quoted(argument: str) -> str:
         return argument
     escaped = argument.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n").replace("\r", "\\r")
     return f'"{_specifiers(escaped).replace("$", "$$")}"'
-
-
-def _json_list(arguments: Sequence[str]) -> str:
-    return json.dumps(list(arguments), ensure_ascii=False)
