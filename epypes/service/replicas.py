@@ -35,7 +35,8 @@ from epypes.service.replica_messages import (
     decode_message,
     encode_message,
 )
-from epypes.transport import Publisher, Subscriber
+from epypes.transport.publisher import Publisher
+from epypes.transport.subscriber import Subscriber
 
 HEARTBEAT_S: Final = 1.0
 # Three heartbeats may be lost before a replica counts as gone.

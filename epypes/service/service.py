@@ -17,10 +17,10 @@ from epypes.service.endpoints import Endpoints, group_address
 from epypes.service.eventlog import EventLog
 from epypes.service.failures.record import FailureRecord
 from epypes.service.failures.store import FailureStore, failures_folder
-from epypes.service.group.peers import Replicas
 from epypes.service.lifecycle import Lifecycle, State
 from epypes.service.options import ANY_PORT, Options
 from epypes.service.parameters import ParameterControl, Parameters
+from epypes.service.replicas import Replicas
 from epypes.service.result_publisher import Latency, Listener, Provenance, ResultPublisher
 from epypes.service.state_file import ServiceState
 from epypes.service.supervisor import Supervisor

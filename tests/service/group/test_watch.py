@@ -3,7 +3,6 @@ from __future__ import annotations
 import logging
 
 import pytest
-
 from epypes.service.group.membership import Heard, Member, Membership
 from epypes.service.group.watch import Watch, odds
 
