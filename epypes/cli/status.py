@@ -50,9 +50,9 @@ def status(
 
 def _is_shared(found: dict[str, Any]) -> bool:
     """Whether a service takes its events from a broker, as others may."""
-    from epypes.transport.channels import is_brokered
+    from epypes.transport.address import is_broker
 
-    return is_brokered(found["addresses"]["sub"])
+    return is_broker(found["addresses"]["sub"])
 
 
 def _of_all(source: str, states: list[ServiceState]) -> list[dict[str, Any]]:

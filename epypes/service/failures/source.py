@@ -256,10 +256,10 @@ def _follow_sockets(path: Path, **secured: Any) -> Iterator[FailureRecord | None
 
 def _check_shared(path: Path, address: str) -> None:
     """Raise ServiceError where failures go to one receiver, which would miss what another one hears."""
-    from epypes.transport.channels import is_brokered
+    from epypes.transport.address import is_broker
 
     bare = address.removeprefix("connect:")
-    if bare != address or is_brokered(bare):
+    if bare != address or is_broker(bare):
         raise ServiceError(
             path, f"The service of {path} sends its failures to {bare}; listen there, or ask its http URL."
         )

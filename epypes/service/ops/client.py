@@ -20,7 +20,7 @@ from epypes.bundle.settings import read_settings
 from epypes.errors import BundleError, EpypesError, RemoteFailure, ServiceError
 from epypes.service.state_file import ServiceState, read_states, running_at, state_file
 from epypes.transport import Publisher, Subscriber, ZMQPublisher, ZMQSubscriber
-from epypes.transport.channels import is_brokered, place_of
+from epypes.transport.address import is_broker, parse_address
 
 if TYPE_CHECKING:
     from epypes.transport import Keys
@@ -242,9 +242,9 @@ def _running(path: str | Path) -> ServiceState:
 
 def _subscriber_to(path: str | Path, address: str, answers: Any, **secured: Any) -> Subscriber | ZMQSubscriber:
     """Return the subscriber to the answers of a service; ServiceError where it would take them from other readers."""
-    if not is_brokered(address):
+    if not is_broker(address):
         return ZMQSubscriber(address, answers, **secured)
-    place = place_of(address)
+    place = parse_address(address)
     if place.kind == "queue":
         text = (
             f"The answers of the service of {path} go to the queue {place}, where each is for one reader: a call would "
@@ -258,7 +258,7 @@ def _subscriber_to(path: str | Path, address: str, answers: Any, **secured: Any)
 def _publisher_to(address: str, requests: Any, **secured: Any) -> Publisher | ZMQPublisher:
     """Return the publisher of events to a service."""
     return (
-        Publisher(address, requests) if is_brokered(address) else ZMQPublisher(address, requests, bind=False, **secured)
+        Publisher(address, requests) if is_broker(address) else ZMQPublisher(address, requests, bind=False, **secured)
     )
 
 

@@ -209,9 +209,9 @@ def _address(address: str) -> Check:
     """Check that an address can be bound now, or that a broker has it."""
     from urllib.parse import urlsplit
 
-    from epypes.transport.channels import is_brokered
+    from epypes.transport.address import is_broker
 
-    if is_brokered(address):
+    if is_broker(address):
         return _broker_address(address)
     name = f"address {address}"
     way_out = "Write tcp://127.0.0.1:5555, http://127.0.0.1:8642, or a broker's, as amqp://HOST/QUEUE."
@@ -235,9 +235,9 @@ def _address(address: str) -> Check:
 
 
 def _broker_address(address: str) -> Check:
-    from epypes.transport.channels import open_channel, place_of
+    from epypes.transport.address import open_channel, parse_address
 
-    place = place_of(address)
+    place = parse_address(address)
     open_channel(place).close()
     return Check(f"address {place}", "ok", "the broker answers, and has it")
 

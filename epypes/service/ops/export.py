@@ -23,7 +23,7 @@ from epypes.bundle.requirements import pins
 from epypes.bundle.seal import check_seal
 from epypes.bundle.settings import read_settings
 from epypes.errors import ServiceError
-from epypes.transport.channels import extra_of, is_brokered
+from epypes.transport.address import is_broker, parse_address
 
 # Python 3.11 is the oldest that EPypes runs on; the container takes the one that the bundle was proved with.
 _PYTHON: Final = f"{sys.version_info.major}.{sys.version_info.minor}"
@@ -168,7 +168,7 @@ def _is_template(options: Sequence[str]) -> bool:
     has_name = any(option.partition("=")[0] == "--replica" for option in options)
     subs = [option.removeprefix("--sub=") for option in options if option.startswith("--sub=")]
     subs += [after for option, after in pairwise(options) if option == "--sub"]
-    return not has_name and any(map(is_brokered, subs))
+    return not has_name and any(map(is_broker, subs))
 
 
 def _check_secrets(bundle: str | Path, options: Sequence[str]) -> None:
@@ -245,7 +245,7 @@ def _extras(options: Sequence[str]) -> set[str]:
         if name == "--store":
             found.add("postgres" if value.startswith("postgres") else "store")
         else:
-            found.add(extra_of(value))
+            found.add(parse_address(value).extra)
     return found - {""}
 
 

@@ -95,8 +95,10 @@ def connect(url: str, *, token: str | None = None, timeout_s: float = 5.0) -> Co
 
 def _token_on_this_machine(address: str) -> str:
     """Return the token of a service of this user; empty if there is none."""
+    from epypes.service import state_file
+
     try:
-        found = state.running_at(address)
+        found = state_file.running_at(address)
         return Path(found.token_file).read_text(encoding="ascii").strip() if found and found.token_file else ""
     except (OSError, UnicodeDecodeError, ServiceError):
         return ""
