@@ -238,7 +238,9 @@ def _broker_address(address: str) -> Check:
     from epypes.transport.address import open_channel, parse_address
 
     place = parse_address(address)
-    open_channel(place).close()
+    channel = open_channel(place)
+    channel.open(None)
+    channel.close()
     return Check(f"address {place}", "ok", "the broker answers, and has it")
 
 
