@@ -1,0 +1,194 @@
+"""A broker within this process, for tests: ``memory://BROKER/NAME``.
+
+It keeps what the others promise: a message of a queue goes to one consumer, is delivered again when that is closed
+before it has acknowledged it, has a count of its deliveries, and can be rejected. `away` has every channel lose its
+connection.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+from epypes.errors import BrokerError
+from epypes.transport.address import Address
+from epypes.transport.brokers.channel import BrokerChannel
+from epypes.transport.brokers.message import IncomingMessage, OutgoingMessage
+from epypes.transport.channel import ChannelOptions
+
+
+@dataclass(slots=True, eq=False)
+class _StoredMessage:
+    body: bytes
+    id: str
+    headers: dict[str, str]
+    deliveries: int = 0
+
+
+@dataclass(slots=True)
+class _MemoryBroker:
+    """The queues, logs and sessions of one name; used on the asyncio thread, but for ``is_away``."""
+
+    queues: dict[str, deque[_StoredMessage]] = field(default_factory=dict)
+    logs: dict[str, list[_StoredMessage]] = field(default_factory=dict)
+    sessions: list[MemorySession] = field(default_factory=list)
+    is_away: bool = False
+
+
+_brokers: Final[dict[str, _MemoryBroker]] = {}
+_lock: Final = threading.Lock()
+
+
+def _broker(name: str) -> _MemoryBroker:
+    with _lock:
+        return _brokers.setdefault(name, _MemoryBroker())
+
+
+@contextlib.contextmanager
+def away(host: str) -> Iterator[None]:
+    """Have a broker be gone for the time of a ``with`` block; what it keeps is there again afterwards."""
+    broker = _broker(host)
+    broker.is_away = True
+    for session in list(broker.sessions):
+        session.lose_from_outside()
+    try:
+        yield
+    finally:
+        broker.is_away = False
+
+
+class MemorySession:
+    """A connection to a broker in this process; see `epypes.transport.brokers.channel.BrokerSession`."""
+
+    most_header_bytes = 65_536
+    lost: asyncio.Future[str]
+
+    def __init__(self, address: Address, timeout_s: float) -> None:
+        self.address, self.timeout_s = address, timeout_s
+        self._broker = _broker(address.host)
+        self._deliver: Callable[[IncomingMessage], object] | None = None
+        self._window = self._read = 0
+        self._unsettled: set[IncomingMessage] = set()
+
+    def check(self, message: OutgoingMessage) -> None:
+        """Take every message."""
+
+    def hint(self, address: Address) -> str:
+        """Return nothing: it always answers."""
+        return ""
+
+    def lose_from_outside(self) -> None:
+        """Have the connection break; from any thread."""
+        loop = self.lost.get_loop()
+        with contextlib.suppress(RuntimeError):
+            loop.call_soon_threadsafe(self._lose)
+
+    def _lose(self) -> None:
+        if not self.lost.done():
+            self.lost.set_result("the broker has gone away")
+
+    async def connect(self, *, receives: bool) -> None:
+        """Connect; the queue is made if the address says so."""
+        address, broker = self.address, self._broker
+        self.lost = asyncio.get_running_loop().create_future()
+        if broker.is_away:
+            raise BrokerError(str(address), f"{address} can't be reached: the broker is away.")
+        if address.kind == "queue" and address.name not in broker.queues:
+            if not address.create:
+                text = f"There is no queue {address.name!r} at {address}. Make it, or add ?create=true to the address."
+                raise BrokerError(str(address), text)
+            broker.queues[address.name] = deque()
+        self._read = 0
+        broker.sessions.append(self)
+
+    async def publish(self, message: OutgoingMessage) -> None:
+        """Keep a message, or hand it to those that are connected."""
+        address, broker = message.address, self._broker
+        if broker.is_away:
+            raise BrokerError(str(address), f"{address} can't be reached: the broker is away.")
+        stored = _StoredMessage(message.body, message.id, dict(message.headers))
+        if address.kind == "queue":
+            broker.queues.setdefault(address.name, deque()).append(stored)
+        elif address.kind == "log":
+            broker.logs.setdefault(address.name, []).append(stored)
+        else:
+            for session in broker.sessions:
+                if session.address.name == address.name:
+                    session.hear(stored)
+        self._hand_out()
+
+    def hear(self, stored: _StoredMessage) -> None:
+        """Deliver a broadcast."""
+        if self._deliver is not None:
+            self._deliver(IncomingMessage(stored.body, stored.id, dict(stored.headers)))
+
+    async def consume(self, deliver: Callable[[IncomingMessage], object], window: int) -> None:
+        """Have a function called with what comes."""
+        self._deliver, self._window = deliver, window
+        self._hand_out()
+
+    async def set_window(self, window: int) -> None:
+        """Change how many may be unsettled."""
+        self._window = window
+        self._hand_out()
+
+    async def settle(self, message: IncomingMessage, *, requeue: bool) -> None:
+        """Forget a message, or put it back."""
+        if message in self._unsettled:
+            self._unsettled.discard(message)
+            if requeue:
+                self._broker.queues[self.address.name].appendleft(message.receipt)
+            self._hand_out()
+
+    def _hand_out(self) -> None:
+        """Deliver what waits, in turn to those that have room."""
+        is_given = True
+        while is_given:
+            is_given = False
+            for session in list(self._broker.sessions):
+                is_given |= session.take_one()
+            # The next one begins.
+            if self._broker.sessions:
+                self._broker.sessions.append(self._broker.sessions.pop(0))
+
+    def take_one(self) -> bool:
+        """Deliver one message that waits, if there is room for it."""
+        address, broker = self.address, self._broker
+        if self._deliver is None or self.lost.done():
+            return False
+        if address.kind == "log":
+            stored_log = broker.logs.get(address.name, [])
+            if self._read >= len(stored_log):
+                return False
+            self.hear(stored_log[self._read])
+            self._read += 1
+            return True
+        waiting = broker.queues.get(address.name)
+        if address.kind != "queue" or not waiting or len(self._unsettled) >= self._window:
+            return False
+        stored = waiting.popleft()
+        stored.deliveries += 1
+        message = IncomingMessage(stored.body, stored.id, dict(stored.headers), stored.deliveries, receipt=stored)
+        self._unsettled.add(message)
+        self._deliver(message)
+        return True
+
+    async def close(self, unsettled: list[IncomingMessage]) -> None:
+        """Disconnect; what is unsettled is delivered again."""
+        broker, self._deliver = self._broker, None
+        if self in broker.sessions:
+            broker.sessions.remove(self)
+        for message in self._unsettled:
+            broker.queues[self.address.name].appendleft(message.receipt)
+        self._unsettled.clear()
+        self._hand_out()
+
+
+def make_channel(address: Address, options: ChannelOptions) -> BrokerChannel:
+    """Return a channel to a broker in this process."""
+    return BrokerChannel(MemorySession(address, options.timeout_s), options)
