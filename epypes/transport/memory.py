@@ -178,7 +178,7 @@ class MemorySession:
         self._deliver(message)
         return True
 
-    async def close(self, unsettled: list[IncomingMessage]) -> None:
+    async def close(self) -> None:
         """Disconnect; what is unsettled is delivered again."""
         broker, self._deliver = self._broker, None
         if self in broker.sessions:

@@ -278,7 +278,7 @@ class AmqpSession:
         else:
             await message.receipt.ack()
 
-    async def close(self, unsettled: list[IncomingMessage]) -> None:
+    async def close(self) -> None:
         """Disconnect; RabbitMQ delivers again what was not acknowledged."""
         connection, self._connection = self._connection, None
         self._queue = self._consuming = self._publishing = None

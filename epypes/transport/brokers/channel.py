@@ -100,8 +100,8 @@ class BrokerSession(Protocol):
     async def settle(self, message: IncomingMessage, *, requeue: bool) -> None:
         """Acknowledge a message, or have the broker deliver it again."""
 
-    async def close(self, unsettled: list[IncomingMessage]) -> None:
-        """Disconnect; have the broker deliver again what is unsettled. Raises nothing of its own."""
+    async def close(self) -> None:
+        """Disconnect; the broker delivers again what is unsettled. As often as you like; may raise."""
 
     def hint(self, address: Address) -> str:
         """Return where to look if the broker doesn't answer: sentences with a space before them, or nothing."""
@@ -348,18 +348,18 @@ class BrokerChannel:
                 if self._handler is not None:
                     await session.consume(self._deliver, self._window)
         except BaseException as error:
-            await self._disconnect([])
+            await self._disconnect()
             if isinstance(error, TimeoutError):
                 text = f"{self.address} did not answer within {timeout_s:g} s.{session.hint(self._address)}"
                 raise BrokerError(self.address, text) from error
             raise
         self._report("")
 
-    async def _disconnect(self, unsettled: list[IncomingMessage]) -> None:
+    async def _disconnect(self) -> None:
         """Close the session, whatever the broker says or does not say."""
         with contextlib.suppress(Exception):
             async with asyncio.timeout(CLOSING_S):
-                await self._session.close(unsettled)
+                await self._session.close()
 
     async def _run(self) -> None:
         """Use one connection after another until the channel is closed."""
@@ -370,7 +370,7 @@ class BrokerChannel:
                 log.warning("%s is connected again after %.1f s", self.address, monotonic() - lost_s)
                 self.reconnects += 1
             reason = await self._use()
-            await self._disconnect([])
+            await self._disconnect()
             log.warning("lost %s, which is tried again until it is connected: %s", self.address, reason)
             lost_s = monotonic()
             self._report(reason)
@@ -574,7 +574,7 @@ class BrokerChannel:
             if self._main is not None:
                 self._main.cancel()
                 await asyncio.gather(self._main, return_exceptions=True)
-            await self._disconnect(list(self._unsettled))
+            await self._disconnect()
         finally:
             self.is_connected = False
             self._unsettled.clear()
