@@ -92,7 +92,7 @@ class MemorySession:
         if not self.lost.done():
             self.lost.set_result("the broker has gone away")
 
-    async def connect(self, *, receives: bool) -> None:
+    async def connect(self, window: int) -> None:
         """Connect; the queue is made if the address says so."""
         address, broker = self.address, self._broker
         self.lost = asyncio.get_running_loop().create_future()

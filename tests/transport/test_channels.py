@@ -165,16 +165,26 @@ def test_a_message_over_the_limit_of_the_channel_is_refused(queue, opened):
     sender.send(bytes(1_000))
 
 
+def in_order(receiver, count):
+    for number in range(count):
+        delivery = receiver.next()
+        assert body(delivery) == b"%d" % number
+        delivery.ack()
+
+
 def test_what_was_sent_before_the_consumer_came_arrives_in_order(queue, opened):
     sender = opened(Sender, queue)
     for number in range(200):
         sender.channel.send([b"%d" % number])
-    receiver = opened(Receiver, queue, prefetch=8)
-    for number in range(200):
-        delivery = receiver.next()
-        assert body(delivery) == b"%d" % number
-        delivery.ack()
     wait_until(lambda: sender.channel.waiting == 0, WAIT_S)
+    in_order(opened(Receiver, queue, prefetch=8), 200)
+
+
+def test_what_is_sent_meanwhile_arrives_in_order(queue, opened):
+    receiver, sender = opened(Receiver, queue, prefetch=8), opened(Sender, queue)
+    for number in range(500):
+        sender.channel.send([b"%d" % number])
+    in_order(receiver, 500)
 
 
 def test_close_sends_what_was_accepted(queue, opened):

@@ -90,7 +90,7 @@ class AmqpSession:
             text = f"The headers of a message take more than {_MOST_HEADER_BYTES:,} bytes."
             raise MessageError("too large", text)
 
-    async def connect(self, *, receives: bool) -> None:
+    async def connect(self, window: int) -> None:
         """Connect, and see that the queues are there, or make them."""
         address = self.address
         self.lost = asyncio.get_running_loop().create_future()
@@ -114,7 +114,7 @@ class AmqpSession:
         await self._make_sure(address)
         if _has_dead_letters(address):
             await self._make_sure(address.dead_letters)
-        if not receives:
+        if not window:
             # Before the first message, since those that waited for it could be overtaken.
             await self._open_publishing()
 

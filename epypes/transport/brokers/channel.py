@@ -71,8 +71,13 @@ class BrokerSession(Protocol):
     def check(self, message: OutgoingMessage) -> None:
         """Raise MessageError if the broker can never take a message; on the thread that sends it."""
 
-    async def connect(self, *, receives: bool) -> None:
+    async def connect(self, window: int) -> None:
         """Connect, and see that the address is there, or make it; again after a connection was closed.
+
+        Parameters
+        ----------
+        window
+            How many messages may be unsettled; 0 on a channel that only sends.
 
         Raises
         ------
@@ -340,7 +345,7 @@ class BrokerChannel:
         session, timeout_s = self._session, self._options.timeout_s
         try:
             async with asyncio.timeout(timeout_s):
-                await session.connect(receives=self._handler is not None)
+                await session.connect(self._window if self._handler is not None else 0)
                 self._connection += 1
                 self._unsettled.clear()
                 self._postponed.clear()

@@ -1,8 +1,8 @@
 """NATS JetStream by nats-py: ``nats://USER:PASSWORD@HOST/SUBJECT``, encrypted ``tls://``.
 
-A queue is a stream of the subject with one durable consumer, the address' group, that all consumers of EPypes pull from;
-a log is a stream that each consumer reads by an ephemeral consumer of its own; a broadcast is plain NATS. What is there
-already is taken as it is.
+A queue is a stream of the subject with one durable consumer, the address' group, that all channels pull from. A log is
+a stream that each channel reads by an ephemeral consumer of its own. A broadcast is plain NATS. What is there already
+is taken as it is.
 
 The session asks for messages ahead, so that none waits for a request; what it has asked for and what is unsettled are
 together no more than the prefetch window, so a busy consumer leaves the rest to others. Each request ends by itself
@@ -90,7 +90,7 @@ class NatsSession:
         """Return nothing: a server that doesn't answer gives no sign."""
         return ""
 
-    async def connect(self, *, receives: bool) -> None:
+    async def connect(self, window: int) -> None:
         """Connect once, without the client's own reconnecting, and see that the streams are there, or make them."""
         address = self.address
         _check_names(address)
