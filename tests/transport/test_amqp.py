@@ -173,7 +173,7 @@ def test_a_deleted_queue_is_named_and_made_again_if_the_address_says_so(rabbitmq
     assert body(receiver.next()) == b"again"
 
 
-def test_a_full_queue_is_named_while_the_message_waits(rabbitmq, name, opened, by_hand):
+def test_a_full_queue_is_named_while_the_message_waits(rabbitmq, name, opened, by_hand, caplog):
     limits = {"x-queue-type": "quorum", "x-max-length": 1, "x-overflow": "reject-publish"}
     by_hand(declare(name, **limits))
     opened(Sender, rabbitmq.address(f"{name}.dead", create=True))
@@ -181,7 +181,7 @@ def test_a_full_queue_is_named_while_the_message_waits(rabbitmq, name, opened, b
     # A quorum queue takes some more than its length.
     for number in range(50):
         sender.channel.send([b"x"], id=str(number), confirmed=outcomes.append)
-    wait_until(lambda: "did not take a message: the queue is full" in sender.channel.trouble, WAIT_S)
+    wait_until(lambda: "did not take a message: the queue is full" in caplog.text, WAIT_S)
     receiver = opened(Receiver, rabbitmq.address(name))
     while len(outcomes) < 50:
         with contextlib.suppress(Exception):
@@ -200,13 +200,13 @@ def test_an_encrypted_broker_is_checked_by_its_certificates(rabbitmq, name, open
         Sender(rabbitmq.address(name, scheme="amqps", ca="/none"))
 
 
-def test_a_broker_that_takes_no_messages_just_now_is_an_error_that_names_where_to_look(rabbitmq, name, opened):
+def test_a_broker_that_takes_no_messages_just_now_is_an_error_that_names_where_to_look(rabbitmq, name, opened, caplog):
     sender = opened(Sender, rabbitmq.address(name, create=True), timeout_s=1.0)
     rabbitmq.evaluate("vm_memory_monitor:set_vm_memory_high_watermark(0).")
     try:
         outcomes = []
         sender.channel.send([b"x"], confirmed=outcomes.append)
-        wait_until(lambda: "low on memory" in sender.channel.trouble, WAIT_S)
+        wait_until(lambda: "low on memory" in caplog.text, WAIT_S)
     finally:
         rabbitmq.evaluate("vm_memory_monitor:set_vm_memory_high_watermark(0.8).")
     wait_until(lambda: outcomes, WAIT_S)
