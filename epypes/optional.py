@@ -15,6 +15,7 @@ from epypes.errors import MissingPackage
 EXTRAS: Final[Mapping[str, tuple[str, str]]] = {
     "IPython": ("ipython", "widgets"),
     "PIL": ("pillow", "widgets"),
+    "aio_pika": ("aio-pika", "rabbitmq"),
     "anywidget": ("anywidget", "widgets"),
     "cv2": ("opencv-python-headless", "vision"),
     "dask": ("dask", "cluster"),

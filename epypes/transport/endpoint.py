@@ -79,7 +79,7 @@ class Endpoint(Startable):
         self.place = parse_address(address)
         self.on_connection: Callable[[bool, str], object] | None = None
         self._max_message_bytes, self._timeout_s = max_message_bytes, timeout_s
-        self._connection = Connection(self)
+        self._connection = ConnectionState(self)
         self._lock = threading.Lock()
         self._channel: Channel | None = None
         self._process = os.getpid()
@@ -185,8 +185,8 @@ class Endpoint(Startable):
         return f"<{type(self).__name__} {self.address[:50]} {state}: {count}>"
 
 
-class Connection:
-    """Hears from a channel whether it is connected, and does not keep the Endpoint alive.
+class ConnectionState:
+    """Whether the channel of an Endpoint is connected; it does not keep the Endpoint alive.
 
     Attributes
     ----------

@@ -18,7 +18,7 @@ from epypes.errors import BrokerError, MessageError, StillRunning
 from epypes.run import Failure
 from epypes.transport.address import Address
 from epypes.transport.channel import NO_HEADERS, Channel, Confirmed, Frames
-from epypes.transport.endpoint import Connection, Endpoint
+from epypes.transport.endpoint import ConnectionState, Endpoint
 from epypes.transport.sequences import check_source
 from epypes.transport.throttle import Throttle
 from epypes.wire import EncodedEnvelope, Envelope, Limits, encode, failure_event, new_id, serialized, topic_frame
@@ -64,7 +64,7 @@ class Publisher(Endpoint):
         the publisher is stopped before. From other queues a thread takes an item a little later, so leave arrays alone,
         or make them read-only. Read-only arrays are sent over ZeroMQ without a copy.
     topic
-        Topic of the envelopes. 2019 mode knows none.
+        Topic of the envelopes; an EncodedEnvelope keeps its own if there is none. 2019 mode knows none.
     bind
         False to connect to a ZeroMQ subscriber that binds.
     insecure
@@ -295,7 +295,9 @@ class Outbox:
         Knows the threads that must not wait for a confirmation.
     """
 
-    def __init__(self, name: str, topic: str, limits: Limits, is_confirmed_later: bool, connection: Connection) -> None:
+    def __init__(
+        self, name: str, topic: str, limits: Limits, is_confirmed_later: bool, connection: ConnectionState
+    ) -> None:
         self._name, self._topic, self._limits = name, topic, limits
         self._topic_frame = topic_frame(topic)
         self.is_confirmed_later, self._connection = is_confirmed_later, connection
@@ -446,11 +448,12 @@ class Outbox:
         MessageError
             It can't be sent. What code of the item itself raises comes as it is.
         """
+        frames: tuple[Any, ...]
         if isinstance(item, Envelope):
             return self._stamped(item.source, encode(item, self._topic, limits=self._limits))
         if isinstance(item, EncodedEnvelope):
-            return self._stamped(item.source, (self._topic_frame, *item.frames[1:]))
-        frames: tuple[Any, ...]
+            frames = (self._topic_frame, *item.frames[1:]) if self._topic else item.frames
+            return self._stamped(item.source, frames)
         if isinstance(item, bytes):
             frames = (item,)
         elif isinstance(item, tuple):

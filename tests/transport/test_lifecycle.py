@@ -192,7 +192,7 @@ def visit():
 threads = [threading.Thread(target=visit) for _ in range(4)]
 for thread in threads:
     thread.start()
-for _ in range(100):
+for _ in range(40):
     with ZMQPublisher("tcp://127.0.0.1:*", queue.SimpleQueue()) as pub:
         address[0] = pub.address
         is_over.wait(0.003)

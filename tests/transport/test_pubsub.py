@@ -295,6 +295,10 @@ def test_encoded_envelopes_get_the_publishers_topic_and_numbers_and_their_values
     assert [each.envelope.sequence for each in deliveries] == [1, 2]
     assert bytes(deliveries[0].frames[0]) == b"cam1/"
     assert deliveries[0].envelope.decode().parts["n"] == 1
+    with ZMQPublisher(LOCAL, out) as pub, ZMQSubscriber(pub.address, into, "elsewhere") as sub:
+        assert sub.wait_joined(WAIT_S)
+        out.put(encoded)
+        assert into.get(timeout=WAIT_S).id == "a"
 
 
 def test_undecoded_messages_are_put_as_they_came_and_their_losses_are_counted(peer):

@@ -119,6 +119,8 @@ class AmqpSession:
             await self._open_publishing()
 
     def _unreachable(self, error: Exception) -> BrokerError:
+        if isinstance(error, BrokerError):
+            return error
         # aiormq wraps the errors of the network.
         inner = error.__cause__ if isinstance(error.__cause__, OSError) else error
         address, code = self.address, error.args[0] if error.args else None
@@ -126,7 +128,8 @@ class AmqpSession:
         if isinstance(error, ProbableAuthenticationError) or code == _NOT_ALLOWED:
             user = f"user {address.user!r}" if address.user else "a connection without a user"
             return BrokerError(str(address), f"{address} refuses {user} or the password. {address.refused_way_out}")
-        if code == _NO_HOST:
+        # aiormq 7.2 has no error of its own for a broker that closes the connection instead of opening a virtual host.
+        if code == _NO_HOST or "Connection.OpenOk" in str(error):
             text = f"{address} has no virtual host {address.vhost!r}, or user {address.user!r} may not use it."
             return BrokerError(str(address), text)
         return unreachable(address, inner, self.timeout_s, "a RabbitMQ", otherwise)

@@ -65,9 +65,9 @@ class NatsSession:
         self._client = Client()
         self._stream = self._requests = ""
         self._subscription: Any = None
-        self._progress: asyncio.Task[None] | None = None
+        self._keeping_alive: asyncio.Task[None] | None = None
         self._deliver: Callable[[IncomingMessage], object] = lambda message: None
-        self._window = 0
+        self._window, self._progress_s = 0, _PROGRESS_S
         # By its reply subject: what was delivered and is not settled.
         self._held: dict[str, Msg] = {}
         # How many messages were asked for and have not come; until when, by the number of the request.
@@ -140,6 +140,7 @@ class NatsSession:
         except Exception as error:
             # The first error says why; the client's last one that no server is left.
             raise self._unreachable(errors[0] if errors else error) from error
+        self._keeping_alive = asyncio.ensure_future(self._keep_alive())
         if address.kind != "broadcast":
             await self._find_streams()
 
@@ -210,7 +211,7 @@ class NatsSession:
         self._requests = f"$JS.API.CONSUMER.MSG.NEXT.{self._stream}.{consumer}"
         self._inbox = self._client.new_inbox()
         self._subscription = await self._client.subscribe(f"{self._inbox}.*", cb=self._take, **unbounded)
-        self._progress = asyncio.ensure_future(self._report_progress(min(_PROGRESS_S, ack_wait_s / 4)))
+        self._progress_s = min(_PROGRESS_S, ack_wait_s / 4)
         await self.set_window(window)
 
     async def _find_consumer(self) -> tuple[str, float]:
@@ -257,14 +258,17 @@ class NatsSession:
         wish = json.dumps({"batch": room, "expires": int(_REQUEST_S * 1e9)}).encode()
         await self._client.publish(self._requests, wish, f"{self._inbox}.{self._last_request}")
 
-    async def _report_progress(self, every_s: float) -> None:
+    async def _keep_alive(self) -> None:
         """Tell the server that the consumer of each unsettled message lives, and ask for what no request brought."""
-        while True:
-            await asyncio.sleep(every_s)
-            if self.address.kind == "queue":
-                for message in tuple(self._held.values()):
+        while not self.lost.done():
+            await asyncio.sleep(self._progress_s)
+            if not self._client.is_connected:
+                # The client calls back only when all that it had to send was taken, which may never be.
+                self._lose(_gone(self._client.last_error))
+            elif self._requests:
+                for message in tuple(self._held.values()) if self.address.kind == "queue" else ():
                     await message.in_progress()
-            await self._request(least=1)
+                await self._request(least=1)
 
     async def _take_broadcast(self, message: Msg) -> None:
         self._deliver(_incoming(message, 0))
@@ -299,10 +303,10 @@ class NatsSession:
 
     async def close(self) -> None:
         """Return what is unsettled, and disconnect."""
-        client, subscription, progress = self._client, self._subscription, self._progress
-        self._subscription, self._progress, self._requests = None, None, ""
-        if progress is not None:
-            progress.cancel()
+        client, subscription = self._client, self._subscription
+        self._subscription, self._requests = None, ""
+        if self._keeping_alive is not None:
+            self._keeping_alive.cancel()
         try:
             if client.is_connected and subscription is not None and self._held and not self.lost.done():
                 await subscription.drain()

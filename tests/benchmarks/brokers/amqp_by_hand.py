@@ -1,85 +1,109 @@
-"""How does somebody use RabbitMQ with pika alone: a work queue, answers confirmed, then the event acknowledged?"""
+"""RabbitMQ with aio-pika alone: a work queue, answers confirmed, then the event acknowledged."""
 
 from __future__ import annotations
 
+import asyncio
 import uuid
 from collections.abc import Callable
-from typing import Any
 
+import aio_pika
 import numpy as np
-import pika
-from pika.adapters.blocking_connection import BlockingChannel
+from aio_pika.abc import AbstractChannel, AbstractConnection, AbstractIncomingMessage
 
-from tests.benchmarks.brokers.parties import DEADLINE_S, PREFETCH, Meeting, keep_busy
-
-_PERSISTENT = 2
+from tests.benchmarks.brokers.parties import DEADLINE_S, OUTSTANDING, PREFETCH, Meeting
 
 
-def _connected(meeting: Meeting, heartbeat: int | None = None) -> BlockingChannel:
-    credentials = pika.PlainCredentials(meeting.user, meeting.password)
-    parameters = pika.ConnectionParameters("127.0.0.1", meeting.port, credentials=credentials, heartbeat=heartbeat)
-    channel = pika.BlockingConnection(parameters).channel()
-    channel.basic_qos(prefetch_count=PREFETCH)
-    channel.confirm_delivery()
+async def _connected(meeting: Meeting) -> AbstractConnection:
+    return await aio_pika.connect(host="127.0.0.1", port=meeting.port, login=meeting.user, password=meeting.password)
+
+
+async def _opened(connection: AbstractConnection) -> AbstractChannel:
+    channel = await connection.channel()
+    await channel.set_qos(PREFETCH)
     return channel
 
 
 def prepare(meeting: Meeting) -> None:
     """Make the two queues as EPypes makes its own."""
-    channel = _connected(meeting)
-    for name in (meeting.events, meeting.answers):
-        channel.queue_declare(name, durable=True, arguments={"x-queue-type": "quorum"})
-    channel.connection.close()
+    asyncio.run(_prepare(meeting))
 
 
-def _send(channel: BlockingChannel, queue: str, body: bytes, message_id: str) -> None:
-    properties = pika.BasicProperties(delivery_mode=_PERSISTENT, message_id=message_id)
-    channel.basic_publish("", queue, body, properties, mandatory=True)
+async def _prepare(meeting: Meeting) -> None:
+    async with await _connected(meeting) as connection:
+        channel = await _opened(connection)
+        for name in (meeting.events, meeting.answers):
+            await channel.declare_queue(name, durable=True, arguments={"x-queue-type": "quorum"})
+
+
+async def _send(channel: AbstractChannel, queue: str, body: bytes, message_id: str) -> None:
+    persistent = aio_pika.DeliveryMode.PERSISTENT
+    await channel.default_exchange.publish(
+        aio_pika.Message(body, message_id=message_id, delivery_mode=persistent), queue
+    )
 
 
 def serve(meeting: Meeting, ready: Callable[[], object]) -> None:
     """Answer every event with what came."""
+    asyncio.run(_serve(meeting, ready))
 
-    def answer(channel: BlockingChannel, method: Any, properties: Any, body: bytes) -> None:
-        _send(channel, meeting.answers, body, properties.message_id)
-        channel.basic_ack(method.delivery_tag)
 
-    channel = _connected(meeting)
-    channel.basic_consume(meeting.events, answer)
+async def _serve(meeting: Meeting, ready: Callable[[], object]) -> None:
+    channel = await _opened(await _connected(meeting))
+
+    async def answer(message: AbstractIncomingMessage) -> None:
+        await _send(channel, meeting.answers, message.body, message.message_id or "")
+        await message.ack()
+
+    events = await channel.get_queue(meeting.events, ensure=False)
+    await events.consume(answer)
     ready()
-    channel.start_consuming()
+    await asyncio.Event().wait()
 
 
 class Asker:
-    """Who asks: a connection that takes answers, and one for each thread that sends."""
+    """A connection, and a task for each of those that send."""
 
     def __init__(self, meeting: Meeting, senders: int) -> None:
-        self._events = meeting.events
-        # Nobody looks after these connections while the other contenders are measured.
-        self._senders = [_connected(meeting, heartbeat=0) for _ in range(senders)]
-        self._receiver = _connected(meeting, heartbeat=0)
-        self._answers: list[bytes] = []
-        self._receiver.basic_consume(meeting.answers, self._take)
+        self._events, self._senders = meeting.events, senders
+        self._loop = asyncio.new_event_loop()
+        self._loop.run_until_complete(self._open(meeting))
 
-    def _take(self, channel: BlockingChannel, method: Any, properties: Any, body: bytes) -> None:
-        self._answers.append(body)
-        channel.basic_ack(method.delivery_tag)
+    async def _open(self, meeting: Meeting) -> None:
+        self._answers: asyncio.Queue[bytes] = asyncio.Queue()
+        self._connection = await _connected(meeting)
+        self._channel = await _opened(self._connection)
+        answers = await self._channel.get_queue(meeting.answers, ensure=False)
+        await answers.consume(self._take)
 
-    def _receive(self) -> bytes:
-        while not self._answers:
-            self._receiver.connection.process_data_events(DEADLINE_S)
-        return self._answers.pop(0)
+    async def _take(self, message: AbstractIncomingMessage) -> None:
+        self._answers.put_nowait(message.body)
+        await message.ack()
 
     def ask(self, image: np.ndarray) -> np.ndarray:
-        _send(self._senders[0], self._events, image.tobytes(), str(uuid.uuid4()))
-        return np.frombuffer(self._receive(), image.dtype).reshape(image.shape)
+        body = self._loop.run_until_complete(self._ask(image.tobytes()))
+        return np.frombuffer(body, image.dtype).reshape(image.shape)
+
+    async def _ask(self, body: bytes) -> bytes:
+        await _send(self._channel, self._events, body, str(uuid.uuid4()))
+        return await asyncio.wait_for(self._answers.get(), DEADLINE_S)
 
     def ask_many(self, image: np.ndarray, count: int) -> None:
-        def sending(channel: BlockingChannel) -> Callable[[], object]:
-            return lambda: _send(channel, self._events, image.tobytes(), str(uuid.uuid4()))
+        self._loop.run_until_complete(self._ask_many(image, count))
 
-        keep_busy([sending(channel) for channel in self._senders], self._receive, count)
+    async def _ask_many(self, image: np.ndarray, count: int) -> None:
+        room, left = asyncio.Semaphore(OUTSTANDING), iter(range(count))
+
+        async def send_on() -> None:
+            for _ in left:
+                await room.acquire()
+                await _send(self._channel, self._events, image.tobytes(), str(uuid.uuid4()))
+
+        sending = [asyncio.create_task(send_on()) for _ in range(self._senders)]
+        for _ in range(count):
+            await asyncio.wait_for(self._answers.get(), DEADLINE_S)
+            room.release()
+        await asyncio.gather(*sending)
 
     def close(self) -> None:
-        for channel in (*self._senders, self._receiver):
-            channel.connection.close()
+        self._loop.run_until_complete(self._connection.close())
+        self._loop.close()

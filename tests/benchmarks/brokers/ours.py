@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 import epypes as ep
-from epypes.transport.channels import Channel, is_brokered, open_channel
-from epypes.wire import Envelope, new_id
+from epypes.transport.address import is_broker
+from epypes.wire import Envelope
 from tests.benchmarks.brokers.parties import DEADLINE_S, PREFETCH, Meeting, keep_busy
 from tests.benchmarks.work import passed
 
@@ -32,11 +32,11 @@ def serve(meeting: Meeting, ready: Callable[[], object]) -> None:
 
 
 def _publisher(address: str, q_out: ep.Mailbox) -> Any:
-    return ep.Publisher(address, q_out) if is_brokered(address) else ep.ZMQPublisher(address, q_out)
+    return ep.Publisher(address, q_out) if is_broker(address) else ep.ZMQPublisher(address, q_out)
 
 
 def _subscriber(address: str, q_in: Any) -> Any:
-    return ep.Subscriber(address, q_in, prefetch=PREFETCH) if is_brokered(address) else ep.ZMQSubscriber(address, q_in)
+    return ep.Subscriber(address, q_in, prefetch=PREFETCH) if is_broker(address) else ep.ZMQSubscriber(address, q_in)
 
 
 def _graph() -> ep.CompGraph:
@@ -50,40 +50,6 @@ def _f_in(event: Any) -> dict[str, Any]:
 def _f_out(view: Any) -> Any:
     out = view["out"]
     return out if isinstance(out, bytes) else Envelope(type="echo", parts={"out": out})
-
-
-class Asker:
-    """Who asks as one does by hand: a channel that takes answers, and one for each thread that sends."""
-
-    def __init__(self, meeting: Meeting, senders: int) -> None:
-        self._stack = ExitStack()
-        self._senders = [self._opened(meeting.events) for _ in range(senders)]
-        self._answers = self._opened(meeting.answers)
-
-    def _opened(self, address: str) -> Channel:
-        channel = open_channel(address, prefetch=PREFETCH)
-        self._stack.callback(channel.close)
-        return channel
-
-    def _receive(self) -> bytes | memoryview:
-        answer = self._answers.receive(DEADLINE_S)
-        if answer is None:
-            raise TimeoutError("No answer has come.")
-        answer.ack()
-        return answer.frames[0]
-
-    def ask(self, image: np.ndarray) -> np.ndarray:
-        self._senders[0].send([image.tobytes()], id=new_id())
-        return np.frombuffer(self._receive(), image.dtype).reshape(image.shape)
-
-    def ask_many(self, image: np.ndarray, count: int) -> None:
-        def sending(channel: Channel) -> Callable[[], object]:
-            return lambda: channel.send([image.tobytes()], id=new_id())
-
-        keep_busy([sending(channel) for channel in self._senders], self._receive, count)
-
-    def close(self) -> None:
-        self._stack.close()
 
 
 class TwinsAsker:
@@ -100,7 +66,7 @@ class TwinsAsker:
         for each in self._senders:
             self._stack.enter_context(_publisher(meeting.events, each))
         self._stack.enter_context(_subscriber(meeting.answers, self._answers))
-        self._is_brokered = is_brokered(meeting.events)
+        self._is_brokered = is_broker(meeting.events)
         if not self._is_brokered:
             self._join()
 
