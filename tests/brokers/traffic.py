@@ -102,16 +102,21 @@ def remove(address):
 
 
 def _left_in_rabbitmq(place):
-    return _in_rabbitmq(place, lambda channel: channel.queue_declare(place.name, passive=True)).method.message_count
+    async def count(channel):
+        return (await channel.declare_queue(place.name, passive=True)).declaration_result.message_count
+
+    return _in_rabbitmq(place, count)
 
 
 def _in_rabbitmq(place, ask):
-    import pika
+    import aio_pika
 
-    credentials = pika.PlainCredentials(place.user, place.password)
-    parameters = pika.ConnectionParameters(place.host, place.port, place.vhost, credentials)
-    with pika.BlockingConnection(parameters) as connection:
-        return ask(connection.channel())
+    async def asked():
+        options = {"host": place.host, "port": place.port, "login": place.user, "password": place.password}
+        async with await aio_pika.connect(**options, virtualhost=place.vhost) as connection:
+            return await ask(await connection.channel())
+
+    return apart(lambda: asyncio.run(asked()))
 
 
 def _left_in_nats(place):

@@ -396,7 +396,7 @@ class BrokerChannel:
         if self.keeps_messages and self._handler is not None:
             helpers.append(asyncio.ensure_future(self._warn_if_stalled()))
         try:
-            return await asyncio.shield(self._session.lost)
+            return await asyncio.shield(self._session.lost) or "the connection was lost"
         finally:
             for task in (*helpers, *self._tasks):
                 task.cancel()
