@@ -40,8 +40,6 @@ EXTRAS: Final[Mapping[str, tuple[str, str]]] = {
     "optuna": ("optuna", "scale"),
     "paho": ("paho-mqtt", "mqtt"),
     "pandas": ("pandas", "scale"),
-    "aio_pika": ("aio-pika", "rabbitmq"),
-    "pika": ("pika", "rabbitmq"),
     "prometheus_client": ("prometheus-client", "serve"),
     "psycopg": ("psycopg", "postgres"),
     "pydantic": ("pydantic", "serve"),

@@ -7,7 +7,7 @@ MessageError, and text that a terminal will show has no control characters.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Final
 
@@ -164,7 +164,7 @@ def decode_message(data: bytes | memoryview) -> ReplicaMessage:
 
 
 def _read_member(document: Any) -> Member:
-    readers = {"int": _integer, "str": _text, "Mapping[str, int]": _counts}
+    readers: dict[str, Callable[[Any], Any]] = {"int": _integer, "str": _text, "Mapping[str, int]": _counts}
     return Member(**{each.name: readers[str(each.type)](document[each.name]) for each in fields(Member)})
 
 
@@ -180,7 +180,7 @@ def _read_parameters(document: Any) -> ParameterSet:
     return ParameterSet(_text(document["digest"]), _integer(document["revision"]), _text(document["author"]), values)
 
 
-_READERS: Final = {
+_READERS: Final[Mapping[str, Callable[[Any], ReplicaMessage]]] = {
     "heartbeat": _read_heartbeat,
     "goodbye": lambda document: Goodbye(_text(document["id"])),
     "parameters": _read_parameters,
@@ -189,7 +189,7 @@ _READERS: Final = {
 }
 
 
-def _items(value: Any, kind: type = list) -> Any:
+def _items(value: Any, kind: type[list[Any] | dict[str, Any]] = list) -> Any:
     if type(value) is not kind or len(value) > _MAX_ITEMS:
         raise TypeError(f"{value!r:.40} is no {kind.__name__} of at most {_MAX_ITEMS} items")
     return value

@@ -456,7 +456,7 @@ class Replicas:
         digest = self._parameters.digest
         own: dict[str, Any] = {"id": self._id, "host": socket.gethostname(), "pid": os.getpid(), "digest": digest}
         author = self._applied.get(digest, (0, ""))[1]
-        version = {"revision": self._parameters.current.revision, "author": author}
+        version: dict[str, Any] = {"revision": self._parameters.current.revision, "author": author}
         return Member(**own, **version, trouble=self._refusal, **facts)
 
     def describe(self) -> dict[str, Any]:

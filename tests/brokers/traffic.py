@@ -8,8 +8,9 @@ import threading
 from collections import Counter
 from time import monotonic
 
-import epypes as ep
 from epypes.transport.channels import open_channel, place_of
+
+import epypes as ep
 from epypes.wire import Envelope
 from tests.apart import apart
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
+from epypes.transport.channels import place, place_of
 
 from epypes.cli.serve import serve
-from epypes.transport.channels import place, place_of
 
 
 @pytest.mark.parametrize("told", [serve.__doc__, place_of.__doc__], ids=["serve --help", "place_of"])

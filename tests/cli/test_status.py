@@ -7,11 +7,11 @@ import re
 from contextlib import ExitStack, contextmanager
 
 import pytest
+from epypes.transport.channels import memory
 
 from epypes.service import Service
 from epypes.service.http import HttpServer
 from epypes.service.state_file import StateLock
-from epypes.transport.channels import memory
 from tests.service.served import acting_bundle, until
 
 pytestmark = pytest.mark.slow
