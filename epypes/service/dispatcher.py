@@ -31,9 +31,10 @@ from epypes.service.result_publisher import (
 )
 
 if TYPE_CHECKING:
-    from epypes.service.endpoints import ReceivedEvent
     from epypes.service.options import Options
     from epypes.service.worker_connection import HangReport, WorkerConnection
+    from epypes.transport.channel import Delivery
+    from epypes.wire import EncodedEnvelope
 
 # Events that may be done before the eldest is, for each that is worked on at once; more would only fill the memory.
 _MAX_AHEAD: Final = 8
@@ -52,8 +53,8 @@ class AcceptedEvent:
     ----------
     seq
         Its place in the order of acceptance, from 1.
-    received
-        Its frames, and the broker's delivery if there is one.
+    delivery
+        Its frames and their header; ack, reject and nack mean nothing over ZeroMQ.
     id
         Id of the event, or of the message that it came in; empty if there is none.
     accepted_ns, started_ns
@@ -67,13 +68,18 @@ class AcceptedEvent:
     """
 
     seq: int
-    received: ReceivedEvent
+    delivery: Delivery
     id: str
     accepted_ns: int
     started_ns: int = 0
     attempts: int = 0
     deaths: int = 0
     result: Result | None = None
+
+    @property
+    def stored(self) -> EncodedEnvelope | bytes:
+        """What the failure store keeps of it."""
+        return self.delivery.envelope or bytes(self.delivery.frames[0])
 
 
 class Dispatcher:
@@ -132,7 +138,7 @@ class Dispatcher:
 
     # -- accepting ----------------------------------------------------------------------------------------------------
 
-    def accept(self, received: ReceivedEvent, block: bool = False, timeout_s: float | None = 0.0) -> None:
+    def accept(self, delivery: Delivery, block: bool = False, timeout_s: float | None = 0.0) -> None:
         """Accept an event; wait for room only if a broker keeps it meanwhile. Called on the subscriber's thread.
 
         Raises
@@ -145,7 +151,7 @@ class Dispatcher:
                 self._has_room() or (block and self._room.wait_for(self._has_room, timeout_s))
             ):
                 raise queue.Full
-            event = self._accepted(received)
+            event = self._accepted(delivery)
             if self._why_refused:
                 self._drop(event, self._why_refused)
             elif self._is_next_taken():
@@ -165,22 +171,22 @@ class Dispatcher:
         if self._to_publish:
             self.publish()
 
-    def accept_exhausted(self, received: ReceivedEvent) -> None:
+    def accept_exhausted(self, delivery: Delivery) -> None:
         """Make a dead letter of an event that a broker has delivered too often; no worker gets it."""
         with self.lock:
-            event = self._accepted(received)
-            event.attempts = (received.attempt or 1) - 1
+            event = self._accepted(delivery)
+            event.attempts = max(delivery.attempt, 1) - 1
             event.result = exhausted_result(event, self._provenance())
             self._count(event, event.result)
             self._to_publish.append(partial(self._results.publish, event, event.result, self._settled))
         self.publish()
 
-    def _accepted(self, received: ReceivedEvent) -> AcceptedEvent:
+    def _accepted(self, delivery: Delivery) -> AcceptedEvent:
         self._last_seq += 1
         self._totals["received"] += 1
-        if self._has_broker:
-            self._totals["redelivered"] += (received.attempt or 0) > 1
-        return AcceptedEvent(self._last_seq, received, received.id, perf_counter_ns())
+        self._totals["redelivered"] += delivery.attempt > 1
+        known_as = (delivery.envelope.id if delivery.envelope is not None else "") or delivery.id
+        return AcceptedEvent(self._last_seq, delivery, known_as, perf_counter_ns())
 
     def _drop(self, event: AcceptedEvent, reason: str) -> None:
         """Drop an event, which is published at once and not in the order of acceptance."""
@@ -254,7 +260,7 @@ class Dispatcher:
             event.started_ns = perf_counter_ns()
             self._running[event.seq] = self._begun[event.seq] = event
             try:
-                connection.post({"kind": "event", "seq": event.seq}, event.received.frames)
+                connection.post({"kind": "event", "seq": event.seq}, event.delivery.frames)
             except MemoryError as error:
                 self._resolve(event, failed_result(event, error, self._provenance(), "raised"))
         if self._has_broker and self._has_room():
@@ -405,7 +411,7 @@ class Dispatcher:
                 self._is_alone = False
                 self._totals["given_back"] += len(returned)
                 for event in returned:
-                    event.received.nack()
+                    event.delivery.nack()
                 self.changed.notify_all()
                 return len(returned)
             waiting = list(self._waiting)
@@ -463,9 +469,9 @@ class Dispatcher:
             # It was given back meanwhile, or dropped.
             return
         if result.failure is not None and result.failure.dead_letter:
-            event.received.reject(result.failure.summary)
+            event.delivery.reject(result.failure.summary)
         else:
-            event.received.ack()
+            event.delivery.ack()
             self.on_answered(event.id)
         # Only now: a thread that waits until nothing is in flight may close the connection then.
         with self.lock:

@@ -15,11 +15,9 @@ from typing import Any, Final
 
 from epypes.errors import BrokerError, EpypesError, MessageError
 from epypes.service.options import CONNECT, Options, bare
-from epypes.transport.address import Address, open_channel, parse_address
+from epypes.transport import Publisher, Subscriber
+from epypes.transport.address import Address, is_broker, open_channel, parse_address
 from epypes.transport.channel import Confirmed, Delivery
-from epypes.transport.publisher import Publisher
-from epypes.transport.sequences import LossCounter, check_source
-from epypes.transport.subscriber import Subscriber
 from epypes.transport.throttle import Throttle
 from epypes.transport.zeromq.channel import prepare_lending
 from epypes.wire import EncodedEnvelope
@@ -38,42 +36,6 @@ _MIN_CLOSE_S: Final = 0.5
 _EXHAUSTED: Final = "exhausted"
 
 _log = logging.getLogger("epypes.service")
-
-
-class ReceivedEvent:
-    """An event as it was received: its frames, and the delivery of a broker.
-
-    Attributes
-    ----------
-    frames
-        Topic, header and payloads; or the one frame of a message of 2019.
-    envelope
-        The header of the frames, with values that are not decoded; None for a message of 2019.
-    id
-        Of the envelope, or of the broker's message; empty if there is none.
-    attempt
-        How often a broker has delivered it, from 1; 0 if the broker does not count; None without a broker.
-    ack, reject, nack
-        Settle the delivery: the event is done, is a dead letter, or is delivered again.
-    """
-
-    __slots__ = ("_delivery", "_is_broker", "ack", "envelope", "frames", "id", "nack", "reject")
-
-    def __init__(self, delivery: Delivery, envelope: EncodedEnvelope | None, is_broker: bool) -> None:
-        self.frames, self.envelope = delivery.frames, envelope
-        self.id = (envelope.id if envelope is not None else "") or delivery.id
-        self.ack, self.reject, self.nack = delivery.ack, delivery.reject, delivery.nack
-        self._delivery, self._is_broker = delivery, is_broker
-
-    @property
-    def attempt(self) -> int | None:
-        """Read anew, since a broker may deliver the event again meanwhile."""
-        return self._delivery.attempt if self._is_broker else None
-
-    @property
-    def stored(self) -> EncodedEnvelope | bytes:
-        """What the failure store keeps of it."""
-        return self.envelope or bytes(self.frames[0])
 
 
 def group_address(options: Options) -> Address | None:
@@ -101,14 +63,15 @@ class EventInput:
     def __init__(
         self,
         options: Options,
-        accept: Callable[[ReceivedEvent, bool, float | None], object],
-        on_exhausted: Callable[[ReceivedEvent], object],
+        accept: Callable[[Delivery, bool, float | None], object],
+        on_exhausted: Callable[[Delivery], object],
         on_change: Callable[[], object],
     ) -> None:
         self._options, self._accept, self._on_exhausted, self._on_change = options, accept, on_exhausted, on_change
         self.is_broker = options.has_broker
-        self._losses, self._log = LossCounter(), Throttle(_log)
-        self._rejected = 0
+        self._log = Throttle(_log)
+        # Of subscribers before this one; and messages of several frames that are no envelopes.
+        self._rejected = self._lost = 0
         # Where a bound socket was, while events are not taken.
         self._closed_at = ""
         self._not_open = ""
@@ -124,7 +87,7 @@ class EventInput:
             prefetch=options.prefetch,
             exhausted=self._exhausted,
             undecoded=True,
-            **({} if self.is_broker else _secured(options)),
+            **_secured(options.sub, options),
         )
         subscriber.on_connection = lambda is_connected, reason: self._on_change()
         return subscriber
@@ -139,30 +102,24 @@ class EventInput:
         queue.Full
             There is no room for a broker's event.
         """
-        received = self._read(item)
-        if received is not None:
-            self._accept(received, block, timeout)
+        if self._is_event(item):
+            self._accept(item, block, timeout)
 
     def _exhausted(self, item: Delivery) -> None:
-        received = self._read(item)
-        if received is not None:
-            self._on_exhausted(received)
+        if self._is_event(item):
+            self._on_exhausted(item)
 
-    def _read(self, delivery: Delivery) -> ReceivedEvent | None:
-        """Return the event of a delivery; None if it is no message, which is counted."""
-        if len(delivery.frames) == 1:
-            return ReceivedEvent(delivery, None, self.is_broker)
+    def _is_event(self, delivery: Delivery) -> bool:
+        """Whether a delivery is an envelope, or a message of 2019; any other is counted and rejected."""
+        if delivery.envelope is not None or len(delivery.frames) == 1:
+            return True
         try:
-            envelope = EncodedEnvelope.read(delivery.frames)
-            check_source(envelope.source)
+            EncodedEnvelope.read(delivery.frames)
         except MessageError as error:
             self._rejected += 1
             self._log.warning(error.reason, f"rejected a message ({error.reason}): {error}")
             delivery.reject(str(error))
-            return None
-        if not self.is_broker:
-            self._losses.add(envelope.source, envelope.epoch, envelope.sequence)
-        return ReceivedEvent(delivery, envelope, self.is_broker)
+        return False
 
     # -- start and stop -----------------------------------------------------------------------------------------------
 
@@ -198,8 +155,8 @@ class EventInput:
             return
         if self._closed_at:
             self._rejected += sum(self._subscriber.rejected.values())
+            self._lost += sum(self._subscriber.lost.values())
             self._subscriber, self._closed_at = self._make_subscriber(self._closed_at), ""
-        self._losses.begin()
         self._subscriber.start()
 
     def _retry(self, is_over: threading.Event) -> None:
@@ -266,7 +223,7 @@ class EventInput:
         counts = {"rejected": self._rejected + sum(rejected.values()) - rejected[_EXHAUSTED]}
         if self.is_broker:
             return {**counts, "duplicates": subscriber.duplicates, "reconnects": subscriber.reconnects}
-        return {**counts, "lost": sum(self._losses.lost.values())}
+        return {**counts, "lost": self._lost + sum(subscriber.lost.values())}
 
 
 class AnswerOutput:
@@ -284,11 +241,11 @@ class AnswerOutput:
 
     def __init__(self, address: str, options: Options, on_change: Callable[[], object]) -> None:
         self._address = address
-        bind, mark = not address.startswith(CONNECT), _MAX_KEPT_ANSWERS
-        self._publisher = Publisher(bare(address), bind=bind, high_water_mark=mark)
+        bind = not address.startswith(CONNECT)
+        self._publisher = Publisher(
+            bare(address), bind=bind, high_water_mark=_MAX_KEPT_ANSWERS, **_secured(address, options)
+        )
         self.is_broker = self._publisher.place.is_broker
-        if not self.is_broker:
-            self._publisher = Publisher(bare(address), bind=bind, high_water_mark=mark, **_secured(options))
         self._publisher.on_connection = lambda is_connected, reason: on_change()
 
     def start(self) -> None:
@@ -345,8 +302,8 @@ class Endpoints:
     def __init__(
         self,
         options: Options,
-        accept: Callable[[ReceivedEvent, bool, float | None], object],
-        on_exhausted: Callable[[ReceivedEvent], object],
+        accept: Callable[[Delivery, bool, float | None], object],
+        on_exhausted: Callable[[Delivery], object],
         on_change: Callable[[], object],
     ) -> None:
         self.events = EventInput(options, accept, on_exhausted, on_change)
@@ -407,5 +364,7 @@ def _named(address: str, trouble: str) -> str:
     return trouble if not trouble or address in trouble else f"{address}: {trouble}"
 
 
-def _secured(options: Options) -> Mapping[str, Any]:
-    return {name: getattr(options, name) for name in ("insecure", "keys", "allow")}
+def _secured(address: str, options: Options) -> Mapping[str, Any]:
+    """Return the options for peers of ZeroMQ, which other endpoints of the service may need; none for a broker."""
+    names = () if is_broker(bare(address)) else ("insecure", "keys", "allow")
+    return {name: getattr(options, name) for name in names}

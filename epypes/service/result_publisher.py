@@ -24,7 +24,7 @@ from epypes.wire import EncodedEnvelope, failure_event
 
 if TYPE_CHECKING:
     from epypes.service.dispatcher import AcceptedEvent
-    from epypes.service.eventlog import EventLog
+    from epypes.service.event_log import EventLog
     from epypes.service.failures.store import FailureStore
 
 Outcome = Literal["answered", "failed", "dead_letters"]
@@ -325,7 +325,7 @@ class ResultPublisher:
     def _report_failure(self, event: AcceptedEvent, result: Result, failure: FailureRecord) -> FailureRecord:
         self._log_failure(failure)
         # In a storm dropped events would fill the store's memory with images of no interest.
-        kept = self._store().keep(failure, None if failure.kind == "dropped" else event.received.stored)
+        kept = self._store().keep(failure, None if failure.kind == "dropped" else event.stored)
         # With its id, by which a receiver can run it again.
         more = {"id": kept.id, "kind": kept.kind, "dead_letter": kept.dead_letter, "when_ns": kept.when_ns}
         for answer in result.answers:

@@ -14,7 +14,7 @@ from epypes.service.bundle_info import read_bundle_info
 from epypes.service.deploy import Deployer
 from epypes.service.dispatcher import Dispatcher
 from epypes.service.endpoints import Endpoints, group_address
-from epypes.service.eventlog import EventLog
+from epypes.service.event_log import EventLog
 from epypes.service.failures.record import FailureRecord
 from epypes.service.failures.store import FailureStore, failures_folder
 from epypes.service.lifecycle import Lifecycle, State
@@ -70,7 +70,7 @@ class Service:
         self.job_timeout_s, self.drain_timeout_s = given.job_timeout_s, given.drain_timeout_s
         self.http = self.token_file = ""
         self.failure_store = FailureStore(failures_folder(bundle.path))
-        self.event_log = EventLog(given.store, bundle.settings.name, self._provenance, given.replica)
+        self.event_log = EventLog(given, bundle.settings.name, self._provenance)
         self._results = ResultPublisher(
             lambda *answer: self._endpoints.answers.publish(*answer),
             lambda failure: self._endpoints.failures.publish(failure, "", lambda error: None),

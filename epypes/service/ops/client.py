@@ -19,8 +19,8 @@ from epypes.bundle.seal import check_seal
 from epypes.bundle.settings import read_settings
 from epypes.errors import BundleError, EpypesError, RemoteFailure, ServiceError
 from epypes.service.state_file import ServiceState, read_states, running_at, state_file
-from epypes.transport import Publisher, Subscriber, ZMQPublisher, ZMQSubscriber
-from epypes.transport.address import is_broker, parse_address
+from epypes.transport import Publisher, Subscriber
+from epypes.transport.address import parse_address
 
 if TYPE_CHECKING:
     from epypes.transport import Keys
@@ -149,13 +149,11 @@ class Client:
 
     def _has_joined(self, deadline_s: float) -> bool:
         """Wait until events and answers arrive; a broker has confirmed both by now."""
-        subscriber, publisher = self._subscriber, self._publisher
-        is_heard = isinstance(subscriber, Subscriber) or subscriber.wait_joined(self.timeout_s)
-        left_s = max(deadline_s - monotonic(), 0.0)
-        return is_heard and (isinstance(publisher, Publisher) or publisher.wait_for_subscriber(left_s))
+        is_heard = self._subscriber.wait_joined(self.timeout_s)
+        return is_heard and self._publisher.wait_for_subscriber(max(deadline_s - monotonic(), 0.0))
 
     def _lost(self) -> int:
-        return 0 if isinstance(self._subscriber, Subscriber) else sum(self._subscriber.lost.values())
+        return sum(self._subscriber.lost.values())
 
     def call(self, payload: Mapping[str, Any]) -> Answer:
         """Send one event and wait for its answer.
@@ -240,26 +238,23 @@ def _running(path: str | Path) -> ServiceState:
     return state
 
 
-def _subscriber_to(path: str | Path, address: str, answers: Any, **secured: Any) -> Subscriber | ZMQSubscriber:
+def _subscriber_to(path: str | Path, address: str, answers: Any, **secured: Any) -> Subscriber:
     """Return the subscriber to the answers of a service; ServiceError where it would take them from other readers."""
-    if not is_broker(address):
-        return ZMQSubscriber(address, answers, **secured)
     place = parse_address(address)
-    if place.kind == "queue":
+    if place.is_broker and place.kind == "queue":
         text = (
             f"The answers of the service of {path} go to the queue {place}, where each is for one reader: a call would "
             "take answers from it. Send the event with ep.Publisher, and read the answers where you read the others; "
             "or serve it with --pub ...?kind=broadcast, which every reader hears."
         )
         raise ServiceError(path, text)
-    return Subscriber(place, answers, acknowledge="received")
+    return Subscriber(place, answers, acknowledge="received", **secured)
 
 
-def _publisher_to(address: str, requests: Any, **secured: Any) -> Publisher | ZMQPublisher:
+def _publisher_to(address: str, requests: Any, **secured: Any) -> Publisher:
     """Return the publisher of events to a service."""
-    return (
-        Publisher(address, requests) if is_broker(address) else ZMQPublisher(address, requests, bind=False, **secured)
-    )
+    place = parse_address(address)
+    return Publisher(place, requests, bind=False, **secured)
 
 
 def _read(path: str | Path, answer: Envelope, round_trip_ns: int, rgb: Collection[str]) -> Answer:

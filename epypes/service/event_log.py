@@ -1,10 +1,9 @@
-"""What is kept in a database of each event that a service has resolved?"""
+"""Rows in a database: one for each event that a service has resolved."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from time import perf_counter_ns, time_ns
 from typing import TYPE_CHECKING, Any, Final
 
@@ -14,6 +13,7 @@ from epypes.store.later import SeriesWriter
 if TYPE_CHECKING:
     from epypes.service.dispatcher import AcceptedEvent
     from epypes.service.failures.record import FailureRecord
+    from epypes.service.options import Options
 
 _log = logging.getLogger("epypes.service")
 
@@ -25,14 +25,12 @@ class EventLog:
 
     Parameters
     ----------
-    store
-        A path, a URL or a Store; None to keep nothing.
+    options
+        Of the service: the store, which is a path or a URL or None, and the name of the replica.
     name
         Of the bundle.
     provenance
         Returns what events are worked on with.
-    replica
-        What the service is called among several.
 
     Raises
     ------
@@ -40,22 +38,17 @@ class EventLog:
         There can be no such database. One that is away is told in the log.
     """
 
-    def __init__(
-        self, store: str | Path | None, name: str, provenance: Callable[[], Provenance], replica: str = ""
-    ) -> None:
-        self._provenance, self._began_ns, self._replica = provenance, time_ns(), replica
-        self._writer = None if store is None else SeriesWriter(store, KIND, name)
+    def __init__(self, options: Options, name: str, provenance: Callable[[], Provenance]) -> None:
+        self._options, self._provenance, self._began_ns = options, provenance, time_ns()
+        self._writer = None if options.store is None else SeriesWriter(options.store, KIND, name)
 
     def keep(self, entry: AcceptedEvent, result: Result, failure: FailureRecord | None) -> None:
         """Have a row of an event written; returns at once and raises nothing."""
         if self._writer is not None:
-            row = {**_row(entry, result, failure, self._provenance().digest), **self._of_broker(entry)}
+            row = _row(entry, result, failure, self._provenance().digest)
+            if self._options.has_broker:
+                row |= {"deliveries": entry.delivery.attempt, "replica": self._options.replica}
             self._writer.append(f"{self._began_ns}-{entry.seq}", row)
-
-    def _of_broker(self, entry: AcceptedEvent) -> dict[str, Any]:
-        """Return what a row has besides where replicas share the events of a broker."""
-        deliveries = entry.received.attempt
-        return {} if deliveries is None else {"deliveries": deliveries, "replica": self._replica}
 
     def counts(self) -> Mapping[str, int]:
         """Return how many rows were written, skipped and so on, as `SeriesWriter.counts`; none without a store."""
