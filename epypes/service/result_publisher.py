@@ -21,6 +21,7 @@ from epypes.service.failures.record import FailureRecord
 from epypes.transport.channel import Confirmed
 from epypes.transport.throttle import Throttle
 from epypes.wire import EncodedEnvelope, failure_event
+from epypes.wire.envelope import request_fields
 
 if TYPE_CHECKING:
     from epypes.service.dispatcher import AcceptedEvent
@@ -113,7 +114,10 @@ def failed_result(
     known = {"function": function, "exception": type(error).__name__, "message": str(error)}
     record = replace(_record(event, known, provenance, kind), dead_letter=is_dead)
     failure = Failure(function, (), {}, error, event.id, max(event.attempts, 1))
-    answer = replace(failure_event(failure, provenance.name, provenance.digest), revision=provenance.revision)
+    request = event.delivery.envelope
+    stamp = {} if request is None else request_fields(request)
+    answer = failure_event(failure, provenance.name, provenance.digest)
+    answer = replace(answer, revision=provenance.revision, **stamp)
     return Result([EncodedEnvelope.encode(answer)], record, provenance.revision)
 
 

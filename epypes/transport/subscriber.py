@@ -80,7 +80,8 @@ class Subscriber(Endpoint):
         None, or called with a message that was delivered more often than the address allows, in place of rejecting it;
         on the channel's thread.
     ordered
-        True to put envelopes in the order of their sequence numbers, by source and epoch. What comes too early waits
+        True to put envelopes in the order of their sequence numbers, by source and epoch; answers in the order of the
+        requests that they answer, also those of several replicas of a service. What comes too early waits
         for what is missing, for a second at most; a line in the log then says what is missing.
     insecure
         True to bind a ZeroMQ address that other machines can reach, without keys.
@@ -456,8 +457,11 @@ class Inbox:
             if self._ordering is None or envelope is None:
                 self._put(item)
                 return
-            source = (envelope.source, envelope.epoch)
-            self._put_all(self._ordering, self._ordering.add(source, envelope.sequence, item))
+            # Answers are in the order of the requests, also those of several replicas.
+            source, sequence = (envelope.request_source, envelope.request_epoch), envelope.request_sequence
+            if not sequence:
+                source, sequence = (envelope.source, envelope.epoch), envelope.sequence
+            self._put_all(self._ordering, self._ordering.add(source, sequence, item))
 
     def _read(self, delivery: Delivery) -> tuple[Any, Envelope | EncodedEnvelope | None]:
         """Return what is put for a delivery, if anything, and the envelope that it is.

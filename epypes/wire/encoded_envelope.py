@@ -56,7 +56,8 @@ class EncodedEnvelope:
         None, or the failure that the envelope reports.
     limits
         The limits that it was checked against.
-    id, type, source, epoch, sequence, acquired_ns, published_ns, correlation_id, revision, bundle_digest
+    id, type, source, epoch, sequence, acquired_ns, published_ns, correlation_id, revision, bundle_digest, \
+    request_source, request_epoch, request_sequence
         As in `Envelope`.
     """
 
@@ -71,6 +72,9 @@ class EncodedEnvelope:
     correlation_id: str
     revision: int
     bundle_digest: str
+    request_source: str
+    request_epoch: int
+    request_sequence: int
     has_attributes: bool
     failure: FailureRecord | None
     limits: Limits

@@ -25,6 +25,9 @@ SCALAR_FIELDS: Final = (
     "correlation_id",
     "revision",
     "bundle_digest",
+    "request_source",
+    "request_epoch",
+    "request_sequence",
 )
 _EMPTY: Final[Mapping[str, Any]] = MappingProxyType({})
 _FAILURE_CHARACTERS: Final = 2_000
@@ -108,6 +111,8 @@ class Envelope:
         Durations by function name, in nanoseconds.
     failure
         None, or the failure that this envelope reports.
+    request_source, request_epoch, request_sequence
+        Source, epoch and sequence of the envelope that this one answers.
     rgb
         Names of the parts whose images have three or four channels in RGB order; those of all others are BGR.
     """
@@ -126,6 +131,9 @@ class Envelope:
     attributes: Mapping[str, Any] = field(default_factory=dict)
     timings: Mapping[str, int] = field(default_factory=dict)
     failure: FailureRecord | None = None
+    request_source: str = ""
+    request_epoch: int = 0
+    request_sequence: int = 0
     rgb: Collection[str] = frozenset()
 
     def __post_init__(self) -> None:
@@ -140,6 +148,18 @@ class Envelope:
         names = ", ".join(map(str, self.parts)) or "no parts"
         text = f"<Envelope {str(self.type)[:20]!r}{number}: {names}"
         return f"{text[:95]}...>" if len(text) > 97 else f"{text}>"
+
+
+def request_fields(request: Any) -> dict[str, Any]:
+    """Return the fields of an envelope that answers a request, which is an Envelope or an EncodedEnvelope.
+
+    With them `Subscriber(..., ordered=True)` puts the answers of all replicas into the order of the requests.
+    """
+    return {
+        "request_source": request.source,
+        "request_epoch": request.epoch,
+        "request_sequence": request.sequence,
+    }
 
 
 def scalar_fields(message: Any) -> dict[str, Any]:

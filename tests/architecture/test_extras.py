@@ -207,7 +207,7 @@ def test_without_an_extra_each_thing_names_the_one_that_it_needs(environment):
         "ep.promote(runner, 'bundle')": "serve",
         "ep.ZMQSubscriber('tcp://127.0.0.1:*', None)": "serve",
         "ep.connect('http://127.0.0.1:1')": "serve",
-        "from epypes.service import serve": "serve",
+        "from epypes.service import Service": "serve",
         "from epypes.wire import Envelope, encode; encode(Envelope('frame', {'number': 7}))": "serve",
         "from epypes.transport import recording_info; recording_info('x.mcap')": "record",
         "from epypes_widgets import tune": "widgets",

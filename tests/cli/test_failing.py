@@ -89,7 +89,7 @@ ROWS = {
         (["systemd", "{folder}/none"], "{folder}/none does not exist"),
         (["docker", "{broken}", "--to", "{folder}/image"], "pipeline.toml can't be read: "),
     ],
-    "record": [(["nonsense", "{folder}/a.mcap"], "nonsense can't be connected: Invalid argument")],
+    "record": [(["nonsense", "{folder}/a.mcap"], "'nonsense' is not the beginning of an address that EPypes knows")],
     "play": [
         (["{folder}/none.mcap"], "can't be read"),
         (["{text}"], "is no MCAP file"),

@@ -245,7 +245,7 @@ def _extras(options: Sequence[str]) -> set[str]:
         if name == "--store":
             found.add("postgres" if value.startswith("postgres") else "store")
         else:
-            found.add(parse_address(value).extra)
+            found.add(parse_address(value).extra if is_broker(value) else "serve")
     return found - {""}
 
 

@@ -29,6 +29,7 @@ from epypes.service.packing import BytesLike
 from epypes.service.worker.inputs import InputQueue, WorkerEvent
 from epypes.service.worker_connection import FrameSocket
 from epypes.wire import Envelope, decode, encode, failure_event, serialized
+from epypes.wire.envelope import request_fields
 
 _MAX_TRACE_FRAMES: Final = 20
 _MAX_LINE: Final = 500
@@ -79,7 +80,9 @@ class Slot:
         self.pipeline: FullPipeline = pipeline_of(bundle, self, self, detach=False)
         self.pipeline.on_error = self._failed
         # What a handle of a subclass raises.
-        self.pipeline.loop.on_error = lambda event, error: self._failed(Failure("handle", (), {}, error, _id_of(event)))
+        self.pipeline.loop.on_error = lambda event, error: self._failed(
+            Failure("handle", (), {}, error, getattr(event, "id", ""))
+        )
         self._is_last_put = _puts_last(self.pipeline)
 
     @property
@@ -122,7 +125,9 @@ class Slot:
                 self._failed(Failure("f_in", self.pipeline.runner.free_source_tokens, {}, error))
                 self._finish()
                 continue
-            work.event_id = _id_of(event)
+            if isinstance(event, Envelope):
+                work.event_id = event.id
+                work.stamp |= request_fields(event)
             return event
 
     # -- as q_out -----------------------------------------------------------------------------------------------
@@ -138,7 +143,7 @@ class Slot:
         work = self._work
         if work is None:
             raise MessageError("no event", "An answer was put on q_out while no event was being worked on.")
-        answer = _answer(item, work.revision)
+        answer = _answer(item, work.stamp)
         if not self._is_last_put:
             # What is put may be written to again before the event is done.
             answer = [*map(bytes, answer)]
@@ -177,7 +182,7 @@ class Slot:
         answers = work.answers
         if work.failure is not None:
             event = failure_event(work.failure, self.pipeline.name, self._digest)
-            answers = [*answers, _answer(event, work.revision)]
+            answers = [*answers, _answer(event, work.stamp)]
         header = {
             "kind": "done",
             "seq": work.seq,
@@ -194,17 +199,19 @@ class Slot:
 class _Work:
     """The event that is worked on, and its answers so far."""
 
-    __slots__ = ("answers", "before", "event_id", "failure", "revision", "seq", "start_ns")
+    __slots__ = ("answers", "before", "event_id", "failure", "revision", "seq", "stamp", "start_ns")
 
     def __init__(self, seq: int, revision: int, before: Run | None) -> None:
         self.seq, self.revision, self.before = seq, revision, before
         self.event_id = ""
+        # Fields of every envelope that answers it.
+        self.stamp: dict[str, Any] = {"revision": revision}
         self.answers: list[list[BytesLike]] = []
         self.failure: Failure | None = None
         self.start_ns = perf_counter_ns()
 
 
-def _answer(item: Any, revision: int) -> list[BytesLike]:
+def _answer(item: Any, stamp: Mapping[str, Any]) -> list[BytesLike]:
     """Return the frames of an item that was put on q_out.
 
     Raises
@@ -213,14 +220,13 @@ def _answer(item: Any, revision: int) -> list[BytesLike]:
         It can't be sent.
     """
     if isinstance(item, Envelope):
-        stamped = item if item.revision == revision else replace(item, revision=revision)
-        return [*encode(stamped)]
+        return [*encode(replace(item, **stamp))]
     if isinstance(item, bytes | bytearray | memoryview):
         return [bytes(item)]
     if callable(getattr(item, "SerializeToString", None)):
         return [serialized(item)]
     if isinstance(item, Failure):
-        return _answer(failure_event(item), revision)
+        return _answer(failure_event(item), stamp)
     kind = type(item).__name__
     text = (
         f"A service sends bytes, protobuf messages, Envelopes and Failures, not {kind}. Let f_out return one of these."
@@ -233,10 +239,6 @@ def _puts_last(pipeline: FullPipeline) -> bool:
     kind = type(pipeline)
     own: Mapping[str, Any] = {"handle": SinkPipeline.handle, "emit": Answering.emit, "put": Answering.put}
     return all(getattr(kind, name) is hook for name, hook in own.items())
-
-
-def _id_of(event: Any) -> str:
-    return event.id if isinstance(event, Envelope) else ""
 
 
 def _describe_failure(failure: Failure) -> dict[str, Any]:
