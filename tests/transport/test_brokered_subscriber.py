@@ -269,7 +269,8 @@ def test_ids_of_any_length_are_told_apart(address, send):
     with Subscriber(address, q) as sub:
         for known_as in (*long, *long):
             send(id=known_as)
-        assert [take(q).id, take(q).id] == long
+        items = [take(q), take(q)]
+        assert [item.id for item in items] == long
         wait_until(lambda: sub.duplicates == 2)
 
 
