@@ -196,7 +196,7 @@ class Replicas:
         return False
 
     def _take_part(self, heard: Subscriber, publisher: Publisher) -> None:
-        next_beat_s = 0.0
+        next_beat_s, self._looked_s = 0.0, monotonic()
         while not self._is_over:
             trouble = heard.trouble or publisher.trouble
             if self._trouble and not trouble:
@@ -352,12 +352,13 @@ class Replicas:
         if now_s - self._looked_s > _HELD_UP_S or self._trouble:
             self._certain_from_s = now_s + _GRACE_S
         self._looked_s = now_s
+        if now_s < self._certain_from_s:
+            # It is decided later whether a silent replica is lost.
+            return
         with self._changed:
             silent = [known for known in self._members.values() if now_s - known.heard_s > _SILENT_AFTER_S]
             for known in silent:
-                del self._members[known.member.id]
-                if now_s >= self._certain_from_s:
-                    self._lost[known.member.id] = known
+                self._lost[known.member.id] = self._members.pop(known.member.id)
             present = {_place(known.member) for known in self._members.values()} | {_place(self._member())}
             for known in [*self._lost.values()]:
                 # A replica of the same name on the same machine has taken its place.
