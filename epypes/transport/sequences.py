@@ -18,9 +18,7 @@ log = logging.getLogger("epypes.transport")
 # Sources whose numbers are followed; a peer that invents sources must not fill the memory.
 _MOST_SOURCES: Final = 1_024
 _MAX_SOURCE_BYTES: Final = 1_024
-# Most items that are held back, and for how long.
 MOST_HELD: Final = 1_000
-HELD_S: Final = 1.0
 
 # Name and epoch.
 Source = tuple[str, int]
@@ -81,12 +79,20 @@ class LossCounter:
 
 
 class ReorderBuffer:
-    """Holds back items that came too early, until those before them have come, or for `HELD_S` at most.
+    """Holds back items that came too early, until those before them have come.
 
+    Parameters
+    ----------
+    hold_s
+        Longest time that an item is held back, in seconds; at most `MOST_HELD` items are.
+
+    Notes
+    -----
     Of a source that is heard for the first time, number 1 is expected: what comes in the middle waits once.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, hold_s: float) -> None:
+        self._hold_s = hold_s
         self._next: dict[Source, int] = {}
         # By source: items by their number, in the order of arrival, with the time of that.
         self._held: dict[Source, dict[int, tuple[float, Any]]] = {}
@@ -117,14 +123,16 @@ class ReorderBuffer:
     @property
     def due_s(self) -> float | None:
         """When `overdue` has something to yield, by the monotonic clock; None if nothing is held back."""
-        return min((min(came_s for came_s, _ in held.values()) + HELD_S for held in self._held.values()), default=None)
+        return min(
+            (min(came_s for came_s, _ in held.values()) + self._hold_s for held in self._held.values()), default=None
+        )
 
     def overdue(self) -> Iterator[Any]:
         """Yield what was held back for too long, in order."""
         now_s = monotonic()
         for source, held in list(self._held.items()):
-            if source in self._held and min(came_s for came_s, _ in held.values()) + HELD_S <= now_s:
-                yield from self._skip(source, f"{HELD_S:g} s are over")
+            if source in self._held and min(came_s for came_s, _ in held.values()) + self._hold_s <= now_s:
+                yield from self._skip(source, f"{self._hold_s:g} s are over")
 
     def rest(self) -> list[Any]:
         """Return all that is held back, and forget it."""

@@ -38,6 +38,10 @@ _FIELDS: Final = tuple(field.name for field in dataclasses.fields(Envelope))
 # A header of this size holds some 10,000 values, which take about 20 ms to decode: too long for the I/O thread.
 _LARGE_HEADER_BYTES: Final = 32 * 1024
 _MOST_LARGE: Final = 256
+# How long an ordered subscriber waits for a missing envelope: ZeroMQ sends none again, and a broker delivers the event
+# of a killed consumer again after some 5 s.
+_HOLD_S: Final = 1.0
+_HOLD_BROKER_S: Final = 10.0
 
 
 class PutQueue(Protocol):
@@ -81,8 +85,10 @@ class Subscriber(Endpoint):
         on the channel's thread.
     ordered
         True to put envelopes in the order of their sequence numbers, by source and epoch; answers in the order of the
-        requests that they answer, also those of several replicas of a service. What comes too early waits
-        for what is missing, for a second at most; a line in the log then says what is missing.
+        requests that they answer, also those of several replicas of a service. What comes too early waits for what is
+        missing: for 1 s over ZeroMQ, for 10 s from a broker, or for the number of seconds that is given in place of
+        True. A line in the log then names what is missing. What waits is unacknowledged: ``prefetch`` bounds how far apart
+        the messages of a broker may come.
     insecure
         True to bind a ZeroMQ address that other machines can reach, without keys.
     keys
@@ -137,7 +143,7 @@ class Subscriber(Endpoint):
         acknowledge: Acknowledge = "done",
         prefetch: int = 8,
         exhausted: Callable[[Any], object] | None = None,
-        ordered: bool = False,
+        ordered: bool | float = False,
         insecure: bool = False,
         keys: Keys | str | Path | None = None,
         allow: PublicKey | Collection[PublicKey] | None = None,
@@ -329,6 +335,12 @@ class ZMQSubscriber(Subscriber):
     takes_brokers: ClassVar[bool] = False
 
 
+def _hold_s(ordered: bool | float, place: Address) -> float:
+    if ordered is True:
+        return _HOLD_BROKER_S if place.is_broker else _HOLD_S
+    return float(ordered)
+
+
 def _checked(prefetch: int) -> int:
     if prefetch < 1:
         raise ValueError(f"prefetch is a whole number from 1, not {prefetch!r}.")
@@ -365,13 +377,13 @@ class Inbox:
         *,
         acknowledge: Acknowledge,
         exhausted: Callable[[Any], object] | None,
-        ordered: bool,
+        ordered: bool | float,
         undecoded: bool,
     ) -> None:
         self._queue, self._topic, self._place, self._limits = queue, topic, place, limits
         self._acknowledge, self._exhausted, self._undecoded = acknowledge, exhausted, undecoded
         self._is_zeromq = not place.is_broker
-        self._ordering = ReorderBuffer() if ordered else None
+        self._ordering = ReorderBuffer(_hold_s(ordered, place)) if ordered else None
         self._timer: threading.Timer | None = None
         self.is_over = True
         self.received = self._refused = self._starts = 0

@@ -345,10 +345,19 @@ def test_ordered_envelopes_are_put_by_their_numbers_source_by_source(address, se
     assert found[0].source == "other"
 
 
+def test_answers_of_several_replicas_are_put_in_the_order_of_their_requests(address, send):
+    q = queue.Queue()
+    with Subscriber(address, q, ordered=True, acknowledge="received"):
+        for own, (replica, request) in enumerate((("a", 2), ("b", 1), ("a", 3), ("b", 5), ("a", 4)), 1):
+            request_of = {"request_source": "cam", "request_epoch": 7, "request_sequence": request}
+            send(*encode(Envelope("answer", source=replica, epoch=1, sequence=own, **request_of)))
+        assert [take(q).request_sequence for _ in range(5)] == [1, 2, 3, 4, 5]
+
+
 @pytest.mark.slow
 def test_ordered_envelopes_go_on_after_a_while_without_the_missing_one_which_is_named(address, send, caplog):
     q = queue.Queue()
-    with Subscriber(address, q, ordered=True, acknowledge="received"):
+    with Subscriber(address, q, ordered=0.3, acknowledge="received"):
         for frames in numbered(1, 4, 5):
             send(*frames)
         assert [take(q).sequence for _ in range(3)] == [1, 4, 5]
