@@ -1,7 +1,7 @@
 """Where a service's events come from, and where answers and failures go: ZeroMQ sockets or a broker's queues.
 
-The one module of the service that uses `epypes.transport`. Events arrive as frames whose header alone is read, and
-answers leave as the frames that the worker encoded, with the publisher's stamp.
+Events arrive as frames whose header alone is read, and answers leave as the frames that the worker encoded, with the
+publisher's stamp.
 """
 
 from __future__ import annotations
