@@ -22,10 +22,10 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from time import monotonic
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from epypes.errors import BrokerError, MessageError, ServiceError
-from epypes.service.parameters import Parameters, value_of
+from epypes.service.parameters import ParameterControl, Parameters, value_of
 from epypes.service.replica_messages import (
     MAX_ID_CHARACTERS,
     MAX_IDS,
@@ -40,9 +40,9 @@ from epypes.service.replica_messages import (
     decode_message,
     encode_message,
 )
+from epypes.transport import Publisher, Subscriber
 from epypes.transport.address import Address
-from epypes.transport.publisher import Publisher
-from epypes.transport.subscriber import Subscriber
+from epypes.transport.channel import Delivery
 
 HEARTBEAT_S: Final = 1.0
 # Three heartbeats may be lost before a replica counts as gone.
@@ -68,33 +68,6 @@ _MAX_TEXT: Final = 500
 _NONE: Final[Version] = (0, "")
 
 _log = logging.getLogger("epypes.service")
-
-
-class SharedParameters(Protocol):
-    """The hyperparameters of this replica, as its worker computes with them."""
-
-    @property
-    def current(self) -> Parameters:
-        """Revision and entries."""
-
-    @property
-    def digest(self) -> str:
-        """Of the bundle that they belong to."""
-
-    def snapshot(self) -> tuple[str, Parameters]:
-        """Return the digest of the bundle and its parameters, read together."""
-
-    def set(self, values: Mapping[str, Any], revision: int | None, at_least: int = 0) -> Parameters:
-        """Change values under a revision of ``at_least`` or more; raise as `Service.set_parameters` does."""
-
-    def follow(self, digest: str, revision: int, values: Mapping[str, Any]) -> Mapping[str, str]:
-        """Take all values as another replica has set them; return the problems by token, if the worker refuses some.
-
-        Raises
-        ------
-        ServiceError
-            There is no worker just now, or it is busy.
-        """
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +106,7 @@ class Replicas:
         self,
         address: Address | None,
         facts: Callable[[], Mapping[str, Any]],
-        parameters: SharedParameters,
+        parameters: ParameterControl,
         on_answered: Callable[[Iterable[str]], object],
         on_joined: Callable[[], object],
     ) -> None:
@@ -194,8 +167,7 @@ class Replicas:
         self.is_joining = False
 
     def _run(self, address: Address) -> None:
-        handler = _Handler(self._receive)
-        subscriber = Subscriber(address, handler, acknowledge="received", undecoded=True)
+        subscriber = Subscriber(address, self, acknowledge="received", undecoded=True)
         publisher = Publisher(address)
         subscriber.on_connection = publisher.on_connection = lambda is_connected, reason: self._beat_soon()
         try:
@@ -223,7 +195,7 @@ class Replicas:
                     self._changed.wait_for(self._has_ended, _RETRY_S)
             else:
                 self._subscriber, self._publisher = subscriber, publisher
-                self._connected_s = monotonic()
+                self._connected_s, self._unreached = monotonic(), "This replica has stopped."
                 return True
         return False
 
@@ -311,9 +283,10 @@ class Replicas:
 
     # -- receiving ----------------------------------------------------------------------------------------------------
 
-    def _receive(self, delivery: Any) -> None:
+    def put(self, item: Delivery, *, block: bool = False, timeout: float | None = None) -> None:
+        """Take a message; called by the subscriber, whose queue this is."""
         try:
-            message = decode_message(b"".join(delivery.frames))
+            message = decode_message(b"".join(item.frames))
         except MessageError as error:
             self._rejected += 1
             _log.debug("rejected on %s: %s", self._address, error)
@@ -363,16 +336,12 @@ class Replicas:
             _log.info("%s is in the group", _label(member))
             # The newcomer need not wait for the next one.
             self._beat_soon()
-        if known is None or known.member.name != member.name:
-            self._warn_of_other_bundle(member)
-        if is_newer:
-            self._publish(ParameterQuery(member.id, member.digest))
-
-    def _warn_of_other_bundle(self, member: Member) -> None:
-        name = self._facts()["name"]
-        if member.name != name:
+        is_name_new = known is None or known.member.name != member.name
+        if is_name_new and member.name != (name := self._facts()["name"]):
             text = "%s serves another bundle from the same queue, %s, and this one serves %s: each takes events of the"
             _log.warning(f"{text} other. Give each bundle a queue of its own.", _label(member), member.name, name)
+        if is_newer:
+            self._publish(ParameterQuery(member.id, member.digest))
 
     def _forget(self, member_id: str) -> None:
         """Forget a replica that has stopped in order."""
@@ -580,16 +549,6 @@ class Replicas:
             "members": [_describe(each, now_s, self._id) for each in present],
             "lost": [_describe(_as_lost(each, now_s), now_s, self._id) for each in _by_name(lost)],
         }
-
-
-class _Handler:
-    """A queue that hands every item to a function."""
-
-    def __init__(self, handle: Callable[[Any], object]) -> None:
-        self._handle = handle
-
-    def put(self, item: Any, *, block: bool = False, timeout: float | None = None) -> None:
-        self._handle(item)
 
 
 def _describe(heard: _Heard, now_s: float, own_id: str) -> dict[str, Any]:
