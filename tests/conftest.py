@@ -44,11 +44,10 @@ def pytest_configure(config):
 # One RabbitMQ for all of them: each start takes five seconds of processor time.
 _WITH_RABBITMQ = (
     "tests/brokers/test_pipelines.py",
-    "tests/service/group/test_group_of_processes.py",
-    "tests/service/group/test_on_brokers.py",
+    "tests/service/test_replica_processes.py",
     "tests/service/test_replicas.py",
     "tests/transport/test_amqp.py",
-    "tests/transport/test_seam.py",
+    "tests/transport/test_channels.py",
 )
 
 

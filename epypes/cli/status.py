@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 _COUNTS = ("received", "answered", "failed", "dropped", "waiting")
 # What is counted besides where a broker delivers the events.
-_OF_BROKER = ("dead_letters", "redelivered", "duplicates", "given_back", "overtaken")
+_OF_BROKER = ("dead_letters", "redelivered", "duplicates", "given_back")
 _DIGITS = 12
 _UNKNOWN = "RUNNING"
 _NO_HTTP = "no --http"
 # In what replicas of one group should be alike.
-_MAY_DIFFER = ("name", "digest", "ordered")
+_MAY_DIFFER = ("name", "digest")
 
 
 def status(
@@ -210,10 +210,7 @@ def _gist(reason: str) -> str:
 
 
 def _differences(member: dict[str, Any], differ: dict[str, bool]) -> list[str]:
-    """Return in what a member differs from others: they should serve one bundle in one way."""
-    found = []
-    if differ["digest"] or differ["name"]:
-        found.append(f"bundle {member.get('name', '')} ({member['digest'][:_DIGITS]})".replace("  ", " "))
-    if differ["ordered"]:
-        found.append("ordered" if member.get("ordered") else "not ordered")
-    return found
+    """Return which bundle a member serves, if not all serve the same one."""
+    if not any(differ.values()):
+        return []
+    return [f"bundle {member.get('name', '')} ({member['digest'][:_DIGITS]})".replace("  ", " ")]

@@ -1,7 +1,7 @@
 """Where a service's events come from, and where answers and failures go: ZeroMQ sockets or a broker's queues.
 
-The one module of the service that uses `epypes.transport`. Events arrive as frames whose header alone is read, and
-answers leave as the frames that the worker encoded, with the publisher's stamp.
+Events arrive as frames whose header alone is read, and answers leave as the frames that the worker encoded, with the
+publisher's stamp.
 """
 
 from __future__ import annotations
@@ -75,7 +75,10 @@ class EventInput:
         # Where a bound socket was, while events are not taken.
         self._closed_at = ""
         self._not_open = ""
-        self._is_retry_over = threading.Event()
+        # Of the thread that connects to the broker; it is set when events are not to be taken any more.
+        self._is_opening_over = threading.Event()
+        self._opening: threading.Thread | None = None
+        self._opening_lock = threading.Lock()
         self._subscriber = self._make_subscriber(options.sub)
 
     def _make_subscriber(self, address: str) -> Subscriber:
@@ -140,18 +143,12 @@ class EventInput:
             self.start()
 
     def start(self) -> None:
-        """Take events; again where they were taken before. If the broker is away, a thread tries that again."""
-        self._end_retry()
+        """Take events; again where they were taken before. A broker is connected by a thread, which waits for it."""
+        self._end_opening()
         if self.is_broker:
-            try:
-                self._subscriber.start()
-                self._subscriber.resume()
-            except BrokerError as error:
-                self._not_open, self._is_retry_over = str(error), threading.Event()
-                threading.Thread(
-                    target=self._retry, args=(self._is_retry_over,), name="epypes opening", daemon=True
-                ).start()
-                self._on_change()
+            self._is_opening_over = is_over = threading.Event()
+            self._opening = threading.Thread(target=self._open, args=(is_over,), name="epypes opening", daemon=True)
+            self._opening.start()
             return
         if self._closed_at:
             self._rejected += sum(self._subscriber.rejected.values())
@@ -159,29 +156,42 @@ class EventInput:
             self._subscriber, self._closed_at = self._make_subscriber(self._closed_at), ""
         self._subscriber.start()
 
-    def _retry(self, is_over: threading.Event) -> None:
+    def _open(self, is_over: threading.Event) -> None:
         pause_s = _FIRST_RETRY_S
-        while not is_over.wait(pause_s):
-            pause_s = min(2 * pause_s, _LONGEST_RETRY_S)
-            try:
-                self._subscriber.start()
-            except BrokerError as error:
-                self._not_open = str(error)
-                continue
-            if is_over.is_set():
-                self._subscriber.stop()
+        # An earlier thread may still wait for a broker that does not answer.
+        with self._opening_lock:
+            while not is_over.is_set():
+                try:
+                    self._subscriber.start()
+                    self._subscriber.resume()
+                except BrokerError as error:
+                    if not is_over.is_set():
+                        self._not_open = str(error)
+                        self._on_change()
+                    is_over.wait(pause_s)
+                    pause_s = min(2 * pause_s, _LONGEST_RETRY_S)
+                    continue
+                if is_over.is_set():
+                    self._subscriber.stop()
+                elif self._not_open:
+                    self._not_open = ""
+                    self._on_change()
                 return
-            self._not_open = ""
-            self._on_change()
-            return
 
-    def _end_retry(self) -> None:
-        self._is_retry_over.set()
+    def _end_opening(self) -> None:
+        self._is_opening_over.set()
         self._not_open = ""
+
+    def _has_opened(self, timeout_s: float) -> bool:
+        """Whether no thread opens the subscriber; one that still does stops it in the end."""
+        if self._opening is not None and self._opening is not threading.current_thread():
+            self._opening.join(timeout_s)
+            return not self._opening.is_alive()
+        return True
 
     def pause(self, timeout_s: float) -> None:
         """Take no more events; those of a broker that were taken can still be acknowledged."""
-        self._end_retry()
+        self._end_opening()
         if self.is_broker:
             self._subscriber.pause()
         else:
@@ -195,9 +205,11 @@ class EventInput:
 
     def stop(self, timeout_s: float) -> None:
         """Close it until the next `start`."""
-        self._end_retry()
+        self._end_opening()
         self._closed_at = ""
-        self._subscriber.stop(timeout_s)
+        until_s = monotonic() + timeout_s
+        if self._has_opened(timeout_s):
+            self._subscriber.stop(max(until_s - monotonic(), 0.0))
 
     # -- description --------------------------------------------------------------------------------------------------
 

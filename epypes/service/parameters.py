@@ -317,6 +317,11 @@ class ParameterControl:
         """Of the bundle that the parameters belong to."""
         return self.bundle.digest
 
+    def snapshot(self) -> tuple[str, Parameters]:
+        """Return the digest of the bundle and its parameters, read together."""
+        with self._dispatcher.lock:
+            return self.bundle.digest, self.current
+
     def set(self, values: Mapping[str, Any], revision: int | None, at_least: int = 0) -> Parameters:
         """Change values, under a revision of ``at_least`` or more; return all of them, with their revision.
 

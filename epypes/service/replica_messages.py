@@ -14,14 +14,17 @@ from typing import Any, Final
 from epypes.errors import MessageError
 
 VERSION: Final = 2
-# Ids in one message; more are sent in the next one.
-MAX_IDS: Final = 500
+# Ids in one message; more are sent in the next one. With the longest ids it is still below the limit of bytes.
+MAX_IDS: Final = 250
 # Longer ids are not sent: the broker's own redelivery count covers them.
 MAX_ID_CHARACTERS: Final = 256
 _MAX_BYTES: Final = 1024**2
 _MAX_CHARACTERS: Final = 2_000
 _MAX_ITEMS: Final = 1_000
-_MAX_INTEGER: Final = 2**64
+_MAX_INTEGER: Final = 2**53
+
+# Revision and author of hyperparameters.
+Version = tuple[int, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +65,11 @@ class Member:
     http: str = ""
     trouble: str = ""
 
+    @property
+    def version(self) -> Version:
+        """Of the hyperparameters that it computes with."""
+        return self.revision, self.author
+
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
@@ -69,11 +77,14 @@ class Heartbeat:
 
     Attributes
     ----------
+    is_joining
+        Whether it does not know yet which parameters the others compute with.
     lost
         Members that it has missed lately, and how many milliseconds ago it heard each: newcomers can't know them.
     """
 
     member: Member
+    is_joining: bool = False
     lost: Sequence[tuple[Member, int]] = ()
 
 
@@ -106,15 +117,24 @@ class ParameterSet:
     values: Mapping[str, Mapping[str, Any]]
 
     @property
-    def version(self) -> tuple[int, str]:
-        """Revision and author: totally ordered, so that all replicas settle on the same set."""
+    def version(self) -> Version:
+        """Two are never equal, so that all replicas settle on the same set."""
         return self.revision, self.author
 
 
 @dataclass(frozen=True, slots=True)
 class ParameterQuery:
-    """A replica asks for the newest `ParameterSet` of a bundle."""
+    """A replica asks another one for the newest `ParameterSet` of a bundle.
 
+    Attributes
+    ----------
+    id
+        Of the replica that is asked.
+    digest
+        Of the bundle.
+    """
+
+    id: str
     digest: str
 
 
@@ -154,13 +174,17 @@ def decode_message(data: bytes | memoryview) -> ReplicaMessage:
     if len(data) > _MAX_BYTES:
         raise MessageError("too large", f"A message of {len(data):,} bytes; between replicas {_MAX_BYTES:,} is most.")
     try:
-        document = json.loads(bytes(data))
+        document = json.loads(bytes(data), parse_constant=_refuse_constant)
         if document["v"] != VERSION:
             raise ValueError(f"version {document['v']!r:.20}")
         return _READERS[document["kind"]](document)
     except (ValueError, TypeError, LookupError, RecursionError) as error:
         text = f"This is no message between replicas (version {VERSION}): {error!r:.200}."
         raise MessageError("bad replica message", text) from error
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"JSON has no {name}")
 
 
 def _read_member(document: Any) -> Member:
@@ -170,7 +194,7 @@ def _read_member(document: Any) -> Member:
 
 def _read_heartbeat(document: Any) -> Heartbeat:
     lost = [(_read_member(member), _integer(silent_ms)) for member, silent_ms in _items(document["lost"])]
-    return Heartbeat(_read_member(document["member"]), lost)
+    return Heartbeat(_read_member(document["member"]), document["is_joining"] is True, lost)
 
 
 def _read_parameters(document: Any) -> ParameterSet:
@@ -184,7 +208,7 @@ _READERS: Final[Mapping[str, Callable[[Any], ReplicaMessage]]] = {
     "heartbeat": _read_heartbeat,
     "goodbye": lambda document: Goodbye(_text(document["id"])),
     "parameters": _read_parameters,
-    "query": lambda document: ParameterQuery(_text(document["digest"])),
+    "query": lambda document: ParameterQuery(_text(document["id"]), _text(document["digest"])),
     "answered": lambda document: Answered(_text(document["id"]), [*map(_short, _items(document["events"]))]),
 }
 

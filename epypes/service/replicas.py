@@ -3,8 +3,12 @@
 Each replica publishes a heartbeat every second on a broadcast address beside the queue, and hears those of the others.
 Hyperparameters that are set at one replica are published to all as one `ParameterSet`; the set with the higher version
 (revision, then id of its author) wins everywhere, so that all settle on the same one whatever was lost or set at the
-same time. A heartbeat names the version that its replica computes with: who knows an older one asks for the newer.
-What must outlive all replicas is written back into the bundle.
+same time. A heartbeat names the version that its replica computes with: a replica that knows only an older one asks for
+it. What must outlive all replicas is written back into the bundle.
+
+Two threads: one publishes, the other has the worker take newer parameters, since that waits for the event that is
+worked on. Messages are received on a thread of the subscriber. Nothing of the service is called while the lock is held:
+the dispatcher calls `Replicas.newest` with its own lock held.
 """
 
 from __future__ import annotations
@@ -18,10 +22,10 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from time import monotonic
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from epypes.errors import BrokerError, MessageError, ServiceError
-from epypes.service.parameters import Parameters, value_of
+from epypes.service.parameters import ParameterControl, Parameters, value_of
 from epypes.service.replica_messages import (
     MAX_ID_CHARACTERS,
     MAX_IDS,
@@ -32,64 +36,45 @@ from epypes.service.replica_messages import (
     ParameterQuery,
     ParameterSet,
     ReplicaMessage,
+    Version,
     decode_message,
     encode_message,
 )
-from epypes.transport.publisher import Publisher
-from epypes.transport.subscriber import Subscriber
+from epypes.transport import Publisher, Subscriber
+from epypes.transport.address import Address
+from epypes.transport.channel import Delivery
 
 HEARTBEAT_S: Final = 1.0
 # Three heartbeats may be lost before a replica counts as gone.
 _SILENT_AFTER_S: Final = 3.5
-# Events wait so long for the parameters of the others; less if no other replica answers.
+# After this time every other replica has published a heartbeat; one that has joined answers that of a newcomer at once.
+_GATHERING_S: Final = 1.25
+# Events wait no longer than this for the parameters of the others.
 _JOIN_TIMEOUT_S: Final = 5.0
-_ALONE_AFTER_S: Final = 1.25
-# A replica that was itself held up, or had no broker, has heard nothing: silence before that proves nothing.
+# A replica that was itself held up, or had no broker, has heard nothing: silence before that proves nothing. The others
+# may take as long to connect again.
 _HELD_UP_S: Final = 2.0
 _GRACE_S: Final = 10.0
 _BATCH_S: Final = 0.1
 _RETRY_S: Final = 0.25
+_CLOSE_S: Final = 1.0
 _LOST_FOR_S: Final = 600.0
 _MAX_MEMBERS: Final = 1_000
-_MAX_LOST: Final = 20
+_MAX_LOST: Final = 50
 _MAX_BUNDLES: Final = 100
 _MAX_UNSENT_IDS: Final = 100_000
-_MAX_REASON: Final = 500
-_PREFETCH: Final = 64
+# Longer texts are cut: a heartbeat is small.
+_MAX_TEXT: Final = 500
+_NONE: Final[Version] = (0, "")
 
 _log = logging.getLogger("epypes.service")
 
 
-class SharedParameters(Protocol):
-    """The hyperparameters of this replica, as its worker computes with them."""
-
-    @property
-    def current(self) -> Parameters:
-        """Revision and entries."""
-
-    @property
-    def digest(self) -> str:
-        """Of the bundle that they belong to."""
-
-    def set(self, values: Mapping[str, Any], revision: int | None, at_least: int = 0) -> Parameters:
-        """Change values under a revision of ``at_least`` or more; raise as `Service.set_parameters` does."""
-
-    def follow(self, digest: str, revision: int, values: Mapping[str, Any]) -> Mapping[str, str]:
-        """Take all values as another replica has set them; return the problems by token, if the worker refuses some.
-
-        Raises
-        ------
-        ServiceError
-            There is no worker just now, or it is busy.
-        """
-
-
-@dataclass(slots=True)
-class _Known:
+@dataclass(frozen=True, slots=True)
+class _Heard:
     member: Member
     heard_s: float
-    # Another bundle on the same queue is reported once.
-    is_reported: bool = False
+    is_joining: bool = False
 
 
 class Replicas:
@@ -105,45 +90,53 @@ class Replicas:
         The hyperparameters of this replica.
     on_answered
         Called with ids of events that another replica has answered.
-    on_change
-        Called when `is_joining` or the members may have changed; on a thread of this object.
+    on_joined
+        Called once after `start`, on a thread of this object: the parameters that the other replicas compute with are
+        taken over, or were not to be had in time. Events must wait until then.
 
     Attributes
     ----------
+    is_shared
+        Whether there is a broker.
     is_joining
-        Whether events must wait: the parameters that the other replicas compute with are not known yet.
-    rejected
-        How many messages on the address were no messages between replicas.
+        Whether `on_joined` is still to be called.
     """
 
     def __init__(
         self,
-        address: Any,
+        address: Address | None,
         facts: Callable[[], Mapping[str, Any]],
-        parameters: SharedParameters,
-        on_answered: Callable[[Iterable[str]], object] = lambda ids: None,
-        on_change: Callable[[], object] = lambda: None,
+        parameters: ParameterControl,
+        on_answered: Callable[[Iterable[str]], object],
+        on_joined: Callable[[], object],
     ) -> None:
         self._address, self._facts, self._parameters = address, facts, parameters
-        self._on_answered, self._on_change = on_answered, on_change
-        self._id = uuid.uuid4().hex
+        self._on_answered, self._on_joined = on_answered, on_joined
+        self.is_shared, self.is_joining = address is not None, False
         self._changed = threading.Condition()
+        # Held while parameters are changed and published: a set of another replica is taken before or after that.
         self._setting = threading.Lock()
-        self._members: dict[str, _Known] = {}
-        self._lost: dict[str, _Known] = {}
+        self._threads: list[threading.Thread] = []
         self._newest: dict[str, ParameterSet] = {}
-        # Versions, by bundle: what this replica computes with, and what its worker has refused.
-        self._applied: dict[str, tuple[int, str]] = {}
-        self._refused: dict[str, tuple[int, str]] = {}
+        # By digest of the bundle: what this replica computes with, and what its worker has refused, and why.
+        self._applied: dict[str, Version] = {}
+        self._refused: dict[str, tuple[Version, str]] = {}
+        self._reset()
+
+    def _reset(self) -> None:
+        self._id = uuid.uuid4().hex
+        self._members: dict[str, _Heard] = {}
+        self._lost: dict[str, _Heard] = {}
+        self._left: deque[str] = deque(maxlen=_MAX_MEMBERS)
         self._unsent: deque[str] = deque(maxlen=_MAX_UNSENT_IDS)
-        self._trouble = f"{address} has not been reached yet." if address is not None else ""
-        self._refusal = ""
-        self._joined_s = self._connected_s = self._looked_s = self._certain_from_s = 0.0
-        self._is_beat_due = self._is_over = False
+        self._subscriber: Subscriber | None = None
         self._publisher: Publisher | None = None
-        self._thread: threading.Thread | None = None
-        self.is_joining = False
-        self.rejected = 0
+        self._unreached = "" if self._address is None else f"{self._address} has not been reached yet."
+        self._connected_s: float | None = None
+        self._join_until_s = monotonic() + _JOIN_TIMEOUT_S
+        self._looked_s = self._certain_from_s = 0.0
+        self._is_beat_due = self._is_over = False
+        self._rejected = 0
 
     # -- start and stop -----------------------------------------------------------------------------------------------
 
@@ -151,142 +144,158 @@ class Replicas:
         """Take part as soon as the broker is there; raises nothing."""
         if self._address is None:
             return
-        self._is_over, self.is_joining = False, True
-        self._joined_s = monotonic() + _JOIN_TIMEOUT_S
-        self._thread = threading.Thread(target=self._run, name="epypes replicas", daemon=True)
-        self._thread.start()
+        for thread in self._threads:
+            # After a stop that did not wait for a broker which does not answer.
+            thread.join()
+        self._reset()
+        self.is_joining = True
+        self._threads = [
+            threading.Thread(target=self._run, args=(self._address,), name="epypes replicas", daemon=True),
+            threading.Thread(target=self._follow, name="epypes following", daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def stop(self, timeout_s: float = 2.0) -> None:
         """Publish that this replica stops, and end, within ``timeout_s``."""
+        until_s = monotonic() + timeout_s
         with self._changed:
             self._is_over = True
             self._changed.notify_all()
-        if self._thread is not None:
-            self._thread.join(timeout_s)
+        for thread in self._threads:
+            thread.join(max(until_s - monotonic(), 0.0))
         self.is_joining = False
 
-    def _run(self) -> None:
-        heard = Subscriber(self._address, _Handler(self._receive), acknowledge="received", undecoded=True)
-        publisher = Publisher(self._address)
+    def _run(self, address: Address) -> None:
+        subscriber = Subscriber(address, self, acknowledge="received", undecoded=True)
+        publisher = Publisher(address)
+        subscriber.on_connection = publisher.on_connection = lambda is_connected, reason: self._beat_soon()
         try:
-            if self._opened(heard, publisher):
-                self._publisher = publisher
-                self._take_part(heard, publisher)
-                self._flush()
+            if self._connect(subscriber, publisher):
+                self._take_part()
+                self._publish_answered()
                 self._publish(Goodbye(self._id))
-        except Exception:
+        except Exception as error:
             _log.exception("this replica takes no part in its group any more")
+            self._unreached = f"This replica takes no part in its group any more: {error!r:.200}"
         finally:
             self._publisher = None
-            publisher.stop(1.0)
-            heard.stop(1.0)
+            publisher.stop(_CLOSE_S)
+            subscriber.stop(_CLOSE_S)
 
-    def _opened(self, heard: Subscriber, publisher: Publisher) -> bool:
+    def _connect(self, subscriber: Subscriber, publisher: Publisher) -> bool:
         """Connect, however long the broker is away; return False if the replica was stopped before."""
         while not self._is_over:
             try:
-                heard.start()
+                subscriber.start()
                 publisher.start()
             except BrokerError as error:
-                self._trouble = str(error)
-                self._wait(_RETRY_S)
-                self._look_at_joining()
+                self._unreached = str(error)
+                with self._changed:
+                    self._changed.wait_for(self._has_ended, _RETRY_S)
             else:
+                self._subscriber, self._publisher = subscriber, publisher
+                self._connected_s, self._unreached = monotonic(), "This replica has stopped."
                 return True
         return False
 
-    def _take_part(self, heard: Subscriber, publisher: Publisher) -> None:
-        next_beat_s, self._looked_s = 0.0, monotonic()
+    def _take_part(self) -> None:
+        beat_s = 0.0
         while not self._is_over:
-            trouble = heard.trouble or publisher.trouble
-            if self._trouble and not trouble:
-                # Connected, perhaps again: the others may have changed the parameters meanwhile.
-                self._connected_s = monotonic()
-                self._publish(ParameterQuery(self._parameters.digest))
-                self._is_beat_due = True
-            self._trouble = trouble
-            if monotonic() >= next_beat_s or self._is_beat_due:
-                self._is_beat_due, next_beat_s = False, monotonic() + HEARTBEAT_S
+            if self._is_beat_due or monotonic() >= beat_s:
+                self._is_beat_due, beat_s = False, monotonic() + HEARTBEAT_S
                 self._beat()
-            self._flush()
-            self._follow()
-            self._look_at_joining()
-            self._wait(min(next_beat_s - monotonic(), _RETRY_S if self._is_behind() else HEARTBEAT_S))
+            self._publish_answered()
+            with self._changed:
+                self._changed.wait_for(self._is_work_due, max(beat_s - monotonic(), 0.0))
+                if self._unsent:
+                    # More answers may follow, and go into the same message.
+                    self._changed.wait_for(self._has_ended, _BATCH_S)
 
-    def _wait(self, seconds: float) -> None:
-        with self._changed:
-            if self._unsent and not self._is_over:
-                # More answers may follow, and go into the same message.
-                seconds = min(seconds, _BATCH_S)
-                self._changed.wait_for(lambda: self._is_over, seconds)
-            elif not (self._is_beat_due or self._is_over):
-                self._changed.wait(max(seconds, 0.0))
+    def _has_ended(self) -> bool:
+        return self._is_over
 
-    def _wake(self) -> None:
+    def _is_work_due(self) -> bool:
+        return self._is_over or self._is_beat_due or (bool(self._unsent) and not self._away)
+
+    def _beat_soon(self) -> None:
         with self._changed:
+            self._is_beat_due = True
             self._changed.notify_all()
+
+    @property
+    def _away(self) -> str:
+        """Why the broker is not connected; empty if it is."""
+        subscriber, publisher = self._subscriber, self._publisher
+        if subscriber is None or publisher is None:
+            return self._unreached
+        return subscriber.trouble or publisher.trouble
 
     # -- publishing ---------------------------------------------------------------------------------------------------
 
     def _publish(self, message: ReplicaMessage) -> None:
+        """Publish a message if the broker is there; what a peer misses is named again by the next heartbeat."""
         publisher = self._publisher
-        if publisher is None or self._trouble:
+        if publisher is None or self._away:
             return
         try:
             publisher.send((encode_message(message),))
         except (BrokerError, MessageError) as error:
-            _log.debug("not published to the other replicas: %s", error)
+            _log.warning("a %s was not published to the other replicas: %s", type(message).__name__, error)
 
     def _beat(self) -> None:
         self._introduce()
-        now_s = monotonic()
-        self._look_for_lost(now_s)
+        member, now_s = self._member(), monotonic()
+        self._look_for_lost(member, now_s)
         with self._changed:
-            lost = [(known.member, int((now_s - known.heard_s) * 1e3)) for known in self._lost.values()]
-        self._publish(Heartbeat(self._member(), lost[-_MAX_LOST:]))
-        self._on_change()
+            lost = [(each.member, int((now_s - each.heard_s) * 1e3)) for each in self._lost.values()]
+        self._publish(Heartbeat(member, self.is_joining, lost))
 
     def _introduce(self) -> None:
         """Publish the revision that this bundle has gone on with here, after a deploy, if no other replica knows it."""
-        digest, current = self._parameters.digest, self._parameters.current
-        newest = self._newest.get(digest)
-        if current.revision > (0 if newest is None else newest.revision):
+        digest, current = self._parameters.snapshot()
+        with self._changed:
+            is_new = current.revision > self._version(digest)[0]
+        if is_new:
             self._announce(digest, current)
 
     def _announce(self, digest: str, current: Parameters) -> None:
-        values = {token: dict(value_of(entry)) for token, entry in current.entries.items()}
+        values = {token: value_of(entry) for token, entry in current.entries.items()}
         new = ParameterSet(digest, current.revision, self._id, values)
         with self._changed:
-            self._keep(new)
             self._applied[digest] = new.version
+            self._keep(new)
         self._publish(new)
-        self._is_beat_due = True
-        self._wake()
+        self._beat_soon()
 
-    def _flush(self) -> None:
-        while self._unsent and not self._trouble:
+    def _publish_answered(self) -> None:
+        while self._unsent and not self._away:
             with self._changed:
                 ids = [self._unsent.popleft() for _ in range(min(len(self._unsent), MAX_IDS))]
             self._publish(Answered(self._id, ids))
 
     def answered(self, event_id: str) -> None:
         """Have the other replicas know that this one has answered an event; returns at once."""
-        if self._address is not None and 0 < len(event_id) <= MAX_ID_CHARACTERS:
+        if self.is_shared and 0 < len(event_id) <= MAX_ID_CHARACTERS:
             with self._changed:
                 self._unsent.append(event_id)
                 self._changed.notify_all()
 
     # -- receiving ----------------------------------------------------------------------------------------------------
 
-    def _receive(self, delivery: Any) -> None:
+    def put(self, item: Delivery, *, block: bool = False, timeout: float | None = None) -> None:
+        """Take a message; called by the subscriber, whose queue this is."""
         try:
-            message = decode_message(b"".join(delivery.frames))
+            message = decode_message(b"".join(item.frames))
         except MessageError as error:
-            self.rejected += 1
+            self._rejected += 1
             _log.debug("rejected on %s: %s", self._address, error)
             return
         if isinstance(message, ParameterQuery):
-            self._answer_query(message.digest)
+            with self._changed:
+                newest = self._newest.get(message.digest)
+            if message.id == self._id and newest is not None:
+                self._publish(newest)
         elif isinstance(message, ParameterSet):
             with self._changed:
                 self._keep(message)
@@ -296,23 +305,18 @@ class Replicas:
         elif message.id == self._id:
             return
         elif isinstance(message, Goodbye):
-            self._left(message.id)
+            self._forget(message.id)
         else:
             self._on_answered(message.events)
-        self._wake()
-
-    def _answer_query(self, digest: str) -> None:
-        newest = self._newest.get(digest)
-        if newest is not None:
-            self._publish(newest)
-        self._is_beat_due = True
 
     def _keep(self, new: ParameterSet) -> None:
         """Remember a set of parameters if it is the newest of its bundle; the lock is held."""
-        known = self._newest.pop(new.digest, None)
-        self._newest[new.digest] = new if known is None or new.version > known.version else known
-        if len(self._newest) > _MAX_BUNDLES:
-            del self._newest[next(iter(self._newest))]
+        if new.version > self._version(new.digest):
+            self._newest.pop(new.digest, None)
+            self._newest[new.digest] = new
+            if len(self._newest) > _MAX_BUNDLES:
+                del self._newest[next(iter(self._newest))]
+            self._changed.notify_all()
 
     def _heard(self, heartbeat: Heartbeat) -> None:
         member, now_s = heartbeat.member, monotonic()
@@ -320,53 +324,53 @@ class Replicas:
             known = self._members.get(member.id)
             if known is None and len(self._members) >= _MAX_MEMBERS:
                 return
-            self._members[member.id] = _Known(member, now_s, known is not None and known.is_reported)
+            self._members[member.id] = _Heard(member, now_s, heartbeat.is_joining)
             self._lost.pop(member.id, None)
             for lost, silent_ms in heartbeat.lost:
-                if lost.id not in self._members and lost.id != self._id:
-                    self._lost.setdefault(lost.id, _Known(lost, now_s - silent_ms / 1e3))
-            newest = self._newest.get(member.digest)
+                is_known = lost.id == self._id or lost.id in self._members or lost.id in self._left
+                if not is_known and len(self._lost) < _MAX_LOST:
+                    self._lost.setdefault(lost.id, _Heard(lost, now_s - silent_ms / 1e3))
+            is_newer = member.version > self._version(member.digest)
+            self._changed.notify_all()
         if known is None:
             _log.info("%s is in the group", _label(member))
-            self._is_beat_due = True
-        self._warn_of_other_bundle(member)
-        if (member.revision, member.author) > ((0, "") if newest is None else newest.version) and member.revision:
-            self._publish(ParameterQuery(member.digest))
-
-    def _warn_of_other_bundle(self, member: Member) -> None:
-        name = str(self._facts().get("name", ""))
-        known = self._members[member.id]
-        if member.name != name and not known.is_reported:
-            known.is_reported = True
+            # The newcomer need not wait for the next one.
+            self._beat_soon()
+        is_name_new = known is None or known.member.name != member.name
+        if is_name_new and member.name != (name := self._facts()["name"]):
             text = "%s serves another bundle from the same queue, %s, and this one serves %s: each takes events of the"
             _log.warning(f"{text} other. Give each bundle a queue of its own.", _label(member), member.name, name)
+        if is_newer:
+            self._publish(ParameterQuery(member.id, member.digest))
 
-    def _left(self, member_id: str) -> None:
+    def _forget(self, member_id: str) -> None:
+        """Forget a replica that has stopped in order."""
         with self._changed:
+            self._left.append(member_id)
+            self._lost.pop(member_id, None)
             known = self._members.pop(member_id, None)
         if known is not None:
             _log.info("%s has left the group", _label(known.member))
-            self._on_change()
 
-    def _look_for_lost(self, now_s: float) -> None:
-        if now_s - self._looked_s > _HELD_UP_S or self._trouble:
+    def _look_for_lost(self, own: Member, now_s: float) -> None:
+        if self._away or (self._looked_s and now_s - self._looked_s > _HELD_UP_S):
             self._certain_from_s = now_s + _GRACE_S
         self._looked_s = now_s
-        if now_s < self._certain_from_s:
-            # It is decided later whether a silent replica is lost.
-            return
         with self._changed:
-            silent = [known for known in self._members.values() if now_s - known.heard_s > _SILENT_AFTER_S]
-            for known in silent:
-                self._lost[known.member.id] = self._members.pop(known.member.id)
-            present = {_place(known.member) for known in self._members.values()} | {_place(self._member())}
-            for known in [*self._lost.values()]:
+            silent = [each for each in self._members.values() if now_s - each.heard_s > _SILENT_AFTER_S]
+            newly_lost = silent if now_s >= self._certain_from_s else []
+            for each in newly_lost:
+                self._lost[each.member.id] = self._members.pop(each.member.id)
+            present = {_place(own), *(_place(each.member) for each in self._members.values())}
+            kept = {
+                key: each
+                for key, each in self._lost.items()
                 # A replica of the same name on the same machine has taken its place.
-                if now_s - known.heard_s > _LOST_FOR_S or _place(known.member) in present:
-                    del self._lost[known.member.id]
-            newly_lost = [known.member for known in silent if known.member.id in self._lost]
-        for member in newly_lost:
-            _log.warning("%s is gone: no heartbeat for %.1f s", _label(member), _SILENT_AFTER_S)
+                if now_s - each.heard_s <= _LOST_FOR_S and _place(each.member) not in present
+            }
+            self._lost = dict([*kept.items()][-_MAX_LOST:])
+        for each in newly_lost:
+            _log.warning("%s is gone: no heartbeat for %.1f s", _label(each.member), now_s - each.heard_s)
 
     # -- hyperparameters ----------------------------------------------------------------------------------------------
 
@@ -378,19 +382,23 @@ class Replicas:
         RevisionConflict, ParametersRefused, ServiceError
             As `Service.set_parameters`; also if the broker is away: nothing is changed then.
         """
-        if self._address is None:
+        if not self.is_shared:
             return self._parameters.set(values, revision)
         with self._setting:
-            digest = self._parameters.digest
-            if self._trouble:
-                text = f"The other replicas can't be reached, so nothing is changed: {self._trouble}"
-                raise ServiceError(digest, text)
-            before, newest = self._parameters.current, self._newest.get(digest)
-            now = self._parameters.set(values, revision, 0 if newest is None else newest.revision + 1)
-            if now.revision != before.revision:
-                self._refusal = ""
-                self._announce(digest, now)
-            return now
+            if away := self._away:
+                text = f"The other replicas can't be reached, so nothing is changed: {away}"
+                raise ServiceError(self._parameters.digest, text)
+            # A change that is known here must not be undone by the next one: its revision is a conflict.
+            self._apply_newest()
+            before = self._parameters.current
+            with self._changed:
+                at_least = self._version(self._parameters.digest)[0] + 1
+            changed = self._parameters.set(values, revision, at_least)
+            digest, current = self._parameters.snapshot()
+            # Otherwise another bundle has been deployed since.
+            if current is changed and changed is not before:
+                self._announce(digest, changed)
+            return changed
 
     def newest(self, digest: str) -> tuple[int, Mapping[str, Any]] | None:
         """Return revision and values that the replicas of a bundle compute with, None if none is known.
@@ -404,61 +412,112 @@ class Replicas:
             self._applied[digest] = found.version
             return found.revision, found.values
 
+    def _version(self, digest: str) -> Version:
+        """Return the newest version of a bundle's parameters that is known; the lock is held."""
+        newest = self._newest.get(digest)
+        return _NONE if newest is None else newest.version
+
     def _is_behind(self) -> bool:
-        newest = self._newest.get(self._parameters.digest)
-        done = self._applied.get(self._parameters.digest), self._refused.get(self._parameters.digest)
-        return newest is not None and newest.version not in done
+        """Whether newer parameters are to be taken over; the lock is held."""
+        digest = self._parameters.digest
+        refused, _ = self._refused.get(digest, (_NONE, ""))
+        return self._version(digest) not in (_NONE, self._applied.get(digest), refused)
 
     def _follow(self) -> None:
-        """Have the worker take the newest parameters, unless this replica computes with them."""
-        if not self._is_behind() or not self._setting.acquire(blocking=False):
-            return
-        try:
-            newest = self._newest[self._parameters.digest]
-            problems = self._parameters.follow(newest.digest, newest.revision, newest.values)
-        except ServiceError as error:
-            _log.debug("parameters of another replica wait: %s", error)
-            return
-        finally:
-            self._setting.release()
+        """Have the worker take newer parameters, one set after the other."""
+        while not self._is_over:
+            is_tried_again = False
+            try:
+                with self._setting:
+                    self._apply_newest()
+            except ServiceError as error:
+                is_tried_again = True
+                _log.debug("parameters of another replica wait: %s", error)
+            except Exception:
+                is_tried_again = True
+                _log.exception("parameters of another replica can't be taken over")
+            self._look_at_joining()
+            with self._changed:
+                # At least each second: a deploy is not notified.
+                timeout_s = _RETRY_S if is_tried_again or self.is_joining else HEARTBEAT_S
+                self._changed.wait_for(self._has_ended if is_tried_again else self._is_follow_due, timeout_s)
+
+    def _is_follow_due(self) -> bool:
+        return self._is_over or self._is_behind() or (self.is_joining and self._may_join())
+
+    def _apply_newest(self) -> None:
+        """Have the worker take the newest parameters, unless it has; `_setting` is held.
+
+        Raises
+        ------
+        ServiceError
+            There is no worker just now, or it is busy.
+        """
+        with self._changed:
+            newest = self._newest.get(self._parameters.digest)
+            if newest is None or not self._is_behind():
+                return
+        problems = self._parameters.follow(newest.digest, newest.revision, newest.values)
+        with self._changed:
+            if problems:
+                why = " ".join(f"{token!r}: {problem}" for token, problem in problems.items())
+                text = f"The worker refuses revision {newest.revision} of the other replicas. {why}"[:_MAX_TEXT]
+                self._refused[newest.digest] = newest.version, text
+            else:
+                self._applied[newest.digest] = newest.version
         if problems:
-            why = " ".join(f"{token!r}: {problem}" for token, problem in problems.items())
-            self._refused[newest.digest] = newest.version
-            self._refusal = f"The worker refuses revision {newest.revision} of the other replicas. {why}"
-            _log.error("%s", self._refusal)
-        else:
-            self._applied[newest.digest] = newest.version
-            self._refusal = ""
-        self._is_beat_due = True
+            _log.error("%s", text)
+        self._beat_soon()
 
     def _look_at_joining(self) -> None:
-        now_s = monotonic()
         if not self.is_joining:
             return
-        others = [known for known in self._members.values() if known.member.digest == self._parameters.digest]
-        newest = self._newest.get(self._parameters.digest)
-        version = (0, "") if newest is None else newest.version
-        is_known = others and all((each.member.revision, each.member.author) <= version for each in others)
-        is_alone = not others and self._connected_s and now_s - self._connected_s > _ALONE_AFTER_S
-        if now_s > self._joined_s or ((is_known or is_alone) and not self._is_behind()):
+        with self._changed:
+            if not self._may_join():
+                return
             self.is_joining = False
-            self._on_change()
+        self._on_joined()
+        # Newcomers may wait for that.
+        self._beat_soon()
+
+    def _may_join(self) -> bool:
+        """Whether events need not wait for the parameters of the others; the lock is held."""
+        now_s, connected_s, digest = monotonic(), self._connected_s, self._parameters.digest
+        others = [each for each in self._members.values() if each.member.digest == digest]
+        is_known = all(each.member.version <= self._version(digest) for each in others) and not self._is_behind()
+        has_gathered = connected_s is not None and now_s - connected_s > _GATHERING_S
+        is_answered = any(not each.is_joining for each in others)
+        return (is_known and (has_gathered or is_answered)) or now_s > self._join_until_s
 
     # -- description --------------------------------------------------------------------------------------------------
 
     @property
-    def trouble(self) -> str:
-        """Why this replica does not take part, or does not compute with the newest parameters; empty if it does."""
-        return self._trouble or self._refusal
+    def _refusal(self) -> str:
+        """Why the newest parameters are not computed with; empty if they are."""
+        digest = self._parameters.digest
+        with self._changed:
+            refused, text = self._refused.get(digest, (_NONE, ""))
+            return text if refused == self._version(digest) else ""
 
     def _member(self) -> Member:
-        facts = dict(self._facts())
-        facts["reason"] = str(facts.get("reason", ""))[:_MAX_REASON]
-        digest = self._parameters.digest
-        own: dict[str, Any] = {"id": self._id, "host": socket.gethostname(), "pid": os.getpid(), "digest": digest}
-        author = self._applied.get(digest, (0, ""))[1]
-        version: dict[str, Any] = {"revision": self._parameters.current.revision, "author": author}
-        return Member(**own, **version, trouble=self._refusal, **facts)
+        digest, current = self._parameters.snapshot()
+        with self._changed:
+            revision, author = self._applied.get(digest, _NONE)
+        about: dict[str, Any] = {
+            **self._facts(),
+            "id": self._id,
+            "host": socket.gethostname(),
+            "pid": os.getpid(),
+            "digest": digest,
+            "revision": current.revision,
+            # If they differ, the revision is about to be announced.
+            "author": author if revision == current.revision else "",
+            "trouble": self._refusal,
+        }
+        cut: dict[str, Any] = {
+            key: value[:_MAX_TEXT] if isinstance(value, str) else value for key, value in about.items()
+        }
+        return Member(**cut)
 
     def describe(self) -> dict[str, Any]:
         """Return the group as this replica knows it, JSON-ready.
@@ -467,53 +526,46 @@ class Replicas:
         -------
         dict
             ``is_shared``: whether there is a broker; ``replicas``: how many are alive; ``ready``: how many of them are
-            READY; ``counts``: sums of theirs; ``agree``: whether all serve one bundle with one revision; ``trouble``;
-            ``rejected``; ``members`` and ``lost``: a dict for each.
+            READY; ``counts``: sums of theirs; ``agree``: whether all serve one bundle with one revision; ``trouble``:
+            why this replica does not take part, or does not compute with the newest parameters, empty if it does;
+            ``rejected``: how many messages were no messages between replicas; ``members`` and ``lost``: a dict for
+            each.
         """
-        now_s = monotonic()
+        own, now_s, subscriber = self._member(), monotonic(), self._subscriber
         with self._changed:
-            members = [_Known(self._member(), now_s), *self._members.values()]
-            lost = [_describe(known, now_s, self._id, "LOST") for known in _by_name(self._lost.values())]
-        present = [known for known in _by_name(members) if now_s - known.heard_s <= _SILENT_AFTER_S]
+            members, lost = [_Heard(own, now_s), *self._members.values()], [*self._lost.values()]
+        present = [each for each in _by_name(members) if now_s - each.heard_s <= _SILENT_AFTER_S]
         counts: Counter[str] = Counter()
-        for known in present:
-            counts.update(known.member.counts)
+        for each in present:
+            counts.update(each.member.counts)
         return {
-            "is_shared": self._address is not None,
+            "is_shared": self.is_shared,
             "replicas": len(present),
-            "ready": sum(known.member.state == "READY" for known in present),
+            "ready": sum(each.member.state == "READY" for each in present),
             "counts": dict(counts),
-            "agree": len({(known.member.digest, known.member.revision) for known in present}) <= 1,
-            "trouble": self.trouble,
-            "rejected": self.rejected,
-            "members": [_describe(known, now_s, self._id) for known in present],
-            "lost": lost,
+            "agree": len({(each.member.digest, each.member.revision) for each in present}) <= 1,
+            "trouble": self._away or own.trouble,
+            "rejected": self._rejected + (0 if subscriber is None else sum(subscriber.rejected.values())),
+            "members": [_describe(each, now_s, self._id) for each in present],
+            "lost": [_describe(_as_lost(each, now_s), now_s, self._id) for each in _by_name(lost)],
         }
 
 
-class _Handler:
-    """A queue that hands every item to a function."""
-
-    def __init__(self, handle: Callable[[Any], object]) -> None:
-        self._handle = handle
-
-    def put(self, item: Any, *, block: bool = False, timeout: float | None = None) -> None:
-        self._handle(item)
-
-
-def _describe(known: _Known, now_s: float, own_id: str, state: str = "") -> dict[str, Any]:
-    member, heard_s = known.member, now_s - known.heard_s
-    if state:
-        text = f"no heartbeat for {heard_s:.1f} s, and it did not stop in order; its counts are of then"
-        member = replace(member, state=state, reason=text)
-    found = asdict(member)
+def _describe(heard: _Heard, now_s: float, own_id: str) -> dict[str, Any]:
+    found = asdict(heard.member)
     is_self = found.pop("id") == own_id
     del found["author"]
-    return {**found, "heard_s": round(heard_s, 3), "is_self": is_self}
+    # A heartbeat may have come since `now_s`.
+    return {**found, "heard_s": round(max(now_s - heard.heard_s, 0.0), 3), "is_self": is_self}
 
 
-def _by_name(known: Iterable[_Known]) -> list[_Known]:
-    return sorted(known, key=lambda each: (len(each.member.replica), each.member.replica, each.member.id))
+def _as_lost(heard: _Heard, now_s: float) -> _Heard:
+    text = f"no heartbeat for {now_s - heard.heard_s:.1f} s, and it did not stop in order; its counts are of then"
+    return replace(heard, member=replace(heard.member, state="LOST", reason=text))
+
+
+def _by_name(heard: Iterable[_Heard]) -> list[_Heard]:
+    return sorted(heard, key=lambda each: (len(each.member.replica), each.member.replica, each.member.id))
 
 
 def _place(member: Member) -> tuple[str, str]:

@@ -90,8 +90,13 @@ class Service:
         self._deployer = Deployer(
             self._dispatcher, self._supervisor, self._parameters, given.job_timeout_s, self._results.notify
         )
-        answered = self._endpoints.events.answered
-        self._replicas = Replicas(group_address(given), self._facts, self._parameters, answered, self._replicas_changed)
+        self._replicas = Replicas(
+            group_address(given),
+            self._facts,
+            self._parameters,
+            self._endpoints.events.answered,
+            lambda: self._dispatcher.release(_JOINING),
+        )
         self._parameters.newest = self._replicas.newest
         self._dispatcher.on_answered = self._replicas.answered
         self._started_ns = 0
@@ -116,8 +121,10 @@ class Service:
                 self._lifecycle.is_running = True
                 self._started_ns = time_ns()
                 self._dispatcher.refuse("")
+                if self._replicas.is_shared:
+                    # Until the parameters of the other replicas are known.
+                    self._dispatcher.hold(_JOINING)
                 self._replicas.start()
-                self._replicas_changed()
                 self._supervisor.start()
                 self._changed()
         self._dispatcher.wait_for(lambda: self.state != "LOADING", None)
@@ -280,14 +287,6 @@ class Service:
         name, replica = self._supervisor.bundle.settings.name, self.options.replica
         about = {"state": state, "reason": reason, "counts": self.counts(), "http": self.http}
         return {"replica": replica, "name": name, **about}
-
-    def _replicas_changed(self) -> None:
-        """Hold events while the parameters of the other replicas are not known."""
-        if self._replicas.is_joining:
-            self._dispatcher.hold(_JOINING)
-        elif self._dispatcher.is_held(_JOINING):
-            self._dispatcher.release(_JOINING)
-        self._changed()
 
     def _provenance(self) -> Provenance:
         bundle, current = self._supervisor.bundle, self._parameters.current

@@ -1,4 +1,4 @@
-"""What was sent, what came back, and what does a broker still keep?"""
+"""Events that tests send to a broker, answers that they read, and what a broker still keeps."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ import threading
 from collections import Counter
 from time import monotonic
 
-from epypes.transport.channels import open_channel, place_of
-
 import epypes as ep
+from epypes.transport.address import open_channel, parse_address
 from epypes.wire import Envelope
 from tests.apart import apart
 
@@ -34,13 +33,15 @@ def event(number, kind=PLAIN):
 def lasting(broker, name, **options):
     """Make a queue, and wait until it outlives a kill of its broker; return its address."""
     address = broker.address(name, create=True, **options)
-    open_channel(address).close()
+    channel = open_channel(address)
+    channel.open(None)
+    channel.close()
     until(lambda: broker.has_written, f"{broker.name} to have written its queues")
     return address
 
 
 class Reader:
-    """Who gathers the answers of a place, each id once."""
+    """Reads the answers of an address, each id once."""
 
     def __init__(self, address):
         self._inbox: queue.SimpleQueue = queue.SimpleQueue()
@@ -55,7 +56,7 @@ class Reader:
         self.subscriber.stop()
 
     def look(self):
-        """Return how many have come."""
+        """Return how many have arrived."""
         while not self._inbox.empty():
             self.answers.append(self._inbox.get_nowait())
         return len(self.answers)
@@ -67,74 +68,75 @@ class Reader:
 
 
 def dead_letters(address, count, timeout_s=WAIT_S):
-    """Take dead letters of a place until there are so many, and look for more; return them by id: ``Received``.
+    """Take dead letters of an address until there are so many, and look for more; return the deliveries by id.
 
-    One whose receiver was killed before it had acknowledged the event may be there twice.
+    One whose consumer was killed before it had acknowledged the event may be there twice.
     """
-    found, end_s = {}, monotonic() + timeout_s
-    channel = open_channel(place_of(address).dead_letters, prefetch=8)
-    try:
+    found, end_s, inbox = {}, monotonic() + timeout_s, queue.SimpleQueue()
+    with ep.Subscriber(parse_address(address).dead_letters, inbox, undecoded=True):
         while monotonic() < end_s:
-            received = channel.receive(0.2)
-            if received is not None:
-                received.ack()
-                found[received.id] = received
-            elif len(found) >= count:
-                break
-    finally:
-        channel.close()
+            try:
+                delivery = inbox.get(timeout=0.2)
+            except queue.Empty:
+                if len(found) >= count:
+                    break
+                continue
+            delivery.ack()
+            found[delivery.id] = delivery
     assert len(found) == count, {name: received.headers for name, received in found.items()}
     return found
 
 
 def left(address):
-    """Return how many messages a broker keeps in a queue, as the broker's own client says; MQTT tells nobody."""
-    place = place_of(address)
-    return {"amqp": _left_in_rabbitmq, "nats": _left_in_nats, "mqtt": lambda place: 0}[place.scheme](place)
+    """Return how many messages a broker keeps in a queue, by the broker's own client; 0 for MQTT, which does not say."""
+    address = parse_address(address)
+    return {"amqp": _left_in_rabbitmq, "nats": _left_in_nats, "mqtt": lambda address: 0}[address.scheme](address)
 
 
 def remove(address):
     """Remove a queue with what it keeps, by the broker's own client."""
-    place = place_of(address)
-    if place.scheme == "amqp":
-        _in_rabbitmq(place, lambda channel: channel.queue_delete(place.name))
+    address = parse_address(address)
+    if address.scheme == "amqp":
+        _in_rabbitmq(address, lambda channel: channel.queue_delete(address.name))
     else:
-        _in_nats(place, lambda jetstream, stream: jetstream.delete_stream(stream))
+        _in_nats(address, lambda jetstream, stream: jetstream.delete_stream(stream))
 
 
-def _left_in_rabbitmq(place):
+def _left_in_rabbitmq(address):
     async def count(channel):
-        return (await channel.declare_queue(place.name, passive=True)).declaration_result.message_count
+        return (await channel.declare_queue(address.name, passive=True)).declaration_result.message_count
 
-    return _in_rabbitmq(place, count)
+    return _in_rabbitmq(address, count)
 
 
-def _in_rabbitmq(place, ask):
+def _in_rabbitmq(address, ask):
     import aio_pika
 
     async def asked():
-        options = {"host": place.host, "port": place.port, "login": place.user, "password": place.password}
-        async with await aio_pika.connect(**options, virtualhost=place.vhost) as connection:
+        options = {"host": address.host, "port": address.port, "login": address.user, "password": address.password}
+        async with await aio_pika.connect(**options, virtualhost=address.vhost) as connection:
             return await ask(await connection.channel())
 
     return apart(lambda: asyncio.run(asked()))
 
 
-def _left_in_nats(place):
+def _left_in_nats(address):
     # Not what the stream keeps: a server that was killed may find messages again in its files that had been
     # acknowledged; it knows that, and delivers them to nobody.
-    found = _in_nats(place, lambda jetstream, stream: jetstream.consumer_info(stream, place.group))
+    found = _in_nats(address, lambda jetstream, stream: jetstream.consumer_info(stream, address.group))
     return found.num_pending + found.num_ack_pending
 
 
-def _in_nats(place, ask):
+def _in_nats(address, ask):
     import nats
 
     async def asked():
-        client = await nats.connect(f"nats://{place.host}:{place.port}", user=place.user, password=place.password)
+        client = await nats.connect(
+            f"nats://{address.host}:{address.port}", user=address.user, password=address.password
+        )
         try:
             jetstream = client.jetstream()
-            return await ask(jetstream, await jetstream.find_stream_name_by_subject(place.name))
+            return await ask(jetstream, await jetstream.find_stream_name_by_subject(address.name))
         finally:
             await client.close()
 

@@ -6,8 +6,10 @@ import pytest
 
 from epypes.service import Service
 from epypes.service.http import HttpServer
+from epypes.service.replica_messages import Goodbye
 from tests.browser.contrast import schemes, unreadable
 from tests.browser.jupyter import open_page
+from tests.service.replicated import lost_replica, publish_to_replicas
 from tests.service.served import acting_bundle, until
 from tests.service.test_brokered import line_of
 
@@ -16,7 +18,7 @@ pytestmark = pytest.mark.browser
 
 @pytest.fixture(scope="module")
 def replicas(tmp_path_factory):
-    """Two replicas with their control, and who sends them events."""
+    """Two replicas with their control, and what sends them events."""
     folder = tmp_path_factory.mktemp("replicas")
     bundle = acting_bundle(folder / "acting")
     with pytest.MonkeyPatch.context() as own:
@@ -68,19 +70,16 @@ def test_the_page_shows_the_replicas_when_there_is_more_than_one(browser, replic
         page.context.close()
 
 
-def test_the_page_shows_who_has_gone_without_a_word(browser, replicas, monkeypatch):
-    _, first, second = replicas
+def test_the_page_shows_a_lost_replica(browser, replicas):
+    line, first, _ = replicas
     page = open_page(browser, viewport={"width": 1400, "height": 1000})
     try:
         page.goto(first.http)
-        with second:
-            page.wait_for_selector("#replicas tbody tr:nth-child(2) .badge.good:has-text('READY')")
-            assert first.group()["lost"] == []
-            # As if it were killed.
-            monkeypatch.setattr(second._replicas._group._talk, "say", lambda data: None)
+        report = lost_replica("2")
+        publish_to_replicas(line.sub, report, Goodbye(report.member.id))
         page.wait_for_selector("#replicas tbody tr:nth-child(2) .badge.error:has-text('LOST')")
-        assert "ago, and has not said that it ends; its counts are of then" in rows(page)[1][1]
-        assert page.locator("#replicas tbody a").count() == 0, "nobody answers there"
+        assert "it did not stop in order; its counts are of then" in rows(page)[1][1]
+        assert page.locator("#replicas tbody a").count() == 0, "it does not answer"
         for scheme in schemes(page):
             assert unreadable(page, "#replicas-section") == [], scheme
     finally:

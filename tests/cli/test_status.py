@@ -1,4 +1,4 @@
-"""Does ``epypes status`` tell of replicas in a line each, and only of what is known?"""
+"""``epypes status`` shows each replica in a line."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ import re
 from contextlib import ExitStack, contextmanager
 
 import pytest
-from epypes.transport.channels import memory
 
 from epypes.service import Service
 from epypes.service.http import HttpServer
+from epypes.service.replica_messages import Goodbye
 from epypes.service.state_file import StateLock
+from epypes.transport import memory
+from tests.service.replicated import lost_replica, publish_to_replicas
 from tests.service.served import acting_bundle, until
 
 pytestmark = pytest.mark.slow
@@ -94,16 +96,15 @@ def test_where_failures_go_besides_is_said_where_somebody_asked_for_it(epypes, a
         assert ("failures at" in told) is bool(failures)
 
 
-def test_each_that_is_lost_is_one_line_with_its_reason(epypes, acting, monkeypatch):
-    with replicas("lost", a=(acting, {}), b=(acting, {}), c=(acting, {})) as (first, *others):
-        for other in others:
-            # It runs here, and the others hear nothing of it.
-            monkeypatch.setattr(other._replicas._group._talk, "say", lambda data: None)
-        until(lambda: len(first.group()["lost"]) == 2)
-        told = epypes("status", acting).stdout
-    assert "Group: replicas 1, ready 1, lost 2, all with the same bundle and parameters" in told
-    assert [re.sub(r"[\d.]+ s ago", "x s ago", line).partition(", 0 answered")[0] for line in members(told)] == [
+def test_each_lost_replica_is_one_line_with_its_reason(epypes, acting):
+    with replicas("lost", a=(acting, {})) as (first,):
+        reports = [lost_replica(name) for name in ("b", "c")]
+        publish_to_replicas(first.options.sub, *reports, Goodbye(reports[0].member.id))
+        until(lambda: len(first.group()["lost"]) == 2 and first.group()["replicas"] == 1)
+        shown = epypes("status", acting).stdout
+    assert "Group: replicas 1, ready 1, lost 2, all with the same bundle and parameters" in shown
+    assert [re.sub(r"[\d.]+ s,", "x s,", line).partition(", 0 answered")[0] for line in members(shown)] == [
         "- a: READY",
-        "- b: LOST (it was heard last x s ago, and has not said that it ends; its counts are of then)",
-        "- c: LOST (it was heard last x s ago, and has not said that it ends; its counts are of then)",
+        "- b: LOST (no heartbeat for x s, and it did not stop in order; its counts are of then)",
+        "- c: LOST (no heartbeat for x s, and it did not stop in order; its counts are of then)",
     ]

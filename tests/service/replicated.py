@@ -1,4 +1,4 @@
-"""How do tests serve several replicas of a bundle on a broker?"""
+"""Replicas of a bundle on a broker, as tests serve them, and peers that publish beside them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import signal
 from contextlib import contextmanager
 
 import epypes as ep
+from epypes.service.replica_messages import Heartbeat, Member, encode_message
+from epypes.transport.address import parse_address
 from tests.brokers.fleet import fleet
 
 TOKEN = "t" * 40
@@ -19,7 +21,7 @@ import numpy as np
 
 
 def kill_front():
-    """Kill the replica that this is computed for; nobody else, wherever else it is computed."""
+    """Kill the replica that this is computed for; do nothing where it is computed for another process."""
     parent = os.getppid()
     with open(f"/proc/{parent}/cmdline", "rb") as file:
         is_replica = b"--replica" in file.read()
@@ -29,7 +31,7 @@ def kill_front():
 
 
 def work(number, kind, gain):
-    """Multiply; do worse where a test asks for it."""
+    """Multiply; raise or kill a process if the event asks for it."""
     if kind == 1:
         os.kill(os.getpid(), 9)
     if kind == 2:
@@ -61,8 +63,8 @@ def replicas(bundle, sub, pub, *options, names=("1", "2", "3"), before=()):
     token = bundle.parent / "token"
     token.write_text(TOKEN)
     token.chmod(0o600)
-    told = ["--sub", sub, "--pub", pub, "--http", "http://127.0.0.1:0", "--token-file", token, *options]
-    command = ["-m", "epypes.cli", "serve", bundle, *told]
+    given = ["--sub", sub, "--pub", pub, "--http", "http://127.0.0.1:0", "--token-file", token, *options]
+    command = ["-m", "epypes.cli", "serve", bundle, *given]
     with fleet([[*map(str, command), "--replica", name] for name in names], before) as members:
         yield members
 
@@ -73,8 +75,21 @@ def control(member):
 
 
 def stopped(member):
-    """End a replica in order; return what it has counted."""
-    said = member.end(signal.SIGTERM)
+    """End a replica in order; return its counts."""
+    line = member.end(signal.SIGTERM)
     assert member.process.returncode == 0, "".join(member.errors)
-    assert said.startswith("STOPPED"), member.lines
-    return {name: int(count) for name, count in re.findall(r"(\w+) (\d+)", said)}
+    assert line.startswith("STOPPED"), member.lines
+    return {name: int(count) for name, count in re.findall(r"(\w+) (\d+)", line)}
+
+
+def publish_to_replicas(sub, *messages):
+    """Publish messages, or any bytes, to the replicas that take events from an address, as a peer process does."""
+    with ep.Publisher(parse_address(sub).beside("group", "broadcast", create=True)) as publisher:
+        for message in messages:
+            publisher.send((message if isinstance(message, bytes) else encode_message(message),))
+
+
+def lost_replica(name, host="elsewhere", silent_ms=5_000):
+    """Return the heartbeat of a replica that reports another one as lost."""
+    lost = Member(f"id of {name}", replica=name, host=host, counts={"answered": 0})
+    return Heartbeat(Member("id of the reporter", replica="reporter", host=host), lost=[(lost, silent_ms)])

@@ -1,166 +1,516 @@
-"""Do replicas of a bundle answer every event once, on a real broker, whoever is killed?"""
+"""Replicas of a bundle that share the events of a broker: services in this process."""
 
 from __future__ import annotations
 
+import itertools
+import json
+import signal
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from time import monotonic
+
+import httpx
 import pytest
+from httpx_sse import EventSource
 
-import epypes as ep
-from tests.brokers.traffic import KILLS, KILLS_PARENT, PLAIN, RAISES, Reader, dead_letters, event, lasting, left, until
-from tests.service.replicated import control, promoted, replicas, stopped
+from epypes.errors import ParametersRefused, RevisionConflict, ServiceError
+from epypes.service import Service
+from epypes.service.http import HttpServer
+from epypes.service.replica_messages import (
+    Answered,
+    Goodbye,
+    Heartbeat,
+    Member,
+    ParameterQuery,
+    ParameterSet,
+    encode_message,
+)
+from epypes.transport import memory
+from epypes.transport.address import parse_address
+from epypes.wire import encode
+from tests.brokers import nats as nats_server
+from tests.service.replicated import lost_replica, publish_to_replicas
+from tests.service.served import TIMEOUT_S, acting_bundle, event, until
+from tests.service.test_brokered import line_of, replica_of, send_raw
+from tests.transport.channels import Receiver
 
-pytestmark = pytest.mark.slow
-
-COUNT = 1_000
-
-
-@pytest.fixture(scope="module")
-def bundle(tmp_path_factory):
-    return promoted(tmp_path_factory.mktemp("replicated"))
+_numbers = itertools.count(1)
 
 
 @pytest.fixture
-def brokered(request):
-    """A broker that has work queues."""
-    return request.getfixturevalue(request.param)
+def host():
+    """The name of a broker of its own."""
+    return f"replicas{next(_numbers)}"
 
 
-def on(name):
-    """Run a test on one of these brokers, and in `make soak` on the other."""
-    other = "nats" if name == "rabbitmq" else "rabbitmq"
-    return pytest.mark.parametrize("brokered", [name, pytest.param(other, marks=pytest.mark.soak)], indirect=True)
+@contextmanager
+def group_of(bundle, line, count=2, **options):
+    """Serve a bundle so many times; yield when all know each other."""
+    with ExitStack() as stack:
+        replicas = [
+            stack.enter_context(replica_of(bundle, line, replica=str(number), **options))
+            for number in range(1, count + 1)
+        ]
+        for replica in replicas:
+            until(lambda replica=replica: replica.group()["replicas"] == count)
+        yield replicas
 
 
-def kind_of(number):
-    """One in a hundred raises, and one of all kills its worker."""
-    if number == COUNT // 3:
-        return KILLS
-    return RAISES if number % 100 == 50 else PLAIN
+@pytest.fixture(scope="module")
+def trio(acting, tmp_path_factory):
+    """Three replicas, and what sends them events."""
+    with pytest.MonkeyPatch.context() as own:
+        own.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        with line_of("trio") as line, group_of(acting, line, 3) as replicas:
+            yield line, replicas
 
 
-def outlived(bundle, broker, sub, pub, restarted_by):
-    """Send a thousand events; kill a replica half-way, and restart the broker. Check what became of each."""
-    outbox = ep.Mailbox("block")
-    with replicas(bundle, sub, pub) as members, Reader(pub) as reader, ep.Publisher(sub, outbox) as publisher:
-        for number in range(COUNT):
-            if number == COUNT // 2:
-                until(lambda: reader.look() > COUNT // 4, "a quarter of the answers")
-                members[0].kill()
-            if number == COUNT * 3 // 4:
-                restarted_by(broker)
-            outbox.put(event(number, kind_of(number)))
-        assert publisher.sent == COUNT
-        until(lambda: reader.look() >= COUNT, lambda: f"{reader.look()} answers of {COUNT}")
-        letters = dead_letters(sub, 1)
-        # What the killed one had answered, and not acknowledged, comes again.
-        until(lambda: left(sub) == 0, lambda: f"{left(sub)} events to be acknowledged")
-        counts = [stopped(member) for member in members[1:]]
-        check_answers(reader, letters)
-    assert (left(sub), left(pub)) == (0, 0)
-    check_counts(counts)
+@pytest.fixture(scope="module")
+def http(trio, tmp_path_factory):
+    """The control of the first of them."""
+    _, (first, *_) = trio
+    with HttpServer(first, "127.0.0.1:*", token_file=tmp_path_factory.mktemp("token") / "token") as server:
+        headers = {"Authorization": f"Bearer {server.token_file.read_text().strip()}"}
+        with httpx.Client(base_url=server.url, trust_env=False, timeout=60, headers=headers) as client:
+            yield client
 
 
-def killed(broker):
-    broker.stop(at_once=True)
-    broker.start()
+def revisions(replicas):
+    return [replica.parameters().revision for replica in replicas]
 
 
-def ended_in_order(broker):
-    broker.stop()
-    broker.start()
+def values(replicas):
+    return [replica.parameters().entries["k"]["value"] for replica in replicas]
 
 
-@on("rabbitmq")
-def test_a_thousand_events_outlive_a_killed_replica_and_a_killed_broker(bundle, brokered):
-    sub = lasting(brokered, "chaos.events", attempts=5)
-    outlived(bundle, brokered, sub, lasting(brokered, "chaos.answers"), killed)
+def member_of(service, replica):
+    """Return what a service shows of another replica; None if that is no member."""
+    found = [each for each in service.group()["members"] if each["replica"] == replica]
+    return found[0] if found else None
 
 
-@pytest.mark.soak
-def test_a_thousand_events_outlive_a_killed_replica_over_mqtt_and_a_broker_that_ends_in_order(bundle, mosquitto):
-    sub = mosquitto.address("chaos/events", create=True)
-    outlived(bundle, mosquitto, sub, mosquitto.address("chaos/answers", create=True), ended_in_order)
+# -- who is there -----------------------------------------------------------------------------------------------------
 
 
-def check_answers(reader, letters):
-    """Every event was answered once: with its product, or with what failed."""
-    assert set(reader.ids().values()) == {1}
-    assert reader.ids().keys() == {f"event-{number}" for number in range(COUNT)}
-    failed = {answer.correlation_id: answer.failure for answer in reader.answers if answer.failure is not None}
-    assert failed.keys() == {f"event-{number}" for number in range(COUNT) if kind_of(number) != PLAIN}
-    assert letters.keys() == {f"event-{COUNT // 3}"}
-    for answer in reader.answers:
-        number = int(answer.correlation_id.removeprefix("event-"))
-        if kind_of(number) == PLAIN:
-            assert answer.parts["result"].tolist() == [number, 2, 2 * number]
-        elif kind_of(number) == RAISES:
-            assert f"event {number} is spoilt" in answer.failure.message
-    (letter,) = letters.values()
-    assert letter.headers["epypes-reason"]
+def test_replicas_share_the_events_and_know_each_other(trio):
+    line, replicas = trio
+    sent = [line.send(number=number) for number in range(60)]
+    answers = line.take(60)
+    assert sorted(answer.correlation_id for answer in answers) == sorted(sent)
+    for replica in replicas:
+        until(lambda replica=replica: replica.group()["counts"]["answered"] == 60)
+        group = replica.group()
+        assert [each["replica"] for each in group["members"]] == ["1", "2", "3"]
+        assert [each["is_self"] for each in group["members"]] == [each is replica for each in replicas]
+        assert all(each["heard_s"] < 3.5 and each["counts"]["answered"] for each in group["members"])
+        assert (group["ready"], group["agree"], group["trouble"], group["lost"]) == (3, True, "", [])
 
 
-def check_counts(counts):
-    """Who survived has shared the load, and has answered what it says."""
-    for counted in counts:
-        assert counted["answered"] > COUNT // 50, counts
-        parts = "answered", "failed", "dead_letters", "given_back"
-        assert counted["received"] == sum(counted[name] for name in parts), counted
-        # Once in each replica at most: it comes to the other one if the broker dies before it knows.
-        assert counted["dead_letters"] <= 1
-    assert sum(counted["answered"] + counted["failed"] for counted in counts) >= COUNT // 2
+def test_every_replica_describes_all_over_http(trio, http):
+    _, (first, *_) = trio
+    group = http.get("/v1/group").json()
+    assert group["replicas"] == 3
+    assert [each["pid"] for each in group["members"]] == [first.info()["pid"]] * 3
+    assert group["lost"] == []
+    assert group["members"][0].keys() >= {"host", "state", "reason", "revision", "digest", "counts", "http", "heard_s"}
+    metrics = http.get("/metrics").text
+    assert "epypes_group_replicas 3.0" in metrics
+    assert "epypes_group_ready 3.0" in metrics
+    assert "epypes_group_lost 0.0" in metrics
 
 
-@on("nats")
-def test_an_event_that_takes_down_each_replica_is_a_dead_letter_that_can_be_opened(bundle, brokered):
-    sub = brokered.address("deadly.events", create=True, attempts=2)
-    pub = brokered.address("deadly.answers", create=True)
-    outbox = ep.Mailbox("block")
-    with replicas(bundle, sub, pub) as members, Reader(pub) as reader, ep.Publisher(sub, outbox):
-        outbox.put(event(0, KILLS_PARENT))
-        until(reader.look, "an answer of the one that is left")
-        (answer,) = reader.answers
-        letters = dead_letters(sub, 1)
-        (alive,) = (member for member in members if member.is_running)
-        counted = stopped(alive)
-    assert answer.correlation_id == "event-0"
-    assert "2 times" in answer.failure.message
-    assert "2 times" in letters["event-0"].headers["epypes-reason"]
-    assert (counted["dead_letters"], counted["answered"]) == (1, 0)
-    with pytest.warns(UserWarning, match="none was run"):
-        opened = ep.load_failure("event-0", bundle)
-    assert (opened["number"], opened["kind"]) == (0, KILLS_PARENT)
+@pytest.mark.slow
+def test_listeners_are_sent_the_group_each_second(http):
+    with http.stream("GET", "/v1/events", params={"for_s": 1.5}) as answer:
+        groups = [json.loads(each.data) for each in EventSource(answer).iter_sse() if each.event == "group"]
+    assert len(groups) >= 2
+    assert groups[0]["replicas"] == 3
 
 
-@on("rabbitmq")
-def test_a_change_of_hyperparameters_reaches_all_replicas_with_one_revision(bundle, brokered):
-    sub = brokered.address("tuned.events", create=True)
-    pub = brokered.address("tuned.answers", create=True)
-    outbox = ep.Mailbox("block")
-    with replicas(bundle, sub, pub) as members, Reader(pub) as reader, ep.Publisher(sub, outbox):
-        controls = [control(member) for member in members]
-        gains = {controls[0].parameters().revision: 2}
+def test_a_service_on_a_socket_is_a_group_of_its_own(acting):
+    group = Service(acting).group()
+    assert (group["is_shared"], group["replicas"], group["agree"], group["trouble"]) == (False, 1, True, "")
+    assert group["members"][0]["state"] == "STOPPED"
 
-        def is_answered() -> bool:
-            """Whether there is an answer of the last revision; others still wait to be answered."""
-            return reader.look() > 0 and max(gains) in {answer.revision for answer in reader.answers}
 
-        for number in range(300):
-            if number in (60, 120, 180):
-                until(is_answered, lambda: f"{reader.look()} answers")
-                gain = number // 10
-                gains[controls[number // 60 - 1].set(gain=gain).revision] = gain
-            outbox.put(event(number))
-        until(lambda: reader.look() >= 300, lambda: f"{reader.look()} answers of 300")
-        last = max(gains)
-        until(lambda: {found.parameters().revision for found in controls} == {last}, "all to have the last revision")
-        assert {found.parameters().entries["gain"]["value"] for found in controls} == {gains[last]}
-        begun = reader.look()
-        for number in range(300, 360):
-            outbox.put(event(number))
-        until(lambda: reader.look() >= 360, lambda: f"{reader.look()} answers of 360")
-        assert {answer.revision for answer in reader.answers[begun:]} == {last}
-        for found in controls:
-            found.close()
-    assert len(gains) == 4
-    for answer in reader.answers:
-        assert int(answer.parts["result"][1]) == gains[answer.revision]
-    assert {answer.revision for answer in reader.answers} == set(gains)
+def test_messages_of_other_programs_are_rejected_and_counted(trio):
+    line, (first, *_) = trio
+    before, known = first.group()["rejected"], first.parameters()
+    digest, member = first.info()["digest"], json.loads(encode_message(Heartbeat(Member("x"))))
+    hostile = [
+        b"",
+        b"\xff\x00",
+        b"[]",
+        b"null",
+        b"[" * 100_000,
+        b'{"v":1,"kind":"goodbye","id":"x"}',
+        b'{"v":2,"kind":"farewell","id":"x"}',
+        b'{"v":2,"kind":"goodbye","id":7}',
+        encode_message(ParameterSet(digest, 10**30, "x", {})),
+        encode_message(ParameterSet(digest, -1, "x", {})),
+        encode_message(ParameterSet(digest, 900, "x", {"k": {"value": float("nan")}})),
+        encode_message(ParameterSet(digest, 900, "x", {"k": 5})),
+        encode_message(ParameterSet(digest, 900, "x", {f"k{number}": {} for number in range(1_001)})),
+        encode_message(Answered("x", ["id"] * 1_001)),
+        encode_message(Answered("x", ["i" * 5_000])),
+        encode_message(Goodbye("x" * 1_100_000)),
+        json.dumps({**member, "member": {**member["member"], "pid": "7"}}).encode(),
+        json.dumps({**member, "member": {**member["member"], "counts": {"answered": -1}}}).encode(),
+        json.dumps({**member, "lost": [["x", 1]]}).encode(),
+    ]
+    publish_to_replicas(line.sub, *hostile, ParameterQuery("of no replica", digest), Goodbye("of no replica"))
+    until(lambda: first.group()["rejected"] == before + len(hostile))
+    assert (first.group()["trouble"], first.parameters()) == ("", known)
+    assert first.group()["replicas"] == 3
+
+
+def test_control_characters_of_a_peer_are_not_shown(trio):
+    line, (first, *_) = trio
+    publish_to_replicas(line.sub, Heartbeat(Member("peer", replica="evil\x1b[2J\n", state="READY")))
+    until(lambda: first.group()["replicas"] == 4)
+    assert [each["replica"] for each in first.group()["members"]][-1] == "evil [2J "
+    publish_to_replicas(line.sub, Goodbye("peer"))
+    until(lambda: first.group()["replicas"] == 3)
+
+
+def test_another_bundle_on_the_same_queue_is_warned_of_once(trio, caplog):
+    caplog.set_level("INFO", "epypes.service")
+    line, (first, *_) = trio
+    peer = Heartbeat(Member("stranger", replica="stranger", host="elsewhere", name="another bundle"))
+    publish_to_replicas(line.sub, peer, peer, Goodbye("stranger"))
+    until(lambda: caplog.text.count("stranger at elsewhere has left") == 3)
+    warned = [record for record in caplog.records if "serves another bundle from the same queue" in record.message]
+    assert len(warned) == 3, "once by each replica"
+    assert first.group()["replicas"] == 3
+
+
+@pytest.mark.slow
+def test_a_replica_that_stops_has_left_at_once(acting, host):
+    with line_of(host) as line, group_of(acting, line) as (first, second):
+        second.stop()
+        until(lambda: first.group()["replicas"] == 1)
+        assert first.group()["lost"] == []
+        second.start()
+        until(lambda: first.group()["replicas"] == second.group()["replicas"] == 2)
+        line.send(number=3)
+        assert line.take()[0].parts["out"] == 6
+
+
+@pytest.mark.slow
+def test_a_silent_replica_is_lost_until_another_of_its_name_is_there(acting, host, caplog):
+    with line_of(host) as line, replica_of(acting, line, replica="1") as first:
+        publish_to_replicas(line.sub, Heartbeat(Member("gone", replica="2", host="elsewhere", counts={"answered": 7})))
+        until(lambda: first.group()["replicas"] == 2)
+        until(lambda: first.group()["lost"])
+        assert first.group()["replicas"] == 1
+        (lost,) = first.group()["lost"]
+        assert (lost["replica"], lost["state"], lost["counts"], lost["is_self"]) == (
+            "2",
+            "LOST",
+            {"answered": 7},
+            False,
+        )
+        assert "it did not stop in order" in lost["reason"]
+        assert "replica 2 at elsewhere is gone" in caplog.text
+        with replica_of(acting, line, replica="3") as newcomer:
+            until(lambda: [each["replica"] for each in newcomer.group()["lost"]] == ["2"])
+            publish_to_replicas(line.sub, Heartbeat(Member("in its place", replica="2", host="elsewhere")))
+            until(lambda: not first.group()["lost"] and not newcomer.group()["lost"])
+
+
+def test_reports_of_lost_replicas_are_bounded(trio):
+    line, (first, *_) = trio
+    reports = [lost_replica(f"made up {number}", silent_ms=599_000) for number in range(200)]
+    publish_to_replicas(line.sub, *reports, Goodbye(reports[0].member.id))
+    until(lambda: first.group()["lost"] and first.group()["replicas"] == 3)
+    assert len(first.group()["lost"]) <= 50
+    until(lambda: not first.group()["lost"])
+
+
+# -- hyperparameters --------------------------------------------------------------------------------------------------
+
+
+def test_a_change_at_one_replica_reaches_all_with_one_revision(trio):
+    line, replicas = trio
+    before = replicas[0].parameters().revision
+    now = replicas[1].set_parameters({"k": 5}, before)
+    assert (now.revision, now.entries["k"]["value"]) == (before + 1, 5)
+    assert replicas[1].parameters() == now, "it is made here when it is answered"
+    until(lambda: revisions(replicas) == [now.revision] * 3)
+    assert values(replicas) == [5, 5, 5]
+    for number in range(30):
+        line.send(number=number)
+    answers = line.take(30)
+    assert {answer.revision for answer in answers} == {now.revision}
+    assert sorted(int(answer.parts["out"]) for answer in answers) == [5 * number for number in range(30)]
+    until(lambda: all(replica.group()["agree"] for replica in replicas))
+
+
+def test_a_change_that_is_refused_reaches_no_replica(trio):
+    _, replicas = trio
+    before = [replica.parameters() for replica in replicas]
+    for wrong in ({"k": "five"}, {"gain": 5}):
+        with pytest.raises(ParametersRefused):
+            replicas[0].set_parameters(wrong)
+    now = replicas[0].set_parameters({"k": 6})
+    assert now.revision == before[0].revision + 1, "none was made between"
+    until(lambda: revisions(replicas) == [now.revision] * 3)
+
+
+def test_a_change_from_an_older_revision_is_a_conflict_at_every_replica(trio, http):
+    _, (first, second, third) = trio
+    before = http.get("/v1/parameters").json()["revision"]
+    assert third.set_parameters({"k": 7}, before).revision == before + 1
+    until(lambda: first.parameters().revision == second.parameters().revision == before + 1)
+    refused = http.patch("/v1/parameters", json={"revision": before, "values": {"k": 8}})
+    assert refused.status_code == 409
+    assert refused.json()["parameters"]["k"]["value"] == 7
+    with pytest.raises(RevisionConflict):
+        second.set_parameters({"k": 9}, before)
+    assert http.patch("/v1/parameters", json={"values": {"k": 8}}).json()["revision"] == before + 2
+    until(lambda: values(trio[1]) == [8, 8, 8])
+
+
+def test_replicas_settle_on_one_of_the_changes_that_are_made_at_the_same_time(trio):
+    _, replicas = trio
+    with ThreadPoolExecutor(3) as pool:
+        for k in range(20, 50, 10):
+            before = revisions(replicas)[0]
+            together = threading.Barrier(3)
+
+            def change(number, k=k, together=together):
+                together.wait(TIMEOUT_S)
+                return replicas[number].set_parameters({"k": k + number}).revision
+
+            made = [*pool.map(change, range(3))]
+            until(lambda: len(set(revisions(replicas))) == len(set(values(replicas))) == 1)
+            assert before < max(made) == revisions(replicas)[0]
+            assert values(replicas)[0] in (k, k + 1, k + 2)
+            until(lambda: all(replica.group()["agree"] for replica in replicas))
+
+
+@pytest.mark.slow
+def test_a_newcomer_has_the_revision_of_the_group_from_its_first_event_on(acting, host):
+    with line_of(host) as line, replica_of(acting, line, replica="1") as first:
+        for number in range(5):
+            first.set_parameters({"k": 10 + number})
+        first.pause()
+        line.send(number=1)
+        with replica_of(acting, line, replica="2") as second:
+            line.send(number=1)
+            line.send(number=1)
+            answers = line.take(3)
+            assert {(answer.revision, int(answer.parts["out"])) for answer in answers} == {(5, 14)}
+            assert second.parameters() == first.parameters()
+            first.resume()
+
+
+@pytest.mark.slow
+def test_a_newcomer_does_not_join_on_the_parameters_of_another_newcomer(acting, host):
+    digest = Service(acting).info()["digest"]
+    with line_of(host) as line, Service(acting, line.sub, line.pub, replica="1") as service:
+        line.send(number=1)
+        # The first knows nothing yet; the other one is late.
+        publish_to_replicas(
+            line.sub,
+            Heartbeat(Member("newcomer", replica="2", host="elsewhere", digest=digest), is_joining=True),
+            Heartbeat(Member("late", replica="3", host="elsewhere", digest=digest, revision=4, author="late")),
+            ParameterSet(digest, 4, "late", {"k": {"value": 9}}),
+        )
+        (answer,) = line.take()
+        assert (answer.revision, int(answer.parts["out"])) == (4, 9)
+        assert service.parameters().revision == 4
+
+
+@pytest.mark.slow
+def test_events_do_not_wait_for_ever_for_parameters_that_no_replica_publishes(acting, host):
+    digest = Service(acting).info()["digest"]
+    with line_of(host) as line, Service(acting, line.sub, line.pub) as service:
+        boast = Member("boaster", replica="2", host="elsewhere", digest=digest, revision=1_000, author="boaster")
+        publish_to_replicas(line.sub, Heartbeat(boast))
+        line.send(number=1)
+        assert line.take()[0].revision == 0
+        assert service.state == "READY"
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_started_again_has_the_revision_of_the_group(acting, host):
+    with line_of(host) as line, group_of(acting, line) as (first, second):
+        first.set_parameters({"k": 7})
+        until(lambda: second.parameters().revision == 1)
+        first.stop()
+        line.send("exit", 1)
+        (answer,) = line.take()
+        assert answer.failure is not None
+        line.send(number=2)
+        (answer,) = line.take()
+        assert (answer.revision, answer.parts["out"]) == (1, 14)
+
+
+@pytest.mark.slow
+def test_a_replica_that_works_on_a_long_event_stays_a_member_while_the_others_change_parameters(acting, host, tmp_path):
+    with line_of(host) as line, group_of(acting, line) as (first, second):
+        line.send(f"hold:{tmp_path}", 1)
+        until((tmp_path / "started").exists)
+        busy, idle = (first, second) if first.counts()["in_flight"] else (second, first)
+        now = idle.set_parameters({"k": 7})
+        known_as, before_s, heartbeats = busy.options.replica, 0.0, 0
+
+        def has_beaten():
+            """Whether enough heartbeats came since the change; each begins the time of silence anew."""
+            nonlocal before_s, heartbeats
+            heard_s = member_of(idle, known_as)["heard_s"]
+            heartbeats, before_s = heartbeats + (heard_s < before_s), heard_s
+            return heartbeats >= 4
+
+        until(has_beaten)
+        assert busy.parameters().revision < now.revision, "a change is made between two events"
+        (tmp_path / "release").touch()
+        assert line.take()[0].revision < now.revision
+        until(lambda: busy.parameters() == now)
+        until(lambda: idle.group()["agree"])
+
+
+@pytest.mark.slow
+def test_another_bundle_begins_with_a_revision_that_its_replicas_share(acting, host, tmp_path):
+    other = acting_bundle(tmp_path / "other", k=4, expected=12)
+    with line_of(host) as line, group_of(acting, line) as replicas:
+        replicas[0].set_parameters({"k": 3})
+        until(lambda: revisions(replicas) == [1, 1])
+        assert replicas[0].deploy(other)["revision"] == 2
+        assert replicas[0].group()["agree"] is False
+        assert replicas[0].set_parameters({"k": 6}).revision == 3
+        digest = replicas[0].info()["digest"]
+        until(lambda: member_of(replicas[1], "1")["digest"] == digest and member_of(replicas[1], "1")["revision"] == 3)
+        assert replicas[1].parameters().revision == 1, "of another bundle"
+        assert replicas[1].deploy(other)["revision"] == 3
+        assert values(replicas) == [6, 6]
+        for number in range(8):
+            line.send(number=number)
+        answers = line.take(8)
+        assert {answer.revision for answer in answers} == {3}
+        assert sorted(int(answer.parts["out"]) for answer in answers) == [6 * number for number in range(8)]
+        until(lambda: replicas[0].group()["agree"] is True)
+        replicas[1].rollback()
+        assert values(replicas) == [6, 3], "as its group had left it"
+
+
+@pytest.mark.slow
+def test_parameters_that_the_worker_refuses_are_not_computed_with(acting, host, tmp_path):
+    other = acting_bundle(tmp_path / "other", k=4, expected=12)
+    with line_of(host) as line, group_of(acting, line, 1) as (replica,):
+        digest, another = replica.info()["digest"], Service(other).info()["digest"]
+        publish_to_replicas(
+            line.sub, *(ParameterSet(each, 4, "peer", {"k": {"value": "no number"}}) for each in (digest, another))
+        )
+        until(lambda: "revision 4" in replica.group()["trouble"])
+        assert "revision 4" in member_of(replica, "1")["trouble"]
+        line.send(number=2)
+        assert line.take()[0].revision == 0
+        assert replica.deploy(other)["state"] == "READY", "with its own values"
+        assert replica.group()["trouble"] == ""
+        line.send(number=2)
+        assert int(line.take()[0].parts["out"]) == 8
+        assert replica.set_parameters({"k": 5}).revision > 5
+        replica.rollback()
+        assert replica.state == "READY"
+        assert replica.set_parameters({"k": 6}).entries["k"]["value"] == 6
+        assert replica.group()["trouble"] == ""
+
+
+# -- events that were answered ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_an_event_that_another_replica_has_answered_is_not_worked_on_again(acting, host):
+    with line_of(host) as line, group_of(acting, line) as (first, second):
+        sent = line.send(number=1)
+        line.take()
+        until(lambda: first.counts()["answered"] + second.counts()["answered"] == 1)
+        done_by, other = (first, second) if first.counts()["answered"] else (second, first)
+        # Its last message comes after the ids of what it has answered.
+        done_by.stop()
+        until(lambda: other.group()["replicas"] == 1)
+        # As a broker does that has not heard the acknowledgement.
+        send_raw(line.sub, tuple(encode(event(number=1))), sent)
+        until(lambda: other.counts()["duplicates"] == 1)
+        assert line.left() == 0
+        assert other.counts()["received"] == 0
+
+
+# -- the broker -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_nothing_is_changed_while_the_broker_is_away_and_replicas_agree_again_afterwards(acting, host):
+    with line_of(host) as line, group_of(acting, line) as replicas:
+        replicas[0].set_parameters({"k": 3})
+        until(lambda: revisions(replicas) == [1, 1])
+        with memory.away(host):
+            until(lambda: all(replica.group()["trouble"] for replica in replicas))
+            with pytest.raises(ServiceError, match="The other replicas can't be reached, so nothing is changed"):
+                replicas[0].set_parameters({"k": 4})
+            assert replicas[0].parameters().revision == 1
+        until(lambda: all(replica.group()["replicas"] == 2 for replica in replicas))
+        until(lambda: not any(replica.group()["trouble"] for replica in replicas))
+        assert replicas[1].set_parameters({"k": 6}).revision == 2
+        until(lambda: values(replicas) == [6, 6])
+        assert not any(replica.group()["lost"] for replica in replicas)
+
+
+@pytest.mark.slow
+def test_a_change_that_a_replica_has_missed_is_made_when_it_hears_of_it(acting, host):
+    with line_of(host) as line, replica_of(acting, line, replica="1") as service:
+        digest = service.info()["digest"]
+        address = parse_address(line.sub).beside("group", "broadcast")
+        heard = []
+        receiver = Receiver(address)
+        try:
+            # A member computes with a revision of which this one has heard nothing.
+            member = Member("peer", replica="2", host="elsewhere", digest=digest, revision=3, author="peer")
+            publish_to_replicas(line.sub, Heartbeat(member))
+            while not heard or heard[-1]["kind"] != "query":
+                heard.append(json.loads(b"".join(receiver.next().frames)))
+            assert (heard[-1]["id"], heard[-1]["digest"]) == ("peer", digest)
+            publish_to_replicas(line.sub, ParameterSet(digest, 3, "peer", {"k": {"value": 8}}))
+            until(lambda: revisions([service]) == [3])
+            assert values([service]) == [8]
+        finally:
+            receiver.channel.close()
+
+
+def test_replicas_agree_on_every_broker_and_a_newcomer_knows_it(acting, broker):
+    """Also where a broadcast is an exchange, a subject or a topic."""
+    name = f"agree{next(_numbers)}"
+    sub, pub = (broker.address(f"{name}.{what}", create=True) for what in ("events", "answers"))
+    with ExitStack() as stack:
+        replicas = [stack.enter_context(Service(acting, sub, pub, replica=str(number))) for number in (1, 2)]
+        until(lambda: all(replica.group()["replicas"] == 2 for replica in replicas))
+        for k in range(3, 6):
+            assert replicas[k % 2].set_parameters({"k": k}).revision == k - 2
+            until(lambda k=k: values(replicas) == [k, k])
+        with Service(acting, sub, pub, replica="late") as late:
+            until(lambda: late.parameters() == replicas[0].parameters())
+            assert late.set_parameters({"k": 8}, 3).revision == 4
+            until(lambda: values(replicas) == [8, 8])
+        until(lambda: all(replica.group()["replicas"] == 2 for replica in replicas))
+
+
+@pytest.mark.skipif(not nats_server.is_installed(), reason="no NATS server is installed")
+@pytest.mark.slow
+def test_a_service_stops_in_time_though_its_broker_does_not_answer(acting):
+    with nats_server.server() as broker:
+        service = Service(acting, broker.address("events", create="true"), broker.address("answers", create="true"))
+        service.start()
+        until(lambda: not service.group()["trouble"] and service.state == "READY")
+        broker.process.send_signal(signal.SIGSTOP)
+        try:
+            began_s = monotonic()
+            service.stop(2.0)
+            took_s = monotonic() - began_s
+        finally:
+            broker.process.send_signal(signal.SIGCONT)
+        assert service.state == "STOPPED"
+        # Bounded by 2 s and the least that each end has; not by the 10 s that one broker's answer is waited for.
+        assert took_s < 10.0

@@ -1,4 +1,4 @@
-"""Does anything get lost between two hosts whose link is cut?"""
+"""Replicas on two hosts whose link is cut."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def hosts():
 
 
 def observed_down(cable, seconds):
-    """Wait until the cable has been seen without a link for so many seconds."""
+    """Wait until the cable has had no link for so many seconds."""
     seen_up_s = monotonic()
 
     def is_long_down():
@@ -42,8 +42,8 @@ def observed_down(cable, seconds):
     until(is_long_down, "a link that stays cut")
 
 
-def said_across(host, bundle):
-    """Return what is said of the service on a host."""
+def status_across(host, bundle):
+    """Return what ``epypes status`` prints on a host."""
     command = [*host.before, sys.executable, "-m", "epypes.cli", "status", str(bundle), "--replica", "across"]
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
 
@@ -67,7 +67,7 @@ def test_a_link_that_is_cut_for_ten_seconds_loses_nothing_that_was_acknowledged(
             cable.pull()
             observed_down(cable, CUT_S)
             at_the_end = now()
-            until(lambda: "DEGRADED" in said_across(far, bundle), lambda: said_across(far, bundle))
+            until(lambda: "DEGRADED" in status_across(far, bundle), lambda: status_across(far, bundle))
             cable.plug()
             until(lambda: not outside.is_running, lambda: f"everything to be answered: {now()}")
             found, counts = now(), [stopped(replica) for replica in (beside, across)]

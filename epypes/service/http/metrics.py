@@ -32,7 +32,6 @@ _BROKER_COUNTERS: Final = {
     "duplicates": ("epypes_events_duplicate", "Events that came again while they were in flight, or done."),
     "given_back": ("epypes_events_given_back", "Events that were left to the broker, which delivers them again."),
     "reconnects": ("epypes_broker_reconnects", "Reconnections to the broker."),
-    "overtaken": ("epypes_events_overtaken", "Answers that were sent before that of an earlier event."),
 }
 _GAUGES: Final = {
     "waiting": ("epypes_events_waiting", "Events in the mailbox."),

@@ -105,7 +105,6 @@ class Member(BaseModel):
     name: str = Field(description="Of the bundle that it serves.")
     digest: str = Field(description="SHA-256 of the manifest of what it serves.")
     revision: int = Field(description="Of the parameters that it computes with.")
-    ordered: bool = Field(description="Whether it keeps the order of events; all replicas should, or none.")
     counts: dict[str, int]
     http: str = Field(description="Its HTTP control; empty if it has none.")
     trouble: str = Field(description="Why it does not follow the others; empty if it does.")

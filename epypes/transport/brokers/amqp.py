@@ -20,6 +20,7 @@ from typing import Any, Final
 
 import aio_pika
 from aio_pika.abc import AbstractChannel, AbstractIncomingMessage, AbstractQueue
+from aio_pika.connection import make_url
 from aio_pika.exceptions import (
     AMQPError,
     ChannelClosed,
@@ -96,19 +97,27 @@ class AmqpSession:
         self.lost = asyncio.get_running_loop().create_future()
         self._publishing = self._consuming = None
         self._consumers.clear()
+        url = make_url(
+            host=address.host,
+            port=address.port,
+            login=address.user or "guest",
+            password=address.password or "guest",
+            virtualhost=address.vhost,
+            ssl=address.is_encrypted,
+            heartbeat=_HEARTBEAT_S,
+        )
+        self._connection = connection = aio_pika.Connection(
+            url,
+            ssl_context=certificates_of(address) if address.is_encrypted else None,
+            client_properties={"product": "EPypes", "connection_name": f"epypes {address.name}"},
+        )
         try:
-            self._connection = await aio_pika.connect(
-                host=address.host,
-                port=address.port,
-                login=address.user or "guest",
-                password=address.password or "guest",
-                virtualhost=address.vhost,
-                ssl=address.is_encrypted,
-                ssl_context=certificates_of(address) if address.is_encrypted else None,
-                client_properties={"product": "EPypes", "connection_name": f"epypes {address.name}"},
-                heartbeat=_HEARTBEAT_S,
-            )
-        except Exception as error:
+            await connection.connect()
+        except BaseException as error:
+            # Otherwise its destructor would close it, on any thread: aio-pika 10.2 needs a running event loop there.
+            await connection.close()
+            if not isinstance(error, Exception):
+                raise
             raise self._unreachable(error) from error
         self._connection.close_callbacks.add(lambda _, error: self._lose(_reason(error)))
         await self._make_sure(address)

@@ -48,6 +48,8 @@ REDELIVERY_S: Final = 5.0
 STALLED_S: Final = 10.0
 # What the end of a connection takes at most.
 CLOSING_S: Final = 2.0
+# A caller of `close` waits for that so much longer than its time-out: a broker that answers needs less.
+_CLOSING_GRACE_S: Final = 0.5
 
 
 class BrokerSession(Protocol):
@@ -296,7 +298,8 @@ class BrokerChannel:
             return
         self._call(self._start_closing, timeout_s)
         if not _thread.is_current():
-            self._finished.wait(timeout_s + 2 * CLOSING_S)
+            # If the broker does not answer, the rest happens in the background.
+            self._finished.wait(timeout_s + _CLOSING_GRACE_S)
 
     def abandon(self) -> None:
         """Close without waiting and without taking a lock: the garbage collector calls it."""
