@@ -87,8 +87,8 @@ class Subscriber(Endpoint):
         True to put envelopes in the order of their sequence numbers, by source and epoch; answers in the order of the
         requests that they answer, also those of several replicas of a service. What comes too early waits for what is
         missing: for 1 s over ZeroMQ, for 10 s from a broker, or for the number of seconds that is given in place of
-        True. A line in the log then names what is missing. What waits is unacknowledged: ``prefetch`` bounds how far apart
-        the messages of a broker may come.
+        True. A line in the log then names what is missing. What waits is unacknowledged: ``prefetch`` bounds how far
+        apart the messages of a broker may come.
     insecure
         True to bind a ZeroMQ address that other machines can reach, without keys.
     keys
