@@ -90,7 +90,7 @@ def member_of(service, replica):
     return found[0] if found else None
 
 
-# -- who is there -----------------------------------------------------------------------------------------------------
+# -- members ----------------------------------------------------------------------------------------------------------
 
 
 def test_replicas_share_the_events_and_know_each_other(trio):
