@@ -35,7 +35,7 @@ class EventLog:
     Raises
     ------
     StoreError
-        There can be no such database. One that is away is told in the log.
+        There can be no such database. One that is away is reported in the log.
     """
 
     def __init__(self, options: Options, name: str, provenance: Callable[[], Provenance]) -> None:
@@ -55,7 +55,7 @@ class EventLog:
         return {} if self._writer is None else self._writer.counts()
 
     def close(self, timeout_s: float) -> None:
-        """Have all that waits written; what can't be in time is told in the log. Events may be kept afterwards."""
+        """Write all rows that wait; those that are not written in time are reported in the log. More may follow."""
         if self._writer is not None and not self._writer.close(timeout_s):
             _log.warning("%d rows of events could not be stored in time", self._writer.counts()["waiting"])
 

@@ -61,7 +61,7 @@ class Player(Startable):
     AddressError
         If ``bind`` is asked for an address that is not loopback, with neither keys nor ``insecure``.
     KeysError
-        If keys can't be read, or it is not said which are allowed.
+        Keys can't be read, or there is no list of allowed keys.
     ValueError
         If ``speed`` or ``loop`` is negative.
 

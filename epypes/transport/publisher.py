@@ -412,7 +412,7 @@ class Outbox:
             raise
 
     def _counting(self, confirmed: Confirmed | None) -> Confirmed:
-        def told(error: Exception | None) -> None:
+        def counted(error: Exception | None) -> None:
             if error is None:
                 self.sent += 1
             else:
@@ -425,7 +425,7 @@ class Outbox:
                 finally:
                     self._connection.callback_threads.discard(me)
 
-        return told
+        return counted
 
     def count_rejected(self, error: BaseException, item: object = None, reason: str = "", once: bool = False) -> None:
         """Count and log an item that can't be sent; with ``once``, the first of its reason alone is logged."""

@@ -306,10 +306,10 @@ def _reason(error: BaseException | None) -> str:
     """Return why a connection or channel was closed: the end of a sentence, without its full stop."""
     if error is None or isinstance(error, asyncio.CancelledError):
         return "nothing was heard from the broker" if error is not None else "it was closed"
-    said = next((argument for argument in reversed(error.args) if isinstance(argument, str)), "")
+    text = next((argument for argument in reversed(error.args) if isinstance(argument, str)), "")
     if isinstance(error, ChannelClosed):
-        return f"the broker says {said[:300]!r}"
-    return f"the broker has gone away ({said[:300] or type(error).__name__})"
+        return f"the broker says {text[:300]!r}"
+    return f"the broker has gone away ({text[:300] or type(error).__name__})"
 
 
 def _text(value: object) -> str:

@@ -7,7 +7,7 @@ the event loop by ``call_soon_threadsafe``.
 
 Order: messages are published in the order of `BrokerChannel.send`, several of them before the first is confirmed. When
 a connection is lost, all that are not confirmed are published again, in the same order and under the same ids. So the
-first copies arrive in order; second copies are told by their ids.
+first copies arrive in order; second copies are detected by their ids.
 """
 
 from __future__ import annotations

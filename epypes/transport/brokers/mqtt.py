@@ -202,13 +202,13 @@ class PahoConnection:
             raise unreachable(address, error, self._timeout_s, "an MQTT broker", f"{address}: {error}") from error
         self._looking_after = asyncio.ensure_future(self._look_after())
         try:
-            code, told = await self._greeting
+            code, granted = await self._greeting
         except BrokerError as error:
             text = f"What answers at {address} is no MQTT 5 broker, or hung up: {self.lost.result()}."
             raise BrokerError(str(address), text) from error
         if code.value >= _REFUSED:
             raise BrokerError(str(address), f"{address} refuses {self._refusal(code)}")
-        self.most_bytes = int(getattr(told, "MaximumPacketSize", _LARGEST))
+        self.most_bytes = int(getattr(granted, "MaximumPacketSize", _LARGEST))
 
     def _refusal(self, code: ReasonCode) -> str:
         if code.value not in _NO_ACCESS:
@@ -398,7 +398,7 @@ class MqttSession:
         self._hand_over()
 
     async def set_window(self, window: int) -> None:
-        """Hand on as many as the window says; the broker itself is told at the next connection."""
+        """Hand on as many as the window allows; the broker learns of a change at the next connection."""
         self._window = window if self.address.kind == "queue" else max(window, _AHEAD)
         self._hand_over()
 
