@@ -156,11 +156,6 @@ class StateLock:
         os.close(self._file)
 
 
-def read_state(bundle: str | Path, replica: str = "") -> ServiceState | None:
-    """Return the state of the running service, or None if none is ready; the first of several replicas."""
-    return next(iter(read_states(bundle, replica)), None)
-
-
 def read_states(bundle: str | Path, replica: str = "") -> list[ServiceState]:
     """Return the states of the running services of a bundle: of all replicas, or of one by its name."""
     alone = state_file(bundle)

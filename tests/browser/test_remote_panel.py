@@ -14,11 +14,11 @@ import pytest
 
 import epypes as ep
 from epypes.bundle.ports import REQUEST
-from epypes.service.state_file import read_state
 from epypes.wire import Envelope
 from tests.browser.jupyter import JupyterLab, Notebook, write_notebook
 from tests.browser.panel import PanelOnScreen
 from tests.service.processes import running
+from tests.service.states import read_state
 
 pytestmark = pytest.mark.browser
 

@@ -11,9 +11,10 @@ import pytest
 
 import epypes as ep
 from epypes.errors import ServiceError
-from epypes.service.state_file import ServiceState, StateLock, read_state, read_states
+from epypes.service.state_file import ServiceState, StateLock, read_states
 from tests.service.processes import run_cli, running
 from tests.service.served import TIMEOUT_S, acting_bundle, event, until
+from tests.service.states import read_state
 
 pytestmark = pytest.mark.usefixtures("own_folders")
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.service.state_file import read_state
 from tests.service.processes import running
+from tests.service.states import read_state
 
 pytestmark = pytest.mark.slow
 

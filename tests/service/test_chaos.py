@@ -21,10 +21,10 @@ import pytest
 
 import epypes as ep
 from epypes.errors import EpypesError
-from epypes.service.state_file import read_state
 from tests.service.bundles import written_bundle
 from tests.service.chaos_publisher import kind_of
 from tests.service.processes import running
+from tests.service.states import read_state
 
 pytestmark = pytest.mark.slow
 

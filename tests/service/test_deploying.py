@@ -13,9 +13,9 @@ from epypes.bundle.seal import check_seal, seal
 from epypes.errors import DeployRefused, ServiceError, UnknownName
 from epypes.service import Service
 from epypes.service.failures.source import failures_of, find_failure
-from epypes.service.state_file import read_state
 from tests.service.processes import run_cli, running
 from tests.service.served import SOURCE, acting_bundle, serving, until
+from tests.service.states import read_state
 
 pytestmark = pytest.mark.slow
 

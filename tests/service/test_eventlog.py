@@ -120,7 +120,7 @@ def test_a_service_with_a_store_that_can_never_be_is_not_started(acting):
 
 
 def test_a_service_of_the_command_line_stores_its_events(acting, tmp_path):
-    from epypes.service.state_file import read_state
+    from tests.service.states import read_state
 
     path = tmp_path / "events.sqlite"
     with running(acting, "--store", str(path)) as process:

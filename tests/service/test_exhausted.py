@@ -18,9 +18,9 @@ import pytest
 import zmq
 
 from epypes.service import Service
-from epypes.service.state_file import read_state
 from tests.service.processes import lowered, running
 from tests.service.served import SOURCE, acting_bundle, check_counts, peer_at, peer_of, until
+from tests.service.states import read_state
 
 pytestmark = pytest.mark.slow
 

@@ -18,12 +18,13 @@ import epypes as ep
 from epypes.bundle.seal import seal
 from epypes.errors import AddressError, BundleError, RemoteFailure, ServiceError
 from epypes.service import Client, Service, call
-from epypes.service.state_file import ServiceState, StateLock, read_state, running_at, state_file
+from epypes.service.state_file import ServiceState, StateLock, running_at, state_file
 from epypes.wire import Envelope, encode
 from tests.colours import red_image, red_runner
 from tests.service.bundles import written_bundle
 from tests.service.processes import run_cli, running
 from tests.service.served import TIMEOUT_S, peer_of, serving, until
+from tests.service.states import read_state
 
 ANY = "tcp://127.0.0.1:*"
 

@@ -11,10 +11,10 @@ import pytest
 
 from epypes.errors import DeployRefused
 from epypes.service import Service
-from epypes.service.state_file import read_state
 from epypes.service.systemd import notify
 from tests.service.processes import running
 from tests.service.served import SOURCE, TIMEOUT_S, acting_bundle, peer_at, until
+from tests.service.states import read_state
 
 pytestmark = pytest.mark.slow  # each starts a service in a process of its own
 

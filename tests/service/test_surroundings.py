@@ -12,9 +12,9 @@ from contextlib import nullcontext
 
 import pytest
 
-from epypes.service.state_file import read_state
 from tests.service.processes import lowered, running
 from tests.service.served import check_counts, peer_at
+from tests.service.states import read_state
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak]
 
