@@ -216,17 +216,19 @@ class ConnectionGuard:
         if has_sent:
             peer.received, peer.read = received, self._read
         elif received - peer.received > self._max_message_bytes + _SLACK_BYTES:
-            self._ask(lambda is_drained: self._judge(peer, is_drained))
+            since = peer.received
+            self._ask(lambda is_drained: self._judge(peer, since, is_drained))
 
-    def _judge(self, peer: _Peer, is_drained: bool) -> None:
-        """Drop a peer that has sent more than a message, if there was no whole message in it.
+    def _judge(self, peer: _Peer, since: int, is_drained: bool) -> None:
+        """Drop a peer that has sent more than a message since ``since`` bytes, if there was no whole message in it.
 
         ZeroMQ reads from connections in turns. So one that had a whole message has been read if nothing is left to be
-        read, or if more messages were read meanwhile than there are connections.
+        read, or if more messages were read meanwhile than there are connections. A later check may have found that
+        before this one is answered.
         """
         with self._lock:
             had_its_turn = is_drained or self._read - peer.read > len(self._peers)
-            if had_its_turn and peer.fd not in self._senders:
+            if had_its_turn and peer.received == since and peer.fd not in self._senders:
                 self._drop(peer, "it sends a message without an end")
 
     def _drop_old(self) -> None:
@@ -248,7 +250,8 @@ class ConnectionGuard:
             self._peers.pop(fd, None)
             self._senders.discard(fd)
             if event["event"] == zmq.EVENT_ACCEPTED:
-                self._peers[fd] = peer = _Peer(fd, read=self._read)
+                # The event may come late, when messages of the connection were read already.
+                self._peers[fd] = peer = _Peer(fd, received=_received_bytes(fd) or 0, read=self._read)
                 if len(self._peers) > self._most:
                     self._drop(peer, f"connection limit reached: {self._most} peers are connected")
 
