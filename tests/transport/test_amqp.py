@@ -179,14 +179,14 @@ def test_a_full_queue_is_named_while_the_message_waits(rabbitmq, name, opened, b
     opened(Sender, rabbitmq.address(f"{name}.dead", create=True))
     sender, outcomes = opened(Sender, rabbitmq.address(name)), []
     # A quorum queue takes more than its length of what comes at once, so far more than that is sent.
-    for number in range(400):
+    for number in range(150):
         sender.channel.send([b"x"], id=str(number), confirmed=outcomes.append)
     wait_until(lambda: "did not take a message: the queue is full" in caplog.text, WAIT_S)
     receiver = opened(Receiver, rabbitmq.address(name))
-    while len(outcomes) < 400:
+    while len(outcomes) < 150:
         with contextlib.suppress(Exception):
             receiver.next(0.1).ack()
-    assert outcomes == [None] * 400
+    assert outcomes == [None] * 150
 
 
 def test_an_encrypted_broker_is_checked_by_its_certificates(rabbitmq, name, opened, certificates):
