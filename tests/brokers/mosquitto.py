@@ -23,6 +23,8 @@ USER, PASSWORD = "epypes", "pa@ss:wörd/1"
 _ACCOUNT = "mosquitto"
 _DEADLINE_S = 60.0
 _PACKET_BYTES = 8 * 1024 * 1024
+# MQTT 5 CONNECT without a user, which is refused: its length, the protocol, a clean start, no properties, no client id.
+_CONNECT = b"\x10\x0d\x00\x04MQTT\x05\x02\x00\x3c\x00\x00\x00"
 
 
 def _binary(name: str) -> str | None:
@@ -48,9 +50,6 @@ class Server:
     tls
         The files of its certificate and of the key to it, for encrypted connections alone.
     """
-
-    # Whether the queues that it has outlive a kill; see the one of RabbitMQ.
-    has_written = True
 
     def __init__(
         self,
@@ -116,6 +115,16 @@ class Server:
         except OSError:
             return False
         return True
+
+    @property
+    def has_written(self) -> bool:
+        """Whether what it has confirmed outlives a kill: it writes at the end of each turn of its loop.
+
+        A new connection is answered in a later turn than what was confirmed before.
+        """
+        with socket.create_connection((self.host, self.port), _DEADLINE_S) as asking:
+            asking.sendall(_CONNECT)
+            return bool(asking.recv(1))
 
     def stop(self, *, at_once: bool = False) -> None:
         """End it; ``at_once`` as a power cut does."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from concurrent.futures import ThreadPoolExecutor
 from uuid import uuid4
 
 import paho.mqtt.client as paho
@@ -151,6 +152,26 @@ def test_a_session_that_was_left_is_announced_and_ended_by_the_next_consumer(ope
     wait_until(lambda: any(heard.values()), WAIT_S)
     assert taken([opened(Receiver, queue)], [str(number) for number in range(21)])["20"] == 1
     wait_until(lambda: not any(heard.values()), WAIT_S)
+
+
+def test_channels_that_make_the_same_queue_at_the_same_moment_do_not_disturb_each_other(queue, opened):
+    with ThreadPoolExecutor(16) as threads:
+        senders = list(threads.map(lambda _: opened(Sender, queue), range(16)))
+    for number, sender in enumerate(senders):
+        sender.send(b"a", id=str(number))
+    taken([opened(Receiver, queue)], list(map(str, range(16))))
+
+
+def test_what_a_consumer_was_still_fetching_from_a_session_when_it_ended_reaches_the_next_one(opened, queue):
+    ids = list(map(str, range(300)))
+    sender, outcomes = opened(Sender, queue), []
+    for known_as in ids:
+        sender.channel.send([b"a"], id=known_as, confirmed=outcomes.append)
+    wait_until(lambda: len(outcomes) == len(ids), WAIT_S)
+    first = Receiver(queue, prefetch=1)
+    first.next()
+    first.channel.close(0.0)
+    taken([opened(Receiver, queue)], ids)
 
 
 def test_after_a_restart_of_the_broker_a_sender_waits_until_there_is_a_session(name, opened, caplog):

@@ -26,7 +26,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hashlib
 import logging
 import secrets
 import socket
@@ -267,12 +266,13 @@ class PahoConnection:
                 self.client.disconnect(properties=properties)
                 await asyncio.shield(self.lost)
         finally:
-            if self._looking_after is not None:
-                self._looking_after.cancel()
-            self._cut()
+            self.abort()
 
-    def _cut(self) -> None:
-        """Have paho close the socket, which it does when it reads the end."""
+    def abort(self) -> None:
+        """Cut the connection, so that the broker announces the session as gone."""
+        if self._looking_after is not None:
+            self._looking_after.cancel()
+        # paho closes the socket when it reads the end.
         opened: Any = self.client.socket()
         if opened is not None:
             with contextlib.suppress(OSError):
@@ -350,14 +350,17 @@ class MqttSession:
             self.lost.set_result(lost.result())
 
     async def _make_session(self, address: Address) -> None:
-        """Have the broker keep what comes for a queue until there is a consumer."""
-        digest = hashlib.sha256(f"{address.group} {address.name}".encode()).hexdigest()[:16]
-        keeping = PahoConnection(address, self.timeout_s, f"epypes-kept-{digest}")
+        """Have the broker keep what comes for a queue until there is a consumer.
+
+        Each session has a name of its own: channels that make one at the same time don't take it over from each other.
+        """
+        session = f"epypes-kept-{secrets.token_hex(8)}"
+        keeping = PahoConnection(address, self.timeout_s, session)
         try:
             await keeping.open()
             for topic in (_consumers(address), address.name):
                 await keeping.subscribe(_shared(address, topic))
-            await keeping.publish(_gone(address, f"epypes-kept-{digest}"), b"kept", {}, retain=True)
+            await keeping.publish(_gone(address, session), b"kept", {}, retain=True)
         finally:
             await keeping.close()
 
@@ -472,12 +475,13 @@ class MqttSession:
                 if message.topic == address.name:
                     await self._send_again(message)
                 emptied.client.ack(message.mid, message.qos)
+            await emptied.close(with_session=True)
         except (BrokerError, MessageError, TimeoutError) as error:
             # Mostly another consumer was quicker; if not, the broker announces it again.
             log.debug("%s: the session %s was not emptied: %s", address, session, error)
         finally:
             self._left.discard(session)
-            await emptied.close(with_session=is_done)
+            emptied.abort()
 
     async def close(self) -> None:
         """Disconnect; the session of a consumer stays, and is announced to the others."""
