@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 RUNS: Final = 3
 # The next run may be further off than the worst of a few; ten times that is far below any change of an algorithm.
 SAFETY: Final = 10.0
-# Noise goes up and down: 1 in 5,040 series of as many runs goes further away each time by chance.
-_RUNS_OF_SUSPECTS: Final = 8
+# Noise goes up and down: 1 in 362,880 series of as many runs goes further away each time by chance.
+_RUNS_OF_SUSPECTS: Final = 10
 _MEANING: Final = (
     f"{counted(RUNS, 'more run')} in the notebook gave other last digits: a replay may differ by {SAFETY:g} times as",
     "much, and each number by no more than the relative part of its own magnitude.",
