@@ -6,7 +6,10 @@ when somebody asks.
 
 from __future__ import annotations
 
+import gc
+import os
 import sys
+import threading
 from collections.abc import Collection, Iterator
 from types import CodeType, FrameType
 from typing import Any, Final
@@ -16,6 +19,15 @@ from epypes.run.compiled import FILE_NAME
 from epypes.run.program import Program, Step
 
 _CALL: Final = call.__code__
+# Before 3.11.9 Python collects garbage while it holds the lock that makes the frames; the end of a thread-local object
+# waits for that lock forever: https://github.com/python/cpython/issues/106883
+_without_collection: Final = threading.RLock()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(
+        before=_without_collection.acquire,
+        after_in_parent=_without_collection.release,
+        after_in_child=_without_collection.release,
+    )
 
 
 def running_functions(program: Program) -> tuple[str, ...]:
@@ -38,12 +50,23 @@ def _frames() -> Iterator[FrameType]:
     """Give the frames of all threads, the innermost of each first."""
     # The frame of this call is among them. A local variable that still held it at the end would be a cycle, which
     # keeps all that its callers hold alive: so what remains to be looked at is taken out of a list.
-    remaining = [*sys._current_frames().values()]
+    remaining = _innermost_frames()
     while remaining:
         frame: FrameType | None = remaining.pop()
         while frame is not None:
             yield frame
             frame = frame.f_back
+
+
+def _innermost_frames() -> list[FrameType]:
+    with _without_collection:
+        is_enabled = gc.isenabled()
+        gc.disable()
+        try:
+            return [*sys._current_frames().values()]
+        finally:
+            if is_enabled:
+                gc.enable()
 
 
 def _steps_under_way() -> Iterator[tuple[Program, Step]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import re
+import subprocess
 import sys
 import threading
 import types
@@ -363,6 +364,36 @@ def test_a_first_value_is_escaped():
     bundle = mimebundle(runner)
     assert "<img src=x" not in bundle["text/html"]
     assert "first" in vertices(bundle["image/svg+xml"])["token-x"].find(f"{SVG}title").text
+
+
+def test_what_runs_can_be_asked_for_while_garbage_is_collected():
+    code = """
+import gc, threading
+import epypes as ep
+
+runner = ep.CompGraphRunner(ep.CompGraph({"f": abs}, {"f": ("x", "y")}))
+# Python before 3.11.9 waited forever when it freed a thread-local object while it made the frames of many threads.
+for threshold in range(1, 80):
+    begun, end = threading.Barrier(21), threading.Event()
+    threads = [threading.Thread(target=lambda: begun.wait() is end.wait()) for _ in range(20)]
+    for thread in threads:
+        thread.start()
+    begun.wait()
+    gc.disable()
+    gc.collect()
+    cycle = [threading.local()]
+    cycle[0].cycle = cycle
+    cycle.append(cycle)
+    del cycle
+    gc.set_threshold(threshold)
+    gc.enable()
+    assert runner.running == ()
+    assert gc.isenabled()
+    end.set()
+    for thread in threads:
+        thread.join()
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=TIMEOUT_S)
 
 
 # -- redefined --------------------------------------------------------------------------------------------------------
