@@ -17,8 +17,6 @@ from epypes.wording import counted
 if TYPE_CHECKING:
     from epypes.transport import RecordingInfo
 
-_CONNECT = "connect:"
-
 
 def play(
     file: Annotated[Path, typer.Argument(help="The MCAP file that epypes record wrote.")],
@@ -42,13 +40,10 @@ def play(
         return
     if speed == math.inf:
         raise RecordingError(file, "--speed inf is no speed. 0 is as fast as possible.")
-    place = address.removeprefix(_CONNECT)
-    bind = not address.startswith(_CONNECT)
     with SignalWait() as signals:
         player = Player(
             file,
-            place,
-            bind,
+            address,
             speed=speed,
             loop=loop,
             wait=wait,

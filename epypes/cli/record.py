@@ -12,7 +12,6 @@ from epypes.cli.options import Allow, Keys
 from epypes.cli.terminal import out
 from epypes.errors import RecordingError
 
-_BIND = "bind:"
 # Long enough for a publisher that is there to confirm; one of 2019 never does.
 _JOIN_S = 0.5
 # A slow disk gets some time for what waits; then that is dropped, and counted.
@@ -37,14 +36,11 @@ def record(
     if seconds is not None and seconds > threading.TIMEOUT_MAX:
         text = f"--seconds {seconds:g} is too long: {threading.TIMEOUT_MAX:.0f} at most; without it, Ctrl+C ends it."
         raise RecordingError(file, text)
-    bind = address.startswith(_BIND)
-    place = address.removeprefix(_BIND)
     with SignalWait() as signals:
         recorder = Recorder(
-            place,
+            address,
             file,
             topic,
-            bind,
             force=force,
             messages=messages,
             insecure=insecure,
@@ -54,7 +50,7 @@ def record(
         )
         recorder.start()
         try:
-            joined = "" if recorder.wait_joined(_JOIN_S) else " (nobody has confirmed yet)"
+            joined = "" if recorder.wait_joined(_JOIN_S) else " (no publisher has confirmed yet)"
             out.print(f"RECORDING {recorder.address}{joined} to {file}. Ctrl+C ends it.")
             signals.wait(seconds)
         finally:

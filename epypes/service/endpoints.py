@@ -13,8 +13,8 @@ from contextlib import ExitStack
 from time import monotonic
 from typing import Any, Final
 
-from epypes.errors import BrokerError, EpypesError, MessageError
-from epypes.service.options import CONNECT, Options, bare
+from epypes.errors import BrokerError, EpypesError
+from epypes.service.options import Options
 from epypes.transport import Publisher, Subscriber
 from epypes.transport.address import Address, is_broker, open_channel, parse_address
 from epypes.transport.channel import Confirmed, Delivery
@@ -42,7 +42,7 @@ def group_address(options: Options) -> Address | None:
     """Return the broadcast address of the replicas that share a broker's queue; None without a broker."""
     if not options.has_broker:
         return None
-    return parse_address(bare(options.sub)).beside("group", "broadcast", create=True)
+    return parse_address(options.sub).beside("group", "broadcast", create=True)
 
 
 class EventInput:
@@ -84,9 +84,9 @@ class EventInput:
     def _make_subscriber(self, address: str) -> Subscriber:
         options = self._options
         subscriber = Subscriber(
-            bare(address),
+            address,
             self,
-            bind=not options.sub.startswith(CONNECT),
+            bind=True,
             prefetch=options.prefetch,
             exhausted=self._exhausted,
             undecoded=True,
@@ -114,14 +114,12 @@ class EventInput:
 
     def _is_event(self, delivery: Delivery) -> bool:
         """Whether a delivery is an envelope, or a message of 2019; any other is counted and rejected."""
-        if delivery.envelope is not None or len(delivery.frames) == 1:
+        error = delivery.error
+        if error is None:
             return True
-        try:
-            EncodedEnvelope.read(delivery.frames)
-        except MessageError as error:
-            self._rejected += 1
-            self._log.warning(error.reason, f"rejected a message ({error.reason}): {error}")
-            delivery.reject(str(error))
+        self._rejected += 1
+        self._log.warning(error.reason, f"rejected a message ({error.reason}): {error}")
+        delivery.reject(str(error))
         return False
 
     # -- start and stop -----------------------------------------------------------------------------------------------
@@ -136,7 +134,7 @@ class EventInput:
         """
         if self.is_broker:
             # Until this service is ready, other replicas can take the events.
-            channel = open_channel(bare(self._options.sub))
+            channel = open_channel(self._options.sub)
             channel.open(None)
             channel.close()
         else:
@@ -216,14 +214,12 @@ class EventInput:
     @property
     def address(self) -> str:
         """Where events come from, without a password; the bound endpoint, also while no events are taken."""
-        if not self.is_broker and self._options.sub.startswith(CONNECT):
-            return self._options.sub
-        return self._closed_at or str(self._subscriber.address)
+        return self._closed_at or _shown(self._subscriber)
 
     @property
     def trouble(self) -> str:
         """Why the broker is not connected; empty if it is."""
-        return self._not_open or _named(self.address, self._subscriber.trouble) if self.is_broker else ""
+        return self._not_open or _named(self.address, self._subscriber.trouble)
 
     def answered(self, ids: Iterable[str]) -> None:
         """Note that other replicas have answered events: they are duplicates if they are delivered again."""
@@ -252,11 +248,7 @@ class AnswerOutput:
     """
 
     def __init__(self, address: str, options: Options, on_change: Callable[[], object]) -> None:
-        self._address = address
-        bind = not address.startswith(CONNECT)
-        self._publisher = Publisher(
-            bare(address), bind=bind, high_water_mark=_MAX_KEPT_ANSWERS, **_secured(address, options)
-        )
+        self._publisher = Publisher(address, high_water_mark=_MAX_KEPT_ANSWERS, **_secured(address, options))
         self.is_broker = self._publisher.place.is_broker
         self._publisher.on_connection = lambda is_connected, reason: on_change()
 
@@ -276,7 +268,7 @@ class AnswerOutput:
 
     def publish(self, answer: EncodedEnvelope | bytes, id: str, confirmed: Confirmed) -> None:  # noqa: A002
         """Publish an answer under an id; returns at once. A ZeroMQ socket confirms what it has taken."""
-        if self.is_broker and self._publisher.waiting >= _MAX_UNCONFIRMED:
+        if self._publisher.waiting >= _MAX_UNCONFIRMED:
             # Events that no broker keeps may be any number.
             text = f"{self.address} has not taken {_MAX_UNCONFIRMED} messages before this one. {self.trouble}"
             confirmed(BrokerError(self.address, text))
@@ -289,17 +281,17 @@ class AnswerOutput:
     @property
     def address(self) -> str:
         """Where it publishes, without a password; ``connect:`` in front where it connects."""
-        return self._address if self._address.startswith(CONNECT) else str(self._publisher.address)
+        return _shown(self._publisher)
 
     @property
     def trouble(self) -> str:
         """Why the broker is not connected; empty if it is."""
-        return _named(self.address, self._publisher.trouble) if self.is_broker else ""
+        return _named(self.address, self._publisher.trouble)
 
     @property
     def slow_subscribers(self) -> int:
         """How often a subscriber was so slow that it lost messages; a broker keeps messages instead."""
-        return 0 if self.is_broker else int(self._publisher.slow_subscribers)
+        return self._publisher.slow_subscribers
 
 
 class Endpoints:
@@ -371,6 +363,11 @@ def _stop(endpoint: EventInput | AnswerOutput, until_s: float, shares: int) -> N
     endpoint.stop(max((until_s - monotonic()) / shares, _MIN_CLOSE_S))
 
 
+def _shown(endpoint: Subscriber | Publisher) -> str:
+    """Return the address of an endpoint, ``connect:`` in front where it connects."""
+    return f"connect:{endpoint.address}" if endpoint.place.binds is False else endpoint.address
+
+
 def _named(address: str, trouble: str) -> str:
     """Return why a broker is not connected, with its address."""
     return trouble if not trouble or address in trouble else f"{address}: {trouble}"
@@ -378,5 +375,5 @@ def _named(address: str, trouble: str) -> str:
 
 def _secured(address: str, options: Options) -> Mapping[str, Any]:
     """Return the options for peers of ZeroMQ, which other endpoints of the service may need; none for a broker."""
-    names = () if is_broker(bare(address)) else ("insecure", "keys", "allow")
+    names = () if is_broker(address) else ("insecure", "keys", "allow")
     return {name: getattr(options, name) for name in names}

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 MailboxPolicy = Literal["latest", "drop_oldest", "fault"]
 POLICIES: Final = get_args(MailboxPolicy)
 ANY_PORT: Final = "tcp://127.0.0.1:*"
-CONNECT: Final = "connect:"
 MAX_THREADS: Final = 64
 
 
@@ -68,12 +67,12 @@ class Options:
     @property
     def has_broker(self) -> bool:
         """Whether events come from a broker, which keeps each until it is answered."""
-        return is_broker(bare(self.sub))
+        return is_broker(self.sub)
 
     @property
     def is_confirmed(self) -> bool:
         """Whether a broker confirms an answer, or the end of an event."""
-        return self.has_broker or is_broker(bare(self.pub))
+        return self.has_broker or is_broker(self.pub)
 
     @property
     def shows_failures(self) -> bool:
@@ -118,7 +117,7 @@ class Options:
             text = f"A broker keeps what waits, so mailbox {self.mailbox_policy!r} drops nothing. Leave that out."
             raise ServiceError(path, text)
         # ZeroMQ would show an address that it does not know, with the password in it.
-        addresses = [parse_address(bare(each)) for each in (self.sub, self.pub, self.failures) if _is_checked(each)]
+        addresses = [parse_address(each) for each in (self.sub, self.pub, self.failures)]
         if self.has_broker and any(_is_same(addresses[0], place) for place in addresses[1:]):
             text = (
                 f"The answers of a service would be its next events: --sub and another address are the same, "
@@ -127,15 +126,6 @@ class Options:
             raise ServiceError(path, text)
 
 
-def _is_checked(address: str) -> bool:
-    return "://" in address and not bare(address).startswith("inproc:")
-
-
 def _is_same(one: Address, other: Address) -> bool:
     """Whether what is sent to one address of a broker comes out of another."""
     return all(getattr(one, name) == getattr(other, name) for name in ("scheme", "host", "port", "vhost", "name"))
-
-
-def bare(address: str) -> str:
-    """Return an address without the prefix ``connect:``."""
-    return address.removeprefix(CONNECT)

@@ -49,7 +49,7 @@ SCHEMES: Final[Mapping[str, Scheme]] = {
 _ENCRYPTED: Final = tuple(known.encrypted_as for known in SCHEMES.values() if known.encrypted_as)
 _OPTIONS: Final = ("attempts", "ca", "create", "dead", "group", "kind", "password_file", "vhost")
 # Which side of two ZeroMQ sockets binds, where it is not the publisher.
-_SIDES: Final = ("", "bind", "connect")
+_SIDES: Final = {"bind": True, "connect": False}
 _FORM: Final = (
     "Write amqp://HOST/QUEUE, nats://HOST/SUBJECT or mqtt://HOST/TOPIC, with USER:PASSWORD@ before HOST, :PORT behind "
     "it and ?create=true at the end as needed; or tcp://127.0.0.1:5555 for ZeroMQ."
@@ -133,6 +133,16 @@ class Address:
     def is_broker(self) -> bool:
         """Whether a broker keeps and shares out the messages; otherwise it is an endpoint of ZeroMQ."""
         return SCHEMES[self.scheme].is_broker
+
+    @property
+    def endpoint(self) -> str:
+        """The endpoint of a ZeroMQ address, without ``bind:`` and ``connect:``."""
+        return self.name.partition(":")[2] if self.binds is not None else self.name
+
+    @property
+    def binds(self) -> bool | None:
+        """Whether a ZeroMQ address says that it is bound or connected to; None if it says neither."""
+        return _SIDES.get(self.name.partition(":")[0])
 
     @property
     def extra(self) -> str:
@@ -233,7 +243,7 @@ def parse_address(address: str | Address) -> Address:
     scheme, found, _ = address.partition("://") if isinstance(address, str) else (type(address).__name__, "", "")
     side, _, plain = scheme.rpartition(":")
     known = SCHEMES.get(plain)
-    if found and known is not None and not known.is_broker and side in _SIDES:
+    if found and known is not None and not known.is_broker and side in ("", *_SIDES):
         return Address(plain, address.partition("://")[2].rpartition(":")[0], 0, address, kind="broadcast")
     if not found or scheme not in SCHEMES:
         # What comes behind it may be a password.

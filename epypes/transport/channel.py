@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Protocol
 
 if TYPE_CHECKING:
+    from epypes.errors import MessageError
     from epypes.wire import EncodedEnvelope
 
 Frames = Sequence[bytes | memoryview]
@@ -47,14 +48,15 @@ class Delivery:
         How often it was delivered, from 1; 0 where the broker does not count.
     headers
         Text that came beside the frames, by name.
-    envelope
-        Set by a Subscriber that puts deliveries: the header of the frames; None if they are no envelope.
+    envelope, error
+        Set by a Subscriber that puts deliveries: the header of the frames; None if they are no envelope, and then, of
+        several frames, why not.
     settle
         Of the channel; called at most once: ``("ack", "")``, ``("reject", reason)`` or ``("nack", "")``. It
         returns at once and raises nothing, from any thread.
     """
 
-    __slots__ = ("attempt", "envelope", "frames", "headers", "id", "is_settled", "settle")
+    __slots__ = ("attempt", "envelope", "error", "frames", "headers", "id", "is_settled", "settle")
 
     def __init__(
         self,
@@ -66,6 +68,7 @@ class Delivery:
     ) -> None:
         self.frames, self.id, self.attempt, self.headers, self.settle = frames, id, attempt, headers, settle
         self.envelope: EncodedEnvelope | None = None
+        self.error: MessageError | None = None
         self.is_settled = False
 
     def ack(self) -> None:

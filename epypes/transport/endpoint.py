@@ -89,10 +89,9 @@ class Endpoint(Startable):
         if not self.place.is_broker:
             with optional_import():
                 from epypes.transport.zeromq.curve import CurveOptions
-            side, _, rest = self.place.name.partition(":")
-            bind = {"bind": True, "connect": False}.get(side, bind)
-            self._given = rest if side in ("bind", "connect") else self.place.name
-            self._security = CurveOptions.checked(self._given, bind, insecure, keys, allow)
+            self._given = self.place.endpoint
+            binds = bind if self.place.binds is None else self.place.binds
+            self._security = CurveOptions.checked(self._given, binds, insecure, keys, allow)
         else:
             self._given = str(self.place)
             if not self.takes_brokers:

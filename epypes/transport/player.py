@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from epypes.errors import BrokerError, RecordingError, StillRunning
+from epypes.transport.address import parse_address
 from epypes.transport.endpoint import Startable, warn_left_running
 from epypes.transport.mcap import BrokenOff, Recorded, messages
 from epypes.transport.zeromq.channel import ZeroMQChannel
@@ -89,13 +90,15 @@ class Player(Startable):
             raise ValueError(f"speed is {speed}; give 1.0, 0.5, 10 ..., or 0 for as fast as possible.")
         if loop < 0:
             raise ValueError(f"loop is {loop}; give how often, or 0 for without end.")
-        self._security = CurveOptions.checked(address, bind, insecure, keys, allow)
+        place = parse_address(address)
+        self._given = place.endpoint
+        binds = bind if place.binds is None else place.binds
+        self._security = CurveOptions.checked(self._given, binds, insecure, keys, allow)
         self.path = Path(path)
-        self._given = address
 
         def make() -> _Playback:
             # Few are kept for a subscriber: what is kept at the end must still be sent before the process ends.
-            channel = ZeroMQChannel(address, self._security, high_water_mark=_HIGH_WATER_MARK)
+            channel = ZeroMQChannel(self._given, self._security, high_water_mark=_HIGH_WATER_MARK)
             return _Playback(self.path, channel, speed, loop, wait, on_end)
 
         self._make = make

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from epypes.errors import RecordingError, StillRunning
+from epypes.transport.address import parse_address
 from epypes.transport.channel import Delivery, Frames
 from epypes.transport.endpoint import Startable
 from epypes.transport.mcap import RecordingCounts, RecordingWriter
@@ -81,7 +82,7 @@ class Recorder(Startable):
         **options: Any,
     ) -> None:
         self.path = Path(path)
-        about = {"address": address, "topic": topic}
+        about = {"address": parse_address(address).endpoint, "topic": topic}
 
         def make() -> tuple[ZMQSubscriber, _Recording]:
             recording = _Recording(self.path, about, force, messages, backlog_bytes, on_end)

@@ -491,37 +491,43 @@ class Inbox:
             )
         if not self._is_zeromq and not self._is_wanted(delivery):
             return None, None
-        envelope: Envelope | EncodedEnvelope | None = None
-        if len(frames) > 1:
-            if not self._undecoded:
-                envelope = decode(frames, self._limits)
-                check_source(envelope.source)
-            else:
-                # What is no envelope is put as well.
-                with contextlib.suppress(MessageError):
-                    envelope = EncodedEnvelope.read(frames, self._limits)
-                    check_source(envelope.source)
+        envelope: Envelope | None = None
+        if len(frames) > 1 and self._undecoded:
+            self._read_header(delivery)
+        elif len(frames) > 1:
+            envelope = decode(frames, self._limits)
+            check_source(envelope.source)
+        header = delivery.envelope if self._undecoded else envelope
         if not self._keeps:
             if self._undecoded:
-                delivery.envelope = envelope if isinstance(envelope, EncodedEnvelope) else None
-                return delivery, envelope
+                return delivery, header
             return bytes(frames[0]) if envelope is None else envelope, envelope
         reconnects = 0 if self._channel is None else self._channel.reconnects
-        known_as = delivery.id or ("" if envelope is None else envelope.id)
+        known_as = delivery.id or ("" if header is None else header.id)
         kept = self.deduplication.first(known_as, delivery, (self._starts, reconnects))
         if kept is None:
             return None, None
         item: Any = kept
-        if isinstance(envelope, EncodedEnvelope):
-            kept.envelope = envelope
+        if self._undecoded:
+            kept.envelope, kept.error = delivery.envelope, delivery.error
         elif envelope is not None:
             item = DeliveredEnvelope.of(envelope, kept)
-        elif not self._undecoded:
+        else:
             item = DeliveredBytes.of(kept)
         if kept.attempt > self._place.attempts:
             self._exhaust(item, kept)
             return None, None
-        return item, envelope
+        return item, header
+
+    def _read_header(self, delivery: Delivery) -> None:
+        """Set the header of a delivery, or why its frames are no envelope."""
+        try:
+            header = EncodedEnvelope.read(delivery.frames, self._limits)
+            check_source(header.source)
+        except MessageError as error:
+            delivery.error = error
+        else:
+            delivery.envelope = header
 
     def _is_wanted(self, delivery: Delivery) -> bool:
         """Check what a broker has delivered; return False if it is of another topic and not kept by a queue."""

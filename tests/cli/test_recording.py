@@ -67,7 +67,7 @@ def test_record_ends_after_the_given_time(epypes, tmp_path):
     done = epypes("record", f"bind:{LOCAL}", tmp_path / "a.mcap", "--seconds", 0.1)
     assert done.returncode == 0, done.stderr
     assert time.monotonic() - before >= 0.1
-    assert re.search(r"RECORDING tcp://127\.0\.0\.1:\d+ \(nobody has confirmed yet\)", done.stdout)
+    assert re.search(r"RECORDING tcp://127\.0\.0\.1:\d+ \(no publisher has confirmed yet\)", done.stdout)
     assert recording_info(tmp_path / "a.mcap").messages == 0
 
 

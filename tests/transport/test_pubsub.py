@@ -308,10 +308,13 @@ def test_undecoded_messages_are_put_as_they_came_and_their_losses_are_counted(pe
         socket.connect(sub.address)
         assert socket.recv() == b"\x01"
         socket.send_multipart([b"no", b"envelope"])
+        socket.send_multipart(encode(Envelope("x", source="s" * 2_000, epoch=1, sequence=1)))
         for sequence in (5, 7):
             socket.send_multipart(encode(Envelope("x", source="a", epoch=1, sequence=sequence)))
-        garbage, first, second = (into.get(timeout=WAIT_S) for _ in range(3))
+        garbage, endless, first, second = (into.get(timeout=WAIT_S) for _ in range(4))
         assert (garbage.envelope, [*map(bytes, garbage.frames)]) == (None, [b"no", b"envelope"])
+        assert (endless.envelope, endless.error.reason, first.error) == (None, "bad source", None)
+        assert garbage.error is not None
         assert [first.envelope.sequence, second.envelope.sequence] == [5, 7]
         assert sub.lost == {("a", 1): 1}
         first.ack()

@@ -256,13 +256,12 @@ def _follow_sockets(path: Path, **secured: Any) -> Iterator[FailureRecord | None
 
 def _check_shared(path: Path, address: str) -> None:
     """Raise ServiceError where failures go to one receiver, which would miss what another one hears."""
-    from epypes.transport.address import is_broker
+    from epypes.transport.address import parse_address
 
-    bare = address.removeprefix("connect:")
-    if bare != address or is_broker(bare):
-        raise ServiceError(
-            path, f"The service of {path} sends its failures to {bare}; listen there, or ask its http URL."
-        )
+    place = parse_address(address)
+    if place.is_broker or place.binds is False:
+        text = f"The service of {path} sends its failures to {place}; listen there, or ask its http URL."
+        raise ServiceError(path, text)
 
 
 def _record_of(event: Envelope) -> FailureRecord:

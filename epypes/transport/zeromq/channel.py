@@ -332,8 +332,6 @@ def _break_off(socket: Socket, frames: Frames) -> None:
 
 def make_channel(address: Address, options: ChannelOptions) -> ZeroMQChannel:
     """Return a channel of an address without keys; the side that sends binds, unless the address says otherwise."""
-    side, _, rest = address.name.partition(":")
-    if side not in ("bind", "connect"):
-        return ZeroMQChannel(address.name, max_message_bytes=options.max_message_bytes)
-    security = CurveOptions.checked(rest, side == "bind")
-    return ZeroMQChannel(rest, security, max_message_bytes=options.max_message_bytes)
+    endpoint, binds = address.endpoint, address.binds
+    security = None if binds is None else CurveOptions.checked(endpoint, binds)
+    return ZeroMQChannel(endpoint, security, max_message_bytes=options.max_message_bytes)
