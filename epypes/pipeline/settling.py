@@ -12,15 +12,15 @@ from epypes.pipeline.log import log_error
 
 
 def settle(event: Any, error: BaseException | None = None, text: str = "") -> None:
-    """Say what became of an event, if it can be told so; raises nothing.
+    """Acknowledge, reject or return an event that has such methods; raises nothing.
 
     Parameters
     ----------
     event
         Any object.
     error
-        Why it failed; None if it did not. After a BrokerError nobody knows whether its answer has arrived: it is left
-        alone, to be delivered again, which its ``nack`` is told if it has one.
+        Why it failed; None if it did not. After a BrokerError the outcome is unknown: ``nack`` is called if the event
+        has it, and otherwise nothing, so that the broker delivers it again.
     text
         The reason it is rejected with; that of the error without.
     """

@@ -85,10 +85,10 @@ class Address:
     kind
         ``"queue"``: each message goes to one consumer, and is kept until that consumer has acknowledged it.
         ``"broadcast"``: each goes to all consumers that are connected just then, and is not kept. ``"log"``: all are
-        kept, in one order, and every consumer gets all of them from the first on. MQTT has neither queues nor logs:
-        `epypes.transport.brokers.mqtt` says what comes nearest, and what may be lost.
+        kept, in one order, and every consumer gets all of them from the first on. MQTT has neither queues nor logs;
+        `epypes.transport.brokers.mqtt` describes what replaces them, and what may be lost.
     create
-        Whether the broker makes it if there is none; otherwise that is an error.
+        Whether the channel creates it if it is missing; otherwise a missing one is an error.
     attempts
         How often a message of a queue is delivered at most, before it is a dead letter; MQTT does not count.
     dead

@@ -7,6 +7,7 @@ until the broker confirms it, and what it has delivered and nobody acknowledged 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -15,6 +16,8 @@ from typing import TYPE_CHECKING, Final, Protocol
 if TYPE_CHECKING:
     from epypes.errors import MessageError
     from epypes.wire import EncodedEnvelope
+
+log = logging.getLogger("epypes.transport")
 
 Frames = Sequence[bytes | memoryview]
 NO_HEADERS: Final[Mapping[str, str]] = MappingProxyType({})
@@ -28,6 +31,15 @@ ERROR, ERROR_REASON = "epypes-error", "epypes-error-reason"
 Confirmed = Callable[[Exception | None], object]
 # Called with whether the broker is connected, and why not, on each change; on the channel's thread.
 ConnectionListener = Callable[[bool, str], object]
+
+
+def confirm(confirmed: Confirmed | None, error: Exception | None) -> None:
+    """Call the confirmation of a message, if it has one; what it raises is logged, and other messages go on."""
+    if confirmed is not None:
+        try:
+            confirmed(error)
+        except BaseException:
+            log.exception("the confirmation of a message itself failed")
 
 
 def _ignore(verdict: str, reason: str) -> None:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol, Self
 from epypes.errors import BrokerError, MessageError, StillRunning
 from epypes.run import Failure
 from epypes.transport.address import Address
-from epypes.transport.channel import NO_HEADERS, Channel, Confirmed, Frames
+from epypes.transport.channel import NO_HEADERS, Channel, Confirmed, Frames, confirm
 from epypes.transport.endpoint import ConnectionState, Endpoint
 from epypes.transport.sequences import check_source
 from epypes.transport.throttle import Throttle
@@ -356,8 +356,8 @@ class Outbox:
                         raise
                     if entry is mine:
                         failure = error
-                    elif entry[3] is not None:
-                        _call(entry[3], error)
+                    else:
+                        confirm(entry[3], error)
                 finally:
                     self._busy_thread = 0
         if failure is not None:
@@ -421,7 +421,7 @@ class Outbox:
                 me = threading.get_ident()
                 self._connection.callback_threads.add(me)
                 try:
-                    _call(confirmed, error)
+                    confirm(confirmed, error)
                 finally:
                     self._connection.callback_threads.discard(me)
 
@@ -486,14 +486,6 @@ class Outbox:
         # Counted when it can be sent: a rejected item is no loss on the way.
         self._sequences[source] = number
         return stamped
-
-
-def _call(confirmed: Confirmed, error: Exception | None) -> None:
-    try:
-        confirmed(error)
-    except BaseException:
-        # It is the caller's; the other messages go on.
-        log.exception("the confirmation of a message itself failed")
 
 
 def take_from(queue: TakeQueue, outbox: Outbox, channel: Channel) -> HandOver | Bridge:

@@ -1,11 +1,32 @@
-"""What do several tests of sockets begin with?"""
+"""Raw sockets, and senders and receivers of channels."""
 
 from __future__ import annotations
+
+from uuid import uuid4
 
 import pytest
 import zmq
 
 from tests.transport.peers import WAIT_S
+
+
+@pytest.fixture
+def opened():
+    """Open senders and receivers, and close them."""
+    made = []
+
+    def make(kind, address, **options):
+        made.append(kind(address, **options))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.channel.close(0.0)
+
+
+@pytest.fixture
+def name():
+    return f"test-{uuid4().hex[:12]}"
 
 
 @pytest.fixture

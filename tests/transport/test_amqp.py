@@ -28,19 +28,6 @@ def name():
 
 
 @pytest.fixture
-def opened():
-    made = []
-
-    def make(kind, address, **options):
-        made.append(kind(address, **options))
-        return made[-1]
-
-    yield make
-    for one in made:
-        one.channel.close(0.0)
-
-
-@pytest.fixture
 def by_hand(rabbitmq):
     """Do something with a channel of aio-pika, as another program does."""
 

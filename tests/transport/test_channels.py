@@ -75,25 +75,6 @@ counting = pytest.mark.parametrize("peer", at("within", "rabbitmq", "nats"), ind
 
 
 @pytest.fixture
-def opened():
-    """Open senders and receivers, and close them."""
-    made = []
-
-    def make(kind, address, **options):
-        made.append(kind(address, **options))
-        return made[-1]
-
-    yield make
-    for one in made:
-        one.channel.close(0.0)
-
-
-@pytest.fixture
-def name():
-    return f"test-{uuid4().hex[:12]}"
-
-
-@pytest.fixture
 def queue(peer, name):
     return peer.address(name, create=True)
 

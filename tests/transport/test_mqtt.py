@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 from concurrent.futures import ThreadPoolExecutor
-from uuid import uuid4
 
 import paho.mqtt.client as paho
 import pytest
@@ -20,24 +19,6 @@ from tests.transport.peers import line_of, process, wait_until
 from tests.transport.test_channels import KILLED
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture
-def opened():
-    made = []
-
-    def make(kind, address, **options):
-        made.append(kind(address, **options))
-        return made[-1]
-
-    yield make
-    for one in made:
-        one.channel.close(0.0)
-
-
-@pytest.fixture
-def name():
-    return f"test-{uuid4().hex[:12]}"
 
 
 @pytest.fixture

@@ -35,7 +35,7 @@ _log = logging.getLogger("epypes.service")
 
 _START_TIMEOUT_S: Final = 30.0
 _STOP_TIMEOUT_S: Final = 3.0
-# How long responses may take to be read when the server stops; uvicorn counts in whole seconds what comes after.
+# When the server stops, clients have this time to read their last responses; then uvicorn's own grace begins.
 _LAST_RESPONSES_S: Final = 0.5
 _GRACE_S: Final = 2
 CALLER_TIMEOUT_S: Final = 10.0

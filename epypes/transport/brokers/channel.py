@@ -29,7 +29,7 @@ from typing import Any, Final, Protocol
 from epypes.errors import BrokerError, MessageError
 from epypes.transport.address import Address
 from epypes.transport.brokers.message import IncomingMessage, OutgoingMessage, dead_letter, pack, unpacked
-from epypes.transport.channel import NO_HEADERS, ChannelOptions, Confirmed, Delivery, Frames
+from epypes.transport.channel import NO_HEADERS, ChannelOptions, Confirmed, Delivery, Frames, confirm
 
 log = logging.getLogger("epypes.transport")
 
@@ -319,7 +319,7 @@ class BrokerChannel:
             self._resumed.wait()
             if message is None or self._is_closed:
                 return
-            # What came over a lost connection comes again.
+            # The broker delivers again what it had delivered over a connection that was lost.
             if message.connection == self._connection and self._handler is not None:
                 self._hand_over(message, self._handler)
             self._call(self._shrink_backlog, _size(message))
@@ -479,7 +479,7 @@ class BrokerChannel:
     def _confirm(self, number: int, error: Exception | None) -> None:
         message = self._unconfirmed.pop(number, None)
         if message is not None:
-            _tell(message, error)
+            confirm(message.confirmed, error)
             self._progress.set()
 
     # --- the asyncio thread: receiving ---
@@ -593,22 +593,14 @@ class BrokerChannel:
                 self._accepted.clear()
             why = self.trouble.rstrip(".") or "the channel was closed before the broker had confirmed it"
             for message in unsent:
-                _tell(message, BrokerError(self.address, f"A message to {self.address} was not sent: {why}."))
+                error = BrokerError(self.address, f"A message to {self.address} was not sent: {why}.")
+                confirm(message.confirmed, error)
             _thread.release()
             self._finished.set()
 
 
 def _size(message: IncomingMessage) -> int:
     return len(message.body) + _MESSAGE_OVERHEAD_BYTES
-
-
-def _tell(message: OutgoingMessage, error: Exception | None) -> None:
-    if message.confirmed is not None:
-        try:
-            message.confirmed(error)
-        except BaseException:
-            # It is the sender's; the other messages go on.
-            log.exception("the confirmation of a message itself failed")
 
 
 # The brokers that were warned of.
