@@ -18,13 +18,13 @@ import os
 import socket
 import threading
 import uuid
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
 from time import monotonic
 from typing import Any, Final
 
 from epypes.errors import BrokerError, MessageError, ServiceError
+from epypes.service.membership import Membership, label
 from epypes.service.parameters import ParameterControl, Parameters, value_of
 from epypes.service.replica_messages import (
     MAX_ID_CHARACTERS,
@@ -45,22 +45,13 @@ from epypes.transport.address import Address
 from epypes.transport.channel import Delivery
 
 HEARTBEAT_S: Final = 1.0
-# Three heartbeats may be lost before a replica counts as gone.
-_SILENT_AFTER_S: Final = 3.5
 # After this time every other replica has published a heartbeat; one that has joined answers that of a newcomer at once.
 _GATHERING_S: Final = 1.25
 # Events wait no longer than this for the parameters of the others.
 _JOIN_TIMEOUT_S: Final = 5.0
-# A replica that was itself held up, or had no broker, has heard nothing: silence before that proves nothing. The others
-# may take as long to connect again.
-_HELD_UP_S: Final = 2.0
-_GRACE_S: Final = 10.0
 _BATCH_S: Final = 0.1
 _RETRY_S: Final = 0.25
 _CLOSE_S: Final = 1.0
-_LOST_FOR_S: Final = 600.0
-_MAX_MEMBERS: Final = 1_000
-_MAX_LOST: Final = 50
 _MAX_BUNDLES: Final = 100
 _MAX_UNSENT_IDS: Final = 100_000
 # Longer texts are cut: a heartbeat is small.
@@ -68,13 +59,6 @@ _MAX_TEXT: Final = 500
 _NONE: Final[Version] = (0, "")
 
 _log = logging.getLogger("epypes.service")
-
-
-@dataclass(frozen=True, slots=True)
-class _Heard:
-    member: Member
-    heard_s: float
-    is_joining: bool = False
 
 
 class Replicas:
@@ -125,16 +109,13 @@ class Replicas:
 
     def _reset(self) -> None:
         self._id = uuid.uuid4().hex
-        self._members: dict[str, _Heard] = {}
-        self._lost: dict[str, _Heard] = {}
-        self._left: deque[str] = deque(maxlen=_MAX_MEMBERS)
+        self._membership = Membership(self._id)
         self._unsent: deque[str] = deque(maxlen=_MAX_UNSENT_IDS)
         self._subscriber: Subscriber | None = None
         self._publisher: Publisher | None = None
         self._unreached = "" if self._address is None else f"{self._address} has not been reached yet."
         self._connected_s: float | None = None
         self._join_until_s = monotonic() + _JOIN_TIMEOUT_S
-        self._looked_s = self._certain_from_s = 0.0
         self._is_beat_due = self._is_over = False
         self._rejected = 0
 
@@ -245,10 +226,8 @@ class Replicas:
 
     def _beat(self) -> None:
         self._introduce()
-        member, now_s = self._member(), monotonic()
-        self._look_for_lost(member, now_s)
-        with self._changed:
-            lost = [(each.member, int((now_s - each.heard_s) * 1e3)) for each in self._lost.values()]
+        member = self._member()
+        lost = self._membership.look_for_lost(member, bool(self._away))
         self._publish(Heartbeat(member, self.is_joining, lost))
 
     def _introduce(self) -> None:
@@ -305,7 +284,7 @@ class Replicas:
         elif message.id == self._id:
             return
         elif isinstance(message, Goodbye):
-            self._forget(message.id)
+            self._membership.forget(message.id)
         else:
             self._on_answered(message.events)
 
@@ -319,58 +298,19 @@ class Replicas:
             self._changed.notify_all()
 
     def _heard(self, heartbeat: Heartbeat) -> None:
-        member, now_s = heartbeat.member, monotonic()
+        member, known = heartbeat.member, self._membership.hear(heartbeat)
         with self._changed:
-            known = self._members.get(member.id)
-            if known is None and len(self._members) >= _MAX_MEMBERS:
-                return
-            self._members[member.id] = _Heard(member, now_s, heartbeat.is_joining)
-            self._lost.pop(member.id, None)
-            for lost, silent_ms in heartbeat.lost:
-                is_known = lost.id == self._id or lost.id in self._members or lost.id in self._left
-                if not is_known and len(self._lost) < _MAX_LOST:
-                    self._lost.setdefault(lost.id, _Heard(lost, now_s - silent_ms / 1e3))
             is_newer = member.version > self._version(member.digest)
             self._changed.notify_all()
         if known is None:
-            _log.info("%s is in the group", _label(member))
             # The newcomer need not wait for the next one.
             self._beat_soon()
-        is_name_new = known is None or known.member.name != member.name
+        is_name_new = known is None or known.name != member.name
         if is_name_new and member.name != (name := self._facts()["name"]):
             text = "%s serves another bundle from the same queue, %s, and this one serves %s: each takes events of the"
-            _log.warning(f"{text} other. Give each bundle a queue of its own.", _label(member), member.name, name)
+            _log.warning(f"{text} other. Give each bundle a queue of its own.", label(member), member.name, name)
         if is_newer:
             self._publish(ParameterQuery(member.id, member.digest))
-
-    def _forget(self, member_id: str) -> None:
-        """Forget a replica that has stopped in order."""
-        with self._changed:
-            self._left.append(member_id)
-            self._lost.pop(member_id, None)
-            known = self._members.pop(member_id, None)
-        if known is not None:
-            _log.info("%s has left the group", _label(known.member))
-
-    def _look_for_lost(self, own: Member, now_s: float) -> None:
-        if self._away or (self._looked_s and now_s - self._looked_s > _HELD_UP_S):
-            self._certain_from_s = now_s + _GRACE_S
-        self._looked_s = now_s
-        with self._changed:
-            silent = [each for each in self._members.values() if now_s - each.heard_s > _SILENT_AFTER_S]
-            newly_lost = silent if now_s >= self._certain_from_s else []
-            for each in newly_lost:
-                self._lost[each.member.id] = self._members.pop(each.member.id)
-            present = {_place(own), *(_place(each.member) for each in self._members.values())}
-            kept = {
-                key: each
-                for key, each in self._lost.items()
-                # A replica of the same name on the same machine has taken its place.
-                if now_s - each.heard_s <= _LOST_FOR_S and _place(each.member) not in present
-            }
-            self._lost = dict([*kept.items()][-_MAX_LOST:])
-        for each in newly_lost:
-            _log.warning("%s is gone: no heartbeat for %.1f s", _label(each.member), now_s - each.heard_s)
 
     # -- hyperparameters ----------------------------------------------------------------------------------------------
 
@@ -483,10 +423,10 @@ class Replicas:
     def _may_join(self) -> bool:
         """Whether events need not wait for the parameters of the others; the lock is held."""
         now_s, connected_s, digest = monotonic(), self._connected_s, self._parameters.digest
-        others = [each for each in self._members.values() if each.member.digest == digest]
-        is_known = all(each.member.version <= self._version(digest) for each in others) and not self._is_behind()
+        others = self._membership.serving(digest)
+        is_known = all(member.version <= self._version(digest) for member, _ in others) and not self._is_behind()
         has_gathered = connected_s is not None and now_s - connected_s > _GATHERING_S
-        is_answered = any(not each.is_joining for each in others)
+        is_answered = any(not is_joining for _, is_joining in others)
         return (is_known and (has_gathered or is_answered)) or now_s > self._join_until_s
 
     # -- description --------------------------------------------------------------------------------------------------
@@ -531,46 +471,10 @@ class Replicas:
             ``rejected``: how many messages were no messages between replicas; ``members`` and ``lost``: a dict for
             each.
         """
-        own, now_s, subscriber = self._member(), monotonic(), self._subscriber
-        with self._changed:
-            members, lost = [_Heard(own, now_s), *self._members.values()], [*self._lost.values()]
-        present = [each for each in _by_name(members) if now_s - each.heard_s <= _SILENT_AFTER_S]
-        counts: Counter[str] = Counter()
-        for each in present:
-            counts.update(each.member.counts)
+        own, subscriber = self._member(), self._subscriber
         return {
             "is_shared": self.is_shared,
-            "replicas": len(present),
-            "ready": sum(each.member.state == "READY" for each in present),
-            "counts": dict(counts),
-            "agree": len({(each.member.digest, each.member.revision) for each in present}) <= 1,
             "trouble": self._away or own.trouble,
             "rejected": self._rejected + (0 if subscriber is None else sum(subscriber.rejected.values())),
-            "members": [_describe(each, now_s, self._id) for each in present],
-            "lost": [_describe(_as_lost(each, now_s), now_s, self._id) for each in _by_name(lost)],
+            **self._membership.describe(own),
         }
-
-
-def _describe(heard: _Heard, now_s: float, own_id: str) -> dict[str, Any]:
-    found = asdict(heard.member)
-    is_self = found.pop("id") == own_id
-    del found["author"]
-    # A heartbeat may have come since `now_s`.
-    return {**found, "heard_s": round(max(now_s - heard.heard_s, 0.0), 3), "is_self": is_self}
-
-
-def _as_lost(heard: _Heard, now_s: float) -> _Heard:
-    text = f"no heartbeat for {now_s - heard.heard_s:.1f} s, and it did not stop in order; its counts are of then"
-    return replace(heard, member=replace(heard.member, state="LOST", reason=text))
-
-
-def _by_name(heard: Iterable[_Heard]) -> list[_Heard]:
-    return sorted(heard, key=lambda each: (len(each.member.replica), each.member.replica, each.member.id))
-
-
-def _place(member: Member) -> tuple[str, str]:
-    return member.replica, member.host
-
-
-def _label(member: Member) -> str:
-    return f"replica {member.replica} at {member.host}"
