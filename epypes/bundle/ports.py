@@ -1,4 +1,4 @@
-"""How does an event become a payload, and a run an answer?"""
+"""The f_in and f_out of a bundle: an event becomes a payload, and a run becomes an answer."""
 
 from __future__ import annotations
 
@@ -55,14 +55,15 @@ def answer_with(
     """Return an f_out: an Envelope with the output tokens and the times, which answers the event by its id.
 
     The arrays are copies, since a function may use the memory of its result again for the next event before this one
-    is sent; ``detach=False`` is for who encodes an answer before the next event. Images of the tokens named in ``rgb``
-    are sent as RGB. What can't be sent raises MessageError here, where it becomes the event's failure.
+    is sent. What can't be sent raises MessageError here, where it becomes the event's failure. A worker passes
+    ``detach=False``: it encodes each answer when the pipeline puts it, before the next event, so that neither a copy
+    nor a check is needed. Images of the tokens named in ``rgb`` are sent as RGB.
     """
 
     def f_out(view: EventView) -> Envelope:
         from epypes.wire import Envelope, encode
 
-        event = view.event if isinstance(view.event, Envelope) else None
+        event, report = view.event if isinstance(view.event, Envelope) else None, view.report
         answer = Envelope(
             type=RESULT,
             parts={token: detached(view[token]) if detach else view[token] for token in outputs},
@@ -71,18 +72,19 @@ def answer_with(
             acquired_ns=event.acquired_ns if event else 0,
             revision=view.run.revision,
             bundle_digest=bundle_digest,
-            attributes={**view.attributes, "total_ns": view.report.total_ns, "overhead_ns": view.report.overhead_ns},
-            timings=view.report.durations_ns,
+            attributes={**view.attributes, "total_ns": report.total_ns, "overhead_ns": report.overhead_ns},
+            timings=report.durations_ns,
             rgb=[token for token in outputs if token in rgb],
         )
-        encode(answer)
+        if detach:
+            encode(answer)
         return answer
 
     return f_out
 
 
 def is_usual(port: Callable[..., Any]) -> bool:
-    """Whether this is an f_in or f_out that a bundle has without being told."""
+    """Whether this is the f_in or f_out of a bundle that names none."""
     return getattr(port, "__module__", None) == __name__
 
 

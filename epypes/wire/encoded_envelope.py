@@ -98,7 +98,7 @@ class EncodedEnvelope:
         views = [*map(as_view, frames)]
         header = read_header(views, limits)
         return cls(
-            tuple(frame if type(frame) is bytes else view for frame, view in zip(frames, views, strict=True)),
+            tuple([frame if type(frame) is bytes else view for frame, view in zip(frames, views, strict=True)]),
             **scalar_fields(header),
             has_attributes=bool(header.attributes),
             failure=read_failure(header),

@@ -44,7 +44,7 @@ def new_id() -> str:
             return _unused_ids.pop()
         except IndexError:
             digits, size = os.urandom(_ID_BYTES * _IDS_PER_CALL).hex(), 2 * _ID_BYTES
-            _unused_ids.extend(digits[begin : begin + size] for begin in range(0, len(digits), size))
+            _unused_ids.extend([digits[begin : begin + size] for begin in range(0, len(digits), size)])
 
 
 # A forked child must not use the ids that its parent will use.

@@ -10,9 +10,11 @@ What is promised, and by which means (seen with mosquitto 2.0.11):
   message that kills each consumer comes again and again; take RabbitMQ or NATS where that may happen. A message that no
   session would get is refused, and sent again until there is one; ``create=true`` makes one that keeps what comes, and
   each consumer makes one for its dead-letter queue, ``NAME/dead``.
-- A session without a connection is announced, retained, at ``NAME/gone/SESSION``. A consumer that reads it connects as
-  that session, sends what the broker keeps there to the queue again, and ends it. What a consumer leaves behind that
-  never returns waits for the next consumer, seven days at most.
+- The state of each session is retained at ``NAME/gone/SESSION``. A consumer that reads there that a session has lost
+  its connection connects as that session, sends what the broker keeps there to the queue again, and ends it. What a
+  consumer leaves behind that never returns waits for the next consumer, seven days at most. A broker that is killed
+  announces no lost connection: so a consumer asks each session that it finds in use, and takes one that does not
+  answer for lost.
 - *broadcast* is a plain subscription with QoS 1.
 - *log* is none: a consumer gets the newest message, which is retained, and then all that come, in the broker's order.
 - What is lost: what mosquitto had confirmed when it was killed or its machine lost power, but had not written to its
@@ -30,7 +32,7 @@ import logging
 import secrets
 import socket
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from typing import Any, Final
 
 import paho.mqtt.client as paho
@@ -62,6 +64,10 @@ _MOST_IN_FLIGHT: Final = 8
 _AHEAD: Final = 64
 _MOST_UNKEPT: Final = 1_000
 _PATIENCE_MS: Final = 200
+# A consumer that lives answers for its session within this time, also if it has to connect again first.
+_ANSWER_S: Final = 10.0
+# What is retained of a session, and sent to ask whether it has a connection. All else: it has lost its connection.
+_IN_USE, _ENDED, _ASK = b"in use", b"", b"?"
 _LARGEST: Final = 268_000_000
 _MOST_HEADER_BYTES: Final = 65_535
 _REFUSED, _UNHEARD, _TOO_LARGE = 0x80, 0x10, 0x95
@@ -133,7 +139,11 @@ class PahoConnection:
             function(opened)
 
     def _start_reading(self, opened: Any) -> None:
-        if opened.fileno() >= 0:
+        if self.lost.done():
+            # It was aborted while paho was connecting.
+            with contextlib.suppress(OSError):
+                opened.shutdown(socket.SHUT_RDWR)
+        elif opened.fileno() >= 0:
             opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._loop.add_reader(opened, self._read, opened)
 
@@ -270,6 +280,7 @@ class PahoConnection:
 
     def abort(self) -> None:
         """Cut the connection, so that the broker announces the session as gone."""
+        self._lose("it was cut here")
         if self._looking_after is not None:
             self._looking_after.cancel()
         # paho closes the socket when it reads the end.
@@ -300,9 +311,10 @@ class MqttSession:
         # By identity, since messages have no hash.
         self._held: dict[int, paho.MQTTMessage] = {}
         self._is_dropping = False
-        # Sessions without a connection, as far as is known, and what empties them.
+        # Sessions without a connection, as far as is known, those that this one empties, and the tasks that do it.
         self._left: set[str] = set()
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._emptying: set[str] = set()
+        self._tasks: set[asyncio.Task[object]] = set()
 
     def check(self, message: OutgoingMessage) -> None:
         """Raise MessageError for headers that can be no user properties."""
@@ -358,6 +370,7 @@ class MqttSession:
         keeping = PahoConnection(address, self.timeout_s, session)
         try:
             await keeping.open()
+            await keeping.publish(_gone(address, session), _IN_USE, {}, retain=True)
             for topic in (_consumers(address), address.name):
                 await keeping.subscribe(_shared(address, topic))
             await keeping.publish(_gone(address, session), b"kept", {}, retain=True)
@@ -393,10 +406,10 @@ class MqttSession:
         if address.kind != "queue":
             await made.subscribe(address.name)
             return
+        await made.publish(_gone(address, self._session), _IN_USE, {}, retain=True)
         # Again after each restart: mosquitto 2.0 forgets shared subscriptions, and keeps the session.
         for topic in (_consumers(address), address.name):
             await made.subscribe(_shared(address, topic))
-        await made.publish(_gone(address, self._session), b"", {}, retain=True)
         await made.subscribe(_gone(address, "+"), qos=0)
         self._hand_over()
 
@@ -440,30 +453,43 @@ class MqttSession:
         await self._open.publish(self.address.name, bytes(message.payload), user_properties)
 
     def _hear_of_session(self, message: paho.MQTTMessage) -> None:
-        """Take note of a session that has lost its connection, or that another consumer has emptied."""
-        session = message.topic.rpartition("/")[2]
-        if not message.topic.startswith(_gone(self.address, "")) or session == self._session:
+        """Take note of the state of a session, or answer for one."""
+        session, state = message.topic.rpartition("/")[2], message.payload
+        if not message.topic.startswith(_gone(self.address, "")):
             return
-        if not message.payload:
+        if state == _ASK:
+            if session == self._session or session in self._emptying:
+                self._spawn(self._open.publish(message.topic, _IN_USE, {}, retain=True))
+        elif session in (self._session, *self._emptying):
+            return
+        elif state == _ENDED or (state == _IN_USE and not message.retain):
             self._left.discard(session)
         elif session not in self._left:
             self._left.add(session)
-            self._tasks.add(task := asyncio.ensure_future(self._empty(session)))
-            task.add_done_callback(self._tasks.discard)
+            self._spawn(self._empty(session, is_asked=state == _IN_USE))
 
-    async def _empty(self, session: str) -> None:
+    def _spawn(self, work: Coroutine[Any, Any, object]) -> None:
+        self._tasks.add(task := asyncio.ensure_future(work))
+        task.add_done_callback(self._tasks.discard)
+
+    async def _empty(self, session: str, *, is_asked: bool) -> None:
         """Send what the broker keeps for a session to the queue again, and end the session."""
+        if is_asked:
+            await self._open.publish(_gone(self.address, session), _ASK, {})
+            await asyncio.sleep(_ANSWER_S)
         # All consumers read of it at the same time; one will do.
         await asyncio.sleep((secrets.randbelow(_PATIENCE_MS) + 20) / 1000)
         if session not in self._left:
             return
-        address, kept, mark = self.address, asyncio.Queue[paho.MQTTMessage](), secrets.token_bytes(16)
+        self._emptying.add(session)
+        address, kept, mark = self.address, asyncio.Queue[paho.MQTTMessage | None](), secrets.token_bytes(16)
         emptied, end = PahoConnection(address, self.timeout_s, session), f"{_gone(address, session)}/end"
         emptied.on_message = kept.put_nowait
+        emptied.lost.add_done_callback(lambda _: kept.put_nowait(None))
         is_done = False
         try:
             await emptied.open()
-            await emptied.publish(_gone(address, session), b"", {}, retain=True)
+            await emptied.publish(_gone(address, session), _IN_USE, {}, retain=True)
             for topic in (_consumers(address), address.name):
                 await emptied.unsubscribe(_shared(address, topic))
             await emptied.subscribe(end)
@@ -471,15 +497,19 @@ class MqttSession:
             await emptied.publish(end, mark, {})
             while not is_done:
                 message = await asyncio.wait_for(kept.get(), self.timeout_s)
+                if message is None:
+                    raise BrokerError(str(address), f"The connection to {address} is over: {emptied.lost.result()}.")
                 is_done = message.topic == end and message.payload == mark
                 if message.topic == address.name:
                     await self._send_again(message)
                 emptied.client.ack(message.mid, message.qos)
+            await emptied.publish(_gone(address, session), _ENDED, {}, retain=True)
             await emptied.close(with_session=True)
         except (BrokerError, MessageError, TimeoutError) as error:
             # Mostly another consumer was quicker; if not, the broker announces it again.
             log.debug("%s: the session %s was not emptied: %s", address, session, error)
         finally:
+            self._emptying.discard(session)
             self._left.discard(session)
             emptied.abort()
 
@@ -489,8 +519,10 @@ class MqttSession:
         self._deliver = None
         for task in tuple(self._tasks):
             task.cancel()
+        self._left.clear()
         if made is None:
             return
+        made.on_message = lambda message: None
         try:
             if is_consumer and not made.lost.done():
                 await made.publish(_gone(self.address, self._session), b"left", {}, retain=True)
