@@ -121,7 +121,7 @@ def test_what_a_killed_consumer_had_comes_to_those_that_live(opened, queue):
 def test_a_session_that_was_left_is_announced_and_ended_by_the_next_consumer(opened, queue, name, foreign):
     heard, client = {}, foreign()
     client.on_message = lambda _client, _data, message: heard.update({message.topic: message.payload})
-    client.subscribe(f"{name}/gone/+", qos=1)
+    client.subscribe(f"{name}/gone/epypes/+", qos=1)
     with process(KILLED, queue, "2") as consumer:
         assert line_of(consumer) == "open"
         sender = opened(Sender, queue)
@@ -191,6 +191,34 @@ def test_what_a_consumer_was_fetching_from_a_session_when_the_broker_was_killed_
         server.stop(at_once=True)
         server.start()
         taken([receiver], [known_as for known_as in ids if known_as != first.id])
+
+
+def test_what_a_consumer_of_one_group_leaves_reaches_that_group_alone_and_others_get_nothing_twice(
+    mosquitto, name, opened
+):
+    ids = list(map(str, range(30)))
+    left, other = (mosquitto.address(name, create=True, group=group) for group in ("left", "other"))
+    receiver = opened(Receiver, other)
+    with process(KILLED, left, "2") as consumer:
+        assert line_of(consumer) == "open"
+        sender = opened(Sender, left)
+        for known_as in ids:
+            sender.send(b"a", id=known_as)
+        assert line_of(consumer) == "holds"
+        consumer.send_signal(signal.SIGKILL)
+        consumer.wait()
+    assert set(taken([receiver], ids).values()) == {1}
+    taken([opened(Receiver, left)], ids)
+    assert receiver.is_quiet()
+
+
+def test_a_message_that_is_returned_is_delivered_again_to_its_group_alone(mosquitto, name, opened):
+    first, second = (opened(Receiver, mosquitto.address(name, create=True, group=group)) for group in ("a", "b"))
+    opened(Sender, mosquitto.address(name)).send(b"x", id="x")
+    first.next().nack()
+    first.next().ack()
+    second.next().ack()
+    assert second.is_quiet()
 
 
 def test_after_a_restart_of_the_broker_a_sender_waits_until_there_is_a_session(name, opened, caplog):

@@ -10,11 +10,11 @@ What is promised, and by which means (seen with mosquitto 2.0.11):
   message that kills each consumer comes again and again; take RabbitMQ or NATS where that may happen. A message that no
   session would get is refused, and sent again until there is one; ``create=true`` makes one that keeps what comes, and
   each consumer makes one for its dead-letter queue, ``NAME/dead``.
-- The state of each session is retained at ``NAME/gone/SESSION``. A consumer that reads there that a session has lost
-  its connection connects as that session, sends what the broker keeps there to the queue again, and ends it. What a
-  consumer leaves behind that never returns waits for the next consumer, seven days at most. A broker that is killed
-  announces no lost connection: so a consumer asks each session that it finds in use, and takes one that does not
-  answer for lost.
+- The state of each session is retained at ``NAME/gone/GROUP/SESSION``. A consumer of that group that reads there that a
+  session has lost its connection connects as that session, sends what the broker keeps there to its group again
+  (``NAME/again/GROUP``), and ends it. What a consumer leaves behind that never returns waits for the next consumer,
+  seven days at most. A broker that is killed announces no lost connection: so a consumer asks each session that it
+  finds in use, and takes one that does not answer for lost.
 - *broadcast* is a plain subscription with QoS 1.
 - *log* is none: a consumer gets the newest message, which is retained, and then all that come, in the broker's order.
 - What is lost: what mosquitto had confirmed when it was killed or its machine lost power, but had not written to its
@@ -371,11 +371,12 @@ class MqttSession:
         try:
             await keeping.open()
             await keeping.publish(_gone(address, session), _IN_USE, {}, retain=True)
-            for topic in (_consumers(address), address.name):
+            for topic in _topics(address):
                 await keeping.subscribe(_shared(address, topic))
             await keeping.publish(_gone(address, session), b"kept", {}, retain=True)
-        finally:
             await keeping.close()
+        finally:
+            keeping.abort()
 
     async def publish(self, message: OutgoingMessage) -> None:
         """Send a message; return when the broker has it, and a session is to get it."""
@@ -408,7 +409,7 @@ class MqttSession:
             return
         await made.publish(_gone(address, self._session), _IN_USE, {}, retain=True)
         # Again after each restart: mosquitto 2.0 forgets shared subscriptions, and keeps the session.
-        for topic in (_consumers(address), address.name):
+        for topic in _topics(address):
             await made.subscribe(_shared(address, topic))
         await made.subscribe(_gone(address, "+"), qos=0)
         self._hand_over()
@@ -419,7 +420,7 @@ class MqttSession:
         self._hand_over()
 
     def _take(self, message: paho.MQTTMessage) -> None:
-        if self.address.kind == "queue" and message.topic != self.address.name:
+        if self.address.kind == "queue" and message.topic not in (self.address.name, _again(self.address)):
             self._acknowledge(message)
             self._hear_of_session(message)
         elif message.qos or len(self._arrived) < _MOST_UNKEPT:
@@ -450,7 +451,7 @@ class MqttSession:
 
     async def _send_again(self, message: paho.MQTTMessage) -> None:
         user_properties = dict(getattr(message.properties, "UserProperty", ()))
-        await self._open.publish(self.address.name, bytes(message.payload), user_properties)
+        await self._open.publish(_again(self.address), bytes(message.payload), user_properties)
 
     def _hear_of_session(self, message: paho.MQTTMessage) -> None:
         """Take note of the state of a session, or answer for one."""
@@ -490,7 +491,7 @@ class MqttSession:
         try:
             await emptied.open()
             await emptied.publish(_gone(address, session), _IN_USE, {}, retain=True)
-            for topic in (_consumers(address), address.name):
+            for topic in _topics(address):
                 await emptied.unsubscribe(_shared(address, topic))
             await emptied.subscribe(end)
             # What is kept comes in order, so all of it before this.
@@ -500,7 +501,7 @@ class MqttSession:
                 if message is None:
                     raise BrokerError(str(address), f"The connection to {address} is over: {emptied.lost.result()}.")
                 is_done = message.topic == end and message.payload == mark
-                if message.topic == address.name:
+                if message.topic in (address.name, _again(address)):
                     await self._send_again(message)
                 emptied.client.ack(message.mid, message.qos)
             await emptied.publish(_gone(address, session), _ENDED, {}, retain=True)
@@ -546,9 +547,19 @@ def _consumers(address: Address) -> str:
     return f"{address.name}/consumers"
 
 
+def _again(address: Address) -> str:
+    """Return the topic of messages that are delivered again: other groups have had them."""
+    return f"{address.name}/again/{address.group}"
+
+
+def _topics(address: Address) -> tuple[str, ...]:
+    """Return the topics that each session of a queue shares with the others of its group."""
+    return _consumers(address), address.name, _again(address)
+
+
 def _gone(address: Address, session: str) -> str:
-    """Return the topic that announces, retained, a session without a connection."""
-    return f"{address.name}/gone/{session}"
+    """Return the topic at which the state of a session is retained."""
+    return f"{address.name}/gone/{address.group}/{session}"
 
 
 def _headers_of(message: paho.MQTTMessage) -> dict[str, str]:
