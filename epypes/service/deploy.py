@@ -13,8 +13,8 @@ from epypes.errors import BundleError, DeployRefused, ServiceError
 from epypes.service.bundle_info import BundleInfo, differing_ports, read_bundle_info
 from epypes.service.dispatcher import Dispatcher
 from epypes.service.parameters import ParameterControl, differing_values
+from epypes.service.sd_notify import notify, notify_reloading
 from epypes.service.supervisor import Supervisor
-from epypes.service.systemd import notify, notify_reloading
 from epypes.service.worker_connection import WorkerConnection
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ class Deployer:
         DeployRefused
             It does not compute what was recorded, or has other ports; the bundle that is served goes on.
         ServiceError
-            Another one is being deployed.
+            A deploy, a rollback or a write-back is running already.
         """
         return self._exclusive(path, lambda: self._deploy(_read(path), "deployed"))
 
@@ -90,7 +90,7 @@ class Deployer:
         BundleError
             The bundle was changed, or can't be written.
         ServiceError
-            Another one is being deployed.
+            A deploy, a rollback or a write-back is running already.
         """
         return self._exclusive(self._supervisor.bundle.path, lambda: self._write_back(dry_run))
 
@@ -131,7 +131,7 @@ class Deployer:
 
     def _exclusive(self, path: str | Path, work: Callable[[], _T]) -> _T:
         if not self._lock.acquire(blocking=False):
-            raise ServiceError(path, "Another bundle is being deployed. Wait until that is done.")
+            raise ServiceError(path, "A deploy, a rollback or a write-back is running already. Wait until it is done.")
         try:
             notify_reloading()
             return work()

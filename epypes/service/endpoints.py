@@ -70,7 +70,7 @@ class EventInput:
         self._options, self._accept, self._on_exhausted, self._on_change = options, accept, on_exhausted, on_change
         self.is_broker = options.has_broker
         self._log = Throttle(_log)
-        # Of subscribers before this one; and messages of several frames that are no envelopes.
+        # Counted by earlier subscribers; `_rejected` also counts messages of several frames that are no envelopes.
         self._rejected = self._lost = 0
         # Where a bound socket was, while events are not taken.
         self._closed_at = ""
@@ -355,7 +355,7 @@ class Endpoints:
         return self.events.trouble or self.answers.trouble or self.failures.trouble
 
     def counts(self) -> dict[str, int]:
-        """Return the counts of what came and left beside events."""
+        """Return the counts of the endpoints: rejected, lost or duplicates, reconnects, slow_subscribers."""
         return {**self.events.counts(), "slow_subscribers": self.answers.slow_subscribers}
 
 

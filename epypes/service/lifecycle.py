@@ -9,99 +9,24 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final, Literal
 
 from epypes.errors import EpypesError
 from epypes.service.dispatcher import Dispatcher
 from epypes.service.endpoints import Endpoints
 from epypes.service.result_publisher import ResultPublisher
-from epypes.service.systemd import notify
+from epypes.service.sd_notify import notify
+from epypes.service.worker_health import WorkerHealth
 
 State = Literal["LOADING", "READY", "PAUSED", "DEGRADED", "DRAINING", "FAULTED", "STOPPED"]
 # In these states other replicas are better off with a broker's events.
 _UNABLE: Final = ("STOPPED", "LOADING", "FAULTED")
-
-RESTART_PAUSE_S: Final = 0.1
-_LONGEST_PAUSE_S: Final = 10.0
-# After so many answered events the next death is a first one again.
-_GOOD_EVENTS: Final = 5
-# A worker that ends by itself sooner than this after it was ready, or before, so often in a row, is a fault.
-_SOON_S: Final = 1.0
-DEATHS_BEFORE_FAULT: Final = 5
-# After that it is tried again this much later, and twice as late each time.
-_FAULT_PAUSE_S: Final = 5.0
-_LONGEST_FAULT_PAUSE_S: Final = 60.0
-# A worker that was ready for so long and then dies is started again without a long wait.
-_STEADY_S: Final = 10.0
 
 _PAUSE: Final = "pause"
 _LEAVE_TIMEOUT_S: Final = 5.0
 _CHECK_PERIOD_S: Final = 0.1
 
 _log = logging.getLogger("epypes.service")
-
-
-@dataclass(slots=True)
-class WorkerHealth:
-    """Facts about the worker; read and written with the dispatcher's lock held.
-
-    Attributes
-    ----------
-    fault
-        Why no event is taken until there is a worker again; empty otherwise.
-    is_final
-        Whether no worker will be started any more.
-    trouble
-        Why there is none just now.
-    stuck
-        Which function has not returned in time, until the worker that replaces it is ready.
-    restarts
-        How often a worker was started again.
-    deaths
-        How often in a row a worker died by itself, with no event, as soon as it was ready or before.
-    pauses
-        How often in a row there was a pause before a start; each pause is twice as long.
-    was_ready
-        Whether there has been a worker that was ready.
-    ready_s
-        Since when the worker is ready; None while there is none.
-    """
-
-    fault: str = ""
-    is_final: bool = False
-    trouble: str = ""
-    stuck: str = ""
-    restarts: int = 0
-    deaths: int = 0
-    pauses: int = 0
-    was_ready: bool = False
-    ready_s: float | None = None
-
-    def count_death(self, now_s: float, answered: int, *, has_cause: bool) -> None:
-        """Note that a worker has ended.
-
-        Parameters
-        ----------
-        answered
-            How many events were answered since the last death.
-        has_cause
-            Whether it ended for the sake of an event, which will not come again for ever.
-        """
-        was_ready_for_s = 0.0 if self.ready_s is None else now_s - self.ready_s
-        self.ready_s = None
-        if answered:
-            self.deaths = 0
-        self.deaths = 0 if has_cause or was_ready_for_s >= _SOON_S else self.deaths + 1
-        if was_ready_for_s >= _STEADY_S or answered >= _GOOD_EVENTS:
-            self.pauses = 0
-
-    def next_pause_s(self) -> float:
-        """Return how long to wait before the next start."""
-        if self.deaths >= DEATHS_BEFORE_FAULT:
-            return min(_FAULT_PAUSE_S * 2.0 ** min(self.deaths - DEATHS_BEFORE_FAULT, 10), _LONGEST_FAULT_PAUSE_S)
-        self.pauses += 1
-        return min(RESTART_PAUSE_S * 2.0 ** min(self.pauses - 1, 10), _LONGEST_PAUSE_S)
 
 
 class Lifecycle:

@@ -21,7 +21,8 @@ MAX_ID_CHARACTERS: Final = 256
 _MAX_BYTES: Final = 1024**2
 _MAX_CHARACTERS: Final = 2_000
 _MAX_ITEMS: Final = 1_000
-_MAX_INTEGER: Final = 2**53
+# The largest number of a message: JSON readers of other languages hold it exactly.
+MAX_INTEGER: Final = 2**53
 
 # Revision and author of hyperparameters.
 Version = tuple[int, str]
@@ -220,7 +221,7 @@ def _items(value: Any, kind: type[list[Any] | dict[str, Any]] = list) -> Any:
 
 
 def _integer(value: Any) -> int:
-    if type(value) is not int or not 0 <= value <= _MAX_INTEGER:
+    if type(value) is not int or not 0 <= value <= MAX_INTEGER:
         raise TypeError(f"{value!r:.40} is no count")
     return int(value)
 

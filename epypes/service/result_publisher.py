@@ -239,7 +239,7 @@ class ResultPublisher:
         self,
         publish_answer: Callable[[EncodedEnvelope | bytes, str, Confirmed], object],
         publish_failure: Callable[[EncodedEnvelope], object],
-        store: Callable[[], FailureStore],
+        store: FailureStore,
         event_log: EventLog,
         provenance: Callable[[], Provenance],
     ) -> None:
@@ -329,7 +329,7 @@ class ResultPublisher:
     def _report_failure(self, event: AcceptedEvent, result: Result, failure: FailureRecord) -> FailureRecord:
         self._log_failure(failure)
         # In a storm dropped events would fill the store's memory with images of no interest.
-        kept = self._store().keep(failure, None if failure.kind == "dropped" else event.stored)
+        kept = self._store.keep(failure, None if failure.kind == "dropped" else event.stored)
         # With its id, by which a receiver can run it again.
         more = {"id": kept.id, "kind": kept.kind, "dead_letter": kept.dead_letter, "when_ns": kept.when_ns}
         for answer in result.answers:

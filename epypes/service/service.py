@@ -22,9 +22,9 @@ from epypes.service.options import ANY_PORT, Options
 from epypes.service.parameters import ParameterControl, Parameters
 from epypes.service.replicas import Replicas
 from epypes.service.result_publisher import Latency, Listener, Provenance, ResultPublisher
+from epypes.service.sd_notify import notify
 from epypes.service.state_file import ServiceState
 from epypes.service.supervisor import Supervisor
-from epypes.service.systemd import notify
 from epypes.service.worker_queries import WorkerQueries
 from epypes.wire import Envelope, decode, encode
 
@@ -59,7 +59,7 @@ class Service:
     AddressError
         An address is not on loopback.
     ServiceError, StoreError
-        The mailbox, a time or the number of threads can't be; or the database.
+        The mailbox, a time-out or the number of threads is invalid; or the database can't be used.
     """
 
     def __init__(self, path: str | Path, sub: str = ANY_PORT, pub: str = ANY_PORT, **options: Any) -> None:
@@ -74,7 +74,7 @@ class Service:
         self._results = ResultPublisher(
             lambda *answer: self._endpoints.answers.publish(*answer),
             lambda failure: self._endpoints.failures.publish(failure, "", lambda error: None),
-            lambda: self.failure_store,
+            self.failure_store,
             self.event_log,
             self._provenance,
         )
@@ -327,7 +327,7 @@ class Service:
         DeployRefused
             It does not compute what was recorded, or has other ports; the bundle that is served goes on.
         ServiceError
-            Another one is being deployed.
+            A deploy, a rollback or a write-back is running already.
         """
         return {"changed": self._deployer.deploy(path), **self.info()}
 
@@ -380,7 +380,7 @@ class Service:
         BundleError
             The bundle was changed, or can't be written.
         ServiceError
-            Another one is being deployed.
+            A deploy, a rollback or a write-back is running already.
         """
         return self._deployer.write_back(dry_run=dry_run)
 

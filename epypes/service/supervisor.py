@@ -16,10 +16,10 @@ from epypes.bundle.replay import REPLAY_TIMEOUT_S
 from epypes.errors import ServiceError
 from epypes.service.bundle_info import BundleInfo
 from epypes.service.dispatcher import Dispatcher
-from epypes.service.lifecycle import DEATHS_BEFORE_FAULT, RESTART_PAUSE_S, WorkerHealth
 from epypes.service.parameters import ParameterControl, others_than
-from epypes.service.systemd import Watchdog
+from epypes.service.sd_notify import Watchdog
 from epypes.service.worker_connection import SETTLING, Message, WorkerConnection
+from epypes.service.worker_health import DEATHS_BEFORE_FAULT, RESTART_PAUSE_S, WorkerHealth
 
 _END_TIMEOUT_S: Final = 2.0
 
@@ -125,7 +125,7 @@ class Supervisor:
                 job()
                 self._dispatcher.publish()
             except Exception:
-                _log.exception("the supervisor goes on")
+                _log.exception("a step of the supervisor failed; the supervisor goes on")
 
     def _wait_s(self) -> float | None:
         """Return how long to wait if nothing changes; None for ever. With the lock held."""
@@ -281,7 +281,7 @@ class Supervisor:
             self._dispatcher.worker_ended()
             self._died(self.health.stuck or connection.process.ending, answered, has_cause=True)
         else:
-            # Events may kill it again and again: each is a dead letter in the end, so that it goes on.
+            # An event that kills workers becomes a dead letter in the end: such deaths must not make a fault.
             has_event, self._answered_before = bool(self._dispatcher.running), 0
             self._dispatcher.worker_died(connection.process.ending, connection.process.died_in)
             self._died(connection.process.ending, answered, has_cause=has_event)
@@ -401,7 +401,7 @@ class Supervisor:
             self._dispatcher.refuse("")
             parameters = self._parameters.for_new_worker()
             if parameters is not None:
-                # Its own values it has proved; others are those that other workers of this bundle have taken.
+                # The worker has proved the bundle's own values; others were accepted by workers of other replicas.
                 connection.post_parameters(parameters[0], others_than(connection.bundle.entries, parameters[1]))
             self._use(connection)
         if before is not None:

@@ -31,8 +31,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from epypes.bundle.load import MODULE
 from epypes.errors import MessageError, ServiceError
 from epypes.service.packing import HEAD, MARK, BytesLike
+from epypes.service.sd_notify import VARIABLES
 from epypes.service.standard_error import STANDARD_ERROR
-from epypes.service.systemd import VARIABLES
 
 if TYPE_CHECKING:
     from epypes.service.bundle_info import BundleInfo
@@ -322,7 +322,7 @@ class WorkerProcess:
         status = self.process.poll()
         if status is None:
             return ""
-        how = f"was killed by {_signal_name(-status)}" if status < 0 else f"ended with status {status}"
+        how = f"was killed by {signal_name(-status)}" if status < 0 else f"ended with status {status}"
         last = next((line for line in reversed(self._lines) if line.strip()), "")
         return f"The worker {how}" + (f"; its last output: {last.strip()[:300]}" if last else "")
 
@@ -385,7 +385,8 @@ def functions_in_trace(text: str, module: str) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _signal_name(number: int) -> str:
+def signal_name(number: int) -> str:
+    """Return the name of a signal, ``SIGSEGV``, or its number where it has none."""
     try:
         return signal.Signals(number).name
     except ValueError:

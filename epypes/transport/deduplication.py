@@ -104,9 +104,9 @@ class Deduplication:
                     self._in_flight[key] = new
                 return Delivery(delivery.frames, id, delivery.attempt, delivery.headers, new.settle)
             self.duplicates += 1
-            # An acknowledgement over a connection that broke may be lost, and so may one of a message that the same
-            # connection delivers again. That does no harm to an answered message; a rejected one would be missing in
-            # the dead-letter queue. One that is delivered for the first time was sent twice.
+            # The broker may not have received the verdict if the connection has changed, or if it delivers the message
+            # again. To acknowledge twice is harmless; without a second reject the message would be missing in the
+            # dead-letter queue. A first delivery over the same connection was sent twice.
             was_heard = outcome.connection == connection and delivery.attempt <= 1
             if outcome.reason is not None and not was_heard:
                 self._remember(key, _Outcome(outcome.reason, connection))

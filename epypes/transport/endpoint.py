@@ -214,7 +214,7 @@ class ConnectionState:
             endpoint.on_connection(is_connected, reason)
         except BaseException:
             # It is the user's; the connection goes on.
-            log.exception("on_connection itself failed")
+            log.exception("%s: on_connection itself failed", endpoint)
         finally:
             self.callback_threads.discard(threading.get_ident())
 

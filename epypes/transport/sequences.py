@@ -88,7 +88,8 @@ class ReorderBuffer:
 
     Notes
     -----
-    Of a source that is heard for the first time, number 1 is expected: what comes in the middle waits once.
+    Of a new source, number 1 is expected. A receiver that joins in mid-stream holds the first items for ``hold_s``
+    once, because number 1 never comes.
     """
 
     def __init__(self, hold_s: float) -> None:

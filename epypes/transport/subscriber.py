@@ -558,7 +558,7 @@ class Inbox:
         try:
             self._exhausted(item)
         except BaseException:
-            log.exception("exhausted itself failed")
+            log.exception("%s: exhausted itself failed", self._place)
             kept.reject(text)
 
     def _put_all(self, ordering: ReorderBuffer, items: Iterator[Any]) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from epypes.errors import DeployRefused
 from epypes.service import Service
-from epypes.service.systemd import notify
+from epypes.service.sd_notify import notify
 from tests.service.processes import running
 from tests.service.served import SOURCE, TIMEOUT_S, acting_bundle, peer_at, until
 from tests.service.states import read_state

@@ -19,8 +19,8 @@ from epypes.errors import (
     UnknownName,
 )
 from epypes.service import Service
-from epypes.service.lifecycle import DEATHS_BEFORE_FAULT, WorkerHealth
 from epypes.service.packing import unpack
+from epypes.service.worker_health import DEATHS_BEFORE_FAULT, WorkerHealth
 from epypes.wire import decode
 from tests.service.served import SOURCE, TIMEOUT_S, acting_bundle, check_counts, peer_of, serving, until
 

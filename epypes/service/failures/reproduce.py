@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.errors import BundleError, EpypesError
 from epypes.service.failures.record import FailureRecord, read_record, values_of, with_id
+from epypes.service.worker_connection import signal_name
 
 if TYPE_CHECKING:
     from epypes.pipeline import FullPipeline
@@ -147,15 +148,8 @@ def _read_result(folder: Path, scratch: Path, status: int | None, timeout_s: flo
     line, code = (int(frame[2]), linecache.getline(frame[1], int(frame[2])).strip()) if frame else (0, "")
     if status is None or (status == 1 and "Timeout (" in dump):
         return Reproduction("stuck", function, "TimeoutError", f"more than {timeout_s:g} s", (), line, code)
-    ended = f"status {status}" if status >= 0 else _signal_name(-status)
+    ended = f"status {status}" if status >= 0 else signal_name(-status)
     return Reproduction("killed", function, ended, "the process ended with it", (), line, code)
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
 
 
 # -- in the process of its own ----------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ import epypes
 from epypes.bundle.seal import check_seal
 from epypes.errors import BundleError, DeployRefused
 from epypes.service import Service
-from epypes.service.http import events, models, previews
+from epypes.service.http import events, graph_routes, models
 from epypes.service.http.metrics import exposed, registry_of
 from epypes.service.http.models import CHANGE_REFUSALS, INVALID, REFUSALS, Responses, ServiceOf, refused
 from epypes.service.http.responses import add_error_handlers, json_response, parameters_body
@@ -68,7 +68,7 @@ def create_app(service: Service) -> FastAPI:
     app.state.events = events.EventHub(service)
     app.state.registry = registry_of(service)
     app.state.deploying = threading.Lock()
-    routers = (health, previews.router, parameters, events.router, failures, operation)
+    routers = (health, graph_routes.router, parameters, events.router, failures, operation)
     add_error_handlers(app, routers)
     for router in routers:
         app.include_router(router)
@@ -165,7 +165,7 @@ def change_parameters(service: ServiceOf, wanted: models.Change) -> Response:
     dependencies=[NEEDS_TOKEN],
     responses={
         **CHANGE_REFUSALS,
-        409: refused("Another bundle is being deployed."),
+        409: refused("A deploy, a rollback or a write-back is running already."),
         422: refused("The bundle can't be written.", models.Invalid),
     },
 )

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from itertools import accumulate
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, get_args
 
 from prometheus_client import CollectorRegistry
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, InfoMetricFamily
 from prometheus_client.exposition import choose_encoder
+
+from epypes.service.lifecycle import State
 
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
@@ -16,7 +18,7 @@ if TYPE_CHECKING:
     from epypes.service import Service
 
 _NS_PER_S: Final = 1e9
-_STATES: Final = ("LOADING", "READY", "PAUSED", "DEGRADED", "DRAINING", "FAULTED", "STOPPED")
+_STATES: Final = get_args(State)
 _EVENT_OUTCOMES: Final = ("answered", "failed", "dropped", "dead_letters")
 _ROW_OUTCOMES: Final = ("written", "skipped", "unwritten")
 # By name in `Service.counts`: name of the metric, and its description.

@@ -417,7 +417,7 @@ class BrokerChannel:
         try:
             listener(self.is_connected, trouble)
         except BaseException:
-            log.exception("on_connection itself failed")
+            log.exception("%s: on_connection itself failed", self.address)
 
     def _spawn(self, work: Callable[..., Coroutine[Any, Any, None]], *args: Any) -> None:
         """Run something beside the rest; the connection is lost if it fails."""

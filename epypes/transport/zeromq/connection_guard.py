@@ -149,7 +149,10 @@ class ConnectionGuard:
             self._peers.clear()
 
     def update(self) -> bool:
-        """Take note of connections that came and went, and refuse those beyond the limit; return False: all are."""
+        """Take note of connections that came and went, and refuse those beyond the limit.
+
+        Always returns False: nothing is left to read.
+        """
         with self._lock:
             self._update()
         return False
@@ -232,9 +235,9 @@ class ConnectionGuard:
                 self._drop(peer, "it sends a message without an end")
 
     def _drop_old(self) -> None:
-        """Drop the peers that nothing is known to be from, since something came that is from none of the others.
+        """Drop every peer that is not known as a sender: one of them sent a message that names no connection.
 
-        libzmq names the connection of what comes over ZMTP 3.0 (libzmq 4.0 of 2013) and later.
+        libzmq names the connection of messages over ZMTP 3.0 (libzmq 4.0 of 2013) and later.
         """
         with self._lock:
             self._update()

@@ -12,7 +12,7 @@ from epypes.service.http.models import INVALID, REFUSALS, Responses, ServiceOf, 
 router = APIRouter(tags=["graph"])
 
 FRAMES: Final = "application/vnd.epypes.v1+frames"
-_PICTURES: Final = frozenset({"image/png", "image/jpeg", "image/webp", "image/gif", "image/svg+xml"})
+_PICTURES: Final = frozenset({"image/png", "image/jpeg", "image/svg+xml"})
 _MAX_TOKENS: Final = 1_000
 _Token = Annotated[str, Path(description="A token of the graph.", max_length=500, examples=["edges"])]
 _TOKEN_REFUSALS: Final[Responses] = {
