@@ -1,4 +1,4 @@
-"""How is the command line run without its script? ``python -m epypes.cli``."""
+"""Runs the command line without its script: ``python -m epypes.cli``."""
 
 from epypes.cli import main
 

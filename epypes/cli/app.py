@@ -57,7 +57,7 @@ app = typer.Typer(
 
 
 def command_named(name: str) -> Any:
-    """Import a command and return it as Typer's; a group of commands likewise."""
+    """Import a command and return it as Typer's; or a group of commands."""
     module, _, attribute = _COMMANDS[name][0].partition(":")
     found = getattr(importlib.import_module(f"epypes.cli.{module}"), attribute)
     if isinstance(found, typer.Typer):

@@ -33,7 +33,7 @@ def call(
     keys: Keys = None,
     allow: Allow = None,
     sub: Annotated[str, typer.Option(help="As of epypes serve, where a broker asks for a password.")] = "",
-    pub: Annotated[str, typer.Option(help="As of epypes serve, likewise.")] = "",
+    pub: Annotated[str, typer.Option(help="As of epypes serve.")] = "",
 ) -> None:
     """Send one image, or other values, to the service of a bundle; write the answer to files and print the rest."""
     from epypes.bundle.load import SETTINGS

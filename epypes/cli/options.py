@@ -1,4 +1,4 @@
-"""Which options do several commands have in common?"""
+"""Options that several commands have in common."""
 
 from __future__ import annotations
 

@@ -28,15 +28,13 @@ def serve(
         ),
     ] = _ANY_PORT,
     pub: Annotated[
-        str, typer.Option(help="Where answers go: an address to bind, connect:ADDRESS, or a place of a broker.")
+        str, typer.Option(help="Where answers go: an address to bind, connect:ADDRESS, or a broker's queue.")
     ] = _ANY_PORT,
     failures: Annotated[
         str,
-        typer.Option(
-            help="Where failures are published besides, for who wants them alone: likewise. They arrive as answers too."
-        ),
+        typer.Option(help="Extra address that receives only failures, as --pub. Failures also arrive as answers."),
     ] = _ANY_PORT,
-    http: Annotated[str, typer.Option(help="Where it is controlled, as 127.0.0.1:8642; nowhere without.")] = "",
+    http: Annotated[str, typer.Option(help="Address of the HTTP control, as 127.0.0.1:8642; none without.")] = "",
     threads: Annotated[
         int, typer.Option(help="How many events are worked on at once, in order; at most 64.", min=1, max=64)
     ] = 1,
@@ -54,7 +52,7 @@ def serve(
     insecure: Annotated[bool, typer.Option(help="Bind addresses that other machines can reach.")] = False,
     keys: Keys = None,
     allow: Allow = None,
-    token_file: Annotated[Path | None, typer.Option(help="The token for HTTP; one is made without.")] = None,
+    token_file: Annotated[Path | None, typer.Option(help="File of the token for HTTP; one is made without.")] = None,
     store: Annotated[
         str | None,
         typer.Option(
@@ -62,7 +60,7 @@ def serve(
         ),
     ] = None,
     replica: Annotated[
-        str, typer.Option(help="What it is called among those that share a broker's queue; a number without.")
+        str, typer.Option(help="Name of this replica among those that share a broker's queue; a number without.")
     ] = "",
 ) -> None:
     """Serve a bundle between a SUB and a PUB socket, or a broker's queues, until SIGTERM or Ctrl+C.

@@ -1,4 +1,4 @@
-"""Which running service does a command mean?"""
+"""The running service that a command is about."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How does the command line print?
+"""Output of the command line.
 
 Results go to standard output, progress to standard error, so that a result can be piped.
 """

@@ -1,4 +1,4 @@
-"""How does what a kernel says reach the page without waiting?
+"""Server extension of JupyterLab: messages of a kernel reach the page without waiting.
 
 JupyterLab loads this module as a server extension when ``epypes lab`` starts it. TCP holds a small message back while
 an earlier one is not acknowledged (Nagle, RFC 896), and the other end delays its acknowledgement by 40 ms;

@@ -1,4 +1,4 @@
-"""How does a run become an answer on q_out?"""
+"""A run becomes an answer on q_out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which try of an event was it that failed?"""
+"""The attempt of an event that failed."""
 
 from __future__ import annotations
 

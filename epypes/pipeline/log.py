@@ -1,4 +1,4 @@
-"""How is it logged that something went wrong, whatever the exception itself does?"""
+"""Logs errors, also those whose exceptions can't be printed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who takes events from a queue, and how does that end?"""
+"""The thread that takes events from a queue, and its end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What happens to events that arrive faster than they are taken?"""
+"""A queue with a policy for events that arrive faster than they are taken."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is a graph at run time?"""
+"""A graph at run time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is a function at run time?"""
+"""A function at run time."""
 
 from __future__ import annotations
 

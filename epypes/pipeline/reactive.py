@@ -1,4 +1,4 @@
-"""How does a pipeline answer events?
+"""Pipelines that answer events.
 
 The paper's reactive pipelines: a SourcePipeline puts what it computes on q_out, a SinkPipeline is driven by q_in,
 a FullPipeline does both.

@@ -1,6 +1,6 @@
-"""Who is told what became of an event? Whoever keeps it, if the event has words for that: ``ack`` and ``reject``.
+"""Settling of events: an event that a broker keeps has ``ack``, ``reject`` and ``nack``.
 
-Events that a broker has delivered have them. They are looked up in the event's class, so that events can be anything.
+They are looked up in the event's class, so that events can be anything.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What does an event pass before and after the graph of a pipeline, and how far has it got?"""
+"""The stages of an event before and after the graph of a pipeline, and their progress."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When was an event taken, and when did f_in and f_out work on it?"""
+"""The times at which an event was taken, and at which f_in and f_out began and ended."""
 
 from __future__ import annotations
 

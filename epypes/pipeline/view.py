@@ -1,4 +1,4 @@
-"""What does f_out see of an event?"""
+"""The view of an event and its run that f_out gets."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 # Events that may be done before the eldest is, for each that is worked on at once; more would only fill the memory.
 _MAX_AHEAD: Final = 8
-# Events whose answers a broker has not confirmed, likewise.
+# The same of events whose answers a broker has not confirmed.
 _MAX_UNCONFIRMED: Final = 256
 _COUNTED: Final = ("received", "answered", "failed", "dropped", "retried", "dead_letters")
 

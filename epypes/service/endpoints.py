@@ -22,8 +22,6 @@ from epypes.transport.throttle import Throttle
 from epypes.transport.zeromq.channel import prepare_lending
 from epypes.wire import EncodedEnvelope
 
-FAILURE_TOPIC: Final = "failure"
-
 # Answers kept for a subscriber that does not read; images are large, so this bounds the memory that one can cost.
 _MAX_KEPT_ANSWERS: Final = 256
 # Unconfirmed messages for a broker that is away.

@@ -13,7 +13,7 @@ from typing import Final
 
 from epypes.errors import MessageError
 from epypes.wire import EncodedEnvelope, Envelope
-from epypes.wire.limits import DEFAULT_LIMITS
+from epypes.wire.limits import DEFAULT_LIMITS, LEADING_FRAMES
 
 BytesLike = bytes | bytearray | memoryview
 
@@ -22,7 +22,7 @@ MARK: Final = b"EPF1"
 HEAD: Final = struct.Struct("<4sI")
 _SIZE_BYTES: Final = 8
 # Of one encoded Envelope: topic, header and payloads.
-_MAX_FRAMES: Final = DEFAULT_LIMITS.frames + 2
+_MAX_FRAMES: Final = DEFAULT_LIMITS.frames + LEADING_FRAMES
 _MAX_BYTES: Final = DEFAULT_LIMITS.total_bytes
 # The first byte of an event in one block.
 _ENVELOPE: Final = b"v"

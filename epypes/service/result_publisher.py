@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.errors import MailboxOverflow, MessageError, ServiceError
 from epypes.run import Failure
-from epypes.service.endpoints import FAILURE_TOPIC
-from epypes.service.failures.record import FailureRecord
+from epypes.service.failures.record import FAILURE_TOPIC, FailureRecord
 from epypes.transport.channel import Confirmed
 from epypes.transport.throttle import Throttle
 from epypes.wire import EncodedEnvelope, failure_event

@@ -34,6 +34,7 @@ class Scheme(NamedTuple):
     encrypted_as: str = ""
 
 
+# To add a broker: an entry here, and a module with ``make_channel`` and a `brokers.channel.BrokerSession`.
 SCHEMES: Final[Mapping[str, Scheme]] = {
     "amqp": Scheme("brokers.amqp", "rabbitmq", 5672, encrypted_as="amqps"),
     "amqps": Scheme("brokers.amqp", "rabbitmq", 5671),

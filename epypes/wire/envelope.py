@@ -1,4 +1,8 @@
-"""The v1 message as Python objects: Envelope, the failure it may report, and ids of new messages."""
+"""The v1 message as Python objects: Envelope, the failure it may report, and ids of new messages.
+
+A new field needs a line in ``proto/epypes/v1/envelope.proto``, from which ``python -m epypes.wire.compile`` makes the
+schema, one in `SCALAR_FIELDS`, and an attribute of `Envelope` and of `epypes.wire.encoded_envelope.EncodedEnvelope`.
+"""
 
 from __future__ import annotations
 

@@ -52,6 +52,10 @@ _ARRAY_REPLACEMENTS: Final = {
 }
 
 
+# The topic and the header of a message, before its payloads.
+LEADING_FRAMES: Final = 2
+
+
 @dataclass(frozen=True, slots=True)
 class Limits:
     """Limits that a decoder accepts and an encoder keeps.

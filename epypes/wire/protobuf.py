@@ -26,7 +26,6 @@ SCHEMA_PATH: Final = Path(__file__).with_name("schema.binpb")
 _TEXT, _MESSAGE = 9, 11
 # Two pools would give two classes per message, which can't be mixed: so it is filled under a lock.
 _lock: Final = threading.Lock()
-_classes: Final[dict[str, Any]] = {}
 
 
 @cache
@@ -40,6 +39,7 @@ def _pool() -> DescriptorPool:
     return pool
 
 
+@cache
 def message_class(full_name: str) -> Any:
     """Return the class of a message.
 
@@ -58,9 +58,6 @@ def message_class(full_name: str) -> Any:
     KeyError
         If the schema has no such message.
     """
-    known = _classes.get(full_name)
-    if known is not None:
-        return known
     with optional_import():
         from google.protobuf.message_factory import GetMessageClass
     with _lock:
@@ -68,7 +65,7 @@ def message_class(full_name: str) -> Any:
         # Protobuf sets neither; help() fails without a module, and lists no fields.
         found.__module__ = "epypes.wire"
         found.__doc__ = f"The message {full_name}: {', '.join(found.DESCRIPTOR.fields_by_name)}."
-        return _classes.setdefault(full_name, found)
+        return found
 
 
 def serialized(message: Message) -> bytes:

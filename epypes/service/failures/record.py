@@ -12,6 +12,8 @@ from typing import Any, Final
 
 from epypes.bundle.entries import read
 
+# The topic of the events that publish failures.
+FAILURE_TOPIC: Final = "failure"
 # Longer texts would make a list of failures slow.
 _MAX_CHARACTERS: Final = 2_000
 _MAX_LINES: Final = 200

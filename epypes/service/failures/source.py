@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from epypes.bundle.seal import check_seal
 from epypes.errors import BundleError, FailureNotKept, ServiceError, UnknownName
-from epypes.service.failures.record import ID, FailureRecord, read_record
+from epypes.service.failures.record import FAILURE_TOPIC, ID, FailureRecord, read_record
 from epypes.service.failures.store import FailureStore, failures_folder
 
 if TYPE_CHECKING:
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 _LATEST: Final = "latest"
 # Ids of one time begin alike: those of a day have six characters in common.
 _MIN_ID_CHARACTERS: Final = 3
-_FAILURE_TOPIC: Final = "failure"
 # How often a follower looks whether the service still runs.
 _LOOK_S: Final = 0.5
 _JOIN_TIMEOUT_S: Final = 10.0
@@ -238,7 +237,7 @@ def _follow_sockets(path: Path, **secured: Any) -> Iterator[FailureRecord | None
     with ExitStack() as subscribers:
         for address in sorted({state.failures for state in states}):
             _check_shared(path, address)
-            subscriber = subscribers.enter_context(ZMQSubscriber(address, received, _FAILURE_TOPIC, **secured))
+            subscriber = subscribers.enter_context(ZMQSubscriber(address, received, FAILURE_TOPIC, **secured))
             if not subscriber.wait_joined(_JOIN_TIMEOUT_S):
                 text = f"The failures of {path} can't be reached at {address} within {_JOIN_TIMEOUT_S:g} s."
                 raise ServiceError(path, f"{text} {why_unreachable(secured['keys'] is not None)}")

@@ -15,12 +15,13 @@ from epypes.errors import MessageError
 from epypes.transport.address import Address
 from epypes.transport.channel import ERROR, ERROR_REASON, Confirmed, Frames
 from epypes.wire import Limits
+from epypes.wire.limits import LEADING_FRAMES
 
 SIZES: Final = "epypes-frames"
 # The headers of a dead letter: why it was rejected, the queue it comes from, and how often it was delivered.
 REASON, FROM, ATTEMPTS = "epypes-reason", "epypes-from", "epypes-attempts"
 # An envelope has two more than its payload.
-_MOST_FRAMES: Final = Limits().frames + 2
+_MOST_FRAMES: Final = Limits().frames + LEADING_FRAMES
 # Whatever can be sent can be rejected, too: what goes along with a dead letter takes no more than this.
 REASON_BYTES: Final = 700
 DEAD_LETTER_BYTES: Final = 1_024

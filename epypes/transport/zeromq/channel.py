@@ -26,6 +26,7 @@ from epypes.transport.zeromq.io_thread import IOThread, OwnedSocket, Socket, has
 from epypes.transport.zeromq.joining import IDENTITY_BYTES, Publishers, Subscriptions
 from epypes.wire import Limits
 from epypes.wire.arrays import is_immutable
+from epypes.wire.limits import LEADING_FRAMES
 
 log = logging.getLogger("epypes.transport")
 
@@ -35,7 +36,7 @@ _BREAK_TRIES: Final = 5
 # Frames that are read at once; of a longer message the rest is read at the next turn, so that other sockets get theirs.
 _BATCH: Final = 256
 # Beside the payloads an envelope has a topic and a header.
-_MOST_FRAMES: Final = Limits().frames + 2
+_MOST_FRAMES: Final = Limits().frames + LEADING_FRAMES
 _DONTWAIT, _MORE = int(zmq.DONTWAIT), int(zmq.DONTWAIT | zmq.SNDMORE)
 
 
