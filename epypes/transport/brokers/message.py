@@ -70,8 +70,6 @@ class IncomingMessage:
         What the session settles it by; None if the broker doesn't wait for an acknowledgement.
     origin
         See `OutgoingMessage`.
-    connection
-        Set by the channel: the number of the connection that it came over.
     """
 
     body: bytes | memoryview
@@ -80,7 +78,6 @@ class IncomingMessage:
     attempt: int = 0
     receipt: Any = None
     origin: str = ""
-    connection: int = 0
 
 
 def pack(frames: Frames, id: str, headers: Mapping[str, str]) -> tuple[bytes, dict[str, str]]:  # noqa: A002
