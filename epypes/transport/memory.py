@@ -119,11 +119,6 @@ class MemorySession(BrokerSession):
         self._deliver, self._window = deliver, window
         self._hand_out()
 
-    async def set_window(self, window: int) -> None:
-        """Change how many may be unsettled."""
-        self._window = window
-        self._hand_out()
-
     async def settle(self, message: IncomingMessage, *, requeue: bool) -> None:
         """Forget a message, or put it back."""
         if message in self._unsettled:

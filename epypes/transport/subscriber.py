@@ -155,7 +155,7 @@ class Subscriber(Endpoint):
     ) -> None:
         if acknowledge not in get_args(Acknowledge):
             raise ValueError(f"acknowledge is {' or '.join(map(repr, get_args(Acknowledge)))}, not {acknowledge!r}.")
-        self._prefetch = _checked(prefetch)
+        self.prefetch = _checked(prefetch)
         super().__init__(
             address,
             bind=bind,
@@ -178,17 +178,6 @@ class Subscriber(Endpoint):
             ordered=ordered,
             undecoded=undecoded,
         )
-
-    @property
-    def prefetch(self) -> int:
-        """How many messages may be unacknowledged at once; it may be set while the subscriber runs."""
-        return self._prefetch
-
-    @prefetch.setter
-    def prefetch(self, count: int) -> None:
-        self._prefetch = _checked(count)
-        if self._channel is not None:
-            self._channel.prefetch = count
 
     @property
     def received(self) -> int:
@@ -253,7 +242,7 @@ class Subscriber(Endpoint):
                     "heartbeat_s": self._heartbeat_s,
                     "on_stale": _reporter(self),
                 }
-            channel = self._new_channel(self._prefetch, **options)
+            channel = self._new_channel(self.prefetch, **options)
             self._inbox.begin(channel)
             try:
                 channel.open(self._inbox.accept)

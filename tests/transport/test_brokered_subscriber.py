@@ -123,17 +123,16 @@ def test_an_unacknowledged_message_is_delivered_again_to_any_subscriber(address,
     assert left(address) == ["b", "c"]
 
 
-def test_delivery_pauses_at_the_prefetch_limit_which_can_be_changed(address, send):
+def test_delivery_pauses_at_the_prefetch_limit(address, send):
     q = queue.SimpleQueue()
-    for known_as in "abcde":
+    for known_as in "abcd":
         send(id=known_as)
-    with Subscriber(address, q, prefetch=2) as sub:
+    with Subscriber(address, q, prefetch=2):
         kept = [take(q), take(q)]
-        wait_until(lambda: left(address) == ["c", "d", "e"])
-        sub.prefetch = 3
+        wait_until(lambda: left(address) == ["c", "d"])
         kept[0].ack()
-        assert (take(q).id, take(q).id) == ("c", "d")
-        assert left(address) == ["e"]
+        assert take(q).id == "c"
+        assert left(address) == ["d"]
 
 
 def test_the_first_of_ack_reject_and_nack_counts(address, send):

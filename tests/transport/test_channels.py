@@ -268,25 +268,6 @@ def test_no_more_are_delivered_than_the_prefetch_window_until_one_is_settled(que
     receiver.next()
 
 
-@counting
-def test_the_prefetch_window_may_be_changed(queue, opened):
-    sender, receiver = opened(Sender, queue), opened(Receiver, queue, prefetch=2)
-    for number in range(9):
-        sender.send(b"%d" % number)
-    held = receiver.take(2)
-    for prefetch in (3, 5):
-        receiver.channel.prefetch = prefetch
-        held += receiver.take(prefetch - len(held))
-        assert receiver.is_quiet()
-    receiver.channel.prefetch = 2
-    assert receiver.is_quiet()
-    for delivery in held:
-        delivery.ack()
-    held += receiver.take(2)
-    assert receiver.is_quiet()
-    assert sorted(map(body, held)) == [b"%d" % number for number in range(7)]
-
-
 def test_a_paused_channel_delivers_nothing_and_what_it_had_delivered_can_be_acknowledged(queue, opened):
     sender, receiver = opened(Sender, queue), opened(Receiver, queue, prefetch=2)
     sender.send(b"a")

@@ -19,7 +19,7 @@ from shlex import quote
 from typing import Any, Final
 
 import aio_pika
-from aio_pika.abc import AbstractChannel, AbstractIncomingMessage, AbstractQueue
+from aio_pika.abc import AbstractChannel, AbstractIncomingMessage
 from aio_pika.connection import make_url
 from aio_pika.exceptions import (
     AMQPError,
@@ -68,10 +68,6 @@ class AmqpSession(BrokerSession):
         self._connection: Any = None
         self._publishing: AbstractChannel | None = None
         self._opening = asyncio.Lock()
-        self._consuming: AbstractChannel | None = None
-        self._queue: AbstractQueue | None = None
-        # How much each consumer lets be unsettled, by its tag: RabbitMQ leaves that as it was when a consumer began.
-        self._consumers: dict[str, int] = {}
         self._deliver: Callable[[IncomingMessage], object] = lambda message: None
 
     def check(self, message: OutgoingMessage) -> None:
@@ -87,8 +83,7 @@ class AmqpSession(BrokerSession):
     async def connect(self, window: int) -> None:
         """Connect, and see that the queues are there, or make them."""
         address = self.address
-        self._publishing = self._consuming = None
-        self._consumers.clear()
+        self._publishing = None
         url = make_url(
             host=address.host,
             port=address.port,
@@ -113,7 +108,7 @@ class AmqpSession(BrokerSession):
             raise self._unreachable(error) from error
         self._connection.close_callbacks.add(lambda _, error: self.lose(_reason(error)))
         await self._make_sure(address)
-        if _has_dead_letters(address):
+        if address.has_dead_letters:
             await self._make_sure(address.dead_letters)
         if not window:
             # Before the first message, since those that waited for it could be overtaken.
@@ -160,7 +155,7 @@ class AmqpSession(BrokerSession):
                 await channel.declare_exchange(address.name, "fanout", passive=passive, durable=True)
                 return
             arguments = {"x-queue-type": "stream" if address.kind == "log" else "quorum"}
-            if _has_dead_letters(address):
+            if address.has_dead_letters:
                 # If the broker itself gives a message up (newer ones do after 20 deliveries), it is kept all the same.
                 letters = address.dead_letters.name
                 arguments |= {"x-dead-letter-exchange": "", "x-dead-letter-routing-key": letters}
@@ -227,37 +222,21 @@ class AmqpSession(BrokerSession):
         """Have a function called with each message of the queue, broadcast or log."""
         address, self._deliver = self.address, deliver
         try:
-            self._consuming = channel = await self._connection.channel(publisher_confirms=False)
+            channel = await self._connection.channel(publisher_confirms=False)
             channel.close_callbacks.add(lambda _, error: self.lose(_reason(error)))
             underlay = await channel.get_underlay_channel()
             deleted = f"the queue {address.name!r} was deleted"
             underlay.on_consumer_cancel_callbacks.add(lambda frame: self.lose(deleted))
             if address.kind == "broadcast":
-                self._queue = await channel.declare_queue(
-                    exclusive=True, auto_delete=True, arguments=dict(_BROADCAST_QUEUE)
-                )
-                await self._queue.bind(address.name)
+                queue = await channel.declare_queue(exclusive=True, auto_delete=True, arguments=dict(_BROADCAST_QUEUE))
+                await queue.bind(address.name)
             else:
-                self._queue = await channel.get_queue(address.name, ensure=False)
-            await self.set_window(window)
+                queue = await channel.get_queue(address.name, ensure=False)
+            await channel.set_qos(min(window, _MOST_PREFETCH))
+            first: dict[str, Any] = {"x-stream-offset": "first"} if address.kind == "log" else {}
+            await queue.consume(self._take, arguments=first)
         except AMQPError as error:
             raise BrokerError(str(address), f"{address} can't be received from: {_reason(error)}.") from error
-
-    async def set_window(self, window: int) -> None:
-        """See that the consumers let as much be unsettled as the window says: add consumers, or cancel them."""
-        if self._queue is None or self._consuming is None:
-            return
-        window = min(max(window, 1), _MOST_PREFETCH)
-        # What a cancelled consumer has got can be acknowledged all the same.
-        while sum(self._consumers.values()) > window:
-            tag, _ = self._consumers.popitem()
-            await self._queue.cancel(tag)
-        missing = window - sum(self._consumers.values())
-        if missing:
-            await self._consuming.set_qos(missing)
-            first: dict[str, Any] = {"x-stream-offset": "first"} if self.address.kind == "log" else {}
-            tag = await self._queue.consume(self._take, arguments=first)
-            self._consumers[tag] = missing
 
     async def _take(self, message: AbstractIncomingMessage) -> None:
         headers = {name: _text(value) for name, value in message.headers.items()}
@@ -279,13 +258,9 @@ class AmqpSession(BrokerSession):
     async def close(self) -> None:
         """Disconnect; RabbitMQ delivers again what was not acknowledged."""
         connection, self._connection = self._connection, None
-        self._queue = self._consuming = self._publishing = None
+        self._publishing = None
         if connection is not None:
             await connection.close()
-
-
-def _has_dead_letters(address: Address) -> bool:
-    return address.kind == "queue" and address.dead_letters.name != address.name
 
 
 def _reason(error: BaseException | None) -> str:

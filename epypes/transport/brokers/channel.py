@@ -125,10 +125,6 @@ class BrokerSession(abc.ABC):
         """Have a function called with each message that comes, with at most so many unsettled."""
 
     @abc.abstractmethod
-    async def set_window(self, window: int) -> None:
-        """Change how many messages may be unsettled."""
-
-    @abc.abstractmethod
     async def settle(self, message: IncomingMessage, *, requeue: bool) -> None:
         """Acknowledge a message, or have the broker deliver it again."""
 
@@ -207,7 +203,7 @@ class BrokerChannel:
         self.address = str(session.address)
         self.keeps_messages = session.address.kind == "queue"
         self.is_connected, self.trouble, self.reconnects = False, "", 0
-        self._prefetch = options.prefetch
+        self.prefetch = options.prefetch
         self._process = os.getpid()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._handler: Callable[[Delivery], object] | None = None
@@ -229,8 +225,6 @@ class BrokerChannel:
         self._closing: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._unsettled: set[IncomingMessage] = set()
-        # What could not be put into the dead-letter queue, and waits to be delivered again.
-        self._postponed: set[IncomingMessage] = set()
         self._changed_s = monotonic()
         self._has_warned = self._is_dropping = False
         self._backlog_bytes = 0
@@ -241,16 +235,6 @@ class BrokerChannel:
     def waiting(self) -> int:
         """How many messages were accepted for sending and are not confirmed."""
         return len(self._unconfirmed)
-
-    @property
-    def prefetch(self) -> int:
-        """The prefetch window; may be set while the channel is open. MQTT takes it at the next connection."""
-        return self._prefetch
-
-    @prefetch.setter
-    def prefetch(self, count: int) -> None:
-        self._prefetch = count
-        self._call(self._update_window)
 
     def open(self, on_delivery: Callable[[Delivery], object] | None) -> None:
         """Connect for the first time; see `epypes.transport.channel.Channel.open`."""
@@ -360,15 +344,15 @@ class BrokerChannel:
     async def _connect(self) -> None:
         session, timeout_s = self._session, self._options.timeout_s
         session.lost = asyncio.get_running_loop().create_future()
+        window = self.prefetch if self.keeps_messages else max(self.prefetch, _AHEAD)
         try:
             async with asyncio.timeout(timeout_s):
-                await session.connect(self._window if self._handler is not None else 0)
+                await session.connect(window if self._handler is not None else 0)
                 self.reconnects += self._main is not None
                 self._unsettled.clear()
-                self._postponed.clear()
                 self._changed_s = monotonic()
                 if self._handler is not None:
-                    await session.consume(self._deliver, self._window)
+                    await session.consume(self._deliver, window)
         except BaseException as error:
             await self._disconnect()
             if isinstance(error, TimeoutError):
@@ -483,16 +467,6 @@ class BrokerChannel:
 
     # --- the asyncio thread: receiving ---
 
-    @property
-    def _window(self) -> int:
-        # Others are delivered while something waits to be put into the dead-letter queue.
-        window = self._prefetch + len(self._postponed)
-        return window if self.keeps_messages else max(window, _AHEAD)
-
-    def _update_window(self) -> None:
-        if self.is_connected and self._handler is not None:
-            self._spawn(self._session.set_window, self._window)
-
     def _deliver(self, message: IncomingMessage) -> None:
         if message.receipt is not None:
             self._unsettled.add(message)
@@ -517,11 +491,11 @@ class BrokerChannel:
         self._changed_s = monotonic()
         if verdict != "reject":
             self._spawn(self._settled, message, verdict == "nack")
-        elif self._address.dead_letters.name == self._address.name:
-            # A dead-letter queue has none of its own: the message stays where it is.
-            self._postpone(message)
-        else:
+        elif self._address.has_dead_letters:
             self._spawn(self._reject, message, reason)
+        else:
+            # This is a dead-letter queue: the message stays where it is.
+            self._redeliver_later(message)
 
     async def _settled(self, message: IncomingMessage, requeue: bool) -> None:
         self._unsettled.discard(message)
@@ -534,25 +508,17 @@ class BrokerChannel:
             if not self._session.lost.done():
                 text = "A message of %s can't be put into the dead-letter queue, and is delivered again in %g s: %s"
                 log.warning(text, self.address, REDELIVERY_S, error)
-                self._postpone(message)
+                self._redeliver_later(message)
         else:
             await self._settled(message, False)
 
-    def _postpone(self, message: IncomingMessage) -> None:
-        self._postponed.add(message)
-        self._update_window()
-        asyncio.get_running_loop().call_later(REDELIVERY_S, self._redeliver, message)
-
-    def _redeliver(self, message: IncomingMessage) -> None:
-        if message in self._postponed:
-            self._postponed.discard(message)
-            self._spawn(self._settled, message, True)
-            self._update_window()
+    def _redeliver_later(self, message: IncomingMessage) -> None:
+        asyncio.get_running_loop().call_later(REDELIVERY_S, self._settle, message, "nack", "")
 
     async def _warn_if_stalled(self) -> None:
         while not self._has_warned:
             await asyncio.sleep(STALLED_S / 2)
-            if len(self._unsettled) >= self._prefetch and monotonic() - self._changed_s > STALLED_S:
+            if len(self._unsettled) >= self.prefetch and monotonic() - self._changed_s > STALLED_S:
                 self._has_warned = True
                 text = (
                     "%s: prefetch limit reached: %d unacknowledged messages, and none was acknowledged for %g s. "

@@ -338,7 +338,7 @@ class MqttSession(BrokerSession):
         await made.open()
         # A queue of ours keeps what comes before there is a consumer; so does its dead-letter queue.
         kept = [address] if is_queue and address.create else []
-        if window and is_queue and address.dead_letters.name != address.name:
+        if window and address.has_dead_letters:
             kept.append(address.dead_letters)
         for queue in kept:
             if not (window and queue is address) and not await made.publish(_consumers(queue), b"", {}):
@@ -395,11 +395,6 @@ class MqttSession(BrokerSession):
         for topic in _topics(address):
             await made.subscribe(_shared(address, topic))
         await made.subscribe(_gone(address, "+"), qos=0)
-        self._hand_over()
-
-    async def set_window(self, window: int) -> None:
-        """Hand on as many as the window allows; the broker learns of a change at the next connection."""
-        self._window = window
         self._hand_over()
 
     def _take(self, message: paho.MQTTMessage) -> None:

@@ -144,7 +144,7 @@ class NatsSession(BrokerSession):
         address, jetstream = self.address, self._client.jetstream(timeout=self.timeout_s)
         try:
             self._stream = await _stream_of(jetstream, address)
-            if address.kind == "queue" and address.dead_letters.name != address.name:
+            if address.has_dead_letters:
                 await _stream_of(jetstream, address.dead_letters)
         except ServiceUnavailableError as error:
             text = f"{address} can't keep messages: JetStream is off there. Start the server with it: nats-server -js."
@@ -195,8 +195,8 @@ class NatsSession(BrokerSession):
         self._requests = f"$JS.API.CONSUMER.MSG.NEXT.{self._stream}.{consumer}"
         self._inbox = self._client.new_inbox()
         self._subscription = await self._client.subscribe(f"{self._inbox}.*", cb=self._take, **unbounded)
-        self._progress_s = min(_PROGRESS_S, ack_wait_s / 4)
-        await self.set_window(window)
+        self._progress_s, self._window = min(_PROGRESS_S, ack_wait_s / 4), window
+        await self._request(least=1)
 
     async def _find_consumer(self) -> tuple[str, float]:
         """Return the name of the consumer that is pulled from, and how long it waits for an acknowledgement."""
@@ -219,12 +219,6 @@ class NatsSession(BrokerSession):
         if found.deliver_subject or found.ack_policy != AckPolicy.EXPLICIT:
             raise BrokerError(str(address), f"{what} is no pull consumer with explicit acknowledgements.")
         return address.group, found.ack_wait or ACK_WAIT_S
-
-    async def set_window(self, window: int) -> None:
-        """Ask for more messages, if there is room for more."""
-        self._window = max(window, 1)
-        if self._requests:
-            await self._request(least=1)
 
     async def _request(self, least: int) -> None:
         """Ask for as many messages as there is room for, if that is enough."""
