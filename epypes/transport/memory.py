@@ -17,7 +17,7 @@ from typing import Final
 from epypes.errors import BrokerError
 from epypes.transport.address import Address, parse_address
 from epypes.transport.brokers.channel import BrokerChannel, BrokerSession
-from epypes.transport.brokers.message import IncomingMessage, OutgoingMessage, unpacked
+from epypes.transport.brokers.message import IncomingMessage, OutgoingMessage, unpack
 from epypes.transport.channel import ChannelOptions, Delivery
 
 
@@ -181,6 +181,6 @@ def queued(address: str | Address) -> list[Delivery]:
     place = parse_address(address)
     found = []
     for stored in [*_broker(place.host).queues.get(place.name, ())]:
-        frames, headers = unpacked(IncomingMessage(stored.body, stored.id, dict(stored.headers)))
+        frames, headers = unpack(IncomingMessage(stored.body, stored.id, dict(stored.headers)))
         found.append(Delivery(frames, stored.id, stored.deliveries, headers))
     return found

@@ -53,7 +53,6 @@ def encode(
     topic: str = "",
     inline_below: int = INLINE_BELOW,
     *,
-    rgb: Collection[str] = (),
     limits: Limits = DEFAULT_LIMITS,
 ) -> list[bytes | memoryview]:
     """Return the frames of an envelope: topic, header, payloads.
@@ -68,8 +67,6 @@ def encode(
         The first frame, see `topic_frame`.
     inline_below
         Arrays and bytes of fewer bytes are put into the header. numpy scalars always are.
-    rgb
-        Names of parts in RGB order, beside those that the envelope names itself.
     limits
         The receiver's limits.
 
@@ -87,7 +84,6 @@ def encode(
     frames: list[bytes | memoryview] = [topic_frame(topic)]
     header = message_class("epypes.v1.Envelope")()
     writer = ValueWriter(limits, inline_below)
-    rgb = {*rgb, *envelope.rgb}
     limits.check_names(envelope)
     try:
         header.version = VERSION
@@ -101,7 +97,9 @@ def encode(
         if envelope.failure is not None:
             _write_failure(header.failure, envelope.failure)
         for name, value in envelope.parts.items():
-            writer.write_named(header.parts.add(name=name).value, value, str(name), "rgb" if name in rgb else "bgr")
+            writer.write_named(
+                header.parts.add(name=name).value, value, str(name), "rgb" if name in envelope.rgb else "bgr"
+            )
         for name, value in envelope.attributes.items():
             writer.write_named(header.attributes.add(name=name).value, value, str(name))
         frames.append(header.SerializeToString())

@@ -35,7 +35,7 @@ from epypes.transport.brokers.message import (
     dead_letter,
     header_bytes,
     pack,
-    unpacked,
+    unpack,
 )
 from epypes.transport.channel import NO_HEADERS, ChannelOptions, Confirmed, Delivery, Frames, confirm
 
@@ -322,7 +322,7 @@ class BrokerChannel:
             self._call(self._shrink_backlog, _size(message))
 
     def _hand_over(self, message: IncomingMessage, handler: Callable[[Delivery], object]) -> None:
-        frames, headers = unpacked(message)
+        frames, headers = unpack(message)
         delivery = Delivery(frames, message.id, message.attempt, headers)
         if self.keeps_messages:
             delivery.settle = partial(self._call, self._settle, message)
