@@ -157,6 +157,15 @@ def test_values_that_can_not_be_decoded_pass_through_unread():
         read.decode()
 
 
+def test_values_are_not_even_parsed_until_they_are_decoded():
+    part_of_garbage = bytes([12 << 3 | 2, 3]) + b"\xff\xff\xff"
+    read = EncodedEnvelope.read([b"/", header_bytes(type="frame") + part_of_garbage])
+    assert read.type == "frame"
+    with pytest.raises(MessageError) as caught:
+        read.decode()
+    assert caught.value.reason == "no envelope"
+
+
 def test_the_repr_is_small_and_free_of_values():
     assert repr(EncodedEnvelope.encode(full_envelope())).startswith("<EncodedEnvelope 'edges' #7: 12,")
     assert len(repr(EncodedEnvelope.encode(Envelope("x" * 500)))) < 100
