@@ -155,7 +155,7 @@ class Subscriber(Endpoint):
     ) -> None:
         if acknowledge not in get_args(Acknowledge):
             raise ValueError(f"acknowledge is {' or '.join(map(repr, get_args(Acknowledge)))}, not {acknowledge!r}.")
-        self.prefetch = _checked(prefetch)
+        self._prefetch = _checked(prefetch)
         super().__init__(
             address,
             bind=bind,
@@ -178,6 +178,11 @@ class Subscriber(Endpoint):
             ordered=ordered,
             undecoded=undecoded,
         )
+
+    @property
+    def prefetch(self) -> int:
+        """How many messages may be unacknowledged at once."""
+        return self._prefetch
 
     @property
     def received(self) -> int:
@@ -242,7 +247,7 @@ class Subscriber(Endpoint):
                     "heartbeat_s": self._heartbeat_s,
                     "on_stale": _reporter(self),
                 }
-            channel = self._new_channel(self.prefetch, **options)
+            channel = self._new_channel(self._prefetch, **options)
             self._inbox.begin(channel)
             try:
                 channel.open(self._inbox.accept)
