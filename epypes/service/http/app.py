@@ -17,11 +17,14 @@ from fastapi import APIRouter, Body, FastAPI, Query, Request, Response
 from fastapi import Path as PathParameter
 from starlette.responses import FileResponse
 from starlette.staticfiles import StaticFiles
+from starlette.types import Lifespan
 
 import epypes
 from epypes.bundle.seal import check_seal
+from epypes.bundle.writeback import WriteBack
 from epypes.errors import BundleError, DeployRefused
 from epypes.service import Service
+from epypes.service.failures.record import FailureRecord
 from epypes.service.http import events, graph_routes, models
 from epypes.service.http.metrics import exposed, registry_of
 from epypes.service.http.models import CHANGE_REFUSALS, INVALID, REFUSALS, Responses, ServiceOf, refused
@@ -52,8 +55,8 @@ failures = APIRouter(prefix="/v1/failures", tags=["failures"])
 operation = APIRouter(prefix="/v1", tags=["operation"], dependencies=[NEEDS_TOKEN])
 
 
-def create_app(service: Service) -> FastAPI:
-    """Return the application that answers for a service."""
+def create_app(service: Service, lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
+    """Return the application that answers for a service; ``lifespan`` is entered on the server's event loop."""
     app = FastAPI(
         title="EPypes service",
         description=_DESCRIPTION,
@@ -63,14 +66,14 @@ def create_app(service: Service) -> FastAPI:
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,
+        lifespan=lifespan,
     )
     app.state.service = service
     app.state.events = events.EventHub(service)
     app.state.registry = registry_of(service)
     app.state.deploying = threading.Lock()
-    routers = (health, graph_routes.router, parameters, events.router, failures, operation)
-    add_error_handlers(app, routers)
-    for router in routers:
+    add_error_handlers(app)
+    for router in (health, graph_routes.router, parameters, events.router, failures, operation):
         app.include_router(router)
 
     @app.get("/", include_in_schema=False)
@@ -161,7 +164,7 @@ def change_parameters(service: ServiceOf, wanted: models.Change) -> Response:
 
 @parameters.post(
     "/v1/parameters/write-back",
-    response_model=models.WrittenBack,
+    response_model=WriteBack,
     dependencies=[NEEDS_TOKEN],
     responses={
         **CHANGE_REFUSALS,
@@ -169,10 +172,10 @@ def change_parameters(service: ServiceOf, wanted: models.Change) -> Response:
         422: refused("The bundle can't be written.", models.Invalid),
     },
 )
-def write_back(request: Request, service: ServiceOf, wanted: models.WriteBack) -> Response:
+def write_back(request: Request, service: ServiceOf, wanted: models.WriteBackRequest) -> Response:
     """Write the parameters into pipeline.toml, or say what would change there; the bundle is replayed and sealed."""
     done = _alone(request, lambda: service.write_back(dry_run=wanted.dry_run))
-    return json_response({"diff": done.diff, "digest": done.digest})
+    return json_response(asdict(done))
 
 
 def _number(value: Any, entry: Mapping[str, Any]) -> Any:
@@ -200,7 +203,7 @@ def list_failures(
     return json_response({"failures": [asdict(record) for record in service.failure_records(limit)]})
 
 
-@failures.get("/{id}", response_model=models.Failure, responses=_FAILURE_REFUSALS)
+@failures.get("/{id}", response_model=FailureRecord, responses=_FAILURE_REFUSALS)
 def failure(service: ServiceOf, id: _FailureId) -> Response:  # noqa: A002 - as in the path
     """Say what failed, where, and with which parameters."""
     return json_response(asdict(service.failure_store.record(id)))

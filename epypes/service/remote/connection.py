@@ -13,6 +13,7 @@ from urllib.parse import quote
 
 from epypes.bundle.entries import plain, written
 from epypes.bundle.ports import in_order
+from epypes.bundle.writeback import WriteBack
 from epypes.errors import EpypesError, ServiceError
 from epypes.service.failures.record import FailureRecord, read_record
 from epypes.service.parameters import Parameters
@@ -28,22 +29,6 @@ _TOKEN_VARIABLE: Final = "EPYPES_TOKEN"  # noqa: S105 - the name of a variable, 
 _REPLAY_TIMEOUT_S: Final = 300.0
 _INFO_KEYS: Final = ("name", "digest", "state", "func_io", "outputs", "versions")
 _DIGEST_CHARACTERS: Final = 12
-
-
-@dataclass(frozen=True, slots=True)
-class WrittenBack:
-    """What writing back has changed, or would change.
-
-    Attributes
-    ----------
-    diff
-        Of pipeline.toml, as ``diff -u`` writes it; empty if nothing is changed.
-    digest
-        The bundle's, from then on.
-    """
-
-    diff: str
-    digest: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,7 +232,7 @@ class Connection:
         body = {"revision": revision, "values": entries}
         return read_parameters(self.url, self._control.change("PATCH", "/v1/parameters", body))
 
-    def write_back(self, dry_run: bool = False) -> WrittenBack:
+    def write_back(self, dry_run: bool = False) -> WriteBack:
         """Write the values of the hyperparameters into the bundle's pipeline.toml, and return what was changed.
 
         Parameters
@@ -256,7 +241,7 @@ class Connection:
             Whether to return only what would be changed.
         """
         body = self._control.change("POST", "/v1/parameters/write-back", {"dry_run": dry_run}, _REPLAY_TIMEOUT_S)
-        return WrittenBack(str(body.get("diff", "")), str(body.get("digest", "")))
+        return WriteBack(str(body.get("diff", "")), str(body.get("digest", "")))
 
     def deploy(self, path: str | Path) -> dict[str, Any]:
         """Serve another bundle on the service's machine from the next event on.
