@@ -138,27 +138,32 @@ def test_a_service_on_a_socket_is_a_group_of_its_own(acting):
 def test_messages_of_other_programs_are_rejected_and_counted(trio):
     line, (first, *_) = trio
     before, known = first.group()["rejected"], first.parameters()
-    digest, member = first.info()["digest"], json.loads(encode_message(Heartbeat(Member("x"))))
+    digest = first.info()["digest"]
+
+    def heartbeat(**fields):
+        document = json.loads(encode_message(Heartbeat(Member("x"))))
+        document["message"] |= fields
+        return json.dumps(document).encode()
+
     hostile = [
         b"",
         b"\xff\x00",
         b"[]",
         b"null",
         b"[" * 100_000,
-        b'{"v":1,"kind":"goodbye","id":"x"}',
-        b'{"v":2,"kind":"farewell","id":"x"}',
-        b'{"v":2,"kind":"goodbye","id":7}',
+        b'{"version":2,"message":{"kind":"goodbye","id":"x"}}',
+        b'{"version":3,"message":{"kind":"farewell","id":"x"}}',
+        b'{"version":3,"message":{"kind":"goodbye","id":7}}',
         encode_message(ParameterSet(digest, 10**30, "x", {})),
         encode_message(ParameterSet(digest, -1, "x", {})),
-        encode_message(ParameterSet(digest, 900, "x", {"k": {"value": float("nan")}})),
         encode_message(ParameterSet(digest, 900, "x", {"k": 5})),
         encode_message(ParameterSet(digest, 900, "x", {f"k{number}": {} for number in range(1_001)})),
         encode_message(Answered("x", ["id"] * 1_001)),
         encode_message(Answered("x", ["i" * 5_000])),
         encode_message(Goodbye("x" * 1_100_000)),
-        json.dumps({**member, "member": {**member["member"], "pid": "7"}}).encode(),
-        json.dumps({**member, "member": {**member["member"], "counts": {"answered": -1}}}).encode(),
-        json.dumps({**member, "lost": [["x", 1]]}).encode(),
+        heartbeat(member={"id": "x", "pid": "7"}),
+        heartbeat(member={"id": "x", "counts": {"answered": -1}}),
+        heartbeat(lost=[["x", 1]]),
     ]
     publish_to_replicas(line.sub, *hostile, ParameterQuery("of no replica", digest), Goodbye("of no replica"))
     until(lambda: first.group()["rejected"] == before + len(hostile))
@@ -486,7 +491,7 @@ def test_a_change_that_a_replica_has_missed_is_made_when_it_hears_of_it(acting, 
             member = Member("peer", replica="2", host="elsewhere", digest=digest, revision=3, author="peer")
             publish_to_replicas(line.sub, Heartbeat(member))
             while not heard or heard[-1]["kind"] != "query":
-                heard.append(json.loads(b"".join(receiver.next().frames)))
+                heard.append(json.loads(b"".join(receiver.next().frames))["message"])
             assert (heard[-1]["id"], heard[-1]["digest"]) == ("peer", digest)
             publish_to_replicas(line.sub, ParameterSet(digest, 3, "peer", {"k": {"value": 8}}))
             until(lambda: revisions([service]) == [3])

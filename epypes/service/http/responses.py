@@ -107,8 +107,10 @@ def add_error_handlers(app: FastAPI) -> None:
         if status == 404:
             return refusal(404, f"There is nothing at {path}. Look at / or /openapi.json.")
         if status == 405:
-            text = f"{path} does not take {request.method:.20}. Look at /openapi.json."
-            return refusal(405, text, getattr(error, "headers", None))
+            # Starlette's Allow header names only the methods of the first route with this path.
+            methods = [method.upper() for method in request.app.openapi()["paths"].get(request.url.path, ())]
+            headers = {"Allow": ", ".join(sorted(methods))} if methods else getattr(error, "headers", None)
+            return refusal(405, f"{path} does not take {request.method:.20}. Look at /openapi.json.", headers)
         if status == 413:
             return refusal(413, "The body is too long. Send less.", {"Connection": "close"})
         return refusal(status, str(getattr(error, "detail", error)), getattr(error, "headers", None))

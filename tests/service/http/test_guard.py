@@ -219,10 +219,14 @@ def is_well_of(client):
     return client.get("/readyz").status_code == 200
 
 
-@pytest.mark.parametrize(("method", "path"), [("DELETE", "/v1/parameters"), ("GET", "/v1/pause"), ("PUT", "/livez")])
-def test_a_method_that_a_path_does_not_take_says_where_to_look(changing, method, path):
+@pytest.mark.parametrize(
+    ("method", "path", "allowed"),
+    [("DELETE", "/v1/parameters", "GET, PATCH"), ("GET", "/v1/pause", "POST"), ("PUT", "/livez", "GET")],
+)
+def test_a_method_that_a_path_does_not_take_is_refused_with_those_it_takes(changing, method, path, allowed):
     answer = changing.request(method, path)
     assert answer.status_code == 405
+    assert answer.headers["allow"] == allowed
     assert "/openapi.json" in sentence(answer)
 
 
