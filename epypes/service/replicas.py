@@ -20,6 +20,7 @@ import threading
 import uuid
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from time import monotonic
 from typing import Any, Final
 
@@ -29,7 +30,6 @@ from epypes.service.parameters import ParameterControl, Parameters, value_of
 from epypes.service.replica_messages import (
     MAX_ID_CHARACTERS,
     MAX_IDS,
-    MAX_INTEGER,
     Answered,
     Goodbye,
     Heartbeat,
@@ -57,9 +57,35 @@ _MAX_BUNDLES: Final = 100
 _MAX_UNSENT_IDS: Final = 100_000
 # Longer texts are cut: a heartbeat is small.
 _MAX_TEXT: Final = 500
-_NONE: Final[Version] = (0, "")
 
 _log = logging.getLogger("epypes.service")
+
+
+@dataclass(slots=True)
+class _BundleParameters:
+    """What a replica knows of the parameters of one bundle.
+
+    Attributes
+    ----------
+    newest
+        The newest set that was published.
+    settled
+        The version of the last set that the worker has taken or refused.
+    refusal
+        Why the worker has refused it; empty if it has taken it.
+    """
+
+    newest: ParameterSet | None = None
+    settled: Version = (0, "")
+    refusal: str = ""
+
+    @property
+    def version(self) -> Version:
+        return (0, "") if self.newest is None else self.newest.version
+
+    @property
+    def is_behind(self) -> bool:
+        return self.version > (0, "") and self.version != self.settled
 
 
 class Replicas:
@@ -102,10 +128,8 @@ class Replicas:
         # Held while parameters are changed and published: a set of another replica is taken before or after that.
         self._setting = threading.Lock()
         self._threads: list[threading.Thread] = []
-        self._newest: dict[str, ParameterSet] = {}
-        # By digest of the bundle: what this replica computes with, and what its worker has refused, and why.
-        self._applied: dict[str, Version] = {}
-        self._refused: dict[str, tuple[Version, str]] = {}
+        # By digest of the bundle; with the lock `_changed`.
+        self._bundles: dict[str, _BundleParameters] = {}
         self._reset()
 
     def _reset(self) -> None:
@@ -235,7 +259,7 @@ class Replicas:
         """Publish the revision that this bundle has gone on with here, after a deploy, if no other replica knows it."""
         digest, current = self._parameters.snapshot()
         with self._changed:
-            is_new = current.revision > self._version(digest)[0]
+            is_new = current.revision > self._bundle(digest).version[0]
         if is_new:
             self._announce(digest, current)
 
@@ -243,8 +267,8 @@ class Replicas:
         values = {token: value_of(entry) for token, entry in current.entries.items()}
         new = ParameterSet(digest, current.revision, self._id, values)
         with self._changed:
-            self._applied[digest] = new.version
             self._keep(new)
+            self._settle(new)
         self._publish(new)
         self._beat_soon()
 
@@ -273,7 +297,7 @@ class Replicas:
             return
         if isinstance(message, ParameterQuery):
             with self._changed:
-                newest = self._newest.get(message.digest)
+                newest = self._bundle(message.digest).newest
             if message.id == self._id and newest is not None:
                 self._publish(newest)
         elif isinstance(message, ParameterSet):
@@ -289,19 +313,30 @@ class Replicas:
         else:
             self._on_answered(message.events)
 
+    def _bundle(self, digest: str) -> _BundleParameters:
+        """Return what is known of a bundle; the lock is held."""
+        known = self._bundles.pop(digest, None) or _BundleParameters()
+        self._bundles[digest] = known
+        if len(self._bundles) > _MAX_BUNDLES:
+            del self._bundles[next(iter(self._bundles))]
+        return known
+
     def _keep(self, new: ParameterSet) -> None:
         """Remember a set of parameters if it is the newest of its bundle; the lock is held."""
-        if new.version > self._version(new.digest):
-            self._newest.pop(new.digest, None)
-            self._newest[new.digest] = new
-            if len(self._newest) > _MAX_BUNDLES:
-                del self._newest[next(iter(self._newest))]
+        known = self._bundle(new.digest)
+        if new.version > known.version:
+            known.newest = new
             self._changed.notify_all()
+
+    def _settle(self, new: ParameterSet, refusal: str = "") -> None:
+        """Remember that the worker has taken or refused a set; the lock is held."""
+        known = self._bundle(new.digest)
+        known.settled, known.refusal = new.version, refusal
 
     def _heard(self, heartbeat: Heartbeat) -> None:
         member, known = heartbeat.member, self._membership.hear(heartbeat)
         with self._changed:
-            is_newer = member.version > self._version(member.digest)
+            is_newer = member.version > self._bundle(member.digest).version
             self._changed.notify_all()
         if known is None:
             # The newcomer need not wait for the next one.
@@ -333,10 +368,7 @@ class Replicas:
             self._apply_newest()
             before = self._parameters.current
             with self._changed:
-                at_least = self._version(self._parameters.digest)[0] + 1
-            if at_least > MAX_INTEGER:
-                text = f"Revision {at_least - 1} is the last one that replicas can read. Write the parameters back."
-                raise ServiceError(self._parameters.digest, text)
+                at_least = self._bundle(self._parameters.digest).version[0] + 1
             changed = self._parameters.set(values, revision, at_least)
             digest, current = self._parameters.snapshot()
             # Otherwise another bundle has been deployed since.
@@ -350,22 +382,15 @@ class Replicas:
         The caller takes them over: it deploys that bundle.
         """
         with self._changed:
-            found = self._newest.get(digest)
+            found = self._bundle(digest).newest
             if found is None:
                 return None
-            self._applied[digest] = found.version
+            self._settle(found)
             return found.revision, found.values
-
-    def _version(self, digest: str) -> Version:
-        """Return the newest version of a bundle's parameters that is known; the lock is held."""
-        newest = self._newest.get(digest)
-        return _NONE if newest is None else newest.version
 
     def _is_behind(self) -> bool:
         """Whether newer parameters are to be taken over; the lock is held."""
-        digest = self._parameters.digest
-        refused, _ = self._refused.get(digest, (_NONE, ""))
-        return self._version(digest) not in (_NONE, self._applied.get(digest), refused)
+        return self._bundle(self._parameters.digest).is_behind
 
     def _follow(self) -> None:
         """Have the worker take newer parameters, one set after the other."""
@@ -398,19 +423,18 @@ class Replicas:
             There is no worker just now, or it is busy.
         """
         with self._changed:
-            newest = self._newest.get(self._parameters.digest)
-            if newest is None or not self._is_behind():
+            known = self._bundle(self._parameters.digest)
+            newest = known.newest
+            if newest is None or not known.is_behind:
                 return
         problems = self._parameters.follow(newest.digest, newest.revision, newest.values)
-        with self._changed:
-            if problems:
-                why = " ".join(f"{token!r}: {problem}" for token, problem in problems.items())
-                text = f"The worker refuses revision {newest.revision} of the other replicas. {why}"[:_MAX_TEXT]
-                self._refused[newest.digest] = newest.version, text
-            else:
-                self._applied[newest.digest] = newest.version
+        refusal = ""
         if problems:
-            _log.error("%s", text)
+            why = " ".join(f"{token!r}: {problem}" for token, problem in problems.items())
+            refusal = f"The worker refuses revision {newest.revision} of the other replicas. {why}"[:_MAX_TEXT]
+            _log.error("%s", refusal)
+        with self._changed:
+            self._settle(newest, refusal)
         self._beat_soon()
 
     def _look_at_joining(self) -> None:
@@ -428,25 +452,18 @@ class Replicas:
         """Whether events need not wait for the parameters of the others; the lock is held."""
         now_s, connected_s, digest = monotonic(), self._connected_s, self._parameters.digest
         others = self._membership.serving(digest)
-        is_known = all(member.version <= self._version(digest) for member, _ in others) and not self._is_behind()
+        is_known = all(member.version <= self._bundle(digest).version for member, _ in others) and not self._is_behind()
         has_gathered = connected_s is not None and now_s - connected_s > _GATHERING_S
         is_answered = any(not is_joining for _, is_joining in others)
         return (is_known and (has_gathered or is_answered)) or now_s > self._join_until_s
 
     # -- description --------------------------------------------------------------------------------------------------
 
-    @property
-    def _refusal(self) -> str:
-        """Why the newest parameters are not computed with; empty if they are."""
-        digest = self._parameters.digest
-        with self._changed:
-            refused, text = self._refused.get(digest, (_NONE, ""))
-            return text if refused == self._version(digest) else ""
-
     def _member(self) -> Member:
         digest, current = self._parameters.snapshot()
         with self._changed:
-            revision, author = self._applied.get(digest, _NONE)
+            known = self._bundle(digest)
+            (revision, author), refusal = known.settled, known.refusal
         about: dict[str, Any] = {
             **self._facts(),
             "id": self._id,
@@ -455,8 +472,8 @@ class Replicas:
             "digest": digest,
             "revision": current.revision,
             # If they differ, the revision is about to be announced.
-            "author": author if revision == current.revision else "",
-            "trouble": self._refusal,
+            "author": author if revision == current.revision and not refusal else "",
+            "trouble": refusal,
         }
         cut: dict[str, Any] = {
             key: value[:_MAX_TEXT] if isinstance(value, str) else value for key, value in about.items()

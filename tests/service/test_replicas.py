@@ -18,7 +18,6 @@ from epypes.errors import ParametersRefused, RevisionConflict, ServiceError
 from epypes.service import Service, replicas
 from epypes.service.http import HttpServer
 from epypes.service.replica_messages import (
-    MAX_INTEGER,
     Answered,
     Goodbye,
     Heartbeat,
@@ -310,17 +309,6 @@ def test_a_newcomer_has_the_revision_of_the_group_from_its_first_event_on(acting
             assert {(answer.revision, int(answer.parts["out"])) for answer in answers} == {(5, 14)}
             assert second.parameters() == first.parameters()
             first.resume()
-
-
-@pytest.mark.slow
-def test_a_revision_beyond_the_last_that_replicas_can_read_is_not_made(acting, host):
-    with line_of(host) as line, group_of(acting, line) as (first, second):
-        last = ParameterSet(first.info()["digest"], MAX_INTEGER, "peer", {"k": {"value": 9}})
-        publish_to_replicas(line.sub, last)
-        until(lambda: {first.parameters().revision, second.parameters().revision} == {MAX_INTEGER})
-        with pytest.raises(ServiceError, match="last one that replicas can read"):
-            first.set_parameters({"k": 4})
-        assert first.parameters() == second.parameters()
 
 
 @pytest.mark.slow
