@@ -204,8 +204,7 @@ class Connection:
         ServiceError
             It is gone.
         """
-        with self._control.events() as stream:
-            yield from stream
+        yield from self._control.events()
 
     # -- changing -----------------------------------------------------------------------------------------------
 
@@ -276,7 +275,7 @@ class Connection:
         from epypes.service.remote.runner import RemoteRunner
 
         if self._runner is None:
-            self._runner = RemoteRunner(self, self._control.events)
+            self._runner = RemoteRunner(self)
         return self._runner
 
     def close(self) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
@@ -25,7 +24,7 @@ from epypes.errors import (
 )
 from epypes.run import Run
 from epypes.service.parameters import Parameters
-from epypes.service.remote.control import EventFollower, EventStream, read_parameters
+from epypes.service.remote.control import EventFollower, read_parameters
 from epypes.service.remote.runs import RemoteRuns, ShownRuns, remote_graph
 
 if TYPE_CHECKING:
@@ -44,8 +43,6 @@ class RemoteRunner:
     ----------
     connection
         To the service.
-    open_stream
-        Opens the stream of its events.
 
     Attributes
     ----------
@@ -57,13 +54,12 @@ class RemoteRunner:
         The values by token when the connection was made.
     """
 
-    def __init__(self, connection: Connection, open_stream: Callable[[], AbstractContextManager[EventStream]]) -> None:
+    def __init__(self, connection: Connection) -> None:
         self.connection = connection
         info, parameters = connection.info(), connection.parameters()
         self.cg = remote_graph(connection.url, info["func_io"], parameters.entries, _rgb(connection, info))
         self._runs = RemoteRuns(connection, self.cg, parameters, info["outputs"])
         self._shown = ShownRuns()
-        self._open_stream = open_stream
         self._follower: EventFollower | None = None
         self._callbacks: tuple[Callable[[], object], ...] = ()
         self._lock = threading.Lock()
@@ -253,7 +249,9 @@ class RemoteRunner:
         with self._lock:
             self._callbacks = (*self._callbacks, entry)
             if self._follower is None:
-                self._follower = EventFollower(self._open_stream, self._on_connected, self._on_event, self._on_lost)
+                self._follower = EventFollower(
+                    self.connection.events, self._on_connected, self._on_event, self._on_lost
+                )
                 self._follower.start()
 
         def forget() -> None:
