@@ -144,6 +144,7 @@ class Service:
             self.token_file,
             self.options.replica,
             self.options.shows_failures,
+            str(self._supervisor.bundle.path),
         )
 
     def stop(self, timeout_s: float | None = None) -> None:

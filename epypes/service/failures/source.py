@@ -226,11 +226,12 @@ def follow_failures(source: Any, *, keys: Any = None, allow: Any = None) -> Iter
 
 
 def _follow_sockets(path: Path, **secured: Any) -> Iterator[FailureRecord | None]:
-    from epypes.service.ops.client import running_services, why_unreachable
+    from epypes.service.ops.client import why_unreachable
+    from epypes.service.state_file import read_states
     from epypes.transport import ZMQSubscriber
     from epypes.wire import Envelope
 
-    states = running_services(path)
+    states = read_states(path)
     if not states:
         raise ServiceError(path, f"No service runs for {path}. Start one: epypes serve {path}")
     received: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -246,7 +247,7 @@ def _follow_sockets(path: Path, **secured: Any) -> Iterator[FailureRecord | None
             try:
                 event = received.get(timeout=_LOOK_S)
             except queue.Empty:
-                if not running_services(path):
+                if not read_states(path):
                     raise ServiceError(path, f"The service of {path} has ended.") from None
                 continue
             if isinstance(event, Envelope) and event.failure is not None:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.bundle.seal import check_seal
 from epypes.errors import EpypesError
-from epypes.service.ops.client import running_services
+from epypes.service.state_file import read_states, state_file
 
 if TYPE_CHECKING:
     from packaging.requirements import Requirement
@@ -195,8 +195,6 @@ def _browser() -> Check:
 
 
 def _state_folder() -> Check:
-    from epypes.service.state_file import state_file
-
     folder = state_file(".").parent
     mode = stat.S_IMODE(folder.stat().st_mode)
     if mode & 0o077:
@@ -295,7 +293,7 @@ def _bundle(path: Path) -> Check:
 
 
 def _service(path: Path) -> Check:
-    running = running_services(path)
+    running = read_states(path)
     if not running:
         return Check("service", "warning", "none runs for this bundle", f"epypes serve {path}")
     services = (
