@@ -24,7 +24,7 @@ from epypes.bundle.seal import check_seal
 from epypes.bundle.writeback import WriteBack
 from epypes.errors import BundleError, DeployRefused
 from epypes.service import Service
-from epypes.service.failures.record import FailureRecord
+from epypes.service.failures.record import FailedEvent
 from epypes.service.http import events, graph_routes, models
 from epypes.service.http.metrics import exposed, registry_of
 from epypes.service.http.models import CHANGE_REFUSALS, INVALID, REFUSALS, Responses, ServiceOf, refused
@@ -203,7 +203,7 @@ def list_failures(
     return json_response({"failures": [asdict(record) for record in service.failure_records(limit)]})
 
 
-@failures.get("/{id}", response_model=FailureRecord, responses=_FAILURE_REFUSALS)
+@failures.get("/{id}", response_model=FailedEvent, responses=_FAILURE_REFUSALS)
 def failure(service: ServiceOf, id: _FailureId) -> Response:  # noqa: A002 - as in the path
     """Say what failed, where, and with which parameters."""
     return json_response(asdict(service.failure_store.record(id)))

@@ -8,7 +8,7 @@ from fastapi import Depends, Request
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from epypes.service import Service
-from epypes.service.failures.record import FailureRecord
+from epypes.service.failures.record import FailedEvent
 
 Sentence = Annotated[str, Field(description="What is wrong, and the way out.")]
 Revision = Annotated[int, Field(ge=0, description="It rises with every change of the parameters.", examples=[3])]
@@ -159,7 +159,7 @@ class WriteBackRequest(BaseModel):
 class Failures(BaseModel):
     """Events that failed, the last one first."""
 
-    failures: list[FailureRecord]
+    failures: list[FailedEvent]
 
 
 class Access(BaseModel):

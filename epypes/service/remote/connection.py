@@ -15,7 +15,7 @@ from epypes.bundle.entries import plain, written
 from epypes.bundle.ports import in_order
 from epypes.bundle.writeback import WriteBack
 from epypes.errors import EpypesError, ServiceError
-from epypes.service.failures.record import FailureRecord, read_record
+from epypes.service.failures.record import FailedEvent, read_record
 from epypes.service.parameters import Parameters
 from epypes.service.remote.control import Control, Event, read_parameters, split_url
 
@@ -182,12 +182,12 @@ class Connection:
         found = self._control.get("/v1/view")
         return found if isinstance(found, dict) else {}
 
-    def failures(self, limit: int = 100) -> list[FailureRecord]:
+    def failures(self, limit: int = 100) -> list[FailedEvent]:
         """Return the records of the last events that failed."""
         body = self._control.get("/v1/failures", limit=limit)
         return [self._record(record) for record in (body.get("failures", []) if isinstance(body, dict) else [])]
 
-    def failure(self, failure_id: str) -> tuple[FailureRecord, Envelope | bytes | None]:
+    def failure(self, failure_id: str) -> tuple[FailedEvent, Envelope | bytes | None]:
         """Return the record of an event that failed, and the event; None if it was not kept."""
         from epypes.service.packing import unpack_event
 
@@ -337,7 +337,7 @@ class Connection:
             raise ServiceError(self.url, f"What answers at {self.url} is no EPypes service. Is the address right?")
         self._info = body
 
-    def _record(self, entries: Any) -> FailureRecord:
+    def _record(self, entries: Any) -> FailedEvent:
         try:
             return read_record(entries)
         except ValueError as error:

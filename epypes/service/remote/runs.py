@@ -180,7 +180,7 @@ class RemoteRuns:
         last
             The last run that completed.
         record
-            As ``FailureRecord``, JSON-ready.
+            As ``FailedEvent``, JSON-ready.
         parameters
             The hyperparameters.
         """
