@@ -7,8 +7,7 @@ replayed for minutes keeps no other request waiting.
 from __future__ import annotations
 
 import os
-import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -20,9 +19,8 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import Lifespan
 
 import epypes
-from epypes.bundle.seal import check_seal
 from epypes.bundle.writeback import WriteBack
-from epypes.errors import BundleError, DeployRefused
+from epypes.errors import BundleError
 from epypes.service import Service
 from epypes.service.failures.record import FailedEvent
 from epypes.service.http import events, graph_routes, models
@@ -71,7 +69,6 @@ def create_app(service: Service, lifespan: Lifespan[FastAPI] | None = None) -> F
     app.state.service = service
     app.state.events = events.EventHub(service)
     app.state.registry = registry_of(service)
-    app.state.deploying = threading.Lock()
     add_error_handlers(app)
     for router in (health, graph_routes.router, parameters, events.router, failures, operation):
         app.include_router(router)
@@ -168,14 +165,12 @@ def change_parameters(service: ServiceOf, wanted: models.Change) -> Response:
     dependencies=[NEEDS_TOKEN],
     responses={
         **CHANGE_REFUSALS,
-        409: refused("A deploy, a rollback or a write-back is running already."),
         422: refused("The bundle can't be written.", models.Invalid),
     },
 )
-def write_back(request: Request, service: ServiceOf, wanted: models.WriteBackRequest) -> Response:
+def write_back(service: ServiceOf, wanted: models.WriteBackRequest) -> Response:
     """Write the parameters into pipeline.toml, or say what would change there; the bundle is replayed and sealed."""
-    done = _alone(request, lambda: service.write_back(dry_run=wanted.dry_run))
-    return json_response(asdict(done))
+    return json_response(asdict(service.write_back(dry_run=wanted.dry_run)))
 
 
 def _number(value: Any, entry: Mapping[str, Any]) -> Any:
@@ -234,24 +229,19 @@ async def access() -> Response:
 
 
 @operation.post("/deploy", response_model=models.Info, responses=_DEPLOY_REFUSALS)
-def deploy(request: Request, service: ServiceOf, wanted: models.Deploy) -> Response:
+def deploy(service: ServiceOf, wanted: models.Deploy) -> Response:
     """Replay another bundle beside the one that is served, and serve it from the next event on."""
-
-    def check_and_deploy() -> dict[str, Any]:
-        # Unlike the methods of Path, these take any text.
-        if not os.path.isabs(wanted.bundle) or not os.path.isdir(wanted.bundle):
-            text = f"{wanted.bundle!r:.300} is no folder on the service's machine. Name a bundle's absolute path."
-            raise BundleError(wanted.bundle, text)
-        check_seal(Path(wanted.bundle))
-        return service.deploy(wanted.bundle)
-
-    return json_response(_alone(request, check_and_deploy))
+    # Unlike the methods of Path, these take any text.
+    if not os.path.isabs(wanted.bundle) or not os.path.isdir(wanted.bundle):
+        text = f"{wanted.bundle!r:.300} is no folder on the service's machine. Name a bundle's absolute path."
+        raise BundleError(wanted.bundle, text)
+    return json_response(service.deploy(wanted.bundle))
 
 
 @operation.post("/rollback", response_model=models.Info, responses=_DEPLOY_REFUSALS)
-def rollback(request: Request, service: ServiceOf) -> Response:
+def rollback(service: ServiceOf) -> Response:
     """Serve the bundle again that was served before this one."""
-    return json_response(_alone(request, service.rollback))
+    return json_response(service.rollback())
 
 
 @operation.post("/pause", response_model=models.Info, responses=CHANGE_REFUSALS)
@@ -273,15 +263,3 @@ def drain(service: ServiceOf, wanted: Annotated[models.Drain | None, Body()] = N
     """Take no more events, and work off those that wait."""
     service.drain((wanted or models.Drain()).timeout_s)
     return json_response(service.info())
-
-
-def _alone(request: Request, function: Callable[[], Any]) -> Any:
-    """Call what exchanges or changes the bundle, one call at a time; another call is refused at once."""
-    lock: threading.Lock = request.app.state.deploying
-    if not lock.acquire(blocking=False):
-        text = "A bundle is being exchanged already. Wait until that has ended, then look at what is served."
-        raise DeployRefused("The bundle", [text])
-    try:
-        return function()
-    finally:
-        lock.release()
