@@ -352,10 +352,8 @@ class RemoteRunner:
         elif name == "state":
             self._state = str(data.get("state", "")), str(data.get("reason") or "")
         elif name == "parameters":
-            is_whole = "parameters" in data
-            news = read_parameters(self.connection.url, data) if is_whole else self.connection.parameters()
             with self._lock:
-                self._news = news
+                self._news = read_parameters(self.connection.url, data)
         else:
             return
         self._notify()
