@@ -32,7 +32,6 @@ _log = logging.getLogger("epypes.service")
 class _Heard:
     member: Member
     heard_s: float
-    is_joining: bool = False
 
 
 class Membership:
@@ -61,7 +60,7 @@ class Membership:
             known = self._members.get(member.id)
             if known is None and len(self._members) >= _MAX_MEMBERS:
                 return member
-            self._members[member.id] = _Heard(member, now_s, heartbeat.is_joining)
+            self._members[member.id] = _Heard(member, now_s)
             self._lost.pop(member.id, None)
             for lost, silent_ms in heartbeat.lost:
                 is_known = lost.id == self._own_id or lost.id in self._members or lost.id in self._left
@@ -112,11 +111,10 @@ class Membership:
             _log.warning("%s is gone: no heartbeat for %.1f s", label(each.member), now_s - each.heard_s)
         return [(each.member, int((now_s - each.heard_s) * 1e3)) for each in lost]
 
-    def serving(self, digest: str) -> list[tuple[Member, bool]]:
-        """Return the others that serve a bundle, and whether each is still joining."""
+    def serving(self, digest: str) -> list[Member]:
+        """Return the others that serve a bundle."""
         with self._lock:
-            members = [*self._members.values()]
-        return [(each.member, each.is_joining) for each in members if each.member.digest == digest]
+            return [each.member for each in self._members.values() if each.member.digest == digest]
 
     def describe(self, own: Member) -> dict[str, Any]:
         """Return the fields of `Replicas.describe` that are about members, this replica among them."""

@@ -87,14 +87,11 @@ class Heartbeat:
 
     Attributes
     ----------
-    is_joining
-        Whether it does not know yet which parameters the others compute with.
     lost
         Members that it has missed lately, and how many milliseconds ago it heard each: newcomers can't know them.
     """
 
     member: Member
-    is_joining: bool = False
     lost: Annotated[list[tuple[Member, _Count]], _MANY] = field(default_factory=list)
     kind: Literal["heartbeat"] = "heartbeat"
 

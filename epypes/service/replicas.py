@@ -46,7 +46,7 @@ from epypes.transport.address import Address
 from epypes.transport.channel import Delivery
 
 HEARTBEAT_S: Final = 1.0
-# After this time every other replica has published a heartbeat; one that has joined answers that of a newcomer at once.
+# After this time every other replica has published a heartbeat.
 _GATHERING_S: Final = 1.25
 # Events wait no longer than this for the parameters of the others.
 _JOIN_TIMEOUT_S: Final = 5.0
@@ -253,7 +253,7 @@ class Replicas:
         self._introduce()
         member = self._member()
         lost = self._membership.look_for_lost(member, bool(self._away))
-        self._publish(Heartbeat(member, self.is_joining, lost))
+        self._publish(Heartbeat(member, lost))
 
     def _introduce(self) -> None:
         """Publish the revision that this bundle has gone on with here, after a deploy, if no other replica knows it."""
@@ -445,17 +445,14 @@ class Replicas:
                 return
             self.is_joining = False
         self._on_joined()
-        # Newcomers may wait for that.
-        self._beat_soon()
 
     def _may_join(self) -> bool:
         """Whether events need not wait for the parameters of the others; the lock is held."""
         now_s, connected_s, digest = monotonic(), self._connected_s, self._parameters.digest
-        others = self._membership.serving(digest)
-        is_known = all(member.version <= self._bundle(digest).version for member, _ in others) and not self._is_behind()
         has_gathered = connected_s is not None and now_s - connected_s > _GATHERING_S
-        is_answered = any(not is_joining for _, is_joining in others)
-        return (is_known and (has_gathered or is_answered)) or now_s > self._join_until_s
+        known = self._bundle(digest)
+        is_known = all(member.version <= known.version for member in self._membership.serving(digest))
+        return (has_gathered and is_known and not known.is_behind) or now_s > self._join_until_s
 
     # -- description --------------------------------------------------------------------------------------------------
 

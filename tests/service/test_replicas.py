@@ -15,7 +15,7 @@ import pytest
 from httpx_sse import EventSource
 
 from epypes.errors import ParametersRefused, RevisionConflict, ServiceError
-from epypes.service import Service, replicas
+from epypes.service import Service
 from epypes.service.http import HttpServer
 from epypes.service.replica_messages import (
     Answered,
@@ -309,26 +309,6 @@ def test_a_newcomer_has_the_revision_of_the_group_from_its_first_event_on(acting
             assert {(answer.revision, int(answer.parts["out"])) for answer in answers} == {(5, 14)}
             assert second.parameters() == first.parameters()
             first.resume()
-
-
-@pytest.mark.slow
-def test_a_newcomer_does_not_join_on_the_parameters_of_another_newcomer(acting, host, monkeypatch):
-    # Only the heartbeats decide when it joins.
-    monkeypatch.setattr(replicas, "_GATHERING_S", 10 * TIMEOUT_S)
-    monkeypatch.setattr(replicas, "_JOIN_TIMEOUT_S", 10 * TIMEOUT_S)
-    digest = Service(acting).info()["digest"]
-    with line_of(host) as line, Service(acting, line.sub, line.pub, replica="1") as service:
-        line.send(number=1)
-        # The first knows nothing yet; the other one is late.
-        publish_to_replicas(
-            line.sub,
-            Heartbeat(Member("newcomer", replica="2", host="elsewhere", digest=digest), is_joining=True),
-            Heartbeat(Member("late", replica="3", host="elsewhere", digest=digest, revision=4, author="late")),
-            ParameterSet(digest, 4, "late", {"k": {"value": 9}}),
-        )
-        (answer,) = line.take()
-        assert (answer.revision, int(answer.parts["out"])) == (4, 9)
-        assert service.parameters().revision == 4
 
 
 @pytest.mark.slow
