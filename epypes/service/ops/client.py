@@ -93,14 +93,15 @@ class Client:
         self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._subscriber = _subscriber_to(path, pub or state.pub, self._answers, keys=keys, allow=allow)
-        self._publisher = _publisher_to(sub or state.sub, self._requests, keys=keys, allow=allow)
+        self._publisher = Publisher(sub or state.sub, self._requests, bind=False, keys=keys, allow=allow)
 
     def __enter__(self) -> Self:
         deadline = monotonic() + self.timeout_s
         try:
             self._subscriber.start()
             self._publisher.start()
-            if not self._has_joined(deadline):
+            is_heard = self._subscriber.wait_joined(self.timeout_s)
+            if not (is_heard and self._publisher.wait_for_subscriber(max(deadline - monotonic(), 0.0))):
                 text = f"The service of {self.path} can't be reached within {self.timeout_s:g} s."
                 raise ServiceError(self.path, f"{text} {why_unreachable(self._has_keys)}")
         except BaseException:
@@ -111,11 +112,6 @@ class Client:
     def __exit__(self, *exception: object) -> None:
         self._publisher.stop()
         self._subscriber.stop()
-
-    def _has_joined(self, deadline_s: float) -> bool:
-        """Wait until events and answers arrive; a broker has confirmed both by now."""
-        is_heard = self._subscriber.wait_joined(self.timeout_s)
-        return is_heard and self._publisher.wait_for_subscriber(max(deadline_s - monotonic(), 0.0))
 
     def _lost(self) -> int:
         return sum(self._subscriber.lost.values())
@@ -214,12 +210,6 @@ def _subscriber_to(path: str | Path, address: str, answers: Any, **secured: Any)
         )
         raise ServiceError(path, text)
     return Subscriber(place, answers, acknowledge="received", **secured)
-
-
-def _publisher_to(address: str, requests: Any, **secured: Any) -> Publisher:
-    """Return the publisher of events to a service."""
-    place = parse_address(address)
-    return Publisher(place, requests, bind=False, **secured)
 
 
 def _read(path: str | Path, answer: Envelope, round_trip_ns: int, rgb: Collection[str]) -> Answer:

@@ -15,6 +15,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
 from time import perf_counter_ns
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 
 Outcome = Literal["ok", "warning", "failed"]
 
-_OLDEST_PYTHON: Final = (3, 11)
 # A missing extra disables one part of EPypes.
 _EXTRAS: Final = ("notebook", "vision", "serve", "service", "scale", "store", "rabbitmq", "nats", "mqtt")
 _BROWSERS: Final = ("chromium", "chromium-browser", "google-chrome", "firefox", "safari", "microsoft-edge")
@@ -106,8 +106,6 @@ def _shown(address: str) -> str:
 
 def _python() -> Check:
     found = f"{platform.python_implementation()} {platform.python_version()} at {sys.executable}, {platform.machine()}"
-    if sys.version_info < _OLDEST_PYTHON:
-        return Check("Python", "failed", found, "EPypes needs Python 3.11 or newer: make an environment with one.")
     return Check("Python", "ok", found)
 
 
@@ -170,19 +168,13 @@ def _graphviz() -> Check:
     from epypes.display.layout.engine import routed_layout
     from epypes.display.layout.geometry import Box
 
-    engine = "pygraphviz" if _has("pygraphviz") else shutil.which("dot") or "none"
+    engine = "pygraphviz" if find_spec("pygraphviz") else shutil.which("dot") or "none"
     try:
         routed_layout([Box("box", 40, 20), Box("ellipse", 40, 20)], [(0, 1)], frozenset())
     except EpypesError as error:
         way_out = "pip install 'epypes[graphviz]', or your system's package graphviz, if you want graphs drawn."
         return Check("Graphviz", "warning", str(error), way_out)
     return Check("Graphviz", "ok", f"lays out by {engine}")
-
-
-def _has(module: str) -> bool:
-    from importlib.util import find_spec
-
-    return find_spec(module) is not None
 
 
 def _browser() -> Check:

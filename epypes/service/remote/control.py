@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import json
-import logging
-import threading
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import Any, Final, NoReturn
 from urllib.parse import parse_qs, urlsplit
 
 from epypes.errors import (
     DeployRefused,
-    EpypesError,
     MessageError,
     NotComputed,
     ParametersRefused,
@@ -26,15 +23,11 @@ from epypes.service.parameters import Parameters
 with optional_import():
     import httpx
 
-_log = logging.getLogger(__name__)
-
 _LOOPBACK: Final = ("localhost", "127.0.0.1", "::1")
 # A service sends its counts each second.
 _SILENCE_S: Final = 5.0
 _MAX_DETAIL_CHARACTERS: Final = 2_000
 _HOW_TO_CHANGE: Final = "Give it here: ep.connect(url, token=...), or set EPYPES_TOKEN."
-_FIRST_WAIT_S: Final = 0.25
-_LAST_WAIT_S: Final = 8.0
 
 Event = tuple[str, dict[str, Any]]
 
@@ -187,68 +180,3 @@ def read_parameters(url: str, body: Any) -> Parameters:
         return Parameters(int(body["revision"]), entries)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ServiceError(url, f"What answers at {url} is no EPypes service: it has no parameters.") from error
-
-
-# -- events -----------------------------------------------------------------------------------------------------------
-
-
-class EventFollower:
-    """Reads the events of a service on a thread of its own, and reconnects when the service is gone.
-
-    Parameters
-    ----------
-    events
-        Opens the stream of events.
-    on_connected
-        Called when the stream is open, before its first event.
-    on_event
-        Called with the name and the data of each event.
-    on_lost
-        Called with the reason when the stream ends, and when it can't be opened.
-
-    Notes
-    -----
-    All are called on its thread, a daemon. Between two attempts it waits 0.25 s, 0.5 s ... 8 s.
-    """
-
-    def __init__(
-        self,
-        events: Callable[[], Iterator[Event]],
-        on_connected: Callable[[], None],
-        on_event: Callable[[str, Mapping[str, Any]], None],
-        on_lost: Callable[[str], None],
-    ) -> None:
-        self._events, self._on_connected = events, on_connected
-        self._on_event, self._on_lost = on_event, on_lost
-        self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="epypes-follower", daemon=True)
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Call nothing any more. The thread ends at the next event: a service sends its counts each second."""
-        self._stopped.set()
-
-    def _run(self) -> None:
-        wait_s = _FIRST_WAIT_S
-        while not self._stopped.is_set():
-            reason, is_connected = "It ended the connection.", False
-            try:
-                for name, data in self._events():
-                    if self._stopped.is_set():
-                        return
-                    if not is_connected:
-                        is_connected, wait_s = True, _FIRST_WAIT_S
-                        self._on_connected()
-                    self._on_event(name, data)
-            except EpypesError as error:
-                reason = str(error)
-            except Exception as error:
-                _log.exception("An event of a service could not be handled")
-                reason = f"{type(error).__name__}: {error}"
-            if not self._stopped.is_set():
-                self._on_lost(reason)
-            self._stopped.wait(wait_s)
-            wait_s = min(2 * wait_s, _LAST_WAIT_S)
