@@ -15,10 +15,6 @@ from pydantic import AfterValidator, Field, StringConstraints, TypeAdapter, Vali
 
 from epypes.errors import MessageError
 
-# Ids in one message; more are sent in the next one. With the longest ids it is still below the limit of bytes.
-MAX_IDS: Final = 250
-# Longer ids are not sent: the broker's own redelivery count covers them.
-MAX_ID_CHARACTERS: Final = 256
 _MAX_BYTES: Final = 1024**2
 # The largest number of a message: JSON readers of other languages hold it exactly.
 MAX_INTEGER: Final = 2**53
@@ -29,8 +25,7 @@ def _printable(text: str) -> str:
     return "".join(character if character.isprintable() else " " for character in text)
 
 
-_Short = Annotated[str, StringConstraints(max_length=2_000)]
-_Text = Annotated[_Short, AfterValidator(_printable)]
+_Text = Annotated[str, StringConstraints(max_length=2_000), AfterValidator(_printable)]
 _Count = Annotated[int, Field(ge=0, le=MAX_INTEGER)]
 _MANY: Final = Field(max_length=1_000)
 # Revision and author of hyperparameters.
@@ -38,8 +33,8 @@ Version = tuple[int, str]
 
 
 @dataclass(frozen=True, slots=True)
-class Member:
-    """What a replica publishes of itself with each heartbeat.
+class Heartbeat:
+    """A replica is alive: what it publishes of itself every second.
 
     Attributes
     ----------
@@ -74,26 +69,12 @@ class Member:
     counts: Annotated[Mapping[_Text, _Count], _MANY] = field(default_factory=dict)
     http: _Text = ""
     trouble: _Text = ""
+    kind: Literal["heartbeat"] = "heartbeat"
 
     @property
     def version(self) -> Version:
         """Of the hyperparameters that it computes with."""
         return self.revision, self.author
-
-
-@dataclass(frozen=True, slots=True)
-class Heartbeat:
-    """A replica is alive.
-
-    Attributes
-    ----------
-    lost
-        Members that it has missed lately, and how many milliseconds ago it heard each: newcomers can't know them.
-    """
-
-    member: Member
-    lost: Annotated[list[tuple[Member, _Count]], _MANY] = field(default_factory=list)
-    kind: Literal["heartbeat"] = "heartbeat"
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,16 +130,7 @@ class ParameterQuery:
     kind: Literal["query"] = "query"
 
 
-@dataclass(frozen=True, slots=True)
-class Answered:
-    """A replica has answered events; one that is delivered again is a duplicate."""
-
-    id: _Text
-    events: Annotated[list[_Short], _MANY]
-    kind: Literal["answered"] = "answered"
-
-
-ReplicaMessage = Heartbeat | Goodbye | ParameterSet | ParameterQuery | Answered
+ReplicaMessage = Heartbeat | Goodbye | ParameterSet | ParameterQuery
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,7 @@ import os
 import socket
 import threading
 import uuid
-from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from time import monotonic
 from typing import Any, Final
@@ -28,12 +27,8 @@ from epypes.errors import BrokerError, MessageError, ServiceError
 from epypes.service.membership import Membership, label
 from epypes.service.parameters import ParameterControl, Parameters, value_of
 from epypes.service.replica_messages import (
-    MAX_ID_CHARACTERS,
-    MAX_IDS,
-    Answered,
     Goodbye,
     Heartbeat,
-    Member,
     ParameterQuery,
     ParameterSet,
     ReplicaMessage,
@@ -50,11 +45,9 @@ HEARTBEAT_S: Final = 1.0
 _GATHERING_S: Final = 1.25
 # Events wait no longer than this for the parameters of the others.
 _JOIN_TIMEOUT_S: Final = 5.0
-_BATCH_S: Final = 0.1
 _RETRY_S: Final = 0.25
 _CLOSE_S: Final = 1.0
 _MAX_BUNDLES: Final = 100
-_MAX_UNSENT_IDS: Final = 100_000
 # Longer texts are cut: a heartbeat is small.
 _MAX_TEXT: Final = 500
 
@@ -96,11 +89,9 @@ class Replicas:
     address
         The broadcast address of the group, beside the queue; None for a service without a broker.
     facts
-        Returns the fields of `Member` that the service knows: replica, name, state, reason, counts, http.
+        Returns the fields of `Heartbeat` that the service knows: replica, name, state, reason, counts, http.
     parameters
         The hyperparameters of this replica.
-    on_answered
-        Called with ids of events that another replica has answered.
     on_joined
         Called once after `start`, on a thread of this object: the parameters that the other replicas compute with are
         taken over, or were not to be had in time. Events must wait until then.
@@ -118,11 +109,10 @@ class Replicas:
         address: Address | None,
         facts: Callable[[], Mapping[str, Any]],
         parameters: ParameterControl,
-        on_answered: Callable[[Iterable[str]], object],
         on_joined: Callable[[], object],
     ) -> None:
         self._address, self._facts, self._parameters = address, facts, parameters
-        self._on_answered, self._on_joined = on_answered, on_joined
+        self._on_joined = on_joined
         self.is_shared, self.is_joining = address is not None, False
         self._changed = threading.Condition()
         # Held while parameters are changed and published: a set of another replica is taken before or after that.
@@ -134,8 +124,7 @@ class Replicas:
 
     def _reset(self) -> None:
         self._id = uuid.uuid4().hex
-        self._membership = Membership(self._id)
-        self._unsent: deque[str] = deque(maxlen=_MAX_UNSENT_IDS)
+        self._membership = Membership()
         self._subscriber: Subscriber | None = None
         self._publisher: Publisher | None = None
         self._unreached = "" if self._address is None else f"{self._address} has not been reached yet."
@@ -179,7 +168,6 @@ class Replicas:
         try:
             if self._connect(subscriber, publisher):
                 self._take_part()
-                self._publish_answered()
                 self._publish(Goodbye(self._id))
         except Exception as error:
             _log.exception("this replica takes no part in its group any more")
@@ -211,18 +199,11 @@ class Replicas:
             if self._is_beat_due or monotonic() >= beat_s:
                 self._is_beat_due, beat_s = False, monotonic() + HEARTBEAT_S
                 self._beat()
-            self._publish_answered()
             with self._changed:
-                self._changed.wait_for(self._is_work_due, max(beat_s - monotonic(), 0.0))
-                if self._unsent:
-                    # More answers may follow, and go into the same message.
-                    self._changed.wait_for(self._has_ended, _BATCH_S)
+                self._changed.wait_for(lambda: self._is_over or self._is_beat_due, max(beat_s - monotonic(), 0.0))
 
     def _has_ended(self) -> bool:
         return self._is_over
-
-    def _is_work_due(self) -> bool:
-        return self._is_over or self._is_beat_due or (bool(self._unsent) and not self._away)
 
     def _beat_soon(self) -> None:
         with self._changed:
@@ -251,9 +232,9 @@ class Replicas:
 
     def _beat(self) -> None:
         self._introduce()
-        member = self._member()
-        lost = self._membership.look_for_lost(member, bool(self._away))
-        self._publish(Heartbeat(member, lost))
+        heartbeat = self._heartbeat()
+        self._membership.look_for_lost(heartbeat, bool(self._away))
+        self._publish(heartbeat)
 
     def _introduce(self) -> None:
         """Publish the revision that this bundle has gone on with here, after a deploy, if no other replica knows it."""
@@ -271,19 +252,6 @@ class Replicas:
             self._settle(new)
         self._publish(new)
         self._beat_soon()
-
-    def _publish_answered(self) -> None:
-        while self._unsent and not self._away:
-            with self._changed:
-                ids = [self._unsent.popleft() for _ in range(min(len(self._unsent), MAX_IDS))]
-            self._publish(Answered(self._id, ids))
-
-    def answered(self, event_id: str) -> None:
-        """Have the other replicas know that this one has answered an event; returns at once."""
-        if self.is_shared and 0 < len(event_id) <= MAX_ID_CHARACTERS:
-            with self._changed:
-                self._unsent.append(event_id)
-                self._changed.notify_all()
 
     # -- receiving ----------------------------------------------------------------------------------------------------
 
@@ -304,14 +272,10 @@ class Replicas:
             with self._changed:
                 self._keep(message)
         elif isinstance(message, Heartbeat):
-            if message.member.id != self._id:
+            if message.id != self._id:
                 self._heard(message)
-        elif message.id == self._id:
-            return
-        elif isinstance(message, Goodbye):
+        elif message.id != self._id:
             self._membership.forget(message.id)
-        else:
-            self._on_answered(message.events)
 
     def _bundle(self, digest: str) -> _BundleParameters:
         """Return what is known of a bundle; the lock is held."""
@@ -334,19 +298,19 @@ class Replicas:
         known.settled, known.refusal = new.version, refusal
 
     def _heard(self, heartbeat: Heartbeat) -> None:
-        member, known = heartbeat.member, self._membership.hear(heartbeat)
+        known = self._membership.hear(heartbeat)
         with self._changed:
-            is_newer = member.version > self._bundle(member.digest).version
+            is_newer = heartbeat.version > self._bundle(heartbeat.digest).version
             self._changed.notify_all()
         if known is None:
             # The newcomer need not wait for the next one.
             self._beat_soon()
-        is_name_new = known is None or known.name != member.name
-        if is_name_new and member.name != (name := self._facts()["name"]):
+        is_name_new = known is None or known.name != heartbeat.name
+        if is_name_new and heartbeat.name != (name := self._facts()["name"]):
             text = "%s serves another bundle from the same queue, %s, and this one serves %s: each takes events of the"
-            _log.warning(f"{text} other. Give each bundle a queue of its own.", label(member), member.name, name)
+            _log.warning(f"{text} other. Give each bundle a queue of its own.", label(heartbeat), heartbeat.name, name)
         if is_newer:
-            self._publish(ParameterQuery(member.id, member.digest))
+            self._publish(ParameterQuery(heartbeat.id, heartbeat.digest))
 
     # -- hyperparameters ----------------------------------------------------------------------------------------------
 
@@ -451,12 +415,12 @@ class Replicas:
         now_s, connected_s, digest = monotonic(), self._connected_s, self._parameters.digest
         has_gathered = connected_s is not None and now_s - connected_s > _GATHERING_S
         known = self._bundle(digest)
-        is_known = all(member.version <= known.version for member in self._membership.serving(digest))
+        is_known = all(each.version <= known.version for each in self._membership.serving(digest))
         return (has_gathered and is_known and not known.is_behind) or now_s > self._join_until_s
 
     # -- description --------------------------------------------------------------------------------------------------
 
-    def _member(self) -> Member:
+    def _heartbeat(self) -> Heartbeat:
         digest, current = self._parameters.snapshot()
         with self._changed:
             known = self._bundle(digest)
@@ -475,7 +439,7 @@ class Replicas:
         cut: dict[str, Any] = {
             key: value[:_MAX_TEXT] if isinstance(value, str) else value for key, value in about.items()
         }
-        return Member(**cut)
+        return Heartbeat(**cut)
 
     def describe(self) -> dict[str, Any]:
         """Return the group as this replica knows it, JSON-ready.
@@ -489,7 +453,7 @@ class Replicas:
             ``rejected``: how many messages were no messages between replicas; ``members`` and ``lost``: a dict for
             each.
         """
-        own, subscriber = self._member(), self._subscriber
+        own, subscriber = self._heartbeat(), self._subscriber
         return {
             "is_shared": self.is_shared,
             "trouble": self._away or own.trouble,

@@ -94,11 +94,9 @@ class Service:
             group_address(given),
             self._facts,
             self._parameters,
-            self._endpoints.events.answered,
             lambda: self._dispatcher.release(_JOINING),
         )
         self._parameters.newest = self._replicas.newest
-        self._dispatcher.on_answered = self._replicas.answered
         self._started_ns = 0
         self._lock = threading.Lock()
 

@@ -18,21 +18,18 @@ from epypes.errors import ParametersRefused, RevisionConflict, ServiceError
 from epypes.service import Service
 from epypes.service.http import HttpServer
 from epypes.service.replica_messages import (
-    Answered,
     Goodbye,
     Heartbeat,
-    Member,
     ParameterQuery,
     ParameterSet,
     encode_message,
 )
 from epypes.transport import memory
 from epypes.transport.address import parse_address
-from epypes.wire import encode
 from tests.brokers import nats as nats_server
-from tests.service.replicated import lost_replica, publish_to_replicas
-from tests.service.served import TIMEOUT_S, acting_bundle, event, until
-from tests.service.test_brokered import line_of, replica_of, send_raw
+from tests.service.replicated import publish_to_replicas
+from tests.service.served import TIMEOUT_S, acting_bundle, until
+from tests.service.test_brokered import line_of, replica_of
 from tests.transport.channels import Receiver
 
 _numbers = itertools.count(1)
@@ -140,7 +137,7 @@ def test_messages_of_other_programs_are_rejected_and_counted(trio):
     digest = first.info()["digest"]
 
     def heartbeat(**fields):
-        document = json.loads(encode_message(Heartbeat(Member("x"))))
+        document = json.loads(encode_message(Heartbeat("x")))
         document["message"] |= fields
         return json.dumps(document).encode()
 
@@ -157,12 +154,10 @@ def test_messages_of_other_programs_are_rejected_and_counted(trio):
         encode_message(ParameterSet(digest, -1, "x", {})),
         encode_message(ParameterSet(digest, 900, "x", {"k": 5})),
         encode_message(ParameterSet(digest, 900, "x", {f"k{number}": {} for number in range(1_001)})),
-        encode_message(Answered("x", ["id"] * 1_001)),
-        encode_message(Answered("x", ["i" * 5_000])),
+        encode_message(Goodbye("x" * 5_000)),
         encode_message(Goodbye("x" * 1_100_000)),
-        heartbeat(member={"id": "x", "pid": "7"}),
-        heartbeat(member={"id": "x", "counts": {"answered": -1}}),
-        heartbeat(lost=[["x", 1]]),
+        heartbeat(pid="7"),
+        heartbeat(counts={"answered": -1}),
     ]
     publish_to_replicas(line.sub, *hostile, ParameterQuery("of no replica", digest), Goodbye("of no replica"))
     until(lambda: first.group()["rejected"] == before + len(hostile))
@@ -172,7 +167,7 @@ def test_messages_of_other_programs_are_rejected_and_counted(trio):
 
 def test_control_characters_of_a_peer_are_not_shown(trio):
     line, (first, *_) = trio
-    publish_to_replicas(line.sub, Heartbeat(Member("peer", replica="evil\x1b[2J\n", state="READY")))
+    publish_to_replicas(line.sub, Heartbeat("peer", replica="evil\x1b[2J\n", state="READY"))
     until(lambda: first.group()["replicas"] == 4)
     assert [each["replica"] for each in first.group()["members"]][-1] == "evil [2J "
     publish_to_replicas(line.sub, Goodbye("peer"))
@@ -182,7 +177,7 @@ def test_control_characters_of_a_peer_are_not_shown(trio):
 def test_another_bundle_on_the_same_queue_is_warned_of_once(trio, caplog):
     caplog.set_level("INFO", "epypes.service")
     line, (first, *_) = trio
-    peer = Heartbeat(Member("stranger", replica="stranger", host="elsewhere", name="another bundle"))
+    peer = Heartbeat("stranger", replica="stranger", host="elsewhere", name="another bundle")
     publish_to_replicas(line.sub, peer, peer, Goodbye("stranger"))
     until(lambda: caplog.text.count("stranger at elsewhere has left") == 3)
     warned = [record for record in caplog.records if "serves another bundle from the same queue" in record.message]
@@ -205,7 +200,7 @@ def test_a_replica_that_stops_has_left_at_once(acting, host):
 @pytest.mark.slow
 def test_a_silent_replica_is_lost_until_another_of_its_name_is_there(acting, host, caplog):
     with line_of(host) as line, replica_of(acting, line, replica="1") as first:
-        publish_to_replicas(line.sub, Heartbeat(Member("gone", replica="2", host="elsewhere", counts={"answered": 7})))
+        publish_to_replicas(line.sub, Heartbeat("gone", replica="2", host="elsewhere", counts={"answered": 7}))
         until(lambda: first.group()["replicas"] == 2)
         until(lambda: first.group()["lost"])
         assert first.group()["replicas"] == 1
@@ -218,19 +213,8 @@ def test_a_silent_replica_is_lost_until_another_of_its_name_is_there(acting, hos
         )
         assert "it did not stop in order" in lost["reason"]
         assert "replica 2 at elsewhere is gone" in caplog.text
-        with replica_of(acting, line, replica="3") as newcomer:
-            until(lambda: [each["replica"] for each in newcomer.group()["lost"]] == ["2"])
-            publish_to_replicas(line.sub, Heartbeat(Member("in its place", replica="2", host="elsewhere")))
-            until(lambda: not first.group()["lost"] and not newcomer.group()["lost"])
-
-
-def test_reports_of_lost_replicas_are_bounded(trio):
-    line, (first, *_) = trio
-    reports = [lost_replica(f"made up {number}", silent_ms=599_000) for number in range(200)]
-    publish_to_replicas(line.sub, *reports, Goodbye(reports[0].member.id))
-    until(lambda: first.group()["lost"] and first.group()["replicas"] == 3)
-    assert len(first.group()["lost"]) <= 50
-    until(lambda: not first.group()["lost"])
+        publish_to_replicas(line.sub, Heartbeat("in its place", replica="2", host="elsewhere"))
+        until(lambda: not first.group()["lost"])
 
 
 # -- hyperparameters --------------------------------------------------------------------------------------------------
@@ -315,8 +299,8 @@ def test_a_newcomer_has_the_revision_of_the_group_from_its_first_event_on(acting
 def test_events_do_not_wait_for_ever_for_parameters_that_no_replica_publishes(acting, host):
     digest = Service(acting).info()["digest"]
     with line_of(host) as line, Service(acting, line.sub, line.pub) as service:
-        boast = Member("boaster", replica="2", host="elsewhere", digest=digest, revision=1_000, author="boaster")
-        publish_to_replicas(line.sub, Heartbeat(boast))
+        boast = Heartbeat("boaster", replica="2", host="elsewhere", digest=digest, revision=1_000, author="boaster")
+        publish_to_replicas(line.sub, boast)
         line.send(number=1)
         assert line.take()[0].revision == 0
         assert service.state == "READY"
@@ -407,26 +391,6 @@ def test_parameters_that_the_worker_refuses_are_not_computed_with(acting, host, 
         assert replica.group()["trouble"] == ""
 
 
-# -- events that were answered ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_an_event_that_another_replica_has_answered_is_not_worked_on_again(acting, host):
-    with line_of(host) as line, group_of(acting, line) as (first, second):
-        sent = line.send(number=1)
-        line.take()
-        until(lambda: first.counts()["answered"] + second.counts()["answered"] == 1)
-        done_by, other = (first, second) if first.counts()["answered"] else (second, first)
-        # Its last message comes after the ids of what it has answered.
-        done_by.stop()
-        until(lambda: other.group()["replicas"] == 1)
-        # As a broker does that has not heard the acknowledgement.
-        send_raw(line.sub, tuple(encode(event(number=1))), sent)
-        until(lambda: other.counts()["duplicates"] == 1)
-        assert line.left() == 0
-        assert other.counts()["received"] == 0
-
-
 # -- the broker -------------------------------------------------------------------------------------------------------
 
 
@@ -456,8 +420,8 @@ def test_a_change_that_a_replica_has_missed_is_made_when_it_hears_of_it(acting, 
         receiver = Receiver(address)
         try:
             # A member computes with a revision of which this one has heard nothing.
-            member = Member("peer", replica="2", host="elsewhere", digest=digest, revision=3, author="peer")
-            publish_to_replicas(line.sub, Heartbeat(member))
+            member = Heartbeat("peer", replica="2", host="elsewhere", digest=digest, revision=3, author="peer")
+            publish_to_replicas(line.sub, member)
             while not heard or heard[-1]["kind"] != "query":
                 heard.append(json.loads(b"".join(receiver.next().frames))["message"])
             assert (heard[-1]["id"], heard[-1]["digest"]) == ("peer", digest)
