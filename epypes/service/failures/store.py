@@ -1,8 +1,8 @@
-"""A folder of failures: a record as JSON and, beside it, the event as it came.
+"""A folder of failures: a file for each, with its record as a line of JSON, and then the event as it came.
 
 A thread of its own writes, so that no caller waits for a disk; what is wrong with the disk is counted and logged. Every
-file appears whole or not at all, under a name that tells its place in time. Files of others in the
-folder are left alone. Several stores, also of other processes, may use one folder.
+file appears whole or not at all, under a name that tells its place in time. Files of others in the folder are left
+alone. Several stores, also of other processes, may use one folder.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import logging
 import os
 import threading
 from collections import Counter, OrderedDict, deque
-from collections.abc import Hashable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Hashable, Iterator, Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from time import time
 from typing import TYPE_CHECKING, Any, Final
@@ -36,7 +36,7 @@ _MAX_FAILURES: Final = 100
 _MAX_BYTES: Final = 256 * 1024**2
 # The share of all bytes that one event may take; a larger one would push out too many others.
 _EVENT_SHARE: Final = 0.25
-_RECORD, _EVENT, _PART = ".json", ".event", ".part"
+_ENDING, _PART = ".failure", ".part"
 # Older parts of files are those of a process that was killed.
 _PART_AGE_S: Final = 600.0
 # Of one cause so many first failures are kept for as long as there are others to remove.
@@ -100,15 +100,6 @@ class _FailureQueue:
 
 
 # -- the store --------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class _Stored:
-    """One failure in the folder: its id, whether it has a record, and the bytes of its files."""
-
-    id: str
-    has_record: bool
-    size: int
 
 
 class FailureStore:
@@ -179,22 +170,22 @@ class FailureStore:
         without = replace(record, has_event=False, no_event=no_event or "it could not be written")
         try:
             if packed is None or not self._is_put(with_event, packed):
-                self._count("unwritten", not self._is_put(without, None))
+                self._count("unwritten", not self._is_put(without, b""))
         except Exception:  # the writer logs it
             self._count("unwritten")
             raise
 
-    def _is_put(self, record: FailedEvent, packed: bytes | None) -> bool:
+    def _is_put(self, record: FailedEvent, packed: bytes) -> bool:
         try:
-            self._make_room(len(packed or b""))
-            self._put_both(record, packed)
+            self._make_room(len(packed))
+            self._put(record, packed)
         except OSError as error:
             text = f"failure {record.id} can't be written to {self.folder}: {error.strerror or error}"
             self._throttle.warning("unwritten", text)
             return False
         self._causes[record.id] = record.cause
         self._count("kept")
-        self._count("without_event", packed is None)
+        self._count("without_event", not record.has_event)
         return True
 
     def _packed(self, event: Any) -> tuple[bytes | None, str]:
@@ -212,64 +203,51 @@ class FailureStore:
             return None, f"it has {len(packed) / 1e6:,.1f} MB, more than the {most / 1e6:,.1f} MB of one event"
         return packed, ""
 
-    def _put_both(self, record: FailedEvent, event: bytes | None) -> None:
-        """Write a failure, its event first: a record that says so has its event."""
-        self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        document = {"record": asdict(record)}
-        try:
-            if event is not None:
-                self._put(record.id + _EVENT, event)
-            self._put(record.id + _RECORD, json.dumps(document, default=str, indent=1).encode())
-        except OSError:
-            self._remove(record.id)
-            raise
-
-    def _put(self, name: str, data: bytes) -> None:
+    def _put(self, record: FailedEvent, packed: bytes) -> None:
         """Write a file under another name first, so that no reader ever sees half of it."""
-        part = self.folder / f".{name}.{os.getpid()}{_PART}"
+        self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        path = self._path(record.id)
+        part = self.folder / f".{path.name}.{os.getpid()}{_PART}"
         try:
             descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o600)
             with os.fdopen(descriptor, "wb") as file:
-                file.write(data)
-            part.replace(self.folder / name)
+                file.write(json.dumps(asdict(record), default=str).encode() + b"\n")
+                file.write(packed)
+            part.replace(path)
         except OSError:
             with contextlib.suppress(OSError):
                 part.unlink(missing_ok=True)
             raise
 
-    def _remove(self, failure_id: str) -> None:
-        """Remove a failure, its record first."""
-        for ending in (_RECORD, _EVENT):
-            with contextlib.suppress(OSError):
-                (self.folder / f"{failure_id}{ending}").unlink()
-
     def _sweep(self) -> None:
-        """Remove what processes that were killed have left: parts of files, and events without a record."""
-        with contextlib.suppress(OSError):
-            orphans = [self.folder / f"{each.id}{_EVENT}" for each in self._stored() if not each.has_record]
-            for file in (*self.folder.glob(f".*{_PART}"), *orphans):
-                with contextlib.suppress(OSError):
-                    if file.lstat().st_mtime < time() - _PART_AGE_S:
-                        file.unlink()
+        """Remove the parts of files that processes which were killed have left."""
+        for file in self.folder.glob(f".*{_PART}"):
+            with contextlib.suppress(OSError):
+                if file.lstat().st_mtime < time() - _PART_AGE_S:
+                    file.unlink()
 
     def _make_room(self, size: int) -> None:
         """Remove failures until there is room for one more."""
         stored = self._stored()
         causes: dict[str, object] = {}
-        for each in stored:
-            record = None if each.id in self._causes or not each.has_record else self._readable(each.id)
-            causes[each.id] = self._causes.get(each.id) or (record.cause if record is not None else None)
+        for failure_id in stored:
+            record = None if failure_id in self._causes else self._readable(failure_id)
+            causes[failure_id] = self._causes.get(failure_id) or (record.cause if record is not None else None)
         self._causes = causes
         for failure_id in list(_to_remove(stored, causes, self._most - 1, self._most_bytes - size)):
-            self._remove(failure_id)
+            with contextlib.suppress(OSError):
+                self._path(failure_id).unlink()
             self._count("removed")
+
+    def _path(self, failure_id: str) -> Path:
+        return self.folder / f"{failure_id}{_ENDING}"
 
     # -- reading ------------------------------------------------------------------------------------------------
 
     def records(self, limit: int | None = None) -> list[FailedEvent]:
         """Return the records that can be read, the newest first."""
         try:
-            stored = [each.id for each in self._stored() if each.has_record]
+            stored = self._stored()
         except OSError:
             self._count("unreadable")
             return []
@@ -292,17 +270,22 @@ class FailureStore:
         FailureNotKept
             It can't be read.
         """
-        path = self.folder / f"{failure_id}{_RECORD}"
+        return self._read(failure_id, with_event=False)[0]
+
+    def _read(self, failure_id: str, *, with_event: bool) -> tuple[FailedEvent, bytes]:
+        """Return what is in a failure's file: its record, and its packed event if that is wanted."""
+        path = self._path(failure_id)
         if not ID.fullmatch(failure_id) or not path.exists():
-            known = [each.id for each in self._stored() if each.has_record]
-            raise UnknownName("failure", failure_id, reversed(known), f"in {self.folder}")
+            raise UnknownName("failure", failure_id, reversed(self._stored()), f"in {self.folder}")
         try:
-            record = read_record(json.loads(path.read_bytes())["record"])
+            with path.open("rb") as file:
+                record = read_record(json.loads(file.readline()))
+                packed = file.read() if with_event else b""
             if record.id != failure_id:
                 raise ValueError(f"it is the record of {record.id}")
         except (OSError, ValueError, TypeError, LookupError, RecursionError) as error:
             raise _damaged(failure_id, path, error) from error
-        return record
+        return record, packed
 
     def packed_event(self, failure_id: str) -> bytes:
         """Return the event of a failure as `pack_event` packed it.
@@ -314,15 +297,11 @@ class FailureStore:
         FailureNotKept
             Its event was not kept, or can't be read any more.
         """
-        record = self.record(failure_id)
+        record, packed = self._read(failure_id, with_event=True)
         if not record.has_event:
             reason = record.no_event or "the service had none to give"
             raise FailureNotKept(failure_id, self.folder, f"The event of failure {failure_id} was not kept: {reason}.")
-        path = self.folder / f"{failure_id}{_EVENT}"
-        try:
-            return path.read_bytes()
-        except OSError as error:
-            raise _damaged(failure_id, path, error) from error
+        return packed
 
     def event(self, failure_id: str) -> Envelope | bytes:
         """Return the event of a failure: an Envelope, or the one frame of a message of 2019.
@@ -338,21 +317,18 @@ class FailureStore:
         try:
             return unpack_event(packed)
         except MessageError as error:
-            raise _damaged(failure_id, self.folder / f"{failure_id}{_EVENT}", error) from error
+            raise _damaged(failure_id, self._path(failure_id), error) from error
 
-    def _stored(self) -> list[_Stored]:
-        """Return what the folder holds, the oldest first; raise OSError if it can't be read."""
-        sizes: dict[str, dict[str, int]] = {}
-        try:
-            with os.scandir(self.folder) as files:
-                for file in files:
-                    stem, _, ending = file.name.partition(".")
-                    if ID.fullmatch(stem) and f".{ending}" in (_RECORD, _EVENT):
-                        with contextlib.suppress(FileNotFoundError):  # another service has just removed it
-                            sizes.setdefault(stem, {})[f".{ending}"] = file.stat(follow_symlinks=False).st_size
-        except FileNotFoundError:
-            return []
-        return [_Stored(name, _RECORD in files, sum(files.values())) for name, files in sorted(sizes.items())]
+    def _stored(self) -> dict[str, int]:
+        """Return the size of each file by its failure's id, the oldest first; raise OSError if that can't be read."""
+        sizes: dict[str, int] = {}
+        with contextlib.suppress(FileNotFoundError), os.scandir(self.folder) as files:
+            for file in files:
+                failure_id = file.name.removesuffix(_ENDING)
+                if ID.fullmatch(failure_id) and file.name.endswith(_ENDING):
+                    with contextlib.suppress(FileNotFoundError):  # another service has just removed it
+                        sizes[failure_id] = file.stat(follow_symlinks=False).st_size
+        return dict(sorted(sizes.items()))
 
     def _readable(self, failure_id: str) -> FailedEvent | None:
         try:
@@ -372,23 +348,19 @@ def _damaged(failure_id: str, path: Path, error: Exception) -> FailureNotKept:
     return FailureNotKept(failure_id, path, f"{path} can't be read: {reason}. Remove it, or restore it.")
 
 
-def _to_remove(stored: Iterable[_Stored], causes: Mapping[str, object], most: int, most_bytes: int) -> Iterator[str]:
+def _to_remove(stored: Mapping[str, int], causes: Mapping[str, object], most: int, most_bytes: int) -> Iterator[str]:
     """Yield which failures have to go until no more than ``most`` of ``most_bytes`` together are left.
 
     Damaged ones go first. Then the cause that has the most loses the oldest after its first ones: a storm leaves other
     failures alone, and its beginning can be seen.
     """
-    left = dict.fromkeys(stored)
-    counts = Counter(causes[each.id] for each in left)
-    size = sum(each.size for each in left)
+    left = dict(stored)
+    counts = Counter(causes[failure_id] for failure_id in left)
+    size = sum(left.values())
     while left and (len(left) > most or size > most_bytes):
-        if counts[None]:
-            goes = next(each for each in left if causes[each.id] is None)
-        else:
-            cause, count = counts.most_common(1)[0]
-            of_cause = [each for each in left if causes[each.id] == cause]
-            goes = of_cause[_FIRST] if count > _FIRST else next(iter(left))
-        del left[goes]
-        counts[causes[goes.id]] -= 1
-        size -= goes.size
-        yield goes.id
+        cause, count = (None, 0) if counts[None] else counts.most_common(1)[0]
+        of_cause = [failure_id for failure_id in left if causes[failure_id] == cause]
+        goes = of_cause[_FIRST] if count > _FIRST else next(iter(of_cause if cause is None else left))
+        size -= left.pop(goes)
+        counts[causes[goes]] -= 1
+        yield goes
