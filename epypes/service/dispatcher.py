@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from time import perf_counter_ns
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from epypes.errors import ServiceError
 from epypes.service.result_publisher import (
@@ -31,6 +31,7 @@ from epypes.service.result_publisher import (
 )
 
 if TYPE_CHECKING:
+    from epypes.service.frame_socket import Message
     from epypes.service.options import Options
     from epypes.service.worker_connection import HangReport, WorkerConnection
     from epypes.transport.channel import Delivery
@@ -260,7 +261,7 @@ class Dispatcher:
             event.started_ns = perf_counter_ns()
             self._running[event.seq] = self._begun[event.seq] = event
             try:
-                connection.post({"kind": "event", "seq": event.seq}, event.delivery.frames)
+                connection.post_event(event.seq, event.delivery.frames)
             except MemoryError as error:
                 self._resolve(event, failed_result(event, error, self._provenance(), "raised"))
         if self._has_broker and self._has_room():
@@ -284,13 +285,13 @@ class Dispatcher:
 
     # -- from the worker ----------------------------------------------------------------------------------------------
 
-    def done(self, connection: WorkerConnection, header: Mapping[str, Any], frames: Sequence[memoryview]) -> None:
+    def done(self, connection: WorkerConnection, message: Message) -> None:
         """Take a worker's ``done`` message. An event that timed out meanwhile has been answered already."""
         with self.lock:
-            event = self._running.get(header["seq"]) if connection is self._connection else None
+            event = self._running.get(message.number) if connection is self._connection else None
         if event is None:
             return
-        result = worker_result(event, header, frames, self._locked_provenance)
+        result = worker_result(event, message, self._locked_provenance)
         with self.lock:
             self._resolve(event, result)
             self.answered_in_row += 1

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from epypes.service.dispatcher import AcceptedEvent
     from epypes.service.event_log import EventLog
     from epypes.service.failures.store import FailureStore
+    from epypes.service.frame_socket import Message
 
 Outcome = Literal["answered", "failed", "dead_letters"]
 FailureKind = Literal["raised", "killed", "stuck", "dropped", "exhausted"]
@@ -85,18 +86,17 @@ class Result:
 # -- results, by cause ------------------------------------------------------------------------------------------------
 
 
-def worker_result(
-    event: AcceptedEvent, header: Mapping[str, Any], frames: Sequence[memoryview], provenance: Callable[[], Provenance]
-) -> Result:
+def worker_result(event: AcceptedEvent, message: Message, provenance: Callable[[], Provenance]) -> Result:
     """Return the result of a worker's ``done`` message."""
+    done, frames = message.content, message.frames
     answers: list[EncodedEnvelope | bytes] = []
     begin = 0
-    for count in header.get("answers", ()):
+    for count in done["answers"]:
         own, begin = frames[begin : begin + count], begin + count
         answers.append(bytes(own[0]) if count == 1 else EncodedEnvelope.read(own))
-    failure = header.get("failure")
+    failure = done["failure"]
     record = _record(event, failure, provenance(), "raised") if failure else None
-    return Result(answers, record, header.get("revision", 0), header.get("total_ns", 0), header.get("durations_ns", {}))
+    return Result(answers, record, done["revision"], done["total_ns"], done["durations_ns"])
 
 
 def failed_result(

@@ -16,9 +16,10 @@ from epypes.bundle.replay import REPLAY_TIMEOUT_S
 from epypes.errors import ServiceError
 from epypes.service.bundle_info import BundleInfo
 from epypes.service.dispatcher import Dispatcher
+from epypes.service.frame_socket import Message
 from epypes.service.parameters import ParameterControl, others_than
 from epypes.service.sd_notify import Watchdog
-from epypes.service.worker_connection import SETTLING, Message, WorkerConnection
+from epypes.service.worker_connection import WorkerConnection
 from epypes.service.worker_health import DEATHS_BEFORE_FAULT, RESTART_PAUSE_S, WorkerHealth
 
 _END_TIMEOUT_S: Final = 2.0
@@ -199,17 +200,15 @@ class Supervisor:
     # -- messages of a worker, on its receiving thread -----------------------------------------------------------------
 
     def _on_message(self, connection: WorkerConnection, message: Message) -> None:
-        header, frames = message
-        kind = header.get("kind")
-        if kind == "done":
-            self._dispatcher.done(connection, header, frames)
-        elif kind in SETTLING:
-            self._parameters.settled(connection, header)
+        if message.kind == "done":
+            self._dispatcher.done(connection, message)
+        elif message.kind == "parameters":
+            self._parameters.settled(connection, message.content)
             with self._changed:
                 if connection is self.worker and connection is not self._dispatcher.connection:
-                    self._confirmed(connection, header.get("problems") or {})
+                    self._confirmed(connection, message.content["problems"])
             self._dispatcher.publish()
-        elif kind == "ready":
+        elif message.kind == "ready":
             with self._changed:
                 if connection is self.worker:
                     self._begin(connection)
