@@ -1,7 +1,7 @@
 """The home of accepted events: which event the worker gets next, and what happens when it is done or the worker dies.
 
-An event waits in the mailbox, is with the worker, is done and held until the events before it are resolved, or waits
-to be tried again. All of that changes under one lock. Nothing is published and no listener is called while the lock is
+An event waits in the mailbox, is with the worker, waits to be tried again, or is done and held until the events before
+it are resolved. All of that changes under one lock. Nothing is published and no listener is called while the lock is
 held: results queue for `publish`, which every caller that has changed anything calls when it has released the lock.
 """
 
@@ -64,6 +64,8 @@ class AcceptedEvent:
         How often it was given to a worker.
     deaths
         How often the worker died while this was all that it worked on.
+    is_suspect
+        Whether a worker died while it had this event: then it is tried alone.
     result
         What is published; None until it is resolved.
     """
@@ -75,6 +77,7 @@ class AcceptedEvent:
     started_ns: int = 0
     attempts: int = 0
     deaths: int = 0
+    is_suspect: bool = False
     result: Result | None = None
 
     @property
@@ -116,7 +119,7 @@ class Dispatcher:
         self.answered_in_row = 0
         self.on_answered: Callable[[str], object] = lambda event_id: None
         self._policy, self._size, self._slots = options.mailbox_policy, options.capacity, options.threads
-        self._retries = options.retries
+        self._max_deaths = options.retries
         # A broker keeps events while there is no room, and confirms their answers: they are in flight until then.
         self._has_broker, self._is_confirmed = options.has_broker, options.is_confirmed
         self._results, self._provenance = results, provenance
@@ -126,11 +129,9 @@ class Dispatcher:
         self._last_seq = 0
         self._totals: Counter[str] = Counter()
         self._waiting: deque[AcceptedEvent] = deque()
-        # To be tried again: events that did not cause the end of the worker, and suspects, which are tried alone.
-        self._again: list[AcceptedEvent] = []
-        self._suspects: list[AcceptedEvent] = []
+        # Events to be tried again, suspects first.
+        self._retry: list[AcceptedEvent] = []
         self._running: dict[int, AcceptedEvent] = {}
-        self._is_alone = False
         # Events that were given to a worker at least once, in the order of acceptance, until they are released.
         self._begun: dict[int, AcceptedEvent] = {}
         self._unconfirmed: dict[int, AcceptedEvent] = {}
@@ -155,16 +156,12 @@ class Dispatcher:
             event = self._accepted(delivery)
             if self._why_refused:
                 self._drop(event, self._why_refused)
-            elif self._is_next_taken():
-                # So it needs no room.
-                self._waiting.append(event)
-            elif len(self._waiting) >= self._size and self._policy == "fault":
-                self._drop(event, overflow_reason(self._policy, self._size))
             else:
-                while len(self._waiting) >= self._size:
-                    self._drop(self._waiting.popleft(), overflow_reason(self._policy, self._size))
                 self._waiting.append(event)
-            self._assign()
+                self._assign()
+                while len(self._waiting) > self._size:
+                    surplus = self._waiting.pop() if self._policy == "fault" else self._waiting.popleft()
+                    self._drop(surplus, overflow_reason(self._policy, self._size))
             if self.is_unwatched:
                 # Restart the job time-out: the worker is not idle any more.
                 self.is_unwatched = False
@@ -178,8 +175,7 @@ class Dispatcher:
             event = self._accepted(delivery)
             event.attempts = max(delivery.attempt, 1) - 1
             event.result = exhausted_result(event, self._provenance())
-            self._count(event, event.result)
-            self._to_publish.append(partial(self._results.publish, event, event.result, self._settled))
+            self._release(event, event.result)
         self.publish()
 
     def _accepted(self, delivery: Delivery) -> AcceptedEvent:
@@ -192,25 +188,13 @@ class Dispatcher:
     def _drop(self, event: AcceptedEvent, reason: str) -> None:
         """Drop an event, which is published at once and not in the order of acceptance."""
         self._totals["dropped"] += 1
-        result = dropped_result(event, reason, self._provenance())
-        self._to_publish.append(partial(self._results.publish, event, result, self._settled))
+        event.result = dropped_result(event, reason, self._provenance())
+        self._to_publish.append(partial(self._results.publish, event, event.result, self._settled))
 
     def _has_room(self) -> bool:
         """Whether an event that comes now is neither dropped nor has another one dropped."""
-        if self.is_closed or self._why_refused:
-            return False
-        return self._is_next_taken() or self._waiting_count() + len(self._unconfirmed) < self._size
-
-    def _is_next_taken(self) -> bool:
-        """Whether the worker gets an event that comes now before another one comes."""
-        return not self._waiting and not self._again and self._may_begin()
-
-    def _may_begin(self) -> bool:
-        if self._connection is None or self._holds or self._suspects or self._is_alone:
-            return False
-        held = len(self._begun) - len(self._running) - len(self._again)
-        is_free = len(self._running) < self._slots and held < _MAX_AHEAD * self._slots
-        return is_free and len(self._unconfirmed) < _MAX_UNCONFIRMED
+        is_open = not (self.is_closed or self._why_refused)
+        return is_open and self._waiting_count() + len(self._unconfirmed) < self._size
 
     # -- to the worker ------------------------------------------------------------------------------------------------
 
@@ -255,7 +239,7 @@ class Dispatcher:
     def _assign(self) -> None:
         """Give the worker what it is free for. With the lock held."""
         connection = self._connection
-        while connection is not None and not self._holds and (event := self._next()) is not None:
+        while connection is not None and (event := self._next()) is not None:
             self._totals["retried"] += event.attempts > 0
             event.attempts += 1
             event.started_ns = perf_counter_ns()
@@ -268,20 +252,19 @@ class Dispatcher:
             self._room.notify_all()
 
     def _next(self) -> AcceptedEvent | None:
-        """Return the event that the worker gets next.
+        """Return the event that the worker gets next; None if it is not free, or events wait.
 
         A suspect is taken when nothing else is worked on, and nothing is taken beside it.
         """
-        if self._suspects:
-            if self._running:
-                return None
-            self._is_alone = True
-            return self._suspects.pop(0)
-        if self._again and not self._is_alone and len(self._running) < self._slots:
-            return self._again.pop(0)
-        if self._waiting and not self._again and self._may_begin():
-            return self._waiting.popleft()
-        return None
+        running = self._running
+        if self._holds or len(running) >= self._slots or any(event.is_suspect for event in running.values()):
+            return None
+        if self._retry:
+            return None if self._retry[0].is_suspect and running else self._retry.pop(0)
+        is_ahead = len(self._begun) - len(running) >= _MAX_AHEAD * self._slots
+        if not self._waiting or is_ahead or len(self._unconfirmed) >= _MAX_UNCONFIRMED:
+            return None
+        return self._waiting.popleft()
 
     # -- from the worker ----------------------------------------------------------------------------------------------
 
@@ -289,40 +272,33 @@ class Dispatcher:
         """Take a worker's ``done`` message. An event that timed out meanwhile has been answered already."""
         with self.lock:
             event = self._running.get(message.number) if connection is self._connection else None
-        if event is None:
-            return
-        result = worker_result(event, message, self._locked_provenance)
-        with self.lock:
-            self._resolve(event, result)
+            if event is None:
+                return
+            self._resolve(event, worker_result(event, message, self._provenance))
             self.answered_in_row += 1
             self._assign()
-            self._wake_idle()
+            self._wake_waiting()
         self.publish()
-
-    def _locked_provenance(self) -> Provenance:
-        with self.lock:
-            return self._provenance()
 
     def _resolve(self, event: AcceptedEvent, result: Result) -> None:
         """Note the result of an event that the worker has, and release what is resolved in the order of acceptance."""
         if self._running.pop(event.seq, None) is None:
             return
-        self._is_alone = False
         event.result = result
         while self._begun:
             eldest = next(iter(self._begun.values()))
             if eldest.result is None:
                 return
             del self._begun[eldest.seq]
-            self._count(eldest, eldest.result)
-            self._to_publish.append(partial(self._results.publish, eldest, eldest.result, self._settled))
+            self._release(eldest, eldest.result)
 
-    def _count(self, event: AcceptedEvent, result: Result) -> None:
-        """Count an event that is released; one whose answer a broker confirms is in flight until then."""
+    def _release(self, event: AcceptedEvent, result: Result) -> None:
+        """Have a result published and counted; if a broker confirms it, it is in flight until then."""
         if self._is_confirmed:
             self._unconfirmed[event.seq] = event
         else:
             self._totals[result.outcome] += 1
+        self._to_publish.append(partial(self._results.publish, event, result, self._settled))
 
     def worker_died(self, ending: str, died_in: Sequence[str]) -> None:
         """Note that the worker died by itself, or of one of its events; they are tried again, or are dead letters."""
@@ -331,27 +307,25 @@ class Dispatcher:
             running = list(self._running.values())
             if len(running) == 1:
                 running[0].deaths += 1
-            dead = [event for event in running if event.deaths > self._retries]
-            self._put_back([event for event in running if event not in dead], self._suspects)
-            for event in dead:
-                function = died_in[0] if died_in else ""
-                self._resolve(event, dead_letter_result(event, ending, function, self._provenance()))
-            self.changed.notify_all()
+            for event in running:
+                event.is_suspect = True
+                if event.deaths > self._max_deaths:
+                    function = died_in[0] if died_in else ""
+                    self._resolve(event, dead_letter_result(event, ending, function, self._provenance()))
+            self._put_back()
 
     def worker_ended(self) -> None:
         """Note that the front itself ended the worker: its events are tried again."""
         with self.lock:
             self._connection = None
-            # An event that is tried alone stays a suspect.
-            self._put_back(list(self._running.values()), self._suspects if self._is_alone else self._again)
-            self.changed.notify_all()
+            self._put_back()
 
-    def _put_back(self, events: list[AcceptedEvent], target: list[AcceptedEvent]) -> None:
-        for event in events:
-            del self._running[event.seq]
-        target += events
-        target.sort(key=lambda event: event.seq)
-        self._is_alone = self._is_alone and bool(self._running)
+    def _put_back(self) -> None:
+        """Have events of a worker that is gone tried again."""
+        self._retry += self._running.values()
+        self._retry.sort(key=lambda event: (not event.is_suspect, event.seq))
+        self._running.clear()
+        self.changed.notify_all()
 
     # -- events that take too long ------------------------------------------------------------------------------------
 
@@ -383,7 +357,7 @@ class Dispatcher:
         if not late:
             return None
         is_blamed = not report.has_answered or bool(report.elapsed_ns)
-        return [event.seq for event in late if is_blamed or event.attempts > self._retries + 1]
+        return [event.seq for event in late if is_blamed or event.attempts > self._max_deaths + 1]
 
     def fail_stuck(self, stuck: Sequence[int], functions: Mapping[int, str], timeout_s: float) -> None:
         """Answer stuck events with a failure that names the function; the worker gets nothing more. With the lock."""
@@ -404,12 +378,8 @@ class Dispatcher:
         with self.lock:
             if self._has_broker:
                 returned = [*self._unconfirmed.values(), *self._begun.values(), *self._waiting]
-                for kept in (
-                    *(self._waiting, self._again, self._suspects),
-                    *(self._running, self._begun, self._unconfirmed),
-                ):
+                for kept in (self._waiting, self._retry, self._running, self._begun, self._unconfirmed):
                     kept.clear()
-                self._is_alone = False
                 self._totals["given_back"] += len(returned)
                 for event in returned:
                     event.delivery.nack()
@@ -419,10 +389,8 @@ class Dispatcher:
             self._waiting.clear()
             for event in waiting:
                 self._drop(event, reason)
-            for event in (*self._again, *self._suspects):
-                self._running[event.seq] = event
-            self._again.clear()
-            self._suspects.clear()
+            self._running |= {event.seq: event for event in self._retry}
+            self._retry.clear()
             begun = sorted(self._running.values(), key=lambda event: event.seq)
             for event in begun:
                 function = (functions or {}).get(event.seq, "")
@@ -479,7 +447,7 @@ class Dispatcher:
             if self._unconfirmed.pop(event.seq, None) is not None:
                 self._totals[result.outcome] += 1
                 self._assign()
-                self._wake_idle()
+                self._wake_waiting()
 
     # -- waiting and counting -----------------------------------------------------------------------------------------
 
@@ -492,9 +460,9 @@ class Dispatcher:
             finally:
                 self._waiting_threads -= 1
 
-    def _wake_idle(self) -> None:
-        # Only if a thread waits for it: otherwise every event would wake up the supervisor.
-        if self._waiting_threads and not self._running:
+    def _wake_waiting(self) -> None:
+        # Only if a thread is in `wait_for`: otherwise every event would wake up the supervisor.
+        if self._waiting_threads:
             self.changed.notify_all()
 
     @property
@@ -508,12 +476,12 @@ class Dispatcher:
         return not (self._begun or self._waiting or self._unconfirmed)
 
     def _waiting_count(self) -> int:
-        return len(self._waiting) + len(self._again) + len(self._suspects)
+        return len(self._waiting) + len(self._retry)
 
     @property
     def in_flight(self) -> int:
         """How many events the worker has, or has done while an earlier one is not, or whose answer is unconfirmed."""
-        return len(self._begun) - len(self._again) - len(self._suspects) + len(self._unconfirmed)
+        return len(self._begun) - len(self._retry) + len(self._unconfirmed)
 
     def counts(self) -> dict[str, int]:
         """Return the counts: received is the sum of all others but ``retried`` and ``redelivered``."""

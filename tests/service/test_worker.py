@@ -651,7 +651,12 @@ def test_a_worker_that_waits_costs_nothing(own):
     with own("--threads", "3") as front:
         front.run(what="a")
         process = psutil.Process(front.process.pid)
-        before = process.num_ctx_switches().voluntary, sum(process.cpu_times()[:2])
-        threading.Event().wait(1.0)
-        assert process.num_ctx_switches().voluntary - before[0] <= 5, "no thread polls"
-        assert sum(process.cpu_times()[:2]) - before[1] <= 0.1
+
+        def idles_for_a_second():
+            before = process.num_ctx_switches().voluntary, sum(process.cpu_times()[:2])
+            threading.Event().wait(1.0)
+            switches = process.num_ctx_switches().voluntary - before[0]
+            return switches <= 5 and sum(process.cpu_times()[:2]) - before[1] <= 0.1
+
+        # Its threads may still be starting; one that polls would do so in every second.
+        assert any(idles_for_a_second() for _ in range(10))
