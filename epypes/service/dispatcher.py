@@ -104,8 +104,6 @@ class Dispatcher:
         The lock, and the condition on it that is notified when anything changes.
     is_closed
         Whether a broker's events are left with it.
-    is_unwatched
-        Whether the supervisor must be woken up by the next event.
     answered_in_row
         How many events were answered since a worker last died.
     on_answered
@@ -115,7 +113,7 @@ class Dispatcher:
     def __init__(self, options: Options, results: ResultPublisher, provenance: Callable[[], Provenance]) -> None:
         self.lock = threading.RLock()
         self.changed, self._room = threading.Condition(self.lock), threading.Condition(self.lock)
-        self.is_closed = self.is_unwatched = False
+        self.is_closed = self._is_idle = False
         self.answered_in_row = 0
         self.on_answered: Callable[[str], object] = lambda event_id: None
         self._policy, self._size, self._slots = options.mailbox_policy, options.capacity, options.threads
@@ -162,9 +160,9 @@ class Dispatcher:
                 while len(self._waiting) > self._size:
                     surplus = self._waiting.pop() if self._policy == "fault" else self._waiting.popleft()
                     self._drop(surplus, overflow_reason(self._policy, self._size))
-            if self.is_unwatched:
+            if self._is_idle:
                 # Restart the job time-out: the worker is not idle any more.
-                self.is_unwatched = False
+                self._is_idle = False
                 self.changed.notify_all()
         if self._to_publish:
             self.publish()
@@ -239,7 +237,7 @@ class Dispatcher:
     def _assign(self) -> None:
         """Give the worker what it is free for. With the lock held."""
         connection = self._connection
-        while connection is not None and (event := self._next()) is not None:
+        while connection is not None and (self._waiting or self._retry) and (event := self._next()) is not None:
             self._totals["retried"] += event.attempts > 0
             event.attempts += 1
             event.started_ns = perf_counter_ns()
@@ -336,8 +334,12 @@ class Dispatcher:
             return [event for event in self._running.values() if now_ns - event.started_ns >= timeout_ns]
 
     def due_in_s(self, timeout_ns: int) -> float | None:
-        """Return in how many seconds an event will have timed out; None if there is none. With the lock held."""
+        """Return in how many seconds an event will have timed out; None if there is none. With the lock held.
+
+        The supervisor, which waits for so long, is woken up by the next event if there is none.
+        """
         starts = [event.started_ns for event in self._running.values()] if self._connection is not None else []
+        self._is_idle = not starts
         return max(min(starts) + timeout_ns - perf_counter_ns(), 0) / 1e9 if starts else None
 
     def stuck(self, report: HangReport, overdue: Sequence[int], timeout_ns: int) -> list[int] | None:

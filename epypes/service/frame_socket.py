@@ -43,6 +43,11 @@ _MAX_BUFFERS: Final = 1_024
 # Of a control message; the system allows no larger packet.
 _MAX_CONTROL_BYTES: Final = 128 * 1024
 
+# As integers: flags of `socket` are combined in Python.
+_NO_SIGNAL: Final = int(socket.MSG_NOSIGNAL)
+_NO_WAITING: Final = int(socket.MSG_NOSIGNAL | socket.MSG_DONTWAIT)
+_WAIT_ALL: Final = int(socket.MSG_WAITALL)
+
 _to_json: Final = json.JSONEncoder(separators=(",", ":")).encode
 _from_json: Final = json.JSONDecoder().decode
 
@@ -146,7 +151,7 @@ class FrameSocket:
         EOFError
             The other side is gone.
         """
-        flags = socket.MSG_NOSIGNAL | (0 if is_waiting else socket.MSG_DONTWAIT)
+        flags = _NO_SIGNAL if is_waiting else _NO_WAITING
         with self._sending:
             try:
                 while left:
@@ -190,10 +195,10 @@ class FrameSocket:
         return _decode(frames.pop(0), frames)
 
     def _read(self, size: int) -> bytes:
-        data = self._socket.recv(size, socket.MSG_WAITALL)
+        data = self._socket.recv(size, _WAIT_ALL)
         while len(data) < size:
             # A signal has interrupted the system call, or the other side is gone.
-            more = self._socket.recv(size - len(data), socket.MSG_WAITALL)
+            more = self._socket.recv(size - len(data), _WAIT_ALL)
             if not more:
                 raise EOFError("The other side of the connection is gone.")
             data += more
@@ -251,7 +256,7 @@ class ControlSocket:
         packet = _encode_head(message)
         if len(packet) <= _MAX_CONTROL_BYTES:
             with self._sending, contextlib.suppress(OSError):
-                self._socket.send(packet, socket.MSG_NOSIGNAL | socket.MSG_DONTWAIT)
+                self._socket.send(packet, _NO_WAITING)
 
     def receive(self) -> Message:
         """Wait for a message; called by one thread.

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from epypes.errors import MailboxOverflow, MessageError, ServiceError
 from epypes.run import Failure
 from epypes.service.failures.record import FAILURE_TOPIC, FailureRecord
+from epypes.store.later import SeriesWriter
 from epypes.transport.channel import Confirmed
 from epypes.transport.throttle import Throttle
 from epypes.wire import EncodedEnvelope, failure_event
@@ -24,9 +25,9 @@ from epypes.wire.envelope import request_fields
 
 if TYPE_CHECKING:
     from epypes.service.dispatcher import AcceptedEvent
-    from epypes.service.event_log import EventLog
     from epypes.service.failures.store import FailureStore
     from epypes.service.frame_socket import Message
+    from epypes.service.options import Options
 
 Outcome = Literal["answered", "failed", "dead_letters"]
 FailureKind = Literal["raised", "killed", "stuck", "dropped", "exhausted"]
@@ -35,6 +36,8 @@ Listener = Callable[[str, dict[str, Any]], None]
 
 # Log texts of an event that failed outside of its graph.
 _FAILED: Final = {"f_in": "could not be read (f_in)", "f_out": "has an answer that could not be given (f_out)"}
+# Of the series that the event log is in.
+_KIND: Final = "events"
 _RECORDED: Final = ("function", "tokens", "exception", "message", "trace")
 # Upper bounds of the latency histogram in seconds: from a trivial graph to the longest job time-outs.
 BOUNDS_S: Final = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
@@ -212,6 +215,79 @@ class LatencyHistogram:
         # Another thread may add a function meanwhile; a copy is made in one step.
         functions_s = {function: spent_ns / 1e9 for function, spent_ns in self._functions_ns.copy().items()}
         return Latency(BOUNDS_S, counts, sum(counts), self._total_ns / 1e9, self._computing_ns / 1e9, functions_s)
+
+
+# -- event log -------------------------------------------------------------------------------------------------------
+
+
+class EventLog:
+    """A row of each event, in the series ``events`` of the bundle's name; nothing waits for the database.
+
+    Parameters
+    ----------
+    options
+        Of the service: the store, which is a path or a URL or None, and the name of the replica.
+    name
+        Of the bundle.
+    provenance
+        Returns what events are worked on with.
+
+    Raises
+    ------
+    StoreError
+        There can be no such database. One that is away is reported in the log.
+    """
+
+    def __init__(self, options: Options, name: str, provenance: Callable[[], Provenance]) -> None:
+        self._options, self._provenance, self._began_ns = options, provenance, time_ns()
+        self._writer = None if options.store is None else SeriesWriter(options.store, _KIND, name)
+
+    def keep(self, event: AcceptedEvent, result: Result, failure: FailureRecord | None) -> None:
+        """Have a row of an event written; returns at once and raises nothing."""
+        if self._writer is not None:
+            row = _row(event, result, failure, self._provenance().digest)
+            if self._options.has_broker:
+                row |= {"deliveries": event.delivery.attempt, "replica": self._options.replica}
+            self._writer.append(f"{self._began_ns}-{event.seq}", row)
+
+    def counts(self) -> Mapping[str, int]:
+        """Return how many rows were written, skipped and so on, as `SeriesWriter.counts`; none without a store."""
+        return {} if self._writer is None else self._writer.counts()
+
+    def close(self, timeout_s: float) -> None:
+        """Write all rows that wait; those that are not written in time are reported in the log. More may follow."""
+        if self._writer is not None and not self._writer.close(timeout_s):
+            _log.warning("%d rows of events could not be stored in time", self._writer.counts()["waiting"])
+
+
+def _row(event: AcceptedEvent, result: Result, failure: FailureRecord | None, digest: str) -> dict[str, Any]:
+    now_ns = time_ns()
+    row = {
+        "seq": event.seq,
+        "event_id": event.id,
+        "outcome": "answered",
+        "received_ns": now_ns - (perf_counter_ns() - event.accepted_ns),
+        "answered_ns": now_ns,
+        "total_ns": result.total_ns,
+        "times_ns": dict(result.durations_ns),
+        "attempts": event.attempts,
+        "revision": result.revision,
+        "digest": digest,
+    }
+    return row if failure is None else {**row, **_of_failure(failure, result)}
+
+
+def _of_failure(failure: FailureRecord, result: Result) -> dict[str, Any]:
+    """Return what a row has besides if the event failed; ``failure`` is the id to open it by."""
+    dropped = failure.kind == "dropped"
+    return {
+        "outcome": "dropped" if dropped else result.outcome.removesuffix("s"),
+        "failure": failure.id,
+        "function": failure.function,
+        "exception": failure.exception,
+        "message": failure.message,
+        "digest": failure.digest,
+    }
 
 
 # -- publishing -------------------------------------------------------------------------------------------------------

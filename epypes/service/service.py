@@ -14,14 +14,13 @@ from epypes.service.bundle_info import read_bundle_info
 from epypes.service.deploy import Deployer
 from epypes.service.dispatcher import Dispatcher
 from epypes.service.endpoints import Endpoints, group_address
-from epypes.service.event_log import EventLog
 from epypes.service.failures.record import FailureRecord
 from epypes.service.failures.store import FailureStore, failures_folder
 from epypes.service.lifecycle import Lifecycle, State
 from epypes.service.options import ANY_PORT, Options
 from epypes.service.parameters import ParameterControl, Parameters
 from epypes.service.replicas import Replicas
-from epypes.service.result_publisher import Latency, Listener, Provenance, ResultPublisher
+from epypes.service.result_publisher import EventLog, Latency, Listener, Provenance, ResultPublisher
 from epypes.service.sd_notify import notify
 from epypes.service.state_file import ServiceState
 from epypes.service.supervisor import Supervisor

@@ -6,6 +6,7 @@ One thread, which lives as long as the service: the system ends a worker with th
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -116,10 +117,10 @@ class Supervisor:
     def _run(self) -> None:
         while True:
             with self._changed:
-                job = self._next()
-                while job is None:
-                    self._changed.wait(self._wait_s())
-                    job = self._next()
+                due_in_s, job = self._next()
+                while due_in_s is None or due_in_s > 0:
+                    self._changed.wait(due_in_s)
+                    due_in_s, job = self._next()
             if self._is_ending:
                 return
             try:
@@ -128,40 +129,22 @@ class Supervisor:
             except Exception:
                 _log.exception("a step of the supervisor failed; the supervisor goes on")
 
-    def _wait_s(self) -> float | None:
-        """Return how long to wait if nothing changes; None for ever. With the lock held."""
-        now_s = monotonic()
-        due_in_s = self._dispatcher.due_in_s(self._timeout_ns)
-        self._dispatcher.is_unwatched = due_in_s is None
-        waits = [due_in_s, self._watchdog.due_in_s()]
-        if self._restart_s is not None:
-            waits.append(self._restart_s - now_s)
-        if self._is_loading:
-            waits.append(self._loading_until_s - now_s)
-        known = [wait for wait in waits if wait is not None]
-        return max(min(known), 0.0) if known else None
-
-    def _next(self) -> Callable[[], object] | None:
-        """Return what must be done now, None if nothing. With the lock held."""
-        now_s = monotonic()
+    def _next(self) -> tuple[float | None, Callable[[], object]]:
+        """Return what must be done next, and in how many seconds; None for never. With the lock held."""
         if self._is_ending:
-            return _nothing
-        if (sign_due_in_s := self._watchdog.due_in_s()) is not None and sign_due_in_s <= 0:
-            return self._watchdog.send
-        if self._to_start:
-            return self._start_for_deploy
+            return 0.0, _nothing
+        now_s = monotonic()
         if self.worker is None and self._restart_s is None and not self.health.is_final:
             # The last attempt to start one has failed.
             self._restart_s = now_s + RESTART_PAUSE_S
-        if self._restart_s is not None and self._restart_s <= now_s:
-            self._restart_s = None
-            return self._start_again
-        due_in_s = self._dispatcher.due_in_s(self._timeout_ns)
-        if self._dispatcher.connection is not None and due_in_s is not None and due_in_s <= 0:
-            return self._end_stuck
-        if self._is_loading and self._loading_until_s <= now_s:
-            return self._end_loading
-        return None
+        jobs: list[tuple[float | None, Callable[[], object]]] = [
+            (self._watchdog.due_in_s(), self._watchdog.send),
+            (0.0 if self._to_start else None, self._start_for_deploy),
+            (None if self._restart_s is None else self._restart_s - now_s, self._start_again),
+            (self._dispatcher.due_in_s(self._timeout_ns), self._end_stuck),
+            (self._loading_until_s - now_s if self._is_loading else None, self._end_loading),
+        ]
+        return min(jobs, key=lambda job: math.inf if job[0] is None else job[0])
 
     @property
     def _is_loading(self) -> bool:
@@ -169,7 +152,7 @@ class Supervisor:
 
     def _start_again(self) -> None:
         with self._changed:
-            bundle = self.bundle
+            bundle, self._restart_s = self.bundle, None
         try:
             connection = WorkerConnection(bundle, self._threads, self._on_message, self._on_end)
         except (OSError, MemoryError, RuntimeError) as error:

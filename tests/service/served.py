@@ -35,6 +35,7 @@ SOURCE = '''
         open(os.path.join(folder, "started"), "w").close()
         while not os.path.exists(os.path.join(folder, "release")):
             time.sleep(0.002)
+        open(os.path.join(folder, "over"), "w").close()
 
 
     def hold_once(folder):

@@ -105,7 +105,7 @@ def test_frames_that_kill_the_worker_one_after_another_are_put_aside_and_the_ser
 
 @pytest.mark.soak
 def test_events_that_do_not_return_one_after_another_are_reported_and_the_service_stays_up(acting):
-    with serving(acting, mailbox_size=100, job_timeout_s=0.1) as (service, peer):
+    with serving(acting, mailbox_size=100, job_timeout_s=0.1) as (_, peer):
         for number in range(6):
             peer.send("sleep:100", number)
         assert all("did not return within 0.1 s" in answer.failure.message for answer in peer.take(6))
