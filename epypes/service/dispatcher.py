@@ -105,7 +105,7 @@ class Dispatcher:
     is_closed
         Whether a broker's events are left with it.
     answered_in_row
-        How many events were answered since a worker last died.
+        How many events were answered since a worker last ended.
     on_answered
         Called with the id of each event that is done, without the lock; it returns at once.
     """
@@ -315,7 +315,7 @@ class Dispatcher:
     def worker_ended(self) -> None:
         """Note that the front itself ended the worker: its events are tried again."""
         with self.lock:
-            self._connection = None
+            self._connection, self.answered_in_row = None, 0
             self._put_back()
 
     def _put_back(self) -> None:
@@ -327,26 +327,32 @@ class Dispatcher:
 
     # -- events that take too long ------------------------------------------------------------------------------------
 
-    def overdue(self, timeout_ns: int) -> list[AcceptedEvent]:
+    def overdue(self, timeout_s: float) -> list[AcceptedEvent]:
         """Return the events that the worker has had for longer than this."""
         with self.lock:
             now_ns = perf_counter_ns()
-            return [event for event in self._running.values() if now_ns - event.started_ns >= timeout_ns]
+            return [event for event in self._running.values() if now_ns - event.started_ns >= timeout_s * 1e9]
 
-    def due_in_s(self, timeout_ns: int) -> float | None:
+    def due_in_s(self, timeout_s: float) -> float | None:
         """Return in how many seconds an event will have timed out; None if there is none. With the lock held.
 
         The supervisor, which waits for so long, is woken up by the next event if there is none.
         """
         starts = [event.started_ns for event in self._running.values()] if self._connection is not None else []
         self._is_idle = not starts
-        return max(min(starts) + timeout_ns - perf_counter_ns(), 0) / 1e9 if starts else None
+        return max(min(starts) / 1e9 + timeout_s - perf_counter_ns() / 1e9, 0.0) if starts else None
 
-    def stuck(self, report: HangReport, overdue: Sequence[int], timeout_ns: int) -> list[int] | None:
-        """Return which overdue events are stuck; None if the worker may go on. With the lock held.
+    def fail_stuck(self, report: HangReport, overdue: Sequence[int], timeout_s: float) -> str | None:
+        """Answer overdue events that are stuck with a failure that names the function; the worker gets nothing more.
 
         An event may have waited in the worker for a change of parameters: its time begins when it is begun. If the
-        worker works on none of them it is held up by something else, and is ended without blaming an event.
+        worker works on none of them it is held up by something else, and is ended without blaming an event. With the
+        lock held.
+
+        Returns
+        -------
+        str or None
+            The function that did not return, empty if that can't be known; None if the worker may go on.
         """
         events = [event for seq in overdue if (event := self._running.get(seq)) is not None]
         now_ns = perf_counter_ns()
@@ -355,22 +361,20 @@ class Dispatcher:
                 event.started_ns = now_ns - report.elapsed_ns[event.seq]
             elif report.elapsed_ns:
                 event.started_ns = now_ns
-        late = [event for event in events if now_ns - event.started_ns >= timeout_ns]
+        late = [event for event in events if now_ns - event.started_ns >= timeout_s * 1e9]
         if not late:
             return None
-        is_blamed = not report.has_answered or bool(report.elapsed_ns)
-        return [event.seq for event in late if is_blamed or event.attempts > self._max_deaths + 1]
-
-    def fail_stuck(self, stuck: Sequence[int], functions: Mapping[int, str], timeout_s: float) -> None:
-        """Answer stuck events with a failure that names the function; the worker gets nothing more. With the lock."""
-        provenance = self._provenance()
-        for event in [event for seq in stuck if (event := self._running.get(seq)) is not None]:
-            function = functions[event.seq]
-            where = f"Function {function!r}" if function else "The worker"
-            text = f"{where} did not return within {timeout_s:g} s; the worker is replaced."
-            error = ServiceError(provenance.bundle, text)
-            self._resolve(event, failed_result(event, error, provenance, "stuck", function=function))
+        is_blamed, provenance, named = not report.has_answered or bool(report.elapsed_ns), self._provenance(), ""
+        for event in late:
+            if is_blamed or event.attempts > self._max_deaths + 1:
+                function = report.functions[event.seq]
+                where = f"Function {function!r}" if function else "The worker"
+                text = f"{where} did not return within {timeout_s:g} s; the worker is replaced."
+                error = ServiceError(provenance.bundle, text)
+                self._resolve(event, failed_result(event, error, provenance, "stuck", function=function))
+                named = named or function
         self._connection = None
+        return named
 
     def give_up(self, reason: str, functions: Mapping[int, str] | None = None) -> int:
         """Answer all that is not resolved with a failure of this reason; return how many events that were.

@@ -25,6 +25,7 @@ from epypes.wire.envelope import request_fields
 
 if TYPE_CHECKING:
     from epypes.service.dispatcher import AcceptedEvent
+    from epypes.service.endpoints import AnswerOutput
     from epypes.service.failures.store import FailureStore
     from epypes.service.frame_socket import Message
     from epypes.service.options import Options
@@ -298,10 +299,8 @@ class ResultPublisher:
 
     Parameters
     ----------
-    publish_answer
-        Publishes an answer under an id, and calls back when it is confirmed or can't be sent.
-    publish_failure
-        Publishes a failure event on the address of failures.
+    answers, failures
+        Where answers go, and where failures are published.
     store
         Returns where failures are kept.
     event_log
@@ -312,13 +311,13 @@ class ResultPublisher:
 
     def __init__(
         self,
-        publish_answer: Callable[[EncodedEnvelope | bytes, str, Confirmed], object],
-        publish_failure: Callable[[EncodedEnvelope], object],
+        answers: AnswerOutput,
+        failures: AnswerOutput,
         store: FailureStore,
         event_log: EventLog,
         provenance: Callable[[], Provenance],
     ) -> None:
-        self._publish_answer, self._publish_failure = publish_answer, publish_failure
+        self._answers, self._failures = answers, failures
         self._store, self._event_log, self._provenance = store, event_log, provenance
         self._listeners: list[Listener] = []
         self.latency = LatencyHistogram()
@@ -364,7 +363,7 @@ class ResultPublisher:
         for number, answer in enumerate(result.answers, 1):
             # Numbered, so that the second answer is no duplicate of the first.
             own_id = f"{event.id}/{number}" if event.id and number > 1 else event.id
-            self._publish_answer(answer, own_id, confirmed)
+            self._answers.publish(answer, own_id, confirmed)
 
     def _confirmed(
         self,
@@ -411,7 +410,7 @@ class ResultPublisher:
             if isinstance(answer, EncodedEnvelope) and answer.failure is not None:
                 envelope = answer.decode()
                 envelope = replace(envelope, attributes={**envelope.attributes, **more})
-                self._publish_failure(EncodedEnvelope.encode(envelope, FAILURE_TOPIC))
+                self._failures.publish(EncodedEnvelope.encode(envelope, FAILURE_TOPIC))
         self.notify("failure", asdict(kept))
         return kept
 

@@ -69,7 +69,7 @@ class Supervisor:
         self.is_rewritten = False
         self.worker: WorkerConnection | None = None
         self._dispatcher, self._threads = dispatcher, threads
-        self._timeout_s, self._timeout_ns = job_timeout_s, int(job_timeout_s * 1e9)
+        self._timeout_s = job_timeout_s
         self._parameters, self._on_change = parameters, on_change
         self._changed = dispatcher.changed
         self._to_start: deque[tuple[BundleInfo, list[WorkerConnection | Exception]]] = deque()
@@ -78,8 +78,6 @@ class Supervisor:
         self._is_ending = False
         self._thread: threading.Thread | None = None
         self._watchdog = Watchdog()
-        # `Dispatcher.answered_in_row` when the last worker ended.
-        self._answered_before = 0
 
     def start(self) -> None:
         """Start the thread, and a worker of the bundle."""
@@ -141,7 +139,7 @@ class Supervisor:
             (self._watchdog.due_in_s(), self._watchdog.send),
             (0.0 if self._to_start else None, self._start_for_deploy),
             (None if self._restart_s is None else self._restart_s - now_s, self._start_again),
-            (self._dispatcher.due_in_s(self._timeout_ns), self._end_stuck),
+            (self._dispatcher.due_in_s(self._timeout_s), self._end_stuck),
             (self._loading_until_s - now_s if self._is_loading else None, self._end_loading),
         ]
         return min(jobs, key=lambda job: math.inf if job[0] is None else job[0])
@@ -253,9 +251,7 @@ class Supervisor:
     def _over(self, connection: WorkerConnection) -> None:
         """Note that the worker is gone. With the lock held."""
         self.worker = None
-        in_row = self._dispatcher.answered_in_row
-        answered = in_row if in_row > self._answered_before else 0
-        self._answered_before = in_row
+        answered = self._dispatcher.answered_in_row
         if connection.status == "refused":
             self._dispatcher.worker_ended()
             self._fault(" ".join(connection.reasons))
@@ -264,7 +260,7 @@ class Supervisor:
             self._died(self.health.stuck or connection.process.ending, answered, has_cause=True)
         else:
             # An event that kills workers becomes a dead letter in the end: such deaths must not make a fault.
-            has_event, self._answered_before = bool(self._dispatcher.running), 0
+            has_event = bool(self._dispatcher.running)
             self._dispatcher.worker_died(connection.process.ending, connection.process.died_in)
             self._died(connection.process.ending, answered, has_cause=has_event)
 
@@ -304,18 +300,16 @@ class Supervisor:
 
     def _end_stuck(self) -> None:
         connection = self._dispatcher.connection
-        overdue = [event.seq for event in self._dispatcher.overdue(self._timeout_ns)]
+        overdue = [event.seq for event in self._dispatcher.overdue(self._timeout_s)]
         if connection is None or not overdue:
             return
         report = connection.hang_report(overdue)
         with self._changed:
-            stuck = self._dispatcher.stuck(report, overdue, self._timeout_ns)
-            if stuck is None:
+            function = self._dispatcher.fail_stuck(report, overdue, self._timeout_s)
+            if function is None:
                 # They were done, or have not taken so long, and the worker goes on.
                 return
-            self._dispatcher.fail_stuck(stuck, report.functions, self._timeout_s)
-            named = next((name for seq in stuck if (name := report.functions[seq])), "")
-            where = f"Function {named!r}" if named else "The worker"
+            where = f"Function {function!r}" if function else "The worker"
             how = " The process was stopped." if connection.process.is_stopped else ""
             self.health.stuck = f"{where} did not return within {self._timeout_s:g} s.{how} The worker is replaced"
             connection.is_dismissed = True

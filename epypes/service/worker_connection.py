@@ -284,9 +284,9 @@ class WorkerConnection:
         self.is_dismissed = False
         self._on_message, self._on_end = on_message, on_end
         self._posting = threading.Lock()
-        # Buffers that the kernel has not taken; while there are any, later messages queue behind them.
-        self._unsent: deque[list[memoryview]] = deque()
-        self._wake: queue.SimpleQueue[bool] = queue.SimpleQueue()
+        # Buffers that the kernel has not taken, None at the end; while there are any, later messages queue behind them.
+        self._unsent: queue.SimpleQueue[list[memoryview] | None] = queue.SimpleQueue()
+        self._unsent_count = 0
         self._is_over = False
         self._numbers = itertools.count(1)
         self._answers: dict[int, queue.SimpleQueue[Message | None]] = {}
@@ -295,7 +295,7 @@ class WorkerConnection:
             for target, name in ((self._send, "to"), (self._receive, "from")):
                 threading.Thread(target=target, name=f"epypes {name} worker", daemon=True).start()
         except BaseException:
-            self._wake.put(False)
+            self._unsent.put(None)
             self.process.kill()
             self.process.close()
             raise
@@ -326,33 +326,30 @@ class WorkerConnection:
             _log.error("a message to the worker was not sent: %s", error)
             return
         with self._posting:
-            if not self._unsent:
+            if not self._unsent_count:
                 try:
                     left = self.process.socket.send_buffers(left, is_waiting=False)
                 except EOFError:
                     return
             if left:
-                self._unsent.append(left)
-                if len(self._unsent) == 1:
-                    self._wake.put(True)
+                self._unsent_count += 1
+                self._unsent.put(left)
 
     def _send(self) -> None:
-        while self._wake.get():
-            left: list[memoryview] | None = self._unsent[0]
-            while left is not None:
-                try:
-                    self.process.socket.send_buffers(left)
-                except EOFError:
-                    return
-                except BaseException:
-                    # Memory may be short. What the worker has not got is given to the next one.
-                    _log.exception("the worker can't be sent messages, so it is ended")
-                    self.process.kill()
-                    return
-                # An event may be large: its memory must not be held until another one comes.
-                with self._posting:
-                    self._unsent.popleft()
-                    left = self._unsent[0] if self._unsent else None
+        while (left := self._unsent.get()) is not None:
+            try:
+                self.process.socket.send_buffers(left)
+            except EOFError:
+                return
+            except BaseException:
+                # Memory may be short. What the worker has not got is given to the next one.
+                _log.exception("the worker can't be sent messages, so it is ended")
+                self.process.kill()
+                return
+            # An event may be large: its memory must not be held until another one comes.
+            left.clear()
+            with self._posting:
+                self._unsent_count -= 1
 
     # -- requests -----------------------------------------------------------------------------------------------------
 
@@ -446,7 +443,7 @@ class WorkerConnection:
             pass
         except BaseException:
             _log.exception("the worker's messages can't be understood, so it is ended")
-        self._wake.put(False)
+        self._unsent.put(None)
         self.process.close()
         if self.status != "refused":
             self.status = "gone"
