@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final, Literal, get_args
 
 from epypes.errors import MessageError
-from epypes.service.packing import HEAD, MARK, BytesLike
+from epypes.service.packing import HEAD, MARK, BytesLike, table_of
 
 Kind = Literal["event", "parameters", "withdraw", "query", "end", "ready", "refused", "done", "answer"]
 _KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
@@ -100,8 +100,7 @@ def buffers_of(message: Message) -> list[memoryview]:
     if len(sizes) > _MAX_FRAMES or sum(sizes) > _MAX_BYTES:
         text = f"{len(sizes):,} frames of {sum(sizes):,} bytes; the limits are {_MAX_FRAMES:,} and"
         raise MessageError("too large", f"{text} {_MAX_BYTES:,}.")
-    table = struct.pack(f"<4sI{len(sizes)}Q", MARK, len(sizes), *sizes)
-    return [memoryview(table), *filter(len, views)]
+    return [memoryview(table_of(sizes)), *filter(len, views)]
 
 
 class FrameSocket:

@@ -174,7 +174,7 @@ MEETING = '''
 
 
     def meet(place):
-        """Return when as many have come as are told."""
+        """Return when so many calls have begun."""
         folder, name, count = place.split("|")
         open(os.path.join(folder, name), "w").close()
         while len(os.listdir(folder)) < int(count):

@@ -220,7 +220,7 @@ def test_answers_keep_the_order_of_events_though_slots_differ_in_speed(acting):
         check_counts(service.counts())
 
 
-def test_a_failed_event_is_told_on_both_sockets_and_its_trace_is_kept(acting):
+def test_a_failed_event_is_reported_on_both_sockets_and_its_trace_is_kept(acting):
     with serving(acting) as (service, peer):
         heard = []
         forget = service.listen(lambda kind, data: heard.append((kind, data)))
@@ -313,7 +313,7 @@ def test_parameters_outlive_the_worker(acting):
         assert (answer.parts["out"], answer.revision) == (21, 1)
 
 
-def test_a_change_that_cannot_be_made_changes_nothing_and_says_why(acting):
+def test_a_change_that_cannot_be_made_changes_nothing_and_has_a_reason(acting):
     with serving(acting) as (service, peer):
         with pytest.raises(ParametersRefused) as refused:
             service.set_parameters({"k": 5, "kk": 1, "n": 2})
@@ -416,7 +416,7 @@ def test_a_bundle_that_is_not_good_leaves_the_other_one_serving(acting, tmp_path
         assert {key for key in before if before[key] != after[key]} == {"counts"}
 
 
-def test_a_bundle_whose_replay_differs_is_never_ready_and_says_why(tmp_path):
+def test_a_bundle_whose_replay_differs_is_never_ready_and_has_a_reason(tmp_path):
     with Service(acting_bundle(tmp_path / "wrong", expected=7)) as service:
         assert service.state == "FAULTED"
         assert "'out'" in service.reason

@@ -26,9 +26,9 @@ from tests.service.workers import TIMEOUT_S, ready_worker, worker_of
 
 pytestmark = pytest.mark.slow
 
-# What its function does is told by the event.
+# The event says what its function does.
 SOURCE = '''
-    """A graph whose functions do what they are told."""
+    """A graph whose functions do what the event says."""
 
     import ctypes
     import os
@@ -213,7 +213,7 @@ def test_what_comes_before_the_worker_is_ready_is_done_then(acting, tmp_path):
         assert (header["revision"], answer.parts["out"]) == (5, "early 3")
 
 
-def test_a_worker_that_is_told_to_end_while_it_loads_ends(acting, tmp_path):
+def test_a_worker_that_gets_the_end_while_it_loads_ends(acting, tmp_path):
     with worker_of(acting, tmp_path) as front:
         assert front.end() == 0
 
@@ -258,7 +258,7 @@ def test_whatever_a_function_raises_is_the_failure_of_its_event(shared, what, fu
     assert shared.run(what="a")[1][0].parts["out"] == "a 2"
 
 
-def test_the_trace_of_a_failure_tells_the_lines_of_the_bundle_and_none_of_ours(shared, acting):
+def test_the_trace_of_a_failure_has_the_lines_of_the_bundle_and_none_of_ours(shared, acting):
     header, _ = shared.run(what="fail")
     failure = header["failure"]
     assert failure["tokens"] == ["what", "k", "out"]
@@ -439,7 +439,7 @@ def test_before_an_event_the_graph_is_seen_and_no_value(own):
             assert "No event has been completed yet" in header["error"]
 
 
-def test_what_is_asked_is_of_the_last_completed_run(shared):
+def test_answers_to_queries_are_of_the_last_completed_run(shared):
     header, _ = shared.run(what="zeros")
     shared.run(what="fail")
     values = shared.values("out", "k", "what")
@@ -472,7 +472,7 @@ def test_what_is_asked_is_of_the_last_completed_run(shared):
         ({"what": "everything"}, "unknown query", "everything"),
     ],
 )
-def test_what_cannot_be_answered_is_told_with_its_reason(shared, ask, reason, text):
+def test_what_cannot_be_answered_is_refused_with_its_reason(shared, ask, reason, text):
     shared.run(what="a")
     header, frames = shared.query(**ask)
     assert (header["reason"], frames) == (reason, [])
@@ -498,7 +498,7 @@ def test_values_of_a_revision_that_no_event_has_had_are_computed_on_the_last_pay
         assert not front.waiting or {message.kind for message in front.waiting} == {"parameters"}
 
 
-def test_a_function_that_fails_with_new_parameters_is_told_to_who_asked(tmp_path):
+def test_a_function_that_fails_with_new_parameters_is_the_answer_to_the_query(tmp_path):
     source = """
         def divide(x, k):
             return x // k
@@ -517,7 +517,7 @@ def test_a_function_that_fails_with_new_parameters_is_told_to_who_asked(tmp_path
         assert front.query("run", tokens=["y"], revision=7)[0]["reason"] == "unknown revision"
 
 
-def test_what_runs_is_told_while_a_function_computes(own):
+def test_the_running_function_is_reported_while_it_computes(own):
     with own() as front:
         seq = front.send_event(Envelope(type="x", parts={"what": "hold"}))
         until(front.started.exists)
@@ -530,7 +530,7 @@ def test_what_runs_is_told_while_a_function_computes(own):
         assert front.query("running")[0]["running"] == []
 
 
-def test_too_many_questions_are_refused_and_none_is_left_without_answer(own):
+def test_too_many_queries_are_refused_and_none_is_left_without_answer(own):
     with own() as front:
         front.run(what="zeros")
         numbers = [front.send_query("preview", token="out", max_side_px=16 + side) for side in range(150)]
@@ -599,7 +599,7 @@ sys.stdin.read()
         control.close()
 
 
-def test_a_worker_says_where_it_is_while_a_function_holds_the_interpreter(own):
+def test_a_worker_writes_its_stacks_while_a_function_holds_the_interpreter(own):
     with own() as front:
         front.send_event(Envelope(type="x", parts={"what": "regex"}))
         until(front.started.exists)
