@@ -31,7 +31,7 @@ from epypes.service.result_publisher import (
 )
 
 if TYPE_CHECKING:
-    from epypes.service.frame_socket import Message
+    from epypes.service.frame_socket import WorkerMessage
     from epypes.service.options import Options
     from epypes.service.worker_connection import HangReport, WorkerConnection
     from epypes.transport.channel import Delivery
@@ -266,7 +266,7 @@ class Dispatcher:
 
     # -- from the worker ----------------------------------------------------------------------------------------------
 
-    def done(self, connection: WorkerConnection, message: Message) -> None:
+    def done(self, connection: WorkerConnection, message: WorkerMessage) -> None:
         """Take a worker's ``done`` message. An event that timed out meanwhile has been answered already."""
         with self.lock:
             event = self._running.get(message.number) if connection is self._connection else None

@@ -23,8 +23,8 @@ from typing import Any, Final, Literal, get_args
 from epypes.errors import MessageError
 from epypes.service.packing import HEAD, MARK, BytesLike, table_of
 
-Kind = Literal["event", "parameters", "withdraw", "query", "end", "ready", "refused", "done", "answer"]
-_KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
+MessageKind = Literal["event", "parameters", "withdraw", "query", "end", "ready", "refused", "done", "answer"]
+_KINDS: Final[tuple[MessageKind, ...]] = get_args(MessageKind)
 # The kind and the number of a message; its contents follow as JSON, if it has any.
 _KIND_AND_NUMBER: Final = struct.Struct("<BQ")
 
@@ -53,7 +53,7 @@ _from_json: Final = json.JSONDecoder().decode
 
 
 @dataclass(slots=True)
-class Message:
+class WorkerMessage:
     """A message between the front and a worker.
 
     Attributes
@@ -68,32 +68,32 @@ class Message:
         Contiguous bytes; read-only in a message that was received.
     """
 
-    kind: Kind
+    kind: MessageKind
     number: int = 0
     content: Mapping[str, Any] = field(default_factory=dict)
     frames: Sequence[BytesLike] = ()
 
 
-def _encode_head(message: Message) -> bytes:
+def _encode_head(message: WorkerMessage) -> bytes:
     content = _to_json(message.content).encode() if message.content else b""
     if len(content) > _MAX_CONTENT_BYTES:
         raise MessageError("too large", f"Contents of {len(content):,} bytes; the limit is {_MAX_CONTENT_BYTES:,}.")
     return _KIND_AND_NUMBER.pack(_KINDS.index(message.kind), message.number) + content
 
 
-def _decode(head: BytesLike, frames: Sequence[BytesLike] = ()) -> Message:
+def _decode(head: BytesLike, frames: Sequence[BytesLike] = ()) -> WorkerMessage:
     try:
         kind, number = _KIND_AND_NUMBER.unpack_from(head)
         text = str(head[_KIND_AND_NUMBER.size :], "utf-8")
         content = _from_json(text) if text else {}
         if not isinstance(content, dict):
             raise ValueError(f"an object is expected, not a {type(content).__name__}")
-        return Message(_KINDS[kind], number, content, frames)
+        return WorkerMessage(_KINDS[kind], number, content, frames)
     except (struct.error, IndexError, ValueError, RecursionError) as error:
         raise MessageError("no message", f"The head of a message can't be read: {error}.") from error
 
 
-def buffers_of(message: Message) -> list[memoryview]:
+def buffers_of(message: WorkerMessage) -> list[memoryview]:
     """Return a message as buffers to send; raise MessageError if the reader would refuse it."""
     views = [memoryview(part).cast("B") for part in (_encode_head(message), *message.frames)]
     sizes = [*map(len, views)]
@@ -126,7 +126,7 @@ class FrameSocket:
             end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
         return cls(ours), theirs
 
-    def send(self, message: Message) -> None:
+    def send(self, message: WorkerMessage) -> None:
         """Send a message, from any thread; wait for as long as the other side does not read.
 
         When it returns, the frames' memory may be written to again.
@@ -165,7 +165,7 @@ class FrameSocket:
                 raise
         return left
 
-    def receive(self) -> Message:
+    def receive(self) -> WorkerMessage:
         """Wait for a message; its frames are read-only. Called by one thread at a time.
 
         Raises
@@ -250,14 +250,14 @@ class ControlSocket:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         return cls(ours), theirs
 
-    def send(self, message: Message) -> None:
+    def send(self, message: WorkerMessage) -> None:
         """Send a message, from any thread, without waiting; it is lost if the other side is gone, or does not read."""
         packet = _encode_head(message)
         if len(packet) <= _MAX_CONTROL_BYTES:
             with self._sending, contextlib.suppress(OSError):
                 self._socket.send(packet, _NO_WAITING)
 
-    def receive(self) -> Message:
+    def receive(self) -> WorkerMessage:
         """Wait for a message; called by one thread.
 
         Raises

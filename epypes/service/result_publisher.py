@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from epypes.service.dispatcher import AcceptedEvent
     from epypes.service.endpoints import AnswerOutput
     from epypes.service.failures.store import FailureStore
-    from epypes.service.frame_socket import Message
+    from epypes.service.frame_socket import WorkerMessage
     from epypes.service.options import Options
 
 Outcome = Literal["answered", "failed", "dead_letters"]
@@ -90,7 +90,7 @@ class Result:
 # -- results, by cause ------------------------------------------------------------------------------------------------
 
 
-def worker_result(event: AcceptedEvent, message: Message, provenance: Callable[[], Provenance]) -> Result:
+def worker_result(event: AcceptedEvent, message: WorkerMessage, provenance: Callable[[], Provenance]) -> Result:
     """Return the result of a worker's ``done`` message."""
     done, frames = message.content, message.frames
     answers: list[EncodedEnvelope | bytes] = []

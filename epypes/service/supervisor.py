@@ -17,7 +17,7 @@ from epypes.bundle.replay import REPLAY_TIMEOUT_S
 from epypes.errors import ServiceError
 from epypes.service.bundle_info import BundleInfo
 from epypes.service.dispatcher import Dispatcher
-from epypes.service.frame_socket import Message
+from epypes.service.frame_socket import WorkerMessage
 from epypes.service.parameters import ParameterControl, others_than
 from epypes.service.sd_notify import Watchdog
 from epypes.service.worker_connection import WorkerConnection
@@ -180,7 +180,7 @@ class Supervisor:
 
     # -- messages of a worker, on its receiving thread -----------------------------------------------------------------
 
-    def _on_message(self, connection: WorkerConnection, message: Message) -> None:
+    def _on_message(self, connection: WorkerConnection, message: WorkerMessage) -> None:
         if message.kind == "done":
             self._dispatcher.done(connection, message)
         elif message.kind == "parameters":

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.bundle.load import MODULE
 from epypes.errors import MessageError, ServiceError
-from epypes.service.frame_socket import ControlSocket, FrameSocket, Message, buffers_of
+from epypes.service.frame_socket import ControlSocket, FrameSocket, WorkerMessage, buffers_of
 from epypes.service.packing import BytesLike
 from epypes.service.sd_notify import VARIABLES
 from epypes.service.standard_error import STANDARD_ERROR
@@ -274,7 +274,7 @@ class WorkerConnection:
         self,
         bundle: BundleInfo,
         threads: int,
-        on_message: Callable[[WorkerConnection, Message], None],
+        on_message: Callable[[WorkerConnection, WorkerMessage], None],
         on_end: Callable[[WorkerConnection], None],
     ) -> None:
         self.bundle = bundle
@@ -289,7 +289,7 @@ class WorkerConnection:
         self._unsent_count = 0
         self._is_over = False
         self._numbers = itertools.count(1)
-        self._answers: dict[int, queue.SimpleQueue[Message | None]] = {}
+        self._answers: dict[int, queue.SimpleQueue[WorkerMessage | None]] = {}
         self.process = WorkerProcess(bundle.path, threads)
         try:
             for target, name in ((self._send, "to"), (self._receive, "from")):
@@ -309,15 +309,15 @@ class WorkerConnection:
 
     def post_event(self, seq: int, frames: Sequence[BytesLike]) -> None:
         """Give the worker an event; returns at once."""
-        self._post(Message("event", seq, frames=frames))
+        self._post(WorkerMessage("event", seq, frames=frames))
 
     def post_parameters(self, revision: int, values: Mapping[str, Any], number: int | None = None) -> None:
         """Have it take values of hyperparameters as soon as it works on no event; a message reports whether it has."""
         number = next(self._numbers) if number is None else number
         # Not in the contents, which are bounded: a table may be large.
-        self._post(Message("parameters", number, {"revision": revision}, [json.dumps(values).encode()]))
+        self._post(WorkerMessage("parameters", number, {"revision": revision}, [json.dumps(values).encode()]))
 
-    def _post(self, message: Message) -> None:
+    def _post(self, message: WorkerMessage) -> None:
         """Send a message after those before it; returns at once. To a worker that is gone nothing is sent."""
         try:
             left = buffers_of(message)
@@ -353,7 +353,7 @@ class WorkerConnection:
 
     # -- requests -----------------------------------------------------------------------------------------------------
 
-    def query(self, what: str, timeout_s: float = _QUERY_TIMEOUT_S, **more: Any) -> Message:
+    def query(self, what: str, timeout_s: float = _QUERY_TIMEOUT_S, **more: Any) -> WorkerMessage:
         """Send a query to the worker, and wait for the answer.
 
         Values of a revision may be computed for it, by a slot; everything else is answered while functions run.
@@ -364,7 +364,7 @@ class WorkerConnection:
             It is gone, or does not answer in time.
         """
         with self._request() as (number, answers):
-            message = Message("query", number, {"what": what, **more})
+            message = WorkerMessage("query", number, {"what": what, **more})
             if "revision" in more:
                 self._post(message)
             else:
@@ -388,7 +388,7 @@ class WorkerConnection:
             try:
                 answer = self._answer(answers, timeout_s)
             except queue.Empty:
-                self.process.control.send(Message("withdraw", number, {"revision": revision}))
+                self.process.control.send(WorkerMessage("withdraw", number, {"revision": revision}))
                 try:
                     answer = self._answer(answers, _WITHDRAW_TIMEOUT_S)
                 except queue.Empty:
@@ -403,7 +403,7 @@ class WorkerConnection:
         return dict(answer.content["problems"])
 
     @contextlib.contextmanager
-    def _request(self) -> Iterator[tuple[int, queue.SimpleQueue[Message | None]]]:
+    def _request(self) -> Iterator[tuple[int, queue.SimpleQueue[WorkerMessage | None]]]:
         """Yield the number of a new request, and the queue of its answers: None when the worker is gone."""
         number = next(self._numbers)
         answers = self._answers[number] = queue.SimpleQueue()
@@ -414,7 +414,7 @@ class WorkerConnection:
         finally:
             del self._answers[number]
 
-    def _answer(self, answers: queue.SimpleQueue[Message | None], timeout_s: float) -> Message:
+    def _answer(self, answers: queue.SimpleQueue[WorkerMessage | None], timeout_s: float) -> WorkerMessage:
         answer = answers.get(timeout=timeout_s)
         if answer is None:
             raise ServiceError(self.bundle.path, "The worker is gone, and is started again. Try again in a moment.")
@@ -452,7 +452,7 @@ class WorkerConnection:
             answers.put(None)
         self._on_end(self)
 
-    def _take(self, message: Message) -> None:
+    def _take(self, message: WorkerMessage) -> None:
         if message.kind == "ready":
             self.about, self.status = message.content, "ready"
         elif message.kind == "refused":
@@ -467,7 +467,7 @@ class WorkerConnection:
         """Let it finish its events and end; kill it if it still loads, or if that takes longer than ``timeout_s``."""
         self.is_dismissed = True
         if self.status != "loading":
-            self._post(Message("end"))
+            self._post(WorkerMessage("end"))
             if self.process.wait(timeout_s):
                 return
         self.process.kill()

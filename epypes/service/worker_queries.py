@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from epypes.errors import NotComputed, ServiceError, UnknownName
 from epypes.service.bundle_info import BundleInfo
-from epypes.service.frame_socket import Message
+from epypes.service.frame_socket import WorkerMessage
 from epypes.service.worker_connection import WorkerConnection
 
 _MAX_CACHED: Final = 64
@@ -33,7 +33,7 @@ class WorkerQueries:
     def __init__(self, bundle: Callable[[], BundleInfo], worker: Callable[[], WorkerConnection | None]) -> None:
         self._bundle, self._worker = bundle, worker
         # By the bundle's digest, the query and its arguments. With the lock.
-        self._cache: OrderedDict[tuple[Any, ...], Message] = OrderedDict()
+        self._cache: OrderedDict[tuple[Any, ...], WorkerMessage] = OrderedDict()
         self._bytes, self._lock = 0, threading.Lock()
 
     def graph(self, what: str) -> bytes:
@@ -53,7 +53,7 @@ class WorkerQueries:
         arguments = {"tokens": list(tokens)} | ({} if revision is None else {"revision": revision})
         return bytes(self._query("run", arguments, self._worker()).frames[0])
 
-    def _cached(self, what: str, **arguments: Any) -> Message:
+    def _cached(self, what: str, **arguments: Any) -> WorkerMessage:
         connection = self._worker()
         digest = (self._bundle() if connection is None else connection.bundle).digest
         key = (digest, what, *arguments.values())
@@ -76,7 +76,7 @@ class WorkerQueries:
                 self._bytes -= _size(self._cache.popitem(last=False)[1])
         return answer
 
-    def _query(self, what: str, arguments: Mapping[str, Any], connection: WorkerConnection | None) -> Message:
+    def _query(self, what: str, arguments: Mapping[str, Any], connection: WorkerConnection | None) -> WorkerMessage:
         if connection is None:
             raise ServiceError(self._bundle().path, "There is no worker just now. Try again in a moment.")
         answer = connection.query(what, **arguments)
@@ -94,5 +94,5 @@ class WorkerQueries:
         raise ServiceError(connection.bundle.path, str(refusal["error"]))
 
 
-def _size(answer: Message) -> int:
+def _size(answer: WorkerMessage) -> int:
     return sum(len(frame) for frame in answer.frames)

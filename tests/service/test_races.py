@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from epypes.errors import RevisionConflict, ServiceError
-from epypes.service.frame_socket import Message
+from epypes.service.frame_socket import WorkerMessage
 from epypes.service.worker_queries import WorkerQueries
 from tests.service.bundles import written_bundle
 from tests.service.served import SOURCE, TIMEOUT_S, acting_bundle, gated_bundle, serving, until
@@ -194,7 +194,7 @@ def test_what_another_bundle_has_shown_is_not_shown_for_this_one(acting, tmp_pat
 
 def test_answers_that_are_kept_for_when_there_is_no_worker_are_bounded_in_bytes():
     bundle = SimpleNamespace(digest="d", path="bundle")
-    answer = Message("answer", 1, {"media_type": "image/png"}, [memoryview(bytes(1024**2))])
+    answer = WorkerMessage("answer", 1, {"media_type": "image/png"}, [memoryview(bytes(1024**2))])
     worker = SimpleNamespace(bundle=bundle, about={}, query=lambda what, **arguments: answer)
     workers = [worker]
     queries = WorkerQueries(lambda: bundle, lambda: workers[0])

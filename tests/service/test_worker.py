@@ -18,7 +18,7 @@ import pytest
 
 from epypes.bundle.seal import seal
 from epypes.display.views.jsonview import from_json
-from epypes.service.frame_socket import ControlSocket, FrameSocket, Message
+from epypes.service.frame_socket import ControlSocket, FrameSocket, WorkerMessage
 from epypes.service.packing import MARK, unpack
 from epypes.wire import Envelope, decode, encode
 from tests.service.bundles import written_bundle
@@ -293,7 +293,7 @@ def test_an_event_that_f_in_does_not_understand_fails(shared, event, message):
 
 def test_an_event_that_cannot_be_decoded_fails_and_the_worker_goes_on(shared):
     seq = next(shared.seqs)
-    shared.channel.send(Message("event", seq, frames=[b"x/", b"\xff\xff"]))
+    shared.channel.send(WorkerMessage("event", seq, frames=[b"x/", b"\xff\xff"]))
     header, (answer,) = shared.done()
     assert (header["seq"], header["failure"]["function"]) == (seq, "f_in")
     assert "no Envelope" in answer.failure.message
@@ -370,14 +370,14 @@ def test_a_change_that_waits_for_an_event_can_be_withdrawn_and_one_that_was_made
     with own() as front:
         front.send_event(Envelope(type="x", parts={"what": "hold"}))
         until(front.started.exists)
-        front.control.send(Message("withdraw", front.set(1, k=8), {"revision": 1}))
+        front.control.send(WorkerMessage("withdraw", front.set(1, k=8), {"revision": 1}))
         assert front.changed()["is_withdrawn"]
         front.release.touch()
         assert front.done()[0]["revision"] == 0
         assert front.run(what="a")[0]["revision"] == 0
         number = front.set(2, k=9)
         assert front.changed()["revision"] == 2
-        front.control.send(Message("withdraw", number, {"revision": 2}))
+        front.control.send(WorkerMessage("withdraw", number, {"revision": 2}))
         header, (answer,) = front.run(what="a")
         assert (header["revision"], answer.parts["out"]) == (2, "a 9")
         assert not front.waiting
@@ -547,7 +547,7 @@ def test_a_worker_works_off_what_it_has_and_ends_with_0(own):
         front.send_event(Envelope(type="x", parts={"what": "hold"}))
         until(front.started.exists)
         seq = front.send_event(Envelope(type="x", parts={"what": "last"}))
-        front.channel.send(Message("end"))
+        front.channel.send(WorkerMessage("end"))
         front.release.touch()
         front.done()
         header, (answer,) = front.done()
@@ -587,7 +587,7 @@ sys.stdin.read()
         )
     try:
         worker = psutil.Process(int(parent.stdout.readline()))
-        ours.send(Message("event", 1, frames=encode(Envelope(type="x", parts={"what": "regex"}))))
+        ours.send(WorkerMessage("event", 1, frames=encode(Envelope(type="x", parts={"what": "regex"}))))
         until(started.exists)
         # Its sockets stay open: this is the end of the process that started it, and nothing else.
         parent.kill()
@@ -639,7 +639,7 @@ def test_a_worker_that_cannot_understand_its_front_ends_with_2(own, message):
 
 @pytest.mark.parametrize(
     ("channel", "message"),
-    [("channel", Message("ready")), ("channel", Message("parameters", 1)), ("control", Message("ready")), ("control", Message("query"))],
+    [("channel", WorkerMessage("ready")), ("channel", WorkerMessage("parameters", 1)), ("control", WorkerMessage("ready")), ("control", WorkerMessage("query"))],
 )  # fmt: skip
 def test_a_worker_that_gets_what_it_does_not_know_ends_with_2(own, channel, message):
     with own() as front:

@@ -10,7 +10,7 @@ import threading
 from contextlib import contextmanager
 from itertools import count
 
-from epypes.service.frame_socket import ControlSocket, FrameSocket, Message
+from epypes.service.frame_socket import ControlSocket, FrameSocket, WorkerMessage
 from epypes.service.packing import unpack
 from epypes.wire import Envelope, decode, encode
 
@@ -45,7 +45,7 @@ class Front:
     def send_event(self, event):
         seq = next(self.seqs)
         frames = [event] if isinstance(event, bytes) else encode(event)
-        self.channel.send(Message("event", seq, frames=frames))
+        self.channel.send(WorkerMessage("event", seq, frames=frames))
         return seq
 
     def done(self):
@@ -71,7 +71,7 @@ class Front:
     def send_parameters(self, revision, values):
         number = next(self.numbers)
         frames = [json.dumps(values).encode()]
-        self.channel.send(Message("parameters", number, {"revision": revision}, frames))
+        self.channel.send(WorkerMessage("parameters", number, {"revision": revision}, frames))
         return number
 
     def changed(self):
@@ -79,7 +79,7 @@ class Front:
         return self.receive("parameters").content
 
     def send_query(self, what, **content):
-        message = Message("query", next(self.numbers), {"what": what, **content})
+        message = WorkerMessage("query", next(self.numbers), {"what": what, **content})
         (self.channel if "revision" in content else self.control).send(message)
         return message.number
 
@@ -99,7 +99,7 @@ class Front:
         self.control.close()
 
     def end(self):
-        self.channel.send(Message("end"))
+        self.channel.send(WorkerMessage("end"))
         return self.process.wait(TIMEOUT_S)
 
 

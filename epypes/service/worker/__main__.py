@@ -28,7 +28,7 @@ from epypes.bundle.replay import replay
 from epypes.errors import EpypesError
 from epypes.pipeline import Pipeline
 from epypes.run import Failure
-from epypes.service.frame_socket import ControlSocket, FrameSocket, Message
+from epypes.service.frame_socket import ControlSocket, FrameSocket, WorkerMessage
 from epypes.service.worker.answers import QueryAnswerer
 from epypes.service.worker.inputs import FRONT_GONE, Inputs, not_understood
 from epypes.service.worker.slots import Slot, SlotParameters
@@ -89,7 +89,7 @@ class Worker:
             except BaseException as error:  # without this thread the worker would be deaf
                 not_understood(error)
 
-    def _take(self, message: Message) -> None:
+    def _take(self, message: WorkerMessage) -> None:
         if message.kind == "withdraw":
             self._inputs.withdraw(message)
         elif message.kind != "query":
@@ -98,7 +98,7 @@ class Worker:
             # At once: the front asks when something takes too long, which may be another query.
             slots = [found for slot in self._slots if (found := slot.running)]
             running = [*(name for found in slots for name in found["functions"]), *self._trial.runner.running]
-            self._front.send(Message("answer", message.number, {"running": running, "slots": slots}))
+            self._front.send(WorkerMessage("answer", message.number, {"running": running, "slots": slots}))
         else:
             self._answers.put(message)
 
@@ -159,7 +159,7 @@ def _loaded(front: FrameSocket, control: ControlSocket, path: Path, threads: int
     except BaseException as error:  # a module may call sys.exit
         worker, reasons = None, [_reason(error, doing, path.resolve())]
     if worker is None:
-        front.send(Message("refused", content={"reasons": list(reasons)}))
+        front.send(WorkerMessage("refused", content={"reasons": list(reasons)}))
         return None
     functions = list(bundle.cg.functions)
     ready = {
@@ -169,7 +169,7 @@ def _loaded(front: FrameSocket, control: ControlSocket, path: Path, threads: int
         "functions": functions,
         "func_io": {name: [bundle.cg.func_inputs(name), bundle.cg.func_outputs(name)] for name in functions},
     }
-    front.send(Message("ready", content=ready))
+    front.send(WorkerMessage("ready", content=ready))
     return worker
 
 

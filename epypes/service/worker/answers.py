@@ -17,7 +17,7 @@ from weakref import ref
 from epypes.errors import EpypesError, MessageError, NotComputed, UnknownName
 from epypes.graph import colour_order
 from epypes.run import CompGraphRunner, Run
-from epypes.service.frame_socket import FrameSocket, Message
+from epypes.service.frame_socket import FrameSocket, WorkerMessage
 from epypes.service.packing import BytesLike, pack
 from epypes.wire import Envelope, encode
 
@@ -70,7 +70,7 @@ class QueryAnswerer:
         self._completed: CompletedRun | None = None
         # The last completed run, and its payload run again with other parameters, until an event comes.
         self._again: tuple[CompletedRun, CompletedRun] | None = None
-        self._queue: queue.SimpleQueue[Message] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[WorkerMessage] = queue.SimpleQueue()
         self._made_of_run: tuple[Callable[[], Run | None], dict[Hashable, Any]] = lambda: None, {}
 
     def start(self) -> None:
@@ -81,7 +81,7 @@ class QueryAnswerer:
         """Make the run of an event the last completed one."""
         self._completed, self._again = completed, None
 
-    def put(self, query: Message) -> None:
+    def put(self, query: WorkerMessage) -> None:
         """Take a query; returns at once."""
         if self._queue.qsize() >= _MOST_WAITING:
             text = "The worker has more queries than it can answer. Ask less often."
@@ -94,11 +94,11 @@ class QueryAnswerer:
             query = self._queue.get()
             self._send(query, lambda: self._answer(query.content))  # noqa: B023 - called before the next is taken
 
-    def answer_by_rerun(self, query: Message) -> None:
+    def answer_by_rerun(self, query: WorkerMessage) -> None:
         """Answer a query of values with a revision, on a slot's thread: the last payload may be run again."""
         self._send(query, lambda: self._values_of_revision(query.content))
 
-    def _send(self, query: Message, made: Callable[[], AnswerParts]) -> None:
+    def _send(self, query: WorkerMessage, made: Callable[[], AnswerParts]) -> None:
         """Send an answer, or why there is none."""
         content: dict[str, Any]
         frames: Sequence[BytesLike] = ()
@@ -107,9 +107,9 @@ class QueryAnswerer:
         except BaseException as error:  # previews and values are of the user's classes
             content = _refusal(error)
         try:
-            self._front.send(Message("answer", query.number, content, frames))
+            self._front.send(WorkerMessage("answer", query.number, content, frames))
         except MessageError as error:
-            self._front.send(Message("answer", query.number, _refusal(error)))
+            self._front.send(WorkerMessage("answer", query.number, _refusal(error)))
         except EOFError:
             return
 

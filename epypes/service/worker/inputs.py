@@ -16,7 +16,7 @@ from time import sleep
 from typing import Any, Final, NoReturn
 
 from epypes.errors import MessageError
-from epypes.service.frame_socket import FrameSocket, Message
+from epypes.service.frame_socket import FrameSocket, WorkerMessage
 
 NOT_UNDERSTOOD: Final = 2
 FRONT_GONE: Final = 3
@@ -51,7 +51,7 @@ class Inputs:
         # Numbers of changes: the last that was made, refused or skipped, and those that are not to be made.
         self._settled, self._withdrawn = 0, set[int]()
 
-    def take(self, block: bool = True) -> Message:
+    def take(self, block: bool = True) -> WorkerMessage:
         """Wait for an event, or a query that runs functions; the slot works on it until `finished` is called.
 
         The process ends if the front is gone, or can't be understood.
@@ -90,7 +90,7 @@ class Inputs:
             self._working -= 1
             self._changed.notify()
 
-    def _settle(self, message: Message) -> None:
+    def _settle(self, message: WorkerMessage) -> None:
         if message.kind == "parameters":
             self._change(message)
         elif message.kind == "end":
@@ -98,7 +98,7 @@ class Inputs:
         else:
             raise MessageError("unknown kind", f"The front has sent a message of kind {message.kind!r}.")
 
-    def _change(self, message: Message) -> None:
+    def _change(self, message: WorkerMessage) -> None:
         """Set parameters when no slot works, unless the change is withdrawn; what comes after it is not read before."""
         revision, number = message.content["revision"], message.number
         with self._lock:
@@ -109,16 +109,16 @@ class Inputs:
                 return
             problems = self._apply(revision, json.loads(bytes(message.frames[0])))
             answer = {"revision": revision, "problems": problems, "is_withdrawn": False}
-            self._front.send(Message("parameters", number, answer))
+            self._front.send(WorkerMessage("parameters", number, answer))
 
-    def withdraw(self, message: Message) -> None:
+    def withdraw(self, message: WorkerMessage) -> None:
         """Have a change not made, and send that; one that was made or refused was answered already."""
         with self._lock:
             if message.number > self._settled:
                 self._withdrawn.add(message.number)
                 self._changed.notify()
                 answer = {"revision": message.content["revision"], "problems": {}, "is_withdrawn": True}
-                self._front.send(Message("parameters", message.number, answer))
+                self._front.send(WorkerMessage("parameters", message.number, answer))
 
 
 def not_understood(error: BaseException) -> NoReturn:

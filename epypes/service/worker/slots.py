@@ -25,7 +25,7 @@ from epypes.pipeline import FullPipeline, Pipeline
 from epypes.pipeline.answering import Answering
 from epypes.pipeline.reactive import SinkPipeline
 from epypes.run import Failure, Run
-from epypes.service.frame_socket import FrameSocket, Message
+from epypes.service.frame_socket import FrameSocket, WorkerMessage
 from epypes.service.packing import BytesLike
 from epypes.service.worker.answers import CompletedRun, QueryAnswerer
 from epypes.service.worker.inputs import Inputs
@@ -180,7 +180,7 @@ class Slot:
             # How many frames belong to each: one of 2019, or those of an envelope.
             "answers": [*map(len, answers)],
         }
-        self._front.send(Message("done", work.seq, content, [*chain.from_iterable(answers)]))
+        self._front.send(WorkerMessage("done", work.seq, content, [*chain.from_iterable(answers)]))
 
 
 @dataclass(slots=True, eq=False)
