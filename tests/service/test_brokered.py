@@ -189,7 +189,7 @@ def test_a_replica_has_no_event_in_hand_that_it_does_not_work_on(acting, host, t
     with line_of(host) as line, replica_of(acting, line, threads=2) as service:
         for number in range(6):
             line.send(f"hold:{tmp_path}", number)
-        until(lambda: len(service._dispatcher.running) == 2)
+        until(lambda: service.counts()["in_flight"] == 2)
         until((tmp_path / "started").exists)
         assert (line.left(), service.counts()["received"]) == (4, 2)
         (tmp_path / "release").touch()
@@ -234,7 +234,7 @@ def test_a_service_is_degraded_while_its_broker_is_away_and_goes_on_afterwards(a
             assert host in service.ready()
             assert service.alive() == ""
             (tmp_path / "release").touch()
-            until(lambda: not service._dispatcher.running)
+            until((tmp_path / "over").exists)
         until(lambda: service.state == "READY")
         (answer,) = line.take()
         assert (answer.correlation_id, answer.parts["out"]) == (sent, 2)
@@ -255,7 +255,7 @@ def test_a_service_whose_broker_is_away_stops_in_time_and_has_answered_nothing_t
             with memory.away(host):
                 until(lambda: service.state == "DEGRADED")
                 (tmp_path / "release").touch()
-                until(lambda: not service._dispatcher.running)
+                until((tmp_path / "over").exists)
                 service.stop(0.3)
             assert (service.counts()["given_back"], service.counts()["answered"]) == (1, 0)
         with replica_of(acting, line):

@@ -1,17 +1,20 @@
-"""What two threads do at once: changes of parameters, deploys, restarts, drains."""
+"""What two threads of a front do at once: changes of parameters, deploys, restarts, drains."""
 
 from __future__ import annotations
 
 import os
 import signal
 import threading
+from contextlib import suppress
+from types import SimpleNamespace
 
 import pytest
 
 from epypes.errors import RevisionConflict, ServiceError
-from epypes.service import parameters, supervisor, worker_queries
+from epypes.service.frame_socket import WorkerMessage
+from epypes.service.worker_queries import WorkerQueries
 from tests.service.bundles import written_bundle
-from tests.service.served import SOURCE, TIMEOUT_S, acting_bundle, serving, until
+from tests.service.served import SOURCE, TIMEOUT_S, acting_bundle, gated_bundle, serving, until
 
 pytestmark = pytest.mark.slow
 
@@ -84,78 +87,49 @@ def test_a_worker_that_refuses_the_parameters_of_the_last_one_is_not_used(tmp_pa
         assert "not again" in service.reason
 
 
-def test_a_worker_started_while_another_bundle_takes_over_is_not_used(acting, better, monkeypatch):
-    made, switched = threading.Event(), threading.Event()
-
-    class Late(supervisor.WorkerConnection):
-        def __init__(self, served, *more):
-            super().__init__(served, *more)
-            if made_late and served.path == acting.resolve():
-                made.set()
-                switched.wait(TIMEOUT_S)
-
-    made_late = []
-    monkeypatch.setattr(supervisor, "WorkerConnection", Late)
-    with serving(acting) as (service, peer):
-        load = service._supervisor.load
-
-        def load_and_lose_the_other(served):
-            link = load(served)
-            made_late.append(True)
-            os.kill(service.info()["worker_pid"], signal.SIGKILL)
-            assert made.wait(TIMEOUT_S)
-            return link
-
-        service._supervisor.load = load_and_lose_the_other
+def test_a_worker_started_while_another_bundle_takes_over_is_not_used(better, tmp_path):
+    gate = tmp_path / "gate"
+    with serving(gated_bundle(tmp_path / "gated", gate)) as (service, peer):
+        gate.touch()
+        os.kill(service.info()["worker_pid"], signal.SIGKILL)
+        until(lambda: service.state == "DEGRADED")
         served_by = service.deploy(better)["worker_pid"]
-        switched.set()
-        assert peer.ask(number=5).parts["out"] == 15
-        until(lambda: service._supervisor._restart_s is None)
+        gate.unlink()
+        assert [peer.ask(number=number).parts["out"] for number in range(5)] == [0, 3, 6, 9, 12]
         assert (service.state, service.info()["worker_pid"]) == ("READY", served_by)
 
 
-@pytest.mark.parametrize("revision", [None, 0])
-def test_a_change_that_another_bundle_overtakes_is_made_for_that_one_or_refused(acting, better, monkeypatch, revision):
-    real, looked, deployed = parameters.changed_entries, threading.Event(), threading.Event()
-
-    def late(*arguments):
-        found = real(*arguments)
-        if not looked.is_set():
-            looked.set()
-            deployed.wait(TIMEOUT_S)
-        return found
-
-    monkeypatch.setattr(parameters, "changed_entries", late)
+def test_changes_while_other_bundles_take_over_are_made_for_one_of_them_or_refused(acting, better):
     with serving(acting) as (service, peer):
-        outcome = []
+        outcomes, is_over = [], threading.Event()
 
         def change():
-            try:
-                outcome.append(service.set_parameters({"k": 50}, revision))
-            except RevisionConflict as conflict:
-                outcome.append(conflict)
+            while not is_over.is_set():
+                before = service.parameters().revision
+                try:
+                    outcomes.append(service.set_parameters({"k": before + 10}, before))
+                except (RevisionConflict, ServiceError) as refusal:
+                    outcomes.append(refusal)
 
         changing = threading.Thread(target=change)
         changing.start()
-        assert looked.wait(TIMEOUT_S)
-        service.deploy(better)
-        deployed.set()
+        for _ in range(3):
+            service.deploy(better)
+            service.rollback()
+        is_over.set()
         changing.join()
-        if revision is None:
-            assert (outcome[0].revision, outcome[0].entries["k"]["value"]) == (2, 50)
-        else:
-            assert outcome[0].current.entries["k"]["value"] == 3
-        answer = peer.ask(number=5)
-        current = service.parameters()
+        made = [outcome.revision for outcome in outcomes if not isinstance(outcome, Exception)]
+        assert made == sorted(set(made))
+        answer, current = peer.ask(number=5), service.parameters()
         assert (answer.parts["out"], answer.revision) == (5 * current.entries["k"]["value"], current.revision)
 
 
+@pytest.mark.soak
 def test_a_change_that_did_not_come_in_time_is_not_made_later(acting, tmp_path):
-    with serving(acting, job_timeout_s=20) as (service, peer):
-        service._parameters._timeout_s = 0.1
+    with serving(acting) as (service, peer):
         peer.send(f"hold:{tmp_path}", 1)
         until((tmp_path / "started").exists)
-        with pytest.raises(ServiceError, match="nothing was changed"):
+        with pytest.raises(ServiceError, match="longer than 10 s, so nothing was changed"):
             service.set_parameters({"k": 77})
         (tmp_path / "release").touch()
         peer.take()
@@ -200,34 +174,35 @@ def test_a_drain_that_waits_holds_up_neither_the_stop_nor_a_resume(acting, tmp_p
         peer.take()
 
 
-def test_whether_it_is_paused_is_whether_events_wait_for_that(acting):
-    with serving(acting) as (service, peer):
-        service.pause()
-        # As if another thread had resumed it between two steps of that.
-        service._dispatcher.release("pause")
-        assert service.state == "READY"
-        assert peer.ask(number=2).parts["out"] == 4
-
-
 # -- what is seen of it ---------------------------------------------------------------------------------------------
 
 
-def test_what_another_bundle_has_shown_is_not_shown_for_this_one(acting, better):
+def test_what_another_bundle_has_shown_is_not_shown_for_this_one(acting, tmp_path):
+    gate = tmp_path / "gate"
+    gated = gated_bundle(tmp_path / "gated", gate, k=3, expected=9)
     with serving(acting) as (service, peer):
         peer.ask(number=5)
         assert service.preview("k")[1].splitlines()[0] == b"2"
-        service.deploy(better)
-        service._dispatcher.use(None)
+        service.deploy(gated)
+        gate.touch()
+        os.kill(service.info()["worker_pid"], signal.SIGKILL)
+        until(lambda: service.state == "DEGRADED")
         with pytest.raises(ServiceError, match="no worker"):
             service.preview("k")
+        gate.unlink()
 
 
-def test_what_is_remembered_for_when_there_is_no_worker_is_bounded_in_bytes(acting, monkeypatch):
-    monkeypatch.setattr(worker_queries, "_MAX_BYTES", 1000)
-    with serving(acting) as (service, peer):
-        peer.ask(number=5)
-        for side in range(100, 400):
-            service.preview("out", side)
-        known = service._queries._cache
-        assert 1 < sum(frame.nbytes for _, frames in known.values() for frame in frames) <= 1000
-        assert service._queries._bytes == sum(frame.nbytes for _, frames in known.values() for frame in frames)
+def test_answers_that_are_kept_for_when_there_is_no_worker_are_bounded_in_bytes():
+    bundle = SimpleNamespace(digest="d", path="bundle")
+    answer = WorkerMessage("answer", 1, {"media_type": "image/png"}, [memoryview(bytes(1024**2))])
+    worker = SimpleNamespace(bundle=bundle, about={}, query=lambda what, **arguments: answer)
+    workers = [worker]
+    queries = WorkerQueries(lambda: bundle, lambda: workers[0])
+    for side_px in range(60):
+        queries.preview("out", side_px)
+    workers[0] = None
+    kept = []
+    for side_px in range(60):
+        with suppress(ServiceError):
+            kept.append(queries.preview("out", side_px))
+    assert len(kept) == 32

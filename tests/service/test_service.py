@@ -121,7 +121,7 @@ def test_a_service_in_another_process_answers_with_what_the_notebook_computed(ed
 
 
 @pytest.mark.slow
-def test_a_function_that_fails_is_told_to_the_caller_and_the_service_goes_on(local, edge_bundle, photograph):
+def test_a_function_that_fails_is_reported_to_the_caller_and_the_service_goes_on(local, edge_bundle, photograph):
     service = local(edge_bundle.path)
     with pytest.raises(RemoteFailure, match="Function 'smooth' failed in the service: error") as error:
         call(edge_bundle.path, {"image": np.zeros((0, 0), np.uint8)}, timeout_s=TIMEOUT_S)
@@ -202,7 +202,7 @@ def test_a_killed_service_is_not_taken_for_a_running_one(edge_bundle, photograph
 
 
 @pytest.mark.slow
-def test_a_service_that_is_killed_while_it_works_is_told_to_the_caller(edge_bundle, photograph):
+def test_a_service_that_is_killed_while_it_works_is_reported_to_the_caller(edge_bundle, photograph):
     with running(edge_bundle.path) as process, Client(edge_bundle.path, timeout_s=TIMEOUT_S) as client:
         client.call({"image": photograph})
         process.kill()
@@ -365,7 +365,7 @@ def test_what_can_not_be_finished_in_time_is_answered_at_the_stop_with_the_funct
     assert (service.counts()["failed"], service.counts()["dropped"]) == (1, 2)
 
 
-def test_a_state_file_without_a_state_is_not_believed(edge_bundle, photograph):
+def test_a_state_file_with_other_contents_is_ignored(edge_bundle, photograph):
     with StateLock(edge_bundle.path):
         for text in ("", "{", "[1]", '{"pid": 1, "http": 3}'):
             state_file(edge_bundle.path).write_text(text)

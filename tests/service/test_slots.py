@@ -157,10 +157,10 @@ def test_parameters_that_a_pipeline_of_its_own_refuses_are_set_in_no_slot(owning
 """
     with ready_worker(owning(body), tmp_path, "--threads", "3") as front:
         front.set(1, times=9)
-        assert front.receive("parameters_refused")[0]["problems"] == {"times": "the third does not"}
+        assert front.changed()["problems"] == {"times": "the third does not"}
         assert {front.run(text="a")[1][0].parts["repeated"] for _ in range(9)} == {"aa"}
         front.set(2, times=3)
-        assert front.receive("parameters")
+        assert not front.changed()["problems"]
         assert {front.run(text="a")[1][0].parts["repeated"] for _ in range(9)} == {"aaa"}
 
 
@@ -174,7 +174,7 @@ MEETING = '''
 
 
     def meet(place):
-        """Return when as many have come as are told."""
+        """Return when so many calls have begun."""
         folder, name, count = place.split("|")
         open(os.path.join(folder, name), "w").close()
         while len(os.listdir(folder)) < int(count):
@@ -236,7 +236,7 @@ def test_parameters_wait_until_no_slot_works_and_hold_for_all_events_after_them(
         assert not expected
 
 
-def test_what_is_run_again_for_who_asks_runs_in_no_more_threads_than_there_are_slots(tmp_path):
+def test_what_is_run_again_for_a_query_runs_in_no_more_threads_than_there_are_slots(tmp_path):
     source = """
         import threading
         import time
@@ -261,25 +261,30 @@ def test_what_is_run_again_for_who_asks_runs_in_no_more_threads_than_there_are_s
     bundle = written_bundle(tmp_path / "b", source, ["x"], ["y"], hyperparameters={"k": 2}, sample=sample)
     with ready_worker(bundle, tmp_path) as front:
         front.run(x=1)
-        asks = set()
+        numbers = set()
         for revision in range(1, 40):
             front.set(revision, k=revision)
-            asks.add(front.send_ask("run", tokens=["y"], revision=revision))
+            numbers.add(front.send_query("run", tokens=["y"], revision=revision))
             front.send_event(Envelope(type="x", parts={"x": 3}))
         for _ in range(1, 40):
             assert front.done()[0]["failure"] is None
-        answers = [front.receive("answer")[0] for _ in asks]
-        assert {answer["ask"] for answer in answers} == asks
-        assert not [answer for answer in answers if "error" in answer]
+        answers = [front.receive("answer") for _ in numbers]
+        assert {answer.number for answer in answers} == numbers
+        assert not [answer.content for answer in answers if "error" in answer.content]
 
 
 # -- what a worker keeps -------------------------------------------------------------------------------------------
 
 IMAGES = """
+    import ctypes
+
     import numpy as np
 
 
     def invert(image):
+        if image.size == 1:
+            # What the allocator holds for later is no memory that the worker needs.
+            ctypes.CDLL(None).malloc_trim(0)
         if image[0, 0] == 13:
             raise ValueError("unlucky")
         return 255 - image
@@ -305,7 +310,8 @@ def test_large_images_go_through_a_worker_unchanged_one_after_another(inverting,
         expected = {}
         for image, value in zip(images * 3, sums * 3, strict=True):
             expected[front.send_event(Envelope(type="x", parts={"image": image}))] = value
-            if len(expected) == 4:
+            # A worker reads when a slot is free, and this front does not read while it sends.
+            if len(expected) == 2:
                 header, (answer,) = front.done()
                 assert hashlib.sha256(answer.parts["inverted"].tobytes()).hexdigest() == expected.pop(header["seq"])
 
@@ -323,7 +329,7 @@ def test_two_thousand_events_leave_nothing_behind(inverting, tmp_path):
             for number in range(count):
                 front.run(image=bad if number % 4 == 3 else image)
                 if number % 50 == 0:
-                    front.ask("svg")
+                    front.query("svg")
                     front.values("image", "inverted")
 
         some(400)
@@ -340,13 +346,13 @@ def test_a_worker_keeps_no_more_of_large_events_than_the_last_run_of_each_slot(i
         before = rss(process)
         for _ in range(8):
             front.run(image=np.full((5000, 4000), 14, np.uint8))
-            front.ask("svg")
+            front.query("svg")
         # An event and its run are 40 MB; the run before it is there until the next one has ended.
         largest = rss(process)
         assert largest - before < 120_000_000
         for _ in range(3):
             front.run(image=np.full((1, 1), 14, np.uint8))
-        assert largest - rss(process) > 30_000_000
+        assert largest - rss(process) > 60_000_000
 
 
 def test_a_page_that_asks_all_the_time_has_each_picture_made_once_per_run(inverting, tmp_path):
@@ -354,9 +360,9 @@ def test_a_page_that_asks_all_the_time_has_each_picture_made_once_per_run(invert
         front.run(image=np.full((2000, 2000), 14, np.uint8))
         process = psutil.Process(front.process.pid)
         for what, more in (("svg", {}), ("view", {}), ("preview", {"token": "inverted", "max_side_px": 512})):
-            first = front.ask(what, **more)[1]
+            first = front.query(what, **more)[1]
             before = sum(process.cpu_times()[:2])
-            assert all(front.ask(what, **more)[1] == first for _ in range(100))
+            assert all(front.query(what, **more)[1] == first for _ in range(100))
             assert sum(process.cpu_times()[:2]) - before < 0.2
     assert Path(front.stderr).read_text() == ""
 

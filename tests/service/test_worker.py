@@ -18,17 +18,17 @@ import pytest
 
 from epypes.bundle.seal import seal
 from epypes.display.views.jsonview import from_json
+from epypes.service.frame_socket import ControlSocket, FrameSocket, WorkerMessage
 from epypes.service.packing import MARK, unpack
-from epypes.service.worker_connection import frame_sockets
 from epypes.wire import Envelope, decode, encode
 from tests.service.bundles import written_bundle
 from tests.service.workers import TIMEOUT_S, ready_worker, worker_of
 
 pytestmark = pytest.mark.slow
 
-# What its function does is told by the event.
+# The event says what its function does.
 SOURCE = '''
-    """A graph whose functions do what they are told."""
+    """A graph whose functions do what the event says."""
 
     import ctypes
     import os
@@ -164,7 +164,6 @@ def until(condition):
 
 
 def test_a_worker_is_ready_when_the_bundle_computes_what_was_recorded(shared):
-    assert shared.ready["kind"] == "ready"
     assert shared.ready["report"] == "identical: 1 token of 1 sample"
     assert shared.ready["functions"] == ["act", "tell"]
     assert shared.ready["pid"] == shared.process.pid
@@ -189,8 +188,8 @@ def test_a_bundle_that_does_not_compute_what_was_recorded_is_refused(acting, tmp
     module.write_text(change(module.read_text()))
     seal(folder)
     with worker_of(folder, tmp_path) as front:
-        header, _ = front.receive("refused")
-        assert any(re.search(reason, found) for found in header["reasons"]), header
+        reasons = front.receive("refused").content["reasons"]
+        assert any(re.search(reason, found) for found in reasons), reasons
         assert front.process.wait(TIMEOUT_S) == 1
 
 
@@ -201,8 +200,7 @@ def test_a_bundle_with_a_changed_file_is_refused(acting, tmp_path, name):
     with (folder / name).open("ab") as file:
         file.write(b"\n")
     with worker_of(folder, tmp_path) as front:
-        header, _ = front.receive("refused")
-        assert f"{name} was changed" in header["reasons"][0]
+        assert f"{name} was changed" in front.receive("refused").content["reasons"][0]
         assert front.process.wait(TIMEOUT_S) == 1
 
 
@@ -215,7 +213,7 @@ def test_what_comes_before_the_worker_is_ready_is_done_then(acting, tmp_path):
         assert (header["revision"], answer.parts["out"]) == (5, "early 3")
 
 
-def test_a_worker_that_is_told_to_end_while_it_loads_ends(acting, tmp_path):
+def test_a_worker_that_gets_the_end_while_it_loads_ends(acting, tmp_path):
     with worker_of(acting, tmp_path) as front:
         assert front.end() == 0
 
@@ -260,7 +258,7 @@ def test_whatever_a_function_raises_is_the_failure_of_its_event(shared, what, fu
     assert shared.run(what="a")[1][0].parts["out"] == "a 2"
 
 
-def test_the_trace_of_a_failure_tells_the_lines_of_the_bundle_and_none_of_ours(shared, acting):
+def test_the_trace_of_a_failure_has_the_lines_of_the_bundle_and_none_of_ours(shared, acting):
     header, _ = shared.run(what="fail")
     failure = header["failure"]
     assert failure["tokens"] == ["what", "k", "out"]
@@ -295,7 +293,7 @@ def test_an_event_that_f_in_does_not_understand_fails(shared, event, message):
 
 def test_an_event_that_cannot_be_decoded_fails_and_the_worker_goes_on(shared):
     seq = next(shared.seqs)
-    shared.channel.send({"kind": "event", "seq": seq}, [b"x/", b"\xff\xff"])
+    shared.channel.send(WorkerMessage("event", seq, frames=[b"x/", b"\xff\xff"]))
     header, (answer,) = shared.done()
     assert (header["seq"], header["failure"]["function"]) == (seq, "f_in")
     assert "no Envelope" in answer.failure.message
@@ -333,13 +331,13 @@ def test_parameters_hold_for_the_events_after_them_and_their_revision_is_stamped
             assert answer.parts["out"] == f"a {revision * 10}"
             header, (answer,) = front.done()
             assert (header["revision"], answer.revision) == (revision, revision)
-            assert front.receive("parameters")[0]["revision"] == revision
+            assert front.changed()["revision"] == revision
 
 
 def test_parameters_are_refused_all_or_none_with_the_reason_of_each(own):
     with own() as front:
         front.send_parameters(9, {"k": {"value": 7}, "kk": {"value": 1}, "what": {"value": 1}, "out": {}})
-        header, _ = front.receive("parameters_refused")
+        header = front.changed()
         assert header["revision"] == 9
         assert set(header["problems"]) == {"kk", "what", "out"}
         assert "Did you mean 'k'?" in header["problems"]["kk"]
@@ -356,31 +354,30 @@ def test_parameters_are_set_when_no_slot_works_and_asked_values_wait_for_that(ow
         front.send_event(Envelope(type="x", parts={"what": "hold"}))
         until(front.started.exists)
         front.set(4, k=8)
-        ask = front.send_ask("run", tokens=["told"], revision=4)
-        other = front.send_ask("svg")
-        assert front.receive("answer")[0]["ask"] == other
+        number = front.send_query("run", tokens=["told"], revision=4)
+        other = front.send_query("svg")
+        assert front.receive("answer").number == other
         assert not front.waiting, "neither is answered as long as the event is under way"
         front.release.touch()
         assert front.done()[0]["revision"] == 0
-        assert front.receive("parameters")[0]["revision"] == 4
-        header, (packed,) = front.receive("answer")
-        assert header["ask"] == ask
-        assert decode(unpack(packed)).parts["told"] == "held 8"
+        assert front.changed()["revision"] == 4
+        answer = front.receive("answer")
+        assert answer.number == number
+        assert decode(unpack(answer.frames[0])).parts["told"] == "held 8"
 
 
 def test_a_change_that_waits_for_an_event_can_be_withdrawn_and_one_that_was_made_cannot(own):
     with own() as front:
         front.send_event(Envelope(type="x", parts={"what": "hold"}))
         until(front.started.exists)
-        front.set(1, k=8)
-        front.channel.send({"kind": "withdraw", "revision": 1})
-        assert front.receive("parameters_withdrawn")[0]["revision"] == 1
+        front.control.send(WorkerMessage("withdraw", front.set(1, k=8), {"revision": 1}))
+        assert front.changed()["is_withdrawn"]
         front.release.touch()
         assert front.done()[0]["revision"] == 0
         assert front.run(what="a")[0]["revision"] == 0
-        front.set(2, k=9)
-        assert front.receive("parameters")[0]["revision"] == 2
-        front.channel.send({"kind": "withdraw", "revision": 2})
+        number = front.set(2, k=9)
+        assert front.changed()["revision"] == 2
+        front.control.send(WorkerMessage("withdraw", number, {"revision": 2}))
         header, (answer,) = front.run(what="a")
         assert (header["revision"], answer.parts["out"]) == (2, "a 9")
         assert not front.waiting
@@ -392,13 +389,13 @@ def test_asked_values_are_not_computed_beside_the_events_of_the_only_slot(own):
         front.set(4, k=8)
         front.send_event(Envelope(type="x", parts={"what": "hold"}))
         until(front.started.exists)
-        front.send_ask("run", tokens=["told"], revision=4)
-        front.ask("running")
-        front.send_ask("svg")
+        front.send_query("run", tokens=["told"], revision=4)
+        front.query("running")
+        front.send_query("svg")
         front.receive("answer")
         front.release.touch()
-        values = front.receive("answer")[1]
-        assert decode(unpack(values[0])).parts["told"] == "held 8", "the event's own values came in time"
+        answer = front.receive("answer")
+        assert decode(unpack(answer.frames[0])).parts["told"] == "held 8", "the event's own values came in time"
 
 
 def test_a_value_that_an_annotation_does_not_allow_is_refused(tmp_path):
@@ -419,11 +416,11 @@ def test_a_value_that_an_annotation_does_not_allow_is_refused(tmp_path):
     bundle = written_bundle(tmp_path / "b", source, ["x"], ["y"], hyperparameters=hparams, sample=sample)
     with ready_worker(bundle, tmp_path, "--threads", "2") as front:
         front.set(1, k=9)
-        assert "annotation allows" in front.receive("parameters_refused")[0]["problems"]["k"]
+        assert "annotation allows" in front.changed()["problems"]["k"]
         front.set(2, k=5)
-        assert front.receive("parameters")[0]["revision"] == 2
+        assert front.changed()["revision"] == 2
         front.set(3, k=0)
-        assert front.receive("parameters_refused")[0]["revision"] == 3
+        assert front.changed()["problems"]
         assert [front.run(x=1)[1][0].parts["y"] for _ in range(4)] == [5] * 4
 
 
@@ -432,35 +429,35 @@ def test_a_value_that_an_annotation_does_not_allow_is_refused(tmp_path):
 
 def test_before_an_event_the_graph_is_seen_and_no_value(own):
     with own() as front:
-        header, (view,) = front.ask("view")
+        header, (view,) = front.query("view")
         assert [function.name for function in from_json(json.loads(view)).functions] == ["act", "tell"]
-        assert front.ask("svg")[1][0].startswith(b"<svg")
-        assert front.ask("preview", token="k", max_side_px=64)[1] == [b"2\nint 2"]
+        assert front.query("svg")[1][0].startswith(b"<svg")
+        assert front.query("preview", token="k", max_side_px=64)[1] == [b"2\nint 2"]
         for ask in ({"what": "preview", "token": "out", "max_side_px": 64}, {"what": "run", "tokens": ["out"]}):
-            header, frames = front.ask(**ask)
+            header, frames = front.query(**ask)
             assert (header["reason"], frames) == ("not computed", [])
             assert "No event has been completed yet" in header["error"]
 
 
-def test_what_is_asked_is_of_the_last_completed_run(shared):
+def test_answers_to_queries_are_of_the_last_completed_run(shared):
     header, _ = shared.run(what="zeros")
     shared.run(what="fail")
     values = shared.values("out", "k", "what")
     assert values.parts["out"].shape == (400, 400)
     assert (values.parts["k"], values.parts["what"], values.revision) == (2, "zeros", header["revision"])
-    header, (picture,) = shared.ask("preview", token="out", max_side_px=100)
+    header, (picture,) = shared.query("preview", token="out", max_side_px=100)
     assert header["media_type"].startswith("image/")
     assert max(header["width"], header["height"]) <= 100
     assert cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_UNCHANGED).shape[:2] == (
         header["height"],
         header["width"],
     )
-    header, (text,) = shared.ask("preview", token="what", max_side_px=100)
+    header, (text,) = shared.query("preview", token="what", max_side_px=100)
     assert (header["media_type"], text.decode().partition("\n")[0]) == ("text/plain", "'zeros'")
-    _, (view,) = shared.ask("view")
+    _, (view,) = shared.query("view")
     tokens = {token.name: token for token in from_json(json.loads(view)).tokens}
     assert tokens["out"].preview.picture is not None
-    assert b"<image" in shared.ask("svg")[1][0]
+    assert b"<image" in shared.query("svg")[1][0]
 
 
 @pytest.mark.parametrize(
@@ -475,16 +472,16 @@ def test_what_is_asked_is_of_the_last_completed_run(shared):
         ({"what": "everything"}, "unknown query", "everything"),
     ],
 )
-def test_what_cannot_be_answered_is_told_with_its_reason(shared, ask, reason, text):
+def test_what_cannot_be_answered_is_refused_with_its_reason(shared, ask, reason, text):
     shared.run(what="a")
-    header, frames = shared.ask(**ask)
+    header, frames = shared.query(**ask)
     assert (header["reason"], frames) == (reason, [])
     assert text in header["error"]
 
 
 def test_a_value_that_cannot_be_sent_is_refused_with_the_reason(shared):
     shared.run(what="object")
-    header, _ = shared.ask("run", tokens=["out"])
+    header, _ = shared.query("run", tokens=["out"])
     assert header["reason"] == "no codec"
     assert shared.values("told").parts["told"].endswith(" 2")
 
@@ -498,10 +495,10 @@ def test_values_of_a_revision_that_no_event_has_had_are_computed_on_the_last_pay
         assert front.values("out").revision == 0, "the last completed run is still the event's"
         assert front.run(what="b")[1][0].parts["out"] == "b 8"
         assert front.values("told", revision=4).parts["told"] == "b 8 8"
-        assert not front.waiting or {header["kind"] for header, _ in front.waiting} == {"parameters"}
+        assert not front.waiting or {message.kind for message in front.waiting} == {"parameters"}
 
 
-def test_a_function_that_fails_with_new_parameters_is_told_to_who_asked(tmp_path):
+def test_a_function_that_fails_with_new_parameters_is_the_answer_to_the_query(tmp_path):
     source = """
         def divide(x, k):
             return x // k
@@ -515,31 +512,31 @@ def test_a_function_that_fails_with_new_parameters_is_told_to_who_asked(tmp_path
     with ready_worker(bundle, tmp_path) as front:
         front.run(x=8)
         front.set(1, k=0)
-        header, _ = front.ask("run", tokens=["y"], revision=1)
+        header, _ = front.query("run", tokens=["y"], revision=1)
         assert (header["reason"], header["error"][:26]) == ("failed", "divide: ZeroDivisionError:")
-        assert front.ask("run", tokens=["y"], revision=7)[0]["reason"] == "unknown revision"
+        assert front.query("run", tokens=["y"], revision=7)[0]["reason"] == "unknown revision"
 
 
-def test_what_runs_is_told_while_a_function_computes(own):
+def test_the_running_function_is_reported_while_it_computes(own):
     with own() as front:
         seq = front.send_event(Envelope(type="x", parts={"what": "hold"}))
         until(front.started.exists)
-        header, _ = front.ask("running")
+        header, _ = front.query("running")
         assert header["running"] == ["act"]
         assert [(slot["seq"], slot["functions"]) for slot in header["slots"]] == [(seq, ["act"])]
-        assert b"<svg" in front.ask("svg")[1][0], "others are answered too"
+        assert b"<svg" in front.query("svg")[1][0], "others are answered too"
         front.release.touch()
         assert front.done()[1][0].parts["out"] == "held"
-        assert front.ask("running")[0]["running"] == []
+        assert front.query("running")[0]["running"] == []
 
 
-def test_too_many_questions_are_refused_and_none_is_left_without_answer(own):
+def test_too_many_queries_are_refused_and_none_is_left_without_answer(own):
     with own() as front:
         front.run(what="zeros")
-        asks = [front.send_ask("preview", token="out", max_side_px=16 + number) for number in range(300)]
-        answers = [front.receive("answer")[0] for _ in asks]
-        assert sorted(answer["ask"] for answer in answers) == asks
-        assert {answer.get("reason") for answer in answers} <= {None, "busy"}
+        numbers = [front.send_query("preview", token="out", max_side_px=16 + side) for side in range(150)]
+        answers = [front.receive("answer") for _ in numbers]
+        assert sorted(answer.number for answer in answers) == numbers
+        assert {answer.content.get("reason") for answer in answers} <= {None, "busy"}
 
 
 # -- how it ends ---------------------------------------------------------------------------------------------------
@@ -550,7 +547,7 @@ def test_a_worker_works_off_what_it_has_and_ends_with_0(own):
         front.send_event(Envelope(type="x", parts={"what": "hold"}))
         until(front.started.exists)
         seq = front.send_event(Envelope(type="x", parts={"what": "last"}))
-        front.channel.send({"kind": "end"})
+        front.channel.send(WorkerMessage("end"))
         front.release.touch()
         front.done()
         header, (answer,) = front.done()
@@ -564,7 +561,7 @@ def test_a_worker_whose_front_goes_ends_at_once_even_while_a_function_computes(o
         front.send_event(Envelope(type="x", parts={"what": "hold"}))
         until(front.started.exists)
         start = time.monotonic()
-        front.channel.close()
+        front.close()
         assert front.process.wait(TIMEOUT_S) == 3
         assert time.monotonic() - start < TIMEOUT_S / 2
 
@@ -572,35 +569,37 @@ def test_a_worker_whose_front_goes_ends_at_once_even_while_a_function_computes(o
 def test_a_worker_ends_with_the_thread_that_started_it_even_while_a_function_holds_the_interpreter(acting, tmp_path):
     code = """
 import os, subprocess, sys
-channel, started = int(sys.argv[1]), sys.argv[3]
-worker = subprocess.Popen([sys.executable, "-I", "-m", "epypes.service.worker", sys.argv[1], sys.argv[2]],
-                          pass_fds=[channel], env={**os.environ, "STARTED": started})
+*arguments, started = sys.argv[1:]
+worker = subprocess.Popen([sys.executable, "-I", "-m", "epypes.service.worker", *arguments],
+                          pass_fds=map(int, arguments[:2]), env={**os.environ, "STARTED": started})
 print(worker.pid, flush=True)
 sys.stdin.read()
 """
-    ours, theirs = frame_sockets()
+    (ours, theirs), (control, their_control) = FrameSocket.pair(), ControlSocket.pair()
     started = tmp_path / "started"
-    with theirs:
+    with theirs, their_control:
+        sockets = theirs.fileno(), their_control.fileno()
         parent = subprocess.Popen(
-            [sys.executable, "-I", "-c", code, str(theirs.fileno()), str(acting), str(started)],
-            pass_fds=[theirs.fileno()],
+            [sys.executable, "-I", "-c", code, *map(str, sockets), str(acting), str(started)],
+            pass_fds=sockets,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
         )
     try:
         worker = psutil.Process(int(parent.stdout.readline()))
-        ours.send({"kind": "event", "seq": 1, "raw": False}, encode(Envelope(type="x", parts={"what": "regex"})))
+        ours.send(WorkerMessage("event", 1, frames=encode(Envelope(type="x", parts={"what": "regex"}))))
         until(started.exists)
-        # Its channel stays open: this is the end of the process that started it, and nothing else.
+        # Its sockets stay open: this is the end of the process that started it, and nothing else.
         parent.kill()
         until(lambda: not worker.is_running() or worker.status() == psutil.STATUS_ZOMBIE)
     finally:
         parent.kill()
         parent.communicate()
         ours.close()
+        control.close()
 
 
-def test_a_worker_says_where_it_is_while_a_function_holds_the_interpreter(own):
+def test_a_worker_writes_its_stacks_while_a_function_holds_the_interpreter(own):
     with own() as front:
         front.send_event(Envelope(type="x", parts={"what": "regex"}))
         until(front.started.exists)
@@ -633,15 +632,18 @@ def test_signals_for_the_front_do_not_end_its_worker(own):
 @pytest.mark.parametrize("message", [b"garbage " * 9, MARK + b"\xff" * 40], ids=["garbage", "too many"])
 def test_a_worker_that_cannot_understand_its_front_ends_with_2(own, message):
     with own() as front:
-        front.channel._socket.sendall(message)
+        front.channel.send_buffers([memoryview(message)])
         assert front.process.wait(TIMEOUT_S) == 2
         assert "can't be understood" in front.stderr.read_text()
 
 
-@pytest.mark.parametrize("header", [{"kind": "nonsense"}, {}, {"kind": "event"}, {"kind": "ask"}])
-def test_a_worker_that_is_told_what_it_does_not_know_ends_with_2(own, header):
+@pytest.mark.parametrize(
+    ("channel", "message"),
+    [("channel", WorkerMessage("ready")), ("channel", WorkerMessage("parameters", 1)), ("control", WorkerMessage("ready")), ("control", WorkerMessage("query"))],
+)  # fmt: skip
+def test_a_worker_that_gets_what_it_does_not_know_ends_with_2(own, channel, message):
     with own() as front:
-        front.channel.send(header)
+        getattr(front, channel).send(message)
         assert front.process.wait(TIMEOUT_S) == 2
 
 
@@ -649,7 +651,12 @@ def test_a_worker_that_waits_costs_nothing(own):
     with own("--threads", "3") as front:
         front.run(what="a")
         process = psutil.Process(front.process.pid)
-        before = process.num_ctx_switches().voluntary, sum(process.cpu_times()[:2])
-        threading.Event().wait(1.0)
-        assert process.num_ctx_switches().voluntary - before[0] <= 5, "no thread polls"
-        assert sum(process.cpu_times()[:2]) - before[1] <= 0.1
+
+        def idles_for_a_second():
+            before = process.num_ctx_switches().voluntary, sum(process.cpu_times()[:2])
+            threading.Event().wait(1.0)
+            switches = process.num_ctx_switches().voluntary - before[0]
+            return switches <= 5 and sum(process.cpu_times()[:2]) - before[1] <= 0.1
+
+        # Its threads may still be starting; one that polls would do so in every second.
+        assert any(idles_for_a_second() for _ in range(10))
