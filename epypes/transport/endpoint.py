@@ -201,6 +201,14 @@ class Endpoint(Startable):
         return f"<{type(self).__name__} {self.address[:50]} {state}: {count}>"
 
 
+def has_ended(thread: threading.Thread | None, timeout_s: float) -> bool:
+    """Return whether a thread has ended in time, or is the one that asks."""
+    if thread is None or thread is threading.current_thread():
+        return True
+    thread.join(max(timeout_s, 0.0))
+    return not thread.is_alive()
+
+
 def weakly(method: Callable[..., object]) -> Callable[..., None]:
     """Return what calls a bound method as long as its object lives, and does not keep that alive."""
     known = weakref.WeakMethod(method)

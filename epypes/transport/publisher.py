@@ -18,7 +18,7 @@ from epypes.errors import BrokerError, MessageError, StillRunning
 from epypes.run import Failure
 from epypes.transport.address import Address
 from epypes.transport.channel import NO_HEADERS, Channel, Confirmed, Frames, confirm
-from epypes.transport.endpoint import Endpoint, not_waiting
+from epypes.transport.endpoint import Endpoint, has_ended, not_waiting
 from epypes.transport.sequences import check_source
 from epypes.transport.throttle import Throttle
 from epypes.wire import EncodedEnvelope, Envelope, Limits, encode, failure_event, new_id, serialized, topic_frame
@@ -175,7 +175,7 @@ class Publisher(Endpoint):
         with self._lock:
             if self._running is not None:
                 return self
-            if not _has_ended(self._bridge, 5.0):
+            if not has_ended(self._bridge, 5.0):
                 raise StillRunning(f"{type(self).__name__} {self._given}", ["get"], 5.0)
             options = {} if self._security is None else {"high_water_mark": self._high_water_mark}
             channel, outbox = self._new_channel(1, **options), self._outbox
@@ -232,11 +232,11 @@ class Publisher(Endpoint):
         self._end_hand_over()
         if not self._outbox.is_stopping:
             self._outbox.until_s, self._outbox.is_stopping = until_s, True
-        has_ended = _has_ended(self._bridge, timeout_s)
+        is_drained = has_ended(self._bridge, timeout_s)
         if channel is not None:
-            rest_s = max(until_s - monotonic(), 0.0) if has_ended else 0.0
+            rest_s = max(until_s - monotonic(), 0.0) if is_drained else 0.0
             channel.close(rest_s if rest_s > 0 or not timeout_s else _CLOSE_S)
-        if timeout_s and not has_ended and not _has_ended(self._bridge, _CLOSE_S):
+        if timeout_s and not is_drained and not has_ended(self._bridge, _CLOSE_S):
             raise StillRunning(f"{type(self).__name__} {self._given}", ["get"], timeout_s)
 
     def send(
@@ -288,14 +288,6 @@ class ZMQPublisher(Publisher):
     """A `Publisher` over ZeroMQ, for addresses of ZeroMQ alone."""
 
     takes_brokers: ClassVar[bool] = False
-
-
-def _has_ended(thread: threading.Thread | None, timeout_s: float) -> bool:
-    """Return whether a thread has ended in time, or is the one that asks."""
-    if thread is None or thread is threading.current_thread():
-        return True
-    thread.join(timeout_s)
-    return not thread.is_alive()
 
 
 class Outbox:
