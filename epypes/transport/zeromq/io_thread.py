@@ -274,9 +274,9 @@ class IOThread:
         try:
             if reader is not None and reader():
                 self._unfinished.add(source)
-        except BaseException as error:
+        except BaseException:
             # A reader counts what it can't read; this is a bug of ours, and must not stop the other sockets.
-            _log_error("a reader failed", error)
+            log.exception("a reader failed")
 
     def _catch_up(self) -> None:
         now_s = monotonic()
@@ -284,10 +284,7 @@ class IOThread:
             for owned in list(self._owned.values()):
                 if owned.tick is not None and owned.due_s <= now_s:
                     owned.due_s = now_s + owned.tick_s
-                    try:
-                        owned.tick()
-                    except BaseException as error:
-                        _log_error("a tick failed", error)
+                    owned.tick()
                     self._unfinished.add(owned.source)
             self._next_due_s = min((owned.due_s for owned in self._owned.values()), default=float("inf"))
         unfinished, self._unfinished = self._unfinished, set()
@@ -415,9 +412,3 @@ def _close(owned: OwnedSocket) -> None:
     owned.socket.close()
     monitor.poll(_CLOSE_MS)
     monitor.close(linger=0)
-
-
-def _log_error(text: str, error: BaseException) -> None:
-    # A log handler of the user's may raise anything as well.
-    with contextlib.suppress(BaseException):
-        log.error(text, exc_info=error)
