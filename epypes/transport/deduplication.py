@@ -34,14 +34,13 @@ class _Outcome:
 class _InFlight:
     """A message that is delivered and not settled. It lives as long as its Delivery: a lost one can't be answered."""
 
-    __slots__ = ("__weakref__", "_owner", "connection", "is_settled", "key", "settlers")
+    __slots__ = ("__weakref__", "_owner", "connection", "key", "settlers")
 
     def __init__(self, owner: Deduplication, key: str, settler: Settler, connection: object) -> None:
         self._owner, self.key = owner, key
         self.connection = connection
-        # Of the deliveries of the channel, the newest one last.
+        # Of the deliveries of the channel, the newest one last; none once the message is settled.
         self.settlers = [settler]
-        self.is_settled = False
 
     def settle(self, verdict: str, reason: str) -> None:
         self._owner.settle(self, verdict, reason)
@@ -124,15 +123,14 @@ class Deduplication:
             # The connection is that of the parent, and so is the message.
             return
         with self._lock:
-            if message.is_settled:
+            if not message.settlers:
                 return
-            message.is_settled = True
+            (*older, newest), message.settlers = message.settlers, []
             self._in_flight.pop(message.key, None)
             if verdict != "nack":
                 # Before the broker hears it: what it delivers meanwhile is a duplicate.
                 self._remember(message.key, _Outcome(reason if verdict == "reject" else None, message.connection))
             self.rejected += verdict == "reject"
-            *older, newest = message.settlers
         newest(verdict, reason)
         for settler in older:
             settler("ack", "")

@@ -29,10 +29,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("epypes.transport")
 
-# How long the bridge sleeps in the user's queue before it checks its stop flag, while items come and when none comes:
-# a stop takes this long at most. To wake up takes up to 100 us of a core.
-_TICK_S: Final = 0.025
-_LONGEST_TICK_S: Final = 0.045
+# How long the bridge sleeps in the user's queue before it checks its stop flag: a stop takes this long at most. To wake
+# up takes up to 100 us of a core.
+_TICK_S: Final = 0.035
 # What it takes for a thread to notice that the channel is closed, when the time for a stop is over.
 _CLOSE_S: Final = 0.5
 
@@ -366,9 +365,8 @@ class Outbox:
 
     def take_all(self, queue: TakeQueue) -> None:
         """Take from a queue until the stop, and then what is queued; the bridge's thread."""
-        tick_s = _TICK_S
         while not self.is_stopping:
-            tick_s = _TICK_S if self._take_next(queue, tick_s) else _LONGEST_TICK_S
+            self._take_next(queue, _TICK_S)
         while monotonic() < self.until_s and self._take_next(queue, 0.0):
             pass
 
@@ -379,7 +377,7 @@ class Outbox:
             return False
         except BaseException as error:
             # A queue that is shut down or broken raises at once, each time: without the pause this would spin.
-            self._count_rejected(error, reason="queue failed", once=True)
+            self._count_rejected(error, reason="queue failed")
             time.sleep(_TICK_S)
             return False
         # What the item's own code raises is counted, even SystemExit; the thread goes on.
@@ -439,8 +437,8 @@ class Outbox:
 
         return counted
 
-    def _count_rejected(self, error: BaseException, item: object = None, reason: str = "", once: bool = False) -> None:
-        """Count and log an item that can't be sent; with ``once``, the first of its reason alone is logged."""
+    def _count_rejected(self, error: BaseException, item: object = None, reason: str = "") -> None:
+        """Count and log an item that can't be sent."""
         text = repr(error)
         if isinstance(error, MessageError | BrokerError):
             text = str(error)
@@ -448,9 +446,8 @@ class Outbox:
         # The item's own code, called to make bytes of it, may raise anything.
         reason = reason or type(error).__name__
         self.rejected[reason] += 1
-        if not once or self.rejected[reason] == 1:
-            kind = "" if item is None else f" of type {type(item).__name__}"
-            self._log.warning(reason, f"{self._name} rejected an item{kind} ({reason}): {text}")
+        kind = "" if item is None else f" of type {type(item).__name__}"
+        self._log.warning(reason, f"{self._name} rejected an item{kind} ({reason}): {text}")
 
     def _frames(self, item: Any) -> Frames:
         """Return the frames of an item.
