@@ -152,6 +152,7 @@ class Endpoint(Startable):
         return None if self._security is None else self._channel  # type: ignore[return-value]
 
     def _new_channel(self, prefetch: int, **zeromq_options: Any) -> Channel:
+        """Return a channel that is not open; of a broker, the options of ZeroMQ have no meaning."""
         if self._security is not None:
             from epypes.transport.zeromq.channel import ZeroMQChannel
 

@@ -176,8 +176,7 @@ class Publisher(Endpoint):
                 return self
             if not has_ended(self._bridge, 5.0):
                 raise StillRunning(f"{type(self).__name__} {self._given}", ["get"], 5.0)
-            options = {} if self._security is None else {"high_water_mark": self._high_water_mark}
-            channel, outbox = self._new_channel(1, **options), self._outbox
+            channel, outbox = self._new_channel(1, high_water_mark=self._high_water_mark), self._outbox
             channel.open(None)
             outbox.begin(channel)
             hand_to = getattr(self._queue, "hand_to", None)

@@ -239,22 +239,20 @@ class Subscriber(Endpoint):
         with self._lock:
             if self._running is not None:
                 return self
-            options: dict[str, Any] = {}
-            if self._security is not None:
-                options = {
-                    "subscription": self._topic,
-                    "high_water_mark": self._high_water_mark,
-                    "heartbeat_s": self._heartbeat_s,
-                    "on_stale": weakly(self._report_stale),
-                }
-            channel = self._new_channel(self._prefetch, **options)
-            self._inbox.begin(channel)
-            try:
-                channel.open(self._inbox.accept)
-            except BaseException:
-                self._inbox.end()
-                raise
+            channel = self._new_channel(
+                self._prefetch,
+                subscription=self._topic,
+                high_water_mark=self._high_water_mark,
+                heartbeat_s=self._heartbeat_s,
+                on_stale=weakly(self._report_stale),
+            )
             inbox = self._inbox
+            inbox.begin(channel)
+            try:
+                channel.open(inbox.accept)
+            except BaseException:
+                inbox.end()
+                raise
 
             def on_forgotten() -> None:
                 inbox.abandon()

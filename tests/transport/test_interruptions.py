@@ -1,4 +1,4 @@
-"""Does a signal, or code of the user's that wants to end the process, leave the sockets in order?"""
+"""Signals, and code of the user that wants to end the process, leave the sockets in order."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def test_an_item_that_wants_to_end_the_process_ends_no_bridge_and_is_counted():
         assert pub.rejected == {"SystemExit": 1}
 
 
-def test_an_item_put_into_a_mailbox_that_wants_to_end_the_process_is_counted_and_its_putter_told():
+def test_an_item_put_into_a_mailbox_that_wants_to_end_the_process_is_counted_and_raises_from_put():
     out = Mailbox()
     with ZMQPublisher(LOCAL, out) as pub:
         with pytest.raises(SystemExit):

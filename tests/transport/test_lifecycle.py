@@ -1,4 +1,4 @@
-"""Can what was started be stopped: twice, from any thread, in bounded time, and does the process end?"""
+"""What was started can be stopped: twice, from any thread, in bounded time; and the process ends."""
 
 from __future__ import annotations
 

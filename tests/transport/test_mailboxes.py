@@ -1,4 +1,4 @@
-"""Is what is put into a Mailbox sent within put, whoever puts, and however it ends?"""
+"""What is put into a Mailbox is sent within put, on any thread."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_many_threads_put_and_every_message_arrives_whole_and_in_the_order_of_it
 
         def put_all(name: str) -> None:
             for number in range(250):
-                out.put(Envelope("x", {"who": name, "n": number, "data": np.full(3_000, number % 251, np.int32)}))
+                out.put(Envelope("x", {"name": name, "n": number, "data": np.full(3_000, number % 251, np.int32)}))
 
         threads = [threading.Thread(target=put_all, args=(name,)) for name in "abcd"]
         for thread in threads:
@@ -78,7 +78,7 @@ def test_many_threads_put_and_every_message_arrives_whole_and_in_the_order_of_it
             thread.join(WAIT_S)
     assert [event.sequence for event in received] == list(range(1, 1_001))
     for name in "abcd":
-        assert [event.parts["n"] for event in received if event.parts["who"] == name] == list(range(250))
+        assert [event.parts["n"] for event in received if event.parts["name"] == name] == list(range(250))
     assert all((event.parts["data"] == event.parts["n"] % 251).all() for event in received)
 
 

@@ -1,4 +1,4 @@
-"""Does what is put into a publisher's queue come out of a subscriber's, and out of a peer's of 2019?"""
+"""What is put into a publisher's queue comes out of a subscriber's, and out of a 2019 peer's socket."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Does what breaks elsewhere hold here? Each test bears a symptom that users of other systems have reported."""
+"""Each test has a symptom that users of other systems have reported, and shows that it does not occur here."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ with ZMQSubscriber(sys.argv[1], asked, bind=True) as sub, ZMQPublisher(sys.argv[
     sys.stdin.read()
 """
 
-# Sends a lot to a subscriber that does not read, and is then told to end.
+# Sends a lot to a subscriber that does not read, and ends by a signal.
 STUFFED = """
 import queue, signal, sys, threading
 from epypes.transport import ZMQPublisher
@@ -194,7 +194,7 @@ def test_five_hundred_starts_and_stops_crash_nothing():
 
 
 class Spy:
-    """Looks which threads use which sockets."""
+    """Records which threads use which sockets."""
 
     def __init__(self) -> None:
         self.inside: dict[int, int] = {}
