@@ -612,8 +612,10 @@ class _LargeMessages:
         self.accepted += 1
         self._waiting.put(delivery)
         if self.thread is None:
-            self.thread = threading.Thread(target=self._run, name="epypes-decoding", daemon=True)
-            self.thread.start()
+            # Where the system has no thread to give just now, the next message asks for it again.
+            thread = threading.Thread(target=self._run, name="epypes-decoding", daemon=True)
+            thread.start()
+            self.thread = thread
         return True
 
     def end(self) -> None:

@@ -173,11 +173,11 @@ class ZeroMQChannel:
 
         With ``must_drop`` it is dropped for such a subscriber, and sent.
         """
+        owned = self._owned
+        if owned is None or owned.socket.closed or self._process != os.getpid():
+            raise BrokerError(self.address, f"A message to {self.address} was not sent: the socket is closed.")
+        socket = owned.socket
         with self._lock:
-            owned = self._owned
-            if owned is None or owned.socket.closed or self._process != os.getpid():
-                raise BrokerError(self.address, f"A message to {self.address} was not sent: the socket is closed.")
-            socket = owned.socket
             if must_drop:
                 socket.setsockopt(zmq.XPUB_NODROP, 0)
             # Few calls from here to the socket: after an image has filled the caches each takes 3 to 5 us.
