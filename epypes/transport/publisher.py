@@ -398,9 +398,8 @@ class Outbox:
         channel = self._channel
         try:
             if channel is None or self._process != os.getpid():
-                raise BrokerError(
-                    self._name, f"A message to {self._name} was not sent: it is not started in this process."
-                )
+                text = f"A message to {self._name} was not sent: the publisher is not started in this process."
+                raise BrokerError(self._name, text)
             with self._turn:
                 if self._is_sending:
                     text = "It was sent by a signal's handler, or by the code of another item, within another send."

@@ -178,10 +178,10 @@ class ZeroMQChannel:
             raise BrokerError(self.address, f"A message to {self.address} was not sent: the socket is closed.")
         socket = owned.socket
         with self._lock:
-            if must_drop:
-                socket.setsockopt(zmq.XPUB_NODROP, 0)
             # Few calls from here to the socket: after an image has filled the caches each takes 3 to 5 us.
             try:
+                if must_drop:
+                    socket.setsockopt(zmq.XPUB_NODROP, 0)
                 for frame in frames[:-1]:
                     socket.send(frame, _MORE, copy=len(frame) < _LENT_FROM_BYTES or not _can_be_lent(frame))
                 last = frames[-1]
