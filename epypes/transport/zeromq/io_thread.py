@@ -234,7 +234,7 @@ class IOThread:
 
     def _run(self) -> None:
         try:
-            while not self._may_end():
+            while self._owned or self._commands or not self._may_end():
                 for source, _ in self._poller.poll(self._wait_ms()):
                     self._read(source)
                 if self._unfinished or self._next_due_s <= monotonic():
@@ -250,9 +250,7 @@ class IOThread:
             self._wake_out.close()
 
     def _may_end(self) -> bool:
-        """Return whether it has neither sockets nor commands; from then on it takes no more."""
-        if self._owned or self._commands:
-            return False
+        """Return whether it has no commands; from then on it takes no more."""
         with _process.lock:
             may_end = not self._commands
             if may_end and _process.current is self:
