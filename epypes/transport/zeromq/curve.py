@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Final
 
 import zmq
-from zmq.auth import load_certificate
 from zmq.utils import z85
 
 from epypes.errors import KeysError
@@ -258,6 +257,9 @@ def _write(path: Path, text: str, mode: int) -> None:
 
 def _read(path: Path) -> Keys:
     """Return the keys of a file; the secret one is empty if the file has none."""
+    # Imported here, since it takes 10 ms, and few sockets have keys.
+    from zmq.auth import load_certificate
+
     try:
         keys = [(key or b"").decode("ascii", "replace") for key in load_certificate(path)]
     except OSError as error:
