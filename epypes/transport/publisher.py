@@ -95,7 +95,8 @@ class Publisher(Endpoint):
     -----
     Start it, or use ``with``. Each start begins a new epoch; within it the sequence numbers of the envelopes of one
     source rise by 1 from 1. A message to a broker has the id of its Envelope, by which duplicates are detected: if an
-    answer may be computed twice, let f_out give it an id made of the event's. Threads are daemons. Semeniuta and
+    answer may be computed twice, let f_out give it an id made of the event's. What the handler of a signal, or the own
+    code of an item, sends within another send is rejected (``"nested"``). Threads are daemons. Semeniuta and
     Falkman 2019, "Reactive pipelines".
     """
 
