@@ -10,12 +10,14 @@ import hashlib
 import os
 import threading
 import weakref
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final
 
 from epypes.transport.channel import Delivery
 
+# Acknowledges, rejects or returns one delivery; see `Delivery.settle`.
+Settler = Callable[[str, str], object]
 MOST_ANSWERED: Final = 100_000
 # Other programs give messages any ids; so many long ones would fill the memory.
 _LONGEST: Final = 128
@@ -32,14 +34,13 @@ class _Outcome:
 class _InFlight:
     """A message that is delivered and not settled. It lives as long as its Delivery: a lost one can't be answered."""
 
-    __slots__ = ("__weakref__", "_owner", "connection", "deliveries", "is_settled", "key")
+    __slots__ = ("__weakref__", "_owner", "connection", "key", "settlers")
 
-    def __init__(self, owner: Deduplication, key: str, delivery: Delivery, connection: object) -> None:
+    def __init__(self, owner: Deduplication, key: str, settler: Settler, connection: object) -> None:
         self._owner, self.key = owner, key
         self.connection = connection
-        # Of the channel, the newest one last.
-        self.deliveries = [delivery]
-        self.is_settled = False
+        # Of the deliveries of the channel, the newest one last; none once the message is settled.
+        self.settlers = [settler]
 
     def settle(self, verdict: str, reason: str) -> None:
         self._owner.settle(self, verdict, reason)
@@ -73,13 +74,13 @@ class Deduplication:
         self._answered: dict[str, _Outcome] = {}
         self.duplicates = self.rejected = 0
 
-    def first(self, id: str, delivery: Delivery, connection: object) -> Delivery | None:  # noqa: A002
-        """Return what the user gets for a delivery: one that settles its duplicates too; None for a duplicate.
+    def is_first(self, id: str, delivery: Delivery, connection: object) -> bool:  # noqa: A002
+        """Return whether a delivery is the first of its message. From then on, it settles its duplicates too.
 
         Parameters
         ----------
         id
-            Of the message; a message without is never a duplicate.
+            Of the message, and of the delivery then; a message without is never a duplicate.
         delivery
             Of the channel.
         connection
@@ -94,15 +95,16 @@ class Deduplication:
                 # The older one is kept over the same connection: to acknowledge it now would acknowledge the message,
                 # where a broker counts by message.
                 if connection != known.connection:
-                    known.deliveries.clear()
+                    known.settlers.clear()
                     known.connection = connection
-                known.deliveries.append(delivery)
-                return None
+                known.settlers.append(delivery.settle)
+                return False
             if outcome is None:
-                new = _InFlight(self, key, delivery, connection)
+                new = _InFlight(self, key, delivery.settle, connection)
                 if key:
                     self._in_flight[key] = new
-                return Delivery(delivery.frames, id, delivery.attempt, delivery.headers, new.settle)
+                delivery.id, delivery.settle = id, new.settle
+                return True
             self.duplicates += 1
             # The broker may not have received the verdict if the connection has changed, or if it delivers the message
             # again. To acknowledge twice is harmless; without a second reject the message would be missing in the
@@ -113,7 +115,7 @@ class Deduplication:
                 delivery.reject(outcome.reason)
             else:
                 delivery.ack()
-            return None
+            return False
 
     def settle(self, message: _InFlight, verdict: str, reason: str) -> None:
         """Settle all deliveries of a message: the newest by the verdict, older copies by acknowledging them."""
@@ -121,23 +123,17 @@ class Deduplication:
             # The connection is that of the parent, and so is the message.
             return
         with self._lock:
-            if message.is_settled:
+            if not message.settlers:
                 return
-            message.is_settled = True
+            (*older, newest), message.settlers = message.settlers, []
             self._in_flight.pop(message.key, None)
             if verdict != "nack":
                 # Before the broker hears it: what it delivers meanwhile is a duplicate.
                 self._remember(message.key, _Outcome(reason if verdict == "reject" else None, message.connection))
             self.rejected += verdict == "reject"
-            *older, newest = message.deliveries
-        if verdict == "reject":
-            newest.reject(reason)
-        elif verdict == "nack":
-            newest.nack()
-        else:
-            newest.ack()
-        for delivery in older:
-            delivery.ack()
+        newest(verdict, reason)
+        for settler in older:
+            settler("ack", "")
 
     def answered(self, ids: Iterable[str]) -> None:
         """Take note that other consumers have answered these; what is in flight or was settled here stays that."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import threading
@@ -9,7 +10,7 @@ import warnings
 import weakref
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -79,7 +80,9 @@ class Endpoint(Startable):
         self.place = parse_address(address)
         self.on_connection: Callable[[bool, str], object] | None = None
         self._max_message_bytes, self._timeout_s = max_message_bytes, timeout_s
-        self._connection = ConnectionState(self)
+        self._established = threading.Event()
+        # The threads that run a callback of the user just now: they must not wait for the channel.
+        self._callback_threads: set[int] = set()
         self._lock = threading.Lock()
         self._channel: Channel | None = None
         self._process = os.getpid()
@@ -137,7 +140,7 @@ class Endpoint(Startable):
         """Return whether the broker is connected within ``timeout_s`` seconds."""
         if self._running is None:
             return False
-        return self.is_connected or (self._connection.established.wait(timeout_s) and self.is_connected)
+        return self.is_connected or (self._established.wait(timeout_s) and self.is_connected)
 
     @property
     def _running(self) -> Channel | None:
@@ -149,6 +152,7 @@ class Endpoint(Startable):
         return None if self._security is None else self._channel  # type: ignore[return-value]
 
     def _new_channel(self, prefetch: int, **zeromq_options: Any) -> Channel:
+        """Return a channel that is not open; of a broker, the options of ZeroMQ have no meaning."""
         if self._security is not None:
             from epypes.transport.zeromq.channel import ZeroMQChannel
 
@@ -159,9 +163,23 @@ class Endpoint(Startable):
             prefetch=prefetch,
             timeout_s=self._timeout_s,
             max_message_bytes=self._max_message_bytes,
-            on_connection=self._connection,
+            on_connection=weakly(self._connection_changed),
         )
         return open_channel(self.place, options)
+
+    def _connection_changed(self, is_connected: bool, reason: str) -> None:
+        """Take note that the broker is connected or lost, and call the user's listener."""
+        if is_connected:
+            self._established.set()
+        else:
+            self._established.clear()
+        if self.on_connection is not None:
+            with not_waiting(self._callback_threads):
+                try:
+                    self.on_connection(is_connected, reason)
+                except BaseException:
+                    # It is the user's; the connection goes on.
+                    log.exception("%s: on_connection itself failed", self)
 
     def _opened(self, channel: Channel, on_forgotten: Callable[[], object]) -> None:
         """Take note of a channel that was opened; ``on_forgotten`` is called by the garbage collector."""
@@ -184,39 +202,35 @@ class Endpoint(Startable):
         return f"<{type(self).__name__} {self.address[:50]} {state}: {count}>"
 
 
-class ConnectionState:
-    """Whether the channel of an Endpoint is connected; it does not keep the Endpoint alive.
+def has_ended(thread: threading.Thread | None, timeout_s: float) -> bool:
+    """Return whether a thread has ended in time, or is the one that asks."""
+    if thread is None or thread is threading.current_thread():
+        return True
+    thread.join(max(timeout_s, 0.0))
+    return not thread.is_alive()
 
-    Attributes
-    ----------
-    established
-        Set while there is a connection.
-    callback_threads
-        The threads that run a callback of the user just now: they must not wait for the channel.
-    """
 
-    def __init__(self, endpoint: Endpoint) -> None:
-        self._endpoint = weakref.ref(endpoint)
-        self.established = threading.Event()
-        self.callback_threads: set[int] = set()
+def weakly(method: Callable[..., object]) -> Callable[..., None]:
+    """Return what calls a bound method as long as its object lives, and does not keep that alive."""
+    known = weakref.WeakMethod(method)
 
-    def __call__(self, is_connected: bool, reason: str) -> None:
-        """Take note of a change, and call the user's listener."""
-        if is_connected:
-            self.established.set()
-        else:
-            self.established.clear()
-        endpoint = self._endpoint()
-        if endpoint is None or endpoint.on_connection is None:
-            return
-        self.callback_threads.add(threading.get_ident())
-        try:
-            endpoint.on_connection(is_connected, reason)
-        except BaseException:
-            # It is the user's; the connection goes on.
-            log.exception("%s: on_connection itself failed", endpoint)
-        finally:
-            self.callback_threads.discard(threading.get_ident())
+    def call(*arguments: object) -> None:
+        found = known()
+        if found is not None:
+            found(*arguments)
+
+    return call
+
+
+@contextlib.contextmanager
+def not_waiting(threads: set[int]) -> Iterator[None]:
+    """Have this thread be one of ``threads`` for the time of a ``with`` block."""
+    me = threading.get_ident()
+    threads.add(me)
+    try:
+        yield
+    finally:
+        threads.discard(me)
 
 
 def _abandon(process: int, name: str, on_forgotten: Callable[[], object]) -> None:

@@ -70,49 +70,46 @@ class MemorySession(BrokerSession):
         super().__init__(address, timeout_s)
         self._broker = _broker(address.host)
         self._deliver: Callable[[IncomingMessage], object] | None = None
-        self._window = self._read = 0
+        self._window = 0
+        # What waits for this session: of a queue, shared by all its sessions; else its own.
+        self.waiting: deque[_StoredMessage] = deque()
         # In the order of delivery.
         self._unsettled: dict[IncomingMessage, None] = {}
 
     def lose_from_outside(self) -> None:
         """Have the connection break; from any thread."""
-        loop = self.lost.get_loop()
         with contextlib.suppress(RuntimeError):
-            loop.call_soon_threadsafe(self.lose, "the broker has gone away")
+            self.lost.get_loop().call_soon_threadsafe(self.lose, "the broker has gone away")
 
     async def connect(self, window: int) -> None:
         """Connect; the queue is made if the address says so."""
         address, broker = self.address, self._broker
         if broker.is_away:
             raise BrokerError(str(address), f"{address} can't be reached: the broker is away.")
-        if address.kind == "queue" and address.name not in broker.queues:
-            if not address.create:
+        if address.kind == "queue":
+            if address.name not in broker.queues and not address.create:
                 text = f"There is no queue {address.name!r} at {address}. Make it, or add ?create=true to the address."
                 raise BrokerError(str(address), text)
-            broker.queues[address.name] = deque()
-        self._read = 0
+            self.waiting = broker.queues.setdefault(address.name, deque())
+        else:
+            self.waiting = deque(broker.logs.get(address.name, ()))
         broker.sessions.append(self)
 
     async def publish(self, message: OutgoingMessage) -> None:
-        """Keep a message, or hand it to those that are connected."""
+        """Keep a message, and deliver it to the sessions that are connected."""
         address, broker = message.address, self._broker
         if broker.is_away or self.lost.done():
             raise BrokerError(str(address), f"{address} can't be reached: the broker is away.")
         stored = _StoredMessage(message.body, message.id, dict(message.headers))
         if address.kind == "queue":
             broker.queues.setdefault(address.name, deque()).append(stored)
-        elif address.kind == "log":
-            broker.logs.setdefault(address.name, []).append(stored)
         else:
+            if address.kind == "log":
+                broker.logs.setdefault(address.name, []).append(stored)
             for session in broker.sessions:
-                if session.address.name == address.name:
-                    session.hear(stored)
+                if (session.address.name, session.address.kind) == (address.name, address.kind):
+                    session.waiting.append(stored)
         self._hand_out()
-
-    def hear(self, stored: _StoredMessage) -> None:
-        """Deliver a broadcast."""
-        if self._deliver is not None:
-            self._deliver(IncomingMessage(stored.body, stored.id, dict(stored.headers)))
 
     async def consume(self, deliver: Callable[[IncomingMessage], object], window: int) -> None:
         """Have a function called with what comes."""
@@ -124,49 +121,37 @@ class MemorySession(BrokerSession):
         if message in self._unsettled:
             del self._unsettled[message]
             if requeue:
-                self._broker.queues[self.address.name].appendleft(message.receipt)
+                self.waiting.appendleft(message.receipt)
             self._hand_out()
 
     def _hand_out(self) -> None:
         """Deliver what waits, in turn to those that have room."""
-        is_given = True
-        while is_given:
-            is_given = False
-            for session in list(self._broker.sessions):
-                is_given |= session.take_one()
+        sessions = self._broker.sessions
+        while any(session.take_one() for session in [*sessions]):
             # The next one begins.
-            if self._broker.sessions:
-                self._broker.sessions.append(self._broker.sessions.pop(0))
+            sessions.append(sessions.pop(0))
 
     def take_one(self) -> bool:
         """Deliver one message that waits, if there is room for it."""
-        address, broker = self.address, self._broker
-        if self._deliver is None or self.lost.done():
+        is_queue = self.address.kind == "queue"
+        is_full = is_queue and len(self._unsettled) >= self._window
+        if self._deliver is None or self.lost.done() or is_full or not self.waiting:
             return False
-        if address.kind == "log":
-            stored_log = broker.logs.get(address.name, [])
-            if self._read >= len(stored_log):
-                return False
-            self.hear(stored_log[self._read])
-            self._read += 1
-            return True
-        waiting = broker.queues.get(address.name)
-        if address.kind != "queue" or not waiting or len(self._unsettled) >= self._window:
-            return False
-        stored = waiting.popleft()
-        stored.deliveries += 1
+        stored = self.waiting.popleft()
+        stored.deliveries += is_queue
         message = IncomingMessage(stored.body, stored.id, dict(stored.headers), stored.deliveries, receipt=stored)
-        self._unsettled[message] = None
+        if is_queue:
+            self._unsettled[message] = None
         self._deliver(message)
         return True
 
     async def close(self) -> None:
         """Disconnect; what is unsettled is delivered again."""
-        broker, self._deliver = self._broker, None
-        if self in broker.sessions:
-            broker.sessions.remove(self)
+        self._deliver = None
+        if self in self._broker.sessions:
+            self._broker.sessions.remove(self)
         for message in reversed(self._unsettled):
-            broker.queues[self.address.name].appendleft(message.receipt)
+            self.waiting.appendleft(message.receipt)
         self._unsettled.clear()
         self._hand_out()
 

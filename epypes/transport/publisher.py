@@ -8,7 +8,7 @@ import os
 import queue as queues
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from time import monotonic
@@ -18,7 +18,7 @@ from epypes.errors import BrokerError, MessageError, StillRunning
 from epypes.run import Failure
 from epypes.transport.address import Address
 from epypes.transport.channel import NO_HEADERS, Channel, Confirmed, Frames, confirm
-from epypes.transport.endpoint import ConnectionState, Endpoint
+from epypes.transport.endpoint import Endpoint, has_ended, not_waiting
 from epypes.transport.sequences import check_source
 from epypes.transport.throttle import Throttle
 from epypes.wire import EncodedEnvelope, Envelope, Limits, encode, failure_event, new_id, serialized, topic_frame
@@ -29,10 +29,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("epypes.transport")
 
-# How long the bridge sleeps in the user's queue before it checks its stop flag, while items come and when none comes:
-# a stop takes this long at most. To wake up takes up to 100 us of a core.
-_TICK_S: Final = 0.025
-_LONGEST_TICK_S: Final = 0.045
+# How long the bridge sleeps in the user's queue before it checks its stop flag: a stop takes this long at most. To wake
+# up takes up to 100 us of a core.
+_TICK_S: Final = 0.035
 # What it takes for a thread to notice that the channel is closed, when the time for a stop is over.
 _CLOSE_S: Final = 0.5
 
@@ -96,7 +95,8 @@ class Publisher(Endpoint):
     -----
     Start it, or use ``with``. Each start begins a new epoch; within it the sequence numbers of the envelopes of one
     source rise by 1 from 1. A message to a broker has the id of its Envelope, by which duplicates are detected: if an
-    answer may be computed twice, let f_out give it an id made of the event's. Threads are daemons. Semeniuta and
+    answer may be computed twice, let f_out give it an id made of the event's. What the handler of a signal, or the own
+    code of an item, sends within another send is rejected (``"nested"``). Threads are daemons. Semeniuta and
     Falkman 2019, "Reactive pipelines".
     """
 
@@ -124,11 +124,13 @@ class Publisher(Endpoint):
             timeout_s=timeout_s,
         )
         self._queue, self._high_water_mark = queue, high_water_mark
-        self._taker: HandOver | Bridge | None = None
         self._slow_subscribers = 0
         self._outbox = Outbox(
-            str(self.place), topic, Limits(total_bytes=max_message_bytes), self.place.is_broker, self._connection
+            str(self.place), topic, Limits(total_bytes=max_message_bytes), self.place.is_broker, self._callback_threads
         )
+        # The thread that takes from a queue which is no Mailbox, and what has a Mailbox keep its items again.
+        self._bridge: threading.Thread | None = None
+        self._end_hand_over: Callable[[], object] = lambda: None
 
     @property
     def sent(self) -> int:
@@ -173,24 +175,30 @@ class Publisher(Endpoint):
         with self._lock:
             if self._running is not None:
                 return self
-            if self._taker is not None and not self._taker.stop(5.0):
+            if not has_ended(self._bridge, 5.0):
                 raise StillRunning(f"{type(self).__name__} {self._given}", ["get"], 5.0)
-            options = {} if self._security is None else {"high_water_mark": self._high_water_mark}
-            channel = self._new_channel(1, **options)
+            channel, outbox = self._new_channel(1, high_water_mark=self._high_water_mark), self._outbox
             channel.open(None)
-            self._outbox.begin(channel)
-            taker: HandOver | Bridge | None = None
+            outbox.begin(channel)
+            hand_to = getattr(self._queue, "hand_to", None)
             try:
-                if self._queue is not None:
-                    taker = take_from(self._queue, self._outbox, channel)
+                if callable(hand_to):
+                    # What the queue has kept comes first, within this call, which waits for no confirmation.
+                    with not_waiting(self._callback_threads):
+                        self._end_hand_over = hand_to(outbox.take)
+                elif self._queue is not None:
+                    name = "epypes-publisher"
+                    bridge = threading.Thread(target=outbox.take_all, args=(self._queue,), name=name, daemon=True)
+                    bridge.start()
+                    self._bridge = bridge
             except BaseException:
                 channel.close()
                 raise
-            self._taker = taker
+            end_hand_over = self._end_hand_over
 
             def on_forgotten() -> None:
-                if taker is not None:
-                    taker.abandon()
+                end_hand_over()
+                outbox.is_stopping = True
                 channel.abandon()
 
             self._opened(channel, on_forgotten)
@@ -199,7 +207,7 @@ class Publisher(Endpoint):
     def stop(self, timeout_s: float = 5.0) -> None:
         """Send what is queued, then disconnect or close the socket; from any thread, as often as you like.
 
-        Called by a queue's own ``get``, it does not wait: the rest happens when that has returned.
+        Called by a queue's own ``get``, it leaves what is queued in the queue.
 
         Parameters
         ----------
@@ -213,18 +221,21 @@ class Publisher(Endpoint):
             The queue's ``get`` does not return in time, or the ``put`` of a subscriber holds up the I/O thread. The
             channel is closed all the same.
         """
-        taker = self._taker
         channel = self._taken_to_stop()
         if channel is not None:
             self._slow_subscribers += getattr(channel, "slow_subscribers", 0)
-        if threading.get_ident() in self._connection.callback_threads:
+        if threading.get_ident() in self._callback_threads:
             # What is not confirmed would wait for this thread, which is the channel's.
             timeout_s = 0.0
         until_s = monotonic() + timeout_s
-        has_ended = taker is None or taker.stop(timeout_s)
-        if channel is not None and (taker is None or not taker.closes_channel):
-            channel.close(max(until_s - monotonic(), 0.0) if has_ended else _CLOSE_S)
-        if timeout_s and not has_ended and taker is not None and not taker.stop(_CLOSE_S):
+        self._end_hand_over()
+        if not self._outbox.is_stopping:
+            self._outbox.until_s, self._outbox.is_stopping = until_s, True
+        is_drained = has_ended(self._bridge, timeout_s)
+        if channel is not None:
+            rest_s = max(until_s - monotonic(), 0.0) if is_drained else 0.0
+            channel.close(rest_s if rest_s > 0 or not timeout_s else _CLOSE_S)
+        if timeout_s and not is_drained and not has_ended(self._bridge, _CLOSE_S):
             raise StillRunning(f"{type(self).__name__} {self._given}", ["get"], timeout_s)
 
     def send(
@@ -279,7 +290,9 @@ class ZMQPublisher(Publisher):
 
 
 class Outbox:
-    """What a publisher does with items: make frames, number the envelopes, send and count; over all its starts.
+    """What a publisher does with items: take them, make frames, number the envelopes, send and count; over all starts.
+
+    It is an object of its own since a Mailbox and the bridge keep it alive, and must not keep the publisher alive.
 
     Parameters
     ----------
@@ -289,93 +302,54 @@ class Outbox:
         Of the envelopes.
     limits
         Larger messages are rejected.
-    is_confirmed_later
+    is_broker
         Whether a message counts as sent when a broker has confirmed it.
-    connection
-        Knows the threads that must not wait for a confirmation.
+    callback_threads
+        The threads that must not wait for a confirmation.
+
+    Attributes
+    ----------
+    is_stopping, until_s
+        Set at the stop: what is queued is sent until then, by the monotonic clock. Not an Event: the garbage collector
+        sets it, in any thread, where a lock could be held already.
     """
 
-    def __init__(
-        self, name: str, topic: str, limits: Limits, is_confirmed_later: bool, connection: ConnectionState
-    ) -> None:
+    def __init__(self, name: str, topic: str, limits: Limits, is_broker: bool, callback_threads: set[int]) -> None:
         self._name, self._topic, self._limits = name, topic, limits
         self._topic_frame = topic_frame(topic)
-        self.is_confirmed_later, self._connection = is_confirmed_later, connection
+        self._is_broker, self._callback_threads = is_broker, callback_threads
         self.sent = 0
         self.rejected: Counter[str] = Counter()
+        self.is_stopping, self.until_s = True, 0.0
         self._log = Throttle(log)
         self._channel: Channel | None = None
         self._process = os.getpid()
         self._epoch = 0
         self._sequences: Counter[str] = Counter()
-        # Re-entrant: a signal's handler may send in the midst of a send, and so may the item's own code.
+        # Re-entrant, so that a send within a send, of a signal's handler or of the item's own code, is noticed.
         self._turn = threading.RLock()
-        # The thread that sends just now; 0 for none.
-        self._busy_thread = 0
-        self._later: deque[tuple[Any, str, Mapping[str, str], Confirmed | None]] = deque()
+        self._is_sending = False
 
     def begin(self, channel: Channel) -> None:
         """Send over a channel from now on, in a new epoch."""
         if self._process != os.getpid():
             # A thread of the parent may hold the lock.
-            self._turn, self._busy_thread, self._process = threading.RLock(), 0, os.getpid()
-            self._later.clear()
+            self._turn, self._is_sending, self._process = threading.RLock(), False, os.getpid()
         self._channel, self._epoch, self._sequences = channel, time.time_ns(), Counter()
+        self.is_stopping, self.until_s = False, 0.0
 
-    def send(
-        self,
-        item: Any,
-        id: str = "",  # noqa: A002
-        headers: Mapping[str, str] = NO_HEADERS,
-        confirmed: Confirmed | None = None,
-    ) -> None:
-        """Send an item; from any thread, one after the other.
+    def take(self, item: Any) -> None:
+        """Send an item of the queue.
 
-        An item that is sent from within, by the item's own code or by a signal's handler, follows. What such a handler
-        raises, as Ctrl+C does, comes as it is, and the next item is sent.
+        To a broker, this waits until it is confirmed, and raises the error if it can't be sent. Else, and on a thread
+        that must not wait, what can't be sent is counted and logged.
         """
-        if self._process != os.getpid():
-            error = BrokerError(self._name, f"A message to {self._name} was not sent: this is a forked child.")
-            self.count_rejected(error)
-            raise error
-        entry = mine = (item, id, headers, confirmed)
-        failure: Exception | None = None
         me = threading.get_ident()
-        # A signal is handled neither between the lock and its block nor between a flag and its try; wherever else one
-        # comes, its handler finds the flag down and sends, or up and leaves its item to the caller that has put it up.
-        with self._turn:
-            self._later.append(mine)
-            while self._later and not self._busy_thread:
-                self._busy_thread = me
-                try:
-                    entry = self._later.popleft()
-                    self._send(*entry)
-                except BaseException as error:
-                    self.count_rejected(error, entry[0])
-                    if not isinstance(error, Exception):
-                        raise
-                    if entry is mine:
-                        failure = error
-                    else:
-                        confirm(entry[3], error)
-                finally:
-                    self._busy_thread = 0
-        if failure is not None:
-            raise failure
-
-    def send_unconfirmed(self, item: Any) -> None:
-        """Send an item; what can't be sent is counted and logged."""
-        try:  # noqa: SIM105 - each call costs 3 to 5 us here, after an image has filled the caches
-            self.send(item)
-        except Exception:  # noqa: S110 - it is counted
-            pass
-
-    def send_and_wait(self, item: Any) -> None:
-        """Send an item, and wait until the broker has confirmed it; raise the error if it can't be sent."""
-        me = threading.get_ident()
-        if self._busy_thread == me or me in self._connection.callback_threads:
-            # This thread sends, or the channel's thread has called the user: it would wait for itself.
-            self.send(item)
+        if not self._is_broker or me in self._callback_threads:
+            try:  # noqa: SIM105 - each call costs 3 to 5 us here, after an image has filled the caches
+                self.send(item)
+            except Exception:  # noqa: S110 - it is counted
+                pass
             return
         is_confirmed = threading.Event()
         errors: list[Exception | None] = []
@@ -389,46 +363,83 @@ class Outbox:
         if errors[0] is not None:
             raise errors[0]
 
-    @property
-    def taken_by(self) -> Callable[[Any], None]:
-        """What a Mailbox hands its items to."""
-        return self.send_and_wait if self.is_confirmed_later else self.send_unconfirmed
+    def take_all(self, queue: TakeQueue) -> None:
+        """Take from a queue until the stop, and then what is queued; the bridge's thread."""
+        while not self.is_stopping:
+            self._take_next(queue, _TICK_S)
+        while monotonic() < self.until_s and self._take_next(queue, 0.0):
+            pass
 
-    def _send(self, item: Any, id: str, headers: Mapping[str, str], confirmed: Confirmed | None) -> None:  # noqa: A002
-        channel = self._channel
-        if channel is None:
-            raise BrokerError(self._name, f"A message to {self._name} was not sent: the publisher was not started.")
-        frames = self._frames(item)
-        if self.is_confirmed_later:
-            known_as = id or (item.id if isinstance(item, Envelope | EncodedEnvelope) else "") or new_id()
-            channel.send(frames, id=known_as, headers=headers, confirmed=self._counting(confirmed))
-            return
-        # Counted before: a thread that has received it must find it counted.
-        self.sent += 1
+    def _take_next(self, queue: TakeQueue, timeout_s: float) -> bool:
         try:
-            channel.send(frames, confirmed=confirmed)
-        except BaseException:
-            self.sent -= 1
+            item = queue.get(timeout=timeout_s)
+        except queues.Empty:
+            return False
+        except BaseException as error:
+            # A queue that is shut down or broken raises at once, each time: without the pause this would spin.
+            self._count_rejected(error, reason="queue failed")
+            time.sleep(_TICK_S)
+            return False
+        # What the item's own code raises is counted, even SystemExit; the thread goes on.
+        with contextlib.suppress(BaseException):
+            self.take(item)
+        return True
+
+    def send(
+        self,
+        item: Any,
+        id: str = "",  # noqa: A002
+        headers: Mapping[str, str] = NO_HEADERS,
+        confirmed: Confirmed | None = None,
+    ) -> None:
+        """Send an item; from any thread, one after the other.
+
+        What a signal's handler raises meanwhile, as Ctrl+C does, comes as it is, and the next item is sent.
+        """
+        channel = self._channel
+        try:
+            if channel is None or self._process != os.getpid():
+                text = f"A message to {self._name} was not sent: the publisher is not started in this process."
+                raise BrokerError(self._name, text)
+            with self._turn:
+                if self._is_sending:
+                    text = "It was sent by a signal's handler, or by the code of another item, within another send."
+                    raise MessageError("nested", text)
+                self._is_sending = True
+                try:
+                    frames = self._frames(item)
+                    if self._is_broker:
+                        known_as = id or (item.id if isinstance(item, Envelope | EncodedEnvelope) else "") or new_id()
+                        channel.send(frames, id=known_as, headers=headers, confirmed=self._counting(confirmed))
+                    else:
+                        # Counted before: a thread that has received it must find it counted.
+                        self.sent += 1
+                        try:
+                            channel.send(frames)
+                        except BaseException:
+                            self.sent -= 1
+                            raise
+                finally:
+                    self._is_sending = False
+        except BaseException as error:
+            self._count_rejected(error, item)
             raise
+        if not self._is_broker:
+            confirm(confirmed, None)
 
     def _counting(self, confirmed: Confirmed | None) -> Confirmed:
         def counted(error: Exception | None) -> None:
             if error is None:
                 self.sent += 1
             else:
-                self.count_rejected(error)
-            if confirmed is not None:
-                me = threading.get_ident()
-                self._connection.callback_threads.add(me)
-                try:
-                    confirm(confirmed, error)
-                finally:
-                    self._connection.callback_threads.discard(me)
+                self._count_rejected(error)
+            with not_waiting(self._callback_threads):
+                confirm(confirmed, error)
 
         return counted
 
-    def count_rejected(self, error: BaseException, item: object = None, reason: str = "", once: bool = False) -> None:
-        """Count and log an item that can't be sent; with ``once``, the first of its reason alone is logged."""
+    def _count_rejected(self, error: BaseException, item: object = None, reason: str = "") -> None:
+        """Count and log an item that can't be sent."""
         text = repr(error)
         if isinstance(error, MessageError | BrokerError):
             text = str(error)
@@ -436,9 +447,8 @@ class Outbox:
         # The item's own code, called to make bytes of it, may raise anything.
         reason = reason or type(error).__name__
         self.rejected[reason] += 1
-        if not once or self.rejected[reason] == 1:
-            kind = "" if item is None else f" of type {type(item).__name__}"
-            self._log.warning(reason, f"{self._name} rejected an item{kind} ({reason}): {text}")
+        kind = "" if item is None else f" of type {type(item).__name__}"
+        self._log.warning(reason, f"{self._name} rejected an item{kind} ({reason}): {text}")
 
     def _frames(self, item: Any) -> Frames:
         """Return the frames of an item.
@@ -486,112 +496,3 @@ class Outbox:
         # Counted when it can be sent: a rejected item is no loss on the way.
         self._sequences[source] = number
         return stamped
-
-
-def take_from(queue: TakeQueue, outbox: Outbox, channel: Channel) -> HandOver | Bridge:
-    """Have the items of a queue sent from now on, within ``put`` if the queue hands them over as a Mailbox does."""
-    hand_to = getattr(queue, "hand_to", None)
-    return HandOver(outbox, hand_to) if callable(hand_to) else Bridge(queue, outbox, channel)
-
-
-class HandOver:
-    """Has a queue hand its items over within the call of ``put``: no thread has to be woken up.
-
-    When ``put`` returns, its item has been sent, and arrays that could still change have been copied.
-    """
-
-    closes_channel: Final = False
-
-    def __init__(self, outbox: Outbox, hand_to: Callable[[Callable[[Any], object]], Callable[[], None]]) -> None:
-        self.is_stopping = False
-        starter: int | None = threading.get_ident()
-
-        def take(item: Any) -> None:
-            # Within the publisher's start the queue hands over what it has kept, which must neither wait nor raise.
-            (outbox.send_unconfirmed if starter == threading.get_ident() else outbox.send_and_wait)(item)
-
-        self._end = hand_to(take if outbox.is_confirmed_later else outbox.send_unconfirmed)
-        starter = None
-
-    def stop(self, timeout_s: float) -> bool:
-        """Take no more: what is put from now on stays in the queue; return True, since nothing has to end."""
-        self.abandon()
-        return True
-
-    def abandon(self) -> None:
-        """Stop without waiting."""
-        self.is_stopping = True
-        self._end()
-
-
-class Bridge:
-    """A thread that takes from a queue which does not hand its items over.
-
-    Attributes
-    ----------
-    closes_channel
-        Whether its thread closes the channel at its end, since that thread itself has called stop.
-    """
-
-    def __init__(self, queue: TakeQueue, outbox: Outbox, channel: Channel) -> None:
-        self._queue, self._outbox, self._channel = queue, outbox, channel
-        self._process = os.getpid()
-        self._deadline_s = 0.0
-        self.closes_channel = False
-        # Not an Event: the garbage collector sets it, in any thread, where a lock could be held already.
-        self.is_stopping = False
-        self._thread = threading.Thread(target=self._run, name="epypes-publisher", daemon=True)
-        self._thread.start()
-
-    def stop(self, timeout_s: float) -> bool:
-        """Let the thread send what is queued; return whether it has ended in time."""
-        if self._process != os.getpid():
-            return True
-        if not self.is_stopping:
-            self._deadline_s = monotonic() + timeout_s
-            self.is_stopping = True
-        if self._thread is threading.current_thread():
-            self.closes_channel = True
-            return True
-        self._thread.join(timeout_s)
-        return not self._thread.is_alive()
-
-    def abandon(self) -> None:
-        """Stop without waiting."""
-        self.is_stopping = True
-
-    def _run(self) -> None:
-        try:
-            tick_s = _TICK_S
-            while not self.is_stopping:
-                tick_s = _TICK_S if self._take(tick_s) else _LONGEST_TICK_S
-            # As many as there were: a producer that goes on must not keep it from stopping.
-            left = _size(self._queue)
-            while left != 0 and monotonic() < self._deadline_s and self._take(0.0):
-                left = None if left is None else left - 1
-        finally:
-            if self.closes_channel:
-                self._channel.close()
-
-    def _take(self, timeout_s: float) -> bool:
-        try:
-            item = self._queue.get(timeout=timeout_s)
-        except queues.Empty:
-            return False
-        except BaseException as error:
-            # A queue that is shut down or broken raises at once, each time: without the pause this would spin.
-            self._outbox.count_rejected(error, reason="queue failed", once=True)
-            time.sleep(_TICK_S)
-            return False
-        # The outbox has counted what the item's own code raises, even SystemExit; the thread goes on.
-        with contextlib.suppress(BaseException):
-            self._outbox.taken_by(item)
-        return True
-
-
-def _size(queue: object) -> int | None:
-    """Return how many items a queue has, or None if it can't tell, as one of multiprocessing on macOS."""
-    try:
-        return int(queue.qsize())  # type: ignore[attr-defined]  # not every queue has one
-    except BaseException:
-        return None

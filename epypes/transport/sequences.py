@@ -9,9 +9,12 @@ import logging
 import time
 from collections.abc import Iterator
 from time import monotonic
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import MessageError
+
+if TYPE_CHECKING:
+    from epypes.wire import EncodedEnvelope, Envelope
 
 log = logging.getLogger("epypes.transport")
 
@@ -29,6 +32,16 @@ def check_source(source: str) -> None:
     size = len(source.encode(errors="surrogatepass"))
     if size > _MAX_SOURCE_BYTES:
         raise MessageError("bad source", f"A source's name of {size:,} bytes; {_MAX_SOURCE_BYTES:,} is the limit.")
+
+
+def place_in_order(envelope: Envelope | EncodedEnvelope) -> tuple[Source, int]:
+    """Return the source and the number by which an envelope is ordered.
+
+    Answers are in the order of the requests, also those of several replicas.
+    """
+    if envelope.request_sequence:
+        return (envelope.request_source, envelope.request_epoch), envelope.request_sequence
+    return (envelope.source, envelope.epoch), envelope.sequence
 
 
 class LossCounter:

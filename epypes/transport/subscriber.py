@@ -8,9 +8,8 @@ import logging
 import os
 import queue as queues
 import threading
-import weakref
-from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, Protocol, Self, get_args
@@ -19,8 +18,8 @@ from epypes.errors import BrokerError, MessageError, StillRunning
 from epypes.transport.address import Address
 from epypes.transport.channel import ERROR, ERROR_REASON, Channel, Delivery
 from epypes.transport.deduplication import Deduplication
-from epypes.transport.endpoint import Endpoint
-from epypes.transport.sequences import LossCounter, ReorderBuffer, Source, check_source
+from epypes.transport.endpoint import Endpoint, has_ended, weakly
+from epypes.transport.sequences import LossCounter, ReorderBuffer, Source, check_source, place_in_order
 from epypes.transport.throttle import Throttle
 from epypes.wire import EncodedEnvelope, Envelope, Limits, decode, topic_frame
 
@@ -34,6 +33,7 @@ Acknowledge = Literal["done", "received"]
 _ENDED: Final = (BrokerError, getattr(queues, "ShutDown", BrokerError))
 # How long a full queue of the user is waited for before it is checked whether the subscriber stops.
 _TICK_S: Final = 0.05
+_NO_DELIVERY: Final = Delivery(())
 _FIELDS: Final = tuple(field.name for field in dataclasses.fields(Envelope))
 # A header of this size holds some 10,000 values, which take about 20 ms to decode: too long for the I/O thread.
 _LARGE_HEADER_BYTES: Final = 32 * 1024
@@ -239,25 +239,23 @@ class Subscriber(Endpoint):
         with self._lock:
             if self._running is not None:
                 return self
-            options: dict[str, Any] = {}
-            if self._security is not None:
-                options = {
-                    "subscription": self._topic,
-                    "high_water_mark": self._high_water_mark,
-                    "heartbeat_s": self._heartbeat_s,
-                    "on_stale": _reporter(self),
-                }
-            channel = self._new_channel(self._prefetch, **options)
-            self._inbox.begin(channel)
-            try:
-                channel.open(self._inbox.accept)
-            except BaseException:
-                self._inbox.end()
-                raise
+            channel = self._new_channel(
+                self._prefetch,
+                subscription=self._topic,
+                high_water_mark=self._high_water_mark,
+                heartbeat_s=self._heartbeat_s,
+                on_stale=weakly(self._report_stale),
+            )
             inbox = self._inbox
+            inbox.begin(channel)
+            try:
+                channel.open(inbox.accept)
+            except BaseException:
+                inbox.end()
+                raise
 
             def on_forgotten() -> None:
-                inbox.is_over = True
+                inbox.abandon()
                 channel.abandon()
 
             self._opened(channel, on_forgotten)
@@ -319,6 +317,10 @@ class Subscriber(Endpoint):
         channel = self._zeromq_channel
         return channel is not None and channel.publishers.wait(timeout_s, publishers)
 
+    def _report_stale(self, is_stale: bool) -> None:
+        if self.on_stale is not None:
+            self.on_stale(is_stale)
+
     def __repr__(self) -> str:
         return self._repr(f"{self.received} received")
 
@@ -339,18 +341,6 @@ def _checked(prefetch: int) -> int:
     if prefetch < 1:
         raise ValueError(f"prefetch is a whole number from 1, not {prefetch!r}.")
     return prefetch
-
-
-def _reporter(subscriber: Subscriber) -> Callable[[bool], None]:
-    """Return what calls a subscriber's on_stale, and does not keep the subscriber alive."""
-    known = weakref.ref(subscriber)
-
-    def report(is_stale: bool) -> None:
-        found = known()
-        if found is not None and found.on_stale is not None:
-            found.on_stale(is_stale)
-
-    return report
 
 
 class Inbox:
@@ -391,7 +381,7 @@ class Inbox:
         # Held while a message is handled: on the thread of the channel, the one of large messages, or a timer's.
         # Re-entrant, since the queue of the user may stop the subscriber.
         self._handling = threading.RLock()
-        self._large = _LargeMessages(self._handle, limits.total_bytes)
+        self._large = _LargeMessages(self._handle)
 
     @property
     def dead_letters(self) -> int:
@@ -406,13 +396,17 @@ class Inbox:
         self._channel, self._keeps = channel, channel.keeps_messages
         self._starts += 1
         self.losses.begin()
-        self._large = _LargeMessages(self._handle, self._limits.total_bytes)
+        self._large = _LargeMessages(self._handle)
         self.is_over = False
+
+    def abandon(self) -> None:
+        """Put nothing from now on; without a lock, since the garbage collector calls this."""
+        self.is_over = True
+        self._large.end()
 
     def end(self) -> None:
         """Put nothing from now on."""
-        self.is_over = True
-        self._large.end()
+        self.abandon()
         timer = self._timer
         if timer is not None:
             timer.cancel()
@@ -426,18 +420,14 @@ class Inbox:
                 self.dropped["stopped"] += len(rest)
         finally:
             self._handling.release()
-        timer = self._timer
-        if timer is not None and timer is not threading.current_thread():
-            timer.join(max(timeout_s, 0.0))
-        return self._large.join(timeout_s)
+        return all(has_ended(thread, timeout_s) for thread in (self._timer, self._large.thread))
 
     def accept(self, delivery: Delivery) -> None:
         """Take a delivery; called by the channel."""
         if self._is_zeromq:
-            frames = delivery.frames
-            is_large = len(frames) > 1 and len(frames[1]) > _LARGE_HEADER_BYTES
-            if is_large or self._large.is_busy:
-                if not self._large.put(delivery):
+            frames, large = delivery.frames, self._large
+            if (len(frames) > 1 and len(frames[1]) > _LARGE_HEADER_BYTES) or large.handled != large.accepted:
+                if not large.put(delivery):
                     self._count_rejected("too many at once", "Large messages come faster than they are decoded.")
                 return
         self._handle(delivery)
@@ -447,81 +437,39 @@ class Inbox:
             if self.is_over:
                 return
             try:
-                item, envelope = self._read(delivery)
+                if not self._is_zeromq and not self._is_wanted(delivery):
+                    delivery.ack()
+                    return
+                envelope = self._read(delivery)
             except Exception as error:
                 # Also if memory is short: the message is gone, and is counted.
                 reason = error.reason if isinstance(error, MessageError) else type(error).__name__
                 self._count_rejected(reason, f"{error!s:.1000}", delivery)
-                if self._keeps:
-                    self._refused += 1
-                    delivery.reject(str(error) or reason)
+                self._refused += self._keeps
+                delivery.reject(str(error) or reason)
                 return
-            if item is None:
-                return
-            if envelope is not None and not self._keeps:
-                self.losses.add(envelope.source, envelope.epoch, envelope.sequence)
+            item: Any = delivery
+            if self._keeps:
+                known_as = delivery.id or ("" if envelope is None else envelope.id)
+                reconnects = 0 if self._channel is None else self._channel.reconnects
+                if not self.deduplication.is_first(known_as, delivery, (self._starts, reconnects)):
+                    return
+                if isinstance(envelope, Envelope):
+                    item = DeliveredEnvelope.of(envelope, delivery)
+                elif not self._undecoded:
+                    item = DeliveredBytes.of(delivery)
+                if delivery.attempt > self._place.attempts:
+                    self._exhaust(item, delivery)
+                    return
+            else:
+                if not self._undecoded:
+                    item = bytes(delivery.frames[0]) if envelope is None else envelope
+                if envelope is not None:
+                    self.losses.add(envelope.source, envelope.epoch, envelope.sequence)
             if self._ordering is None or envelope is None:
-                self._put(item)
+                self._put(item, delivery)
                 return
-            # Answers are in the order of the requests, also those of several replicas.
-            source, sequence = (envelope.request_source, envelope.request_epoch), envelope.request_sequence
-            if not sequence:
-                source, sequence = (envelope.source, envelope.epoch), envelope.sequence
-            self._put_all(self._ordering, self._ordering.add(source, sequence, item))
-
-    def _read(self, delivery: Delivery) -> tuple[Any, Envelope | EncodedEnvelope | None]:
-        """Return what is put for a delivery, if anything, and the envelope that it is.
-
-        Raises
-        ------
-        MessageError
-            It can't be understood.
-        """
-        frames = delivery.frames
-        if not frames:
-            raise MessageError(
-                delivery.headers.get(ERROR_REASON, "bad frames"),
-                delivery.headers.get(ERROR, "The message has no frames."),
-            )
-        if not self._is_zeromq and not self._is_wanted(delivery):
-            return None, None
-        envelope: Envelope | None = None
-        if len(frames) > 1 and self._undecoded:
-            self._read_header(delivery)
-        elif len(frames) > 1:
-            envelope = decode(frames, self._limits)
-            check_source(envelope.source)
-        header = delivery.envelope if self._undecoded else envelope
-        if not self._keeps:
-            if self._undecoded:
-                return delivery, header
-            return bytes(frames[0]) if envelope is None else envelope, envelope
-        reconnects = 0 if self._channel is None else self._channel.reconnects
-        known_as = delivery.id or ("" if header is None else header.id)
-        kept = self.deduplication.first(known_as, delivery, (self._starts, reconnects))
-        if kept is None:
-            return None, None
-        item: Any = kept
-        if self._undecoded:
-            kept.envelope, kept.error = delivery.envelope, delivery.error
-        elif envelope is not None:
-            item = DeliveredEnvelope.of(envelope, kept)
-        else:
-            item = DeliveredBytes.of(kept)
-        if kept.attempt > self._place.attempts:
-            self._exhaust(item, kept)
-            return None, None
-        return item, header
-
-    def _read_header(self, delivery: Delivery) -> None:
-        """Set the header of a delivery, or why its frames are no envelope."""
-        try:
-            header = EncodedEnvelope.read(delivery.frames, self._limits)
-            check_source(header.source)
-        except MessageError as error:
-            delivery.error = error
-        else:
-            delivery.envelope = header
+            self._put_all(self._ordering, self._ordering.add(*place_in_order(envelope), (item, delivery)))
 
     def _is_wanted(self, delivery: Delivery) -> bool:
         """Check what a broker has delivered; return False if it is of another topic and not kept by a queue."""
@@ -529,35 +477,61 @@ class Inbox:
         size = sum(map(len, frames))
         if size > self._limits.total_bytes:
             raise MessageError("too large", f"A message of {size:,} bytes; the limit is {self._limits.total_bytes:,}.")
-        if not self._topic or bytes(frames[0][: len(self._topic)]) == self._topic:
+        if not frames or not self._topic or bytes(frames[0][: len(self._topic)]) == self._topic:
             return True
         if self._place.kind == "queue":
             raise MessageError("other topic", f"The message is not of topic {self._topic.decode()}.")
-        delivery.ack()
         return False
 
-    def _exhaust(self, item: Any, kept: Delivery) -> None:
+    def _read(self, delivery: Delivery) -> Envelope | EncodedEnvelope | None:
+        """Return the envelope that a delivery is; None for a message of 2019.
+
+        If nothing is to be decoded, the header is set at the delivery, or why its frames are no envelope.
+
+        Raises
+        ------
+        MessageError
+            It can't be understood.
+        """
+        frames, headers = delivery.frames, delivery.headers
+        if not frames:
+            text = headers.get(ERROR, "The message has no frames.")
+            raise MessageError(headers.get(ERROR_REASON, "bad frames"), text)
+        if len(frames) == 1:
+            return None
+        if not self._undecoded:
+            envelope = decode(frames, self._limits)
+            check_source(envelope.source)
+            return envelope
+        try:
+            header = EncodedEnvelope.read(frames, self._limits)
+            check_source(header.source)
+        except MessageError as error:
+            delivery.error = error
+            return None
+        delivery.envelope = header
+        return header
+
+    def _exhaust(self, item: Any, delivery: Delivery) -> None:
         self.rejected["exhausted"] += 1
-        text = f"delivered {kept.attempt} times, and no consumer has answered it"
-        if self._exhausted is None:
+        text = f"delivered {delivery.attempt} times, and no consumer has answered it"
+        try:
+            if self._exhausted is not None:
+                self._exhausted(item)
+                return
             way_out = (
                 "Its consumers crashed, or took it and called neither ack() nor reject(). It is in the dead-letter "
                 "queue %s; attempts=N in the address allows more."
             )
-            log.warning(
-                f"rejected message %r of %s: %s. {way_out}", kept.id, self._place, text, self._place.dead_letters
-            )
-            kept.reject(text)
-            return
-        try:
-            self._exhausted(item)
+            place = self._place
+            log.warning(f"rejected message %r of %s: %s. {way_out}", delivery.id, place, text, place.dead_letters)
         except BaseException:
             log.exception("%s: exhausted itself failed", self._place)
-            kept.reject(text)
+        delivery.reject(text)
 
-    def _put_all(self, ordering: ReorderBuffer, items: Iterator[Any]) -> None:
-        for item in items:
-            self._put(item)
+    def _put_all(self, ordering: ReorderBuffer, entries: Iterator[tuple[Any, Delivery]]) -> None:
+        for item, delivery in entries:
+            self._put(item, delivery)
         due_s = ordering.due_s
         if due_s is not None and self._timer is None and not self.is_over:
             self._timer = threading.Timer(max(due_s - monotonic(), 0.0) + 0.001, self._put_overdue)
@@ -570,50 +544,42 @@ class Inbox:
             if self._ordering is not None and not self.is_over:
                 self._put_all(self._ordering, self._ordering.overdue())
 
-    def _put(self, item: Any) -> None:
-        """Put an item into the queue of the user, and settle it if that is to be done now."""
+    def _put(self, item: Any, delivery: Delivery) -> None:
+        """Put an item into the queue of the user, and settle its delivery if that is to be done now."""
         # Counted before: a thread that has the item must find it counted.
         self.received += 1
         try:
-            if self._is_zeromq:
+            try:
                 self._queue.put(item, block=False)
-                return
-            is_put = self._put_when_there_is_room(item)
+            except queues.Full:
+                if self._is_zeromq:
+                    raise
+                self._put_when_there_is_room(item)
         except queues.Full:
             self.received -= 1
-            self.dropped["queue full"] += 1
-            return
+            if self._is_zeromq:
+                self.dropped["queue full"] += 1
+            delivery.nack()
         except BaseException as error:
             # The user's queue may raise anything, as a Mailbox of policy "fault" does; other messages go on.
             self.received -= 1
             self.dropped[type(error).__name__] += 1
             self._log.warning("refused", f"the queue refused a message: {error!r}")
-            if not self._keeps:
-                return
             if isinstance(error, _ENDED):
-                item.nack()
+                delivery.nack()
             else:
-                item.reject(f"the queue refused it: {error!r}")
-            return
-        if not is_put:
-            self.received -= 1
-        if not self._keeps:
-            return
-        if not is_put:
-            item.nack()
-        elif self._acknowledge == "received":
-            item.ack()
+                delivery.reject(f"the queue refused it: {error!r}")
+        else:
+            if self._acknowledge == "received":
+                delivery.ack()
 
-    def _put_when_there_is_room(self, item: Any) -> bool:
-        """Put an item; return False if the subscriber stops before there is room."""
-        with contextlib.suppress(queues.Full):
-            self._queue.put(item, block=False)
-            return True
+    def _put_when_there_is_room(self, item: Any) -> None:
+        """Put an item; raise queue.Full if the subscriber stops before there is room."""
         while not self.is_over:
             with contextlib.suppress(queues.Full):
                 self._queue.put(item, block=True, timeout=_TICK_S)  # type: ignore[call-arg]  # see PutQueue
-                return True
-        return False
+                return
+        raise queues.Full
 
     def _count_rejected(self, reason: str, text: str, delivery: Delivery | None = None) -> None:
         self.rejected[reason] += 1
@@ -622,82 +588,46 @@ class Inbox:
 
 
 class _LargeMessages:
-    """Messages with large headers, decoded in order on a thread of their own; it lives while messages wait.
+    """Messages with large headers, and those behind them: handled in order, on a thread that starts with the first.
 
-    Parameters
+    Attributes
     ----------
-    handle
-        Called with each.
-    most_bytes
-        Of all messages that wait.
+    accepted, handled
+        How many messages; while they differ, what comes must wait for its turn.
+    thread
+        None before the first message.
     """
 
-    def __init__(self, handle: Callable[[Delivery], None], most_bytes: int) -> None:
-        self._handle, self._most_bytes = handle, most_bytes
-        self._lock = threading.Lock()
-        self._waiting: deque[Delivery] = deque()
-        self._bytes = 0
-        self._thread: threading.Thread | None = None
-        self._is_over = False
-
-    @property
-    def is_busy(self) -> bool:
-        """Whether a message waits or is being decoded: what comes after it must wait for its turn."""
-        return self._thread is not None
+    def __init__(self, handle: Callable[[Delivery], None]) -> None:
+        self._handle = handle
+        # Its put may be called by the garbage collector.
+        self._waiting: queues.SimpleQueue[Delivery | None] = queues.SimpleQueue()
+        self.accepted = self.handled = 0
+        self.thread: threading.Thread | None = None
 
     def put(self, delivery: Delivery) -> bool:
-        """Hand over a message; return False if too many wait already."""
-        size = _size(delivery.frames)
-        with self._lock:
-            # One of the largest that are allowed can always wait.
-            if len(self._waiting) >= _MOST_LARGE or (self._waiting and self._bytes + size > self._most_bytes):
-                return False
-            self._waiting.append(delivery)
-            self._bytes += size
-            if self._thread is None:
-                thread = threading.Thread(target=self._run, name="epypes-decoding", daemon=True)
-                try:
-                    thread.start()
-                except RuntimeError:
-                    # The system has no thread to give just now.
-                    self._waiting.clear()
-                    self._bytes = 0
-                    return False
-                self._thread = thread
+        """Hand over a message; return False if too many wait already. On the I/O thread."""
+        if self.accepted - self.handled >= _MOST_LARGE:
+            return False
+        self.accepted += 1
+        self._waiting.put(delivery)
+        if self.thread is None:
+            # Where the system has no thread to give just now, the next message asks for it again.
+            thread = threading.Thread(target=self._run, name="epypes-decoding", daemon=True)
+            thread.start()
+            self.thread = thread
         return True
 
     def end(self) -> None:
-        """Forget what waits."""
-        with self._lock:
-            self._is_over = True
-            self._waiting.clear()
-
-    def join(self, timeout_s: float) -> bool:
-        """Return whether the thread has ended in time."""
-        thread = self._thread
-        if thread is None or thread is threading.current_thread():
-            return True
-        thread.join(max(timeout_s, 0.0))
-        return not thread.is_alive()
+        """Let the thread end; what waits is then no longer wanted."""
+        self._waiting.put(None)
 
     def _run(self) -> None:
-        while True:
-            with self._lock:
-                if self._is_over or not self._waiting:
-                    self._thread = None
-                    return
-                delivery = self._waiting.popleft()
-                self._bytes -= _size(delivery.frames)
-            try:
-                self._handle(delivery)
-            except BaseException:
-                # What can't be read is counted; this is a bug of ours, and must not stop the others.
-                log.exception("a message could not be handled")
+        while (delivery := self._waiting.get()) is not None:
+            self._handle(delivery)
+            # Not kept in memory while the next one is waited for.
             del delivery
-
-
-def _size(frames: Sequence[bytes | memoryview]) -> int:
-    return sum(map(len, frames))
+            self.handled += 1
 
 
 class _Delivered:
@@ -709,29 +639,26 @@ class _Delivered:
     __slots__ = ()
 
     @property
-    def delivery(self) -> Delivery | None:
-        """The delivery, without its frames; None for a copy."""
-        return getattr(self, "_delivery", None)
+    def delivery(self) -> Delivery:
+        """The delivery, without its frames; of a copy, one that nothing keeps."""
+        return getattr(self, "_delivery", _NO_DELIVERY)
 
     @property
     def attempt(self) -> int:
         """How often it was delivered, from 1; 0 where the broker does not count."""
-        return 0 if self.delivery is None else self.delivery.attempt
+        return self.delivery.attempt
 
     def ack(self) -> None:
         """Tell the broker that it is done. The first of ack, reject and nack counts; it raises nothing."""
-        if self.delivery is not None:
-            self.delivery.ack()
+        self.delivery.ack()
 
     def reject(self, reason: str) -> None:
         """Have the broker put it into the dead-letter queue, with the reason. Otherwise as `ack`."""
-        if self.delivery is not None:
-            self.delivery.reject(reason)
+        self.delivery.reject(reason)
 
     def nack(self) -> None:
         """Return it to the broker, which delivers it again, to any consumer. Otherwise as `ack`."""
-        if self.delivery is not None:
-            self.delivery.nack()
+        self.delivery.nack()
 
 
 class DeliveredEnvelope(_Delivered, Envelope):
@@ -760,7 +687,7 @@ class DeliveredBytes(_Delivered, bytes):
     @property
     def id(self) -> str:
         """The id of the message; empty if it came without."""
-        return "" if self.delivery is None else self.delivery.id
+        return self.delivery.id
 
     @classmethod
     def of(cls, delivery: Delivery) -> Self:

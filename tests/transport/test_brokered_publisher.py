@@ -201,20 +201,6 @@ def test_what_a_mailbox_has_kept_is_sent_at_the_start_whatever_it_is(address):
         wait_until(lambda: (pub.sent, pub.rejected) == (1, {"no codec": 1}))
 
 
-def test_an_item_that_puts_another_from_its_own_code_does_not_wait_for_itself(address):
-    out = ep.Mailbox("block", 8)
-
-    class Item:
-        def SerializeToString(self):
-            out.put(b"second")
-            return b"first"
-
-    with Publisher(address, out) as pub:
-        out.put(Item())
-        wait_until(lambda: pub.sent == 2)
-    assert bodies(address) == [b"first", b"second"]
-
-
 def test_a_confirmation_that_puts_more_does_not_wait_for_itself(address):
     out, is_put = ep.Mailbox("block", 8), threading.Event()
 

@@ -1,4 +1,4 @@
-"""Is a publisher that has stopped told from one that has nothing to say?"""
+"""A subscriber distinguishes a publisher that has stopped from one that is idle."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ pytestmark = pytest.mark.slow  # each waits for heartbeats
 
 
 class Changes:
-    """What on_stale was told."""
+    """The changes that on_stale was called with."""
 
     def __init__(self) -> None:
-        self.told: queue.SimpleQueue = queue.SimpleQueue()
+        self.seen: queue.SimpleQueue = queue.SimpleQueue()
 
     def __call__(self, is_stale: bool) -> None:
-        self.told.put(is_stale)
+        self.seen.put(is_stale)
 
 
 def test_a_stopped_publisher_is_reported_stale_and_recovers():
@@ -35,10 +35,10 @@ def test_a_stopped_publisher_is_reported_stale_and_recovers():
         assert into.get(timeout=WAIT_S).parts["n"] == 1
         assert not sub.is_stale
         peer.send_signal(signal.SIGSTOP)
-        assert changes.told.get(timeout=WAIT_S) is True
+        assert changes.seen.get(timeout=WAIT_S) is True
         assert sub.is_stale
         peer.send_signal(signal.SIGCONT)
-        assert changes.told.get(timeout=WAIT_S) is False
+        assert changes.seen.get(timeout=WAIT_S) is False
         publish(peer, 1)
         assert into.get(timeout=WAIT_S).parts["n"] == 2
         assert not sub.is_stale
@@ -52,7 +52,7 @@ def test_an_idle_publisher_is_not_stale():
             sub.on_stale = changes
             assert sub.wait_joined(WAIT_S)
             with pytest.raises(queue.Empty):
-                changes.told.get(timeout=2.0)
+                changes.seen.get(timeout=2.0)
             assert sub.last_heard_s < 1.5
         assert sub.last_heard_s is None
 
@@ -66,9 +66,9 @@ def test_a_publisher_that_has_ended_is_stale_until_another_comes():
         sub.on_stale = changes
         assert sub.wait_joined(WAIT_S)
     with sub:
-        assert changes.told.get(timeout=WAIT_S) is True
+        assert changes.seen.get(timeout=WAIT_S) is True
         with ZMQPublisher(address, out):
-            assert changes.told.get(timeout=WAIT_S) is False
+            assert changes.seen.get(timeout=WAIT_S) is False
 
 
 def test_a_subscriber_that_never_met_a_publisher_waits_and_is_not_stale():
@@ -76,7 +76,7 @@ def test_a_subscriber_that_never_met_a_publisher_waits_and_is_not_stale():
     with ZMQSubscriber(LOCAL, queue.SimpleQueue(), bind=True, heartbeat_s=0.02) as sub:
         sub.on_stale = changes
         with pytest.raises(queue.Empty):
-            changes.told.get(timeout=0.3)
+            changes.seen.get(timeout=0.3)
         assert sub.last_heard_s is None
 
 

@@ -1,4 +1,4 @@
-"""Can only those with a known key listen and speak?"""
+"""Only peers with a known key can subscribe and publish."""
 
 from __future__ import annotations
 

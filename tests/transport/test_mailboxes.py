@@ -1,4 +1,4 @@
-"""Is what is put into a Mailbox sent within put, whoever puts, and however it ends?"""
+"""What is put into a Mailbox is sent within put, on any thread."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_many_threads_put_and_every_message_arrives_whole_and_in_the_order_of_it
 
         def put_all(name: str) -> None:
             for number in range(250):
-                out.put(Envelope("x", {"who": name, "n": number, "data": np.full(3_000, number % 251, np.int32)}))
+                out.put(Envelope("x", {"name": name, "n": number, "data": np.full(3_000, number % 251, np.int32)}))
 
         threads = [threading.Thread(target=put_all, args=(name,)) for name in "abcd"]
         for thread in threads:
@@ -78,22 +78,32 @@ def test_many_threads_put_and_every_message_arrives_whole_and_in_the_order_of_it
             thread.join(WAIT_S)
     assert [event.sequence for event in received] == list(range(1, 1_001))
     for name in "abcd":
-        assert [event.parts["n"] for event in received if event.parts["who"] == name] == list(range(250))
+        assert [event.parts["n"] for event in received if event.parts["name"] == name] == list(range(250))
     assert all((event.parts["data"] == event.parts["n"] % 251).all() for event in received)
 
 
-def test_an_item_whose_own_code_puts_another_is_sent_first():
+def test_an_item_that_another_items_own_code_puts_is_refused_and_the_other_one_is_sent():
     out, into = Mailbox(), queue.SimpleQueue()
 
     class Item:
         def SerializeToString(self):
-            out.put(b"second")
-            return b"first"
+            out.put(b"inner")
+            return b"outer"
 
     with ZMQPublisher(LOCAL, out) as pub, ZMQSubscriber(pub.address, into) as sub:
         assert sub.wait_joined(WAIT_S)
         out.put(Item())
-        assert [into.get(timeout=WAIT_S) for _ in range(2)] == [b"first", b"second"]
+        out.put(b"next")
+        assert [into.get(timeout=WAIT_S) for _ in range(2)] == [b"outer", b"next"]
+        assert pub.rejected == {"nested": 1}
+
+
+def test_a_confirmation_may_put_the_next_item():
+    out, into = Mailbox(), queue.SimpleQueue()
+    with ZMQPublisher(LOCAL, out) as pub, ZMQSubscriber(pub.address, into) as sub:
+        assert sub.wait_joined(WAIT_S)
+        pub.send(b"1", confirmed=lambda error: out.put(b"2"))
+        assert [into.get(timeout=WAIT_S) for _ in range(2)] == [b"1", b"2"]
 
 
 def test_two_publishers_can_not_share_a_mailbox_and_the_second_leaves_no_socket():

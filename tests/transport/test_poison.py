@@ -1,4 +1,4 @@
-"""Can a peer that sends nonsense stop a subscriber, or hide in its counts?"""
+"""A peer that sends nonsense stops no subscriber, and each of its messages is counted."""
 
 from __future__ import annotations
 

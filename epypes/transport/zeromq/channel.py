@@ -11,7 +11,7 @@ import logging
 import os
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import Final
 
 import zmq
 
@@ -20,10 +20,10 @@ from epypes.transport.address import Address
 from epypes.transport.channel import ERROR, ERROR_REASON, NO_HEADERS, ChannelOptions, Confirmed, Delivery, Frames
 from epypes.transport.throttle import Throttle
 from epypes.transport.zeromq import io_thread
-from epypes.transport.zeromq.connection_guard import SUBSCRIPTION_OPTIONS
+from epypes.transport.zeromq.connection_guard import SUBSCRIPTION_OPTIONS, has_arrived
 from epypes.transport.zeromq.curve import CurveOptions
-from epypes.transport.zeromq.io_thread import IOThread, OwnedSocket, Socket, has_arrived
-from epypes.transport.zeromq.joining import IDENTITY_BYTES, Publishers, Subscriptions
+from epypes.transport.zeromq.handshake import IDENTITY_BYTES, Publishers, Subscriptions
+from epypes.transport.zeromq.io_thread import IOThread, OwnedSocket
 from epypes.wire import Limits
 from epypes.wire.arrays import is_immutable
 from epypes.wire.limits import LEADING_FRAMES
@@ -32,7 +32,6 @@ log = logging.getLogger("epypes.transport")
 
 # Below this a copy takes less time than to keep account of a buffer that is lent.
 _LENT_FROM_BYTES: Final = 64 * 1024
-_BREAK_TRIES: Final = 5
 # Frames that are read at once; of a longer message the rest is read at the next turn, so that other sockets get theirs.
 _BATCH: Final = 256
 # Beside the payloads an envelope has a topic and a header.
@@ -111,43 +110,38 @@ class ZeroMQChannel:
         """Open the socket; see `Channel.open`."""
         self._on_delivery = on_delivery
         security = self._security or CurveOptions.checked(self.address, bind=on_delivery is None)
-        allow_list, curve_options = security.socket_options()
-        # What both kinds of sockets are opened with.
-        common: dict[str, Any] = {"address": self.address, "bind": security.bind, "allow_list": allow_list}
 
         def open_socket(thread: IOThread) -> OwnedSocket:
+            options: list[tuple[int, int | bytes]]
             if on_delivery is None:
+                options = [
+                    (zmq.XPUB_MANUAL, 1),
+                    (zmq.SNDHWM, self._high_water_mark),
+                    # Not in order to wait for a slow subscriber, but in order to notice it; see `send`.
+                    (zmq.XPUB_NODROP, 1),
+                    *SUBSCRIPTION_OPTIONS,
+                ]
                 self._owned = thread.open(
-                    zmq.XPUB,
-                    reader=self._read_subscriptions,
-                    options=[
-                        (zmq.XPUB_MANUAL, 1),
-                        (zmq.SNDHWM, self._high_water_mark),
-                        # Not in order to wait for a slow subscriber, but in order to notice it; see `send`.
-                        (zmq.XPUB_NODROP, 1),
-                        *SUBSCRIPTION_OPTIONS,
-                        *curve_options,
-                    ],
-                    lock=self._lock,
-                    **common,
+                    zmq.XPUB, self.address, security, self._read_subscriptions, options, lock=self._lock
                 )
             else:
+                options = [
+                    (zmq.RCVHWM, self._high_water_mark),
+                    (zmq.MAXMSGSIZE, self._max_message_bytes),
+                    # A subscriber has nothing to send but its subscriptions.
+                    (zmq.LINGER, 0),
+                    (zmq.SUBSCRIBE, self._subscription),
+                    (zmq.SUBSCRIBE, self.publishers.topic),
+                ]
                 self._owned = thread.open(
                     zmq.SUB,
-                    reader=self._read_message,
-                    options=[
-                        (zmq.RCVHWM, self._high_water_mark),
-                        (zmq.MAXMSGSIZE, self._max_message_bytes),
-                        # A subscriber has nothing to send but its subscriptions.
-                        (zmq.LINGER, 0),
-                        (zmq.SUBSCRIBE, self._subscription),
-                        (zmq.SUBSCRIBE, self.publishers.topic),
-                        *curve_options,
-                    ],
+                    self.address,
+                    security,
+                    self._read_message,
+                    options,
                     max_message_bytes=self._max_message_bytes,
                     tick=self._check_heartbeat,
                     tick_s=self._heartbeat_s,
-                    **common,
                 )
             return self._owned
 
@@ -169,39 +163,51 @@ class ZeroMQChannel:
             self.slow_subscribers += 1
             text = f"{self.address}: a subscriber is too slow and loses messages, which it counts itself (lost)"
             self._log.warning("slow subscriber", text)
-            with self._lock:
-                socket = self._open_socket()
-                # ZeroMQ then leaves that subscriber out, without notice, until half of its queue is empty.
-                socket.setsockopt(zmq.XPUB_NODROP, 0)
-                try:
-                    _send(socket, frames)
-                finally:
-                    socket.setsockopt(zmq.XPUB_NODROP, 1)
+            # ZeroMQ then leaves that subscriber out, without notice, until half of its queue is empty.
+            self.send_if_room(frames, must_drop=True)
         if confirmed is not None:
             confirmed(None)
 
-    def send_if_room(self, frames: Frames) -> bool:
-        """Hand a message to ZeroMQ, unless the queue of a subscriber is full; return whether it was sent."""
+    def send_if_room(self, frames: Frames, *, must_drop: bool = False) -> bool:
+        """Hand a message to ZeroMQ, unless the queue of a subscriber is full; return whether it was sent.
+
+        With ``must_drop`` it is dropped for such a subscriber, and sent.
+        """
+        owned = self._owned
+        if owned is None or owned.socket.closed or self._process != os.getpid():
+            raise BrokerError(self.address, f"A message to {self.address} was not sent: the socket is closed.")
+        socket = owned.socket
         with self._lock:
-            socket = self._open_socket()
+            # Few calls from here to the socket: after an image has filled the caches each takes 3 to 5 us.
             try:
-                _send(socket, frames)
+                if must_drop:
+                    socket.setsockopt(zmq.XPUB_NODROP, 0)
+                for frame in frames[:-1]:
+                    socket.send(frame, _MORE, copy=len(frame) < _LENT_FROM_BYTES or not _can_be_lent(frame))
+                last = frames[-1]
+                socket.send(last, _DONTWAIT, copy=len(last) < _LENT_FROM_BYTES or not _can_be_lent(last))
             except zmq.Again:
                 # Nothing has left yet.
                 return False
-            except zmq.ZMQError as error:
-                raise BrokerError(self.address, f"A message to {self.address} was not sent: {error}.") from error
+            except BaseException as error:
+                # Of a signal's handler, too, as Ctrl+C: how many frames have left is unknown. These two end a message
+                # that was begun, or make one without a header, so that the receiver rejects it and not the next one.
+                if len(frames) > 1:
+                    with contextlib.suppress(zmq.ZMQError):
+                        socket.send(frames[0], _MORE)
+                        socket.send(b"", _DONTWAIT)
+                if isinstance(error, zmq.ZMQError):
+                    text = f"A message to {self.address} was not sent: {error}."
+                    raise BrokerError(self.address, text) from error
+                raise
+            finally:
+                if must_drop:
+                    socket.setsockopt(zmq.XPUB_NODROP, 1)
             # The I/O thread reads subscriptions: a signal must not interrupt the answer to a join.
             if not self._is_read_soon and has_arrived(socket):
                 self._is_read_soon = True
-                io_thread.soon(self._read_again)
+                io_thread.soon(lambda thread: thread.read_again(owned))
             return True
-
-    def _open_socket(self) -> Socket:
-        owned = self._owned
-        if owned is None or owned.socket.closed:
-            raise BrokerError(self.address, f"A message to {self.address} was not sent: the socket is closed.")
-        return owned.socket
 
     def pause(self) -> None:
         """Drop what arrives from now on; a subscriber counts it as `lost`."""
@@ -224,10 +230,6 @@ class ZeroMQChannel:
         owned = self._owned
         if owned is not None and self._process == os.getpid():
             io_thread.soon(lambda thread: thread.close(owned))
-
-    def _read_again(self, thread: IOThread) -> None:
-        if self._owned is not None:
-            thread.read_again(self._owned)
 
     def _read_subscriptions(self) -> bool:
         owned = self._owned
@@ -268,18 +270,15 @@ class ZeroMQChannel:
         if refusal:
             headers = {ERROR: "The message is larger than the limits.", ERROR_REASON: refusal}
             on_delivery(Delivery((), headers=headers))
-        elif not self._is_join_answer(frames) and not self._is_paused:
+        # A message that is no answer to a join for its size is one of a user.
+        elif len(frames) == 2 and len(frames[1]) == IDENTITY_BYTES and self.publishers.answered(*map(bytes, frames)):
+            pass
+        elif not self._is_paused:
             on_delivery(Delivery(frames))
         # After it, since the thread that waits for the message is woken up by now. The poller finds out whether there
         # are more: to ask here would keep the interpreter's lock from that thread.
         self.publishers.heard()
         return False
-
-    def _is_join_answer(self, frames: list[memoryview]) -> bool:
-        # A message that is no answer for its size is one of a user.
-        if len(frames) != 2 or len(frames[1]) != IDENTITY_BYTES:
-            return False
-        return self.publishers.answered(bytes(frames[0]), bytes(frames[1]))
 
 
 def prepare_lending() -> None:
@@ -290,45 +289,9 @@ def prepare_lending() -> None:
     zmq.Frame(bytes(_LENT_FROM_BYTES), copy=False)
 
 
-def _send(socket: Socket, frames: Frames) -> None:
-    is_begun = False
-    # Few calls from here to the socket: after an image has filled the caches each takes 3 to 5 us.
-    try:
-        for frame in frames[:-1]:
-            socket.send(frame, _MORE, copy=len(frame) < _LENT_FROM_BYTES or not _can_be_lent(frame))
-            is_begun = True
-        last = frames[-1]
-        socket.send(last, _DONTWAIT, copy=len(last) < _LENT_FROM_BYTES or not _can_be_lent(last))
-    except (zmq.ZMQError, MemoryError):
-        # This frame has not left. The next message would be taken for the rest of this one.
-        if is_begun:
-            _break_off(socket, frames)
-        raise
-    except BaseException:
-        # Of a signal's handler: whether the frame has left is unknown.
-        _break_off(socket, frames)
-        raise
-
-
 def _can_be_lent(frame: bytes | memoryview) -> bool:
     """Return whether ZeroMQ may read a large frame later, since it can't be changed meanwhile."""
     return isinstance(frame, bytes) or is_immutable(frame)
-
-
-def _break_off(socket: Socket, frames: Frames) -> None:
-    """End a message that was interrupted, so that the receiver rejects it, and not the next one as well.
-
-    How many frames have left is unknown. After some of them these two make a message that has the wrong ones; alone
-    they make one without a header.
-    """
-    if len(frames) < 2:
-        return
-    for _ in range(_BREAK_TRIES):
-        # Another signal may come.
-        with contextlib.suppress(BaseException):
-            socket.send(frames[0], _MORE)
-            socket.send(b"", _DONTWAIT)
-            return
 
 
 def make_channel(address: Address, options: ChannelOptions) -> ZeroMQChannel:

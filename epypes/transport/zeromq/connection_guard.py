@@ -24,10 +24,10 @@ import struct
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from time import monotonic
 from typing import Any, Final
 
 import zmq
+from zmq.backend import zmq_poll
 from zmq.utils.monitor import parse_monitor_message
 
 from epypes.transport.throttle import Throttle
@@ -53,13 +53,25 @@ _BURST_BYTES: Final = 2 * MAX_SUBSCRIPTION_BYTES
 _BYTES_PER_S: Final = 64 * 1024
 # What the kernel may hold of the messages behind the one that is being received, and the heads of its frames.
 _SLACK_BYTES: Final = 64 * 1024**2
-_TICK_S: Final = 0.1
+# How often `ConnectionGuard.check` is called.
+CHECK_S: Final = 0.1
 _EVENTS: Final = int(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
 _SRCFD, _HAS, _POLLIN = int(zmq.SRCFD), int(zmq.EVENTS), int(zmq.POLLIN)
 # In Linux' struct tcp_info: tcpi_bytes_received, 8 bytes.
 _RECEIVED_AT: Final = 128
 
 log = logging.getLogger("epypes.transport")
+
+
+def has_arrived(opened: zmq.Socket[bytes]) -> bool:
+    """Return whether a socket can be read.
+
+    To be asked after other calls on the socket: they may have used up the signal by which its file descriptor wakes
+    the I/O thread.
+    """
+    # Not socket.get(EVENTS), which holds the interpreter's lock while libzmq takes in subscriptions: for 19 s if a peer
+    # sends 20,000 of 1 kB.
+    return bool(zmq_poll([(opened, _POLLIN)], 0))
 
 
 def connection_limit(most: int, share: int) -> int:
@@ -105,8 +117,8 @@ class ConnectionGuard:
         The socket, before it is bound; called on the I/O thread.
     max_message_bytes
         Of one message with all its parts; 0 for a socket that receives subscriptions only.
-    ask
-        Has a function called on the I/O thread, with whether nothing is left to be read.
+    submit
+        Has a function called on the I/O thread.
 
     Attributes
     ----------
@@ -117,7 +129,7 @@ class ConnectionGuard:
     """
 
     def __init__(
-        self, socket: zmq.Socket[bytes], max_message_bytes: int, ask: Callable[[Callable[[bool], None]], object]
+        self, socket: zmq.Socket[bytes], max_message_bytes: int, submit: Callable[[Callable[[object], None]], object]
     ) -> None:
         address = f"inproc://connections-{int(socket.get(zmq.FD))}"
         socket.monitor(address, _EVENTS)
@@ -128,7 +140,7 @@ class ConnectionGuard:
         self._monitor.connect(address)
         self.descriptor = int(self._monitor.get(zmq.FD))
         self._most = connection_limit(MOST_CONNECTIONS, _SHARE)
-        self._max_message_bytes, self._ask = max_message_bytes, ask
+        self._max_message_bytes, self._submit = max_message_bytes, submit
         # Held by every thread that touches the monitor or the peers.
         self._lock = threading.Lock()
         self._peers: dict[int, _Peer] = {}
@@ -220,17 +232,19 @@ class ConnectionGuard:
             peer.received, peer.read = received, self._read
         elif received - peer.received > self._max_message_bytes + _SLACK_BYTES:
             since = peer.received
-            self._ask(lambda is_drained: self._judge(peer, since, is_drained))
+            self._submit(lambda _: self._judge(peer, since))
 
-    def _judge(self, peer: _Peer, since: int, is_drained: bool) -> None:
+    def _judge(self, peer: _Peer, since: int) -> None:
         """Drop a peer that has sent more than a message since ``since`` bytes, if there was no whole message in it.
 
-        ZeroMQ reads from connections in turns. So one that had a whole message has been read if nothing is left to be
-        read, or if more messages were read meanwhile than there are connections. A later check may have found that
-        before this one is answered.
+        On the I/O thread. ZeroMQ reads from connections in turns. So one that had a whole message has been read if
+        nothing is left to be read, or if more messages were read meanwhile than there are connections. A later check
+        may have found that before this one is answered.
         """
         with self._lock:
-            had_its_turn = is_drained or self._read - peer.read > len(self._peers)
+            if self._is_closed:
+                return
+            had_its_turn = self._read - peer.read > len(self._peers) or not has_arrived(self._socket)
             if had_its_turn and peer.received == since and peer.fd not in self._senders:
                 self._drop(peer, "it sends a message without an end")
 
@@ -274,53 +288,6 @@ class ConnectionGuard:
                     borrowed.shutdown(sockets.SHUT_RDWR)
             finally:
                 borrowed.detach()
-
-
-class GuardThread:
-    """The thread that checks all guarded sockets of one I/O thread; it runs while there are any."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._guards: list[ConnectionGuard] = []
-        self._thread: threading.Thread | None = None
-        self._is_idle = threading.Event()
-
-    def add(self, guard: ConnectionGuard) -> None:
-        """Begin to check a socket's connections."""
-        with self._lock:
-            self._guards.append(guard)
-            self._is_idle.clear()
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="epypes-guard", daemon=True)
-                self._thread.start()
-
-    def remove(self, guard: ConnectionGuard) -> None:
-        """Stop checking a socket's connections."""
-        with self._lock:
-            if guard in self._guards:
-                self._guards.remove(guard)
-            if not self._guards:
-                self._is_idle.set()
-
-    def join(self) -> None:
-        """Wait until the thread has ended, after the last `remove`."""
-        thread = self._thread
-        if thread is not None:
-            thread.join()
-
-    def _run(self) -> None:
-        checked_s = monotonic()
-        while True:
-            self._is_idle.wait(_TICK_S)
-            with self._lock:
-                guards = [*self._guards]
-                if not guards:
-                    self._thread = None
-                    return
-            now_s = monotonic()
-            for guard in guards:
-                guard.check(now_s - checked_s)
-            checked_s = now_s
 
 
 def _received_bytes(fd: int) -> int | None:

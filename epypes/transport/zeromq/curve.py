@@ -24,12 +24,10 @@ from epypes.transport.address import check_bind
 
 log = logging.getLogger("epypes.transport")
 
-_LINE = re.compile(r'^\s*(public|secret)-key\s*=\s*"([^"\n]*)"\s*$', re.MULTILINE)
 # Z85 of 32 bytes.
 _KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 _OTHERS = 0o077
 _ZAP_ADDRESS: Final = "inproc://zeromq.zap.01"
-_BATCH: Final = 100
 # Unknown keys that are counted one by one; a peer that makes keys must not fill the memory.
 _MOST_UNKNOWN: Final = 1_024
 
@@ -93,9 +91,9 @@ def read_keys(path: str | Path) -> Keys:
     found = _read(file)
     if os.name == "posix" and file.stat().st_mode & _OTHERS:
         raise KeysError(file, f"Others can read the secret key {file}. Say: chmod 600 {file}")
-    if "secret" not in found:
+    if not found.secret:
         raise KeysError(file, f"{file} has no secret key. epypes.transport.make_keys makes a pair.")
-    return Keys(found["public"], found["secret"])
+    return found
 
 
 def public_keys(given: PublicKey | Collection[PublicKey]) -> frozenset[str]:
@@ -119,83 +117,37 @@ def _public(given: PublicKey) -> list[str]:
         raise KeysError("", f"{given!r:.60} is no public key. Give its 40 characters, a .key file or a folder of them.")
     path = Path(given)
     files = sorted(path.glob("*.key")) if path.is_dir() else [path]
-    return [_read(file)["public"] for file in files]
-
-
-class AllowList:
-    """The keys that may connect to one socket; a peer with another key is refused and counted.
-
-    Parameters
-    ----------
-    allowed
-        Public keys.
-    refused
-        Gets the counts of refused peers, by public key.
-
-    Attributes
-    ----------
-    domain
-        The socket's ZAP domain, by which ZeroMQ names it.
-    """
-
-    def __init__(self, allowed: Collection[str], refused: Counter[str]) -> None:
-        self.domain = uuid.uuid4().hex.encode()
-        self._allowed, self._refused = frozenset(allowed), refused
-
-    def admits(self, mechanism: bytes, credentials: list[bytes]) -> bool:
-        """Return whether a peer may connect; count it if it may not."""
-        key = "no key"
-        if mechanism == b"CURVE" and len(credentials) == 1 and len(credentials[0]) == 32:
-            key = z85.encode(credentials[0]).decode()
-        if key in self._allowed:
-            return True
-        known = key in self._refused or len(self._refused) < _MOST_UNKNOWN
-        self._refused[key if known else "others"] += 1
-        if self._refused[key] == 1:
-            log.warning("refused a peer with the unknown key %s; to let it in, add it to allow=", key)
-        return False
+    return [_read(file).public for file in files]
 
 
 class ZapHandler:
-    """Answers ZeroMQ, on the I/O thread, whether a peer may connect to a guarded socket of a context.
+    """Answers ZeroMQ, on the I/O thread, whether a peer may connect to a guarded socket of a context (RFC 27).
 
     Attributes
     ----------
-    allow_lists
-        Of the guarded sockets, by ZAP domain.
-    descriptor
-        Readable when there is something for `read`.
+    guarded
+        The options of the guarded sockets, by ZAP domain.
+    socket
+        Readable when there is a request for `read`.
     """
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
-        self.allow_lists: dict[bytes, AllowList] = {}
-        self._socket: zmq.Socket[bytes] = context.socket(zmq.REP)
-        self._socket.linger = 0
-        self._socket.bind(_ZAP_ADDRESS)
-        self.descriptor = int(self._socket.get(zmq.FD))
-
-    def close(self) -> None:
-        """Close the socket; ZeroMQ lets any peer in from then on, so no guarded socket may be left."""
-        self._socket.close()
+        self.guarded: dict[bytes, CurveOptions] = {}
+        self.socket: zmq.Socket[bytes] = context.socket(zmq.REP)
+        self.socket.linger = 0
+        self.socket.bind(_ZAP_ADDRESS)
 
     def read(self) -> bool:
-        """Answer some requests; return whether there may be more."""
-        for _ in range(_BATCH):
-            if self._socket.closed:
-                return False
-            try:
-                request = self._socket.recv_multipart(zmq.DONTWAIT)
-            except zmq.Again:
-                return False
-            version, number, domain, _, _, mechanism, *credentials = request
-            allow_list = self.allow_lists.get(domain)
-            ok = allow_list is not None and allow_list.admits(mechanism, credentials)
-            status = [b"200", b"OK"] if ok else [b"400", b"This key is not on the list"]
-            self._socket.send_multipart([version, number, *status, b"", b""], zmq.DONTWAIT)
-        return True
+        """Answer one request; always returns False."""
+        version, number, domain, _, _, _, *credentials = self.socket.recv_multipart(zmq.DONTWAIT)
+        options = self.guarded.get(domain)
+        ok = options is not None and options.admits(credentials)
+        status = [b"200", b"OK"] if ok else [b"400", b"This key is not on the list"]
+        self.socket.send_multipart([version, number, *status, b"", b""], zmq.DONTWAIT)
+        return False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class CurveOptions:
     """The security of one address.
 
@@ -209,12 +161,15 @@ class CurveOptions:
         Whether it is bound.
     refused
         How often peers were refused, by their public key.
+    domain
+        Of the socket in ZAP, by which ZeroMQ names it.
     """
 
     keys: Keys | None
     allowed: frozenset[str]
     bind: bool
     refused: Counter[str] = field(default_factory=Counter)
+    domain: bytes = field(default_factory=lambda: uuid.uuid4().hex.encode())
 
     @classmethod
     def checked(
@@ -251,26 +206,36 @@ class CurveOptions:
             raise KeysError("", f"{text} {len(allowed)} were given.")
         return cls(own, allowed, bind)
 
-    def socket_options(self) -> tuple[AllowList | None, Sequence[tuple[int, int | bytes]]]:
-        """Return the options of a new socket, and its list of allowed keys if it is bound with keys."""
+    @property
+    def is_guarded(self) -> bool:
+        """Whether ZeroMQ asks which peers may connect."""
+        return self.bind and self.keys is not None
+
+    def admits(self, credentials: Sequence[bytes]) -> bool:
+        """Return whether the peer with a key of 32 bytes may connect; count it if it may not."""
+        key = z85.encode(b"".join(credentials)).decode()
+        if key in self.allowed:
+            return True
+        known = key in self.refused or len(self.refused) < _MOST_UNKNOWN
+        self.refused[key if known else "others"] += 1
+        if self.refused[key] == 1:
+            log.warning("refused a peer with the unknown key %s; to let it in, add it to allow=", key)
+        return False
+
+    def socket_options(self) -> Sequence[tuple[int, int | bytes]]:
+        """Return the options of a new socket."""
         if self.keys is None:
-            return None, ()
-        secret = self.keys.secret.encode()
+            return ()
+        secret = (zmq.CURVE_SECRETKEY, self.keys.secret.encode())
         if not self.bind:
             (server,) = self.allowed
-            return None, [
+            return [
                 (zmq.CURVE_SERVERKEY, server.encode()),
                 (zmq.CURVE_PUBLICKEY, self.keys.public.encode()),
-                (zmq.CURVE_SECRETKEY, secret),
+                secret,
             ]
-        allow_list = AllowList(self.allowed, self.refused)
-        return allow_list, [
-            (zmq.CURVE_SERVER, 1),
-            (zmq.CURVE_SECRETKEY, secret),
-            (zmq.ZAP_DOMAIN, allow_list.domain),
-            # Without it any peer would be let in while no handler answers for the domain.
-            (zmq.ZAP_ENFORCE_DOMAIN, 1),
-        ]
+        # Without ZAP_ENFORCE_DOMAIN any peer would be let in while no handler answers for the domain.
+        return [(zmq.CURVE_SERVER, 1), secret, (zmq.ZAP_DOMAIN, self.domain), (zmq.ZAP_ENFORCE_DOMAIN, 1)]
 
 
 def _stem(path: Path) -> Path:
@@ -290,14 +255,18 @@ def _write(path: Path, text: str, mode: int) -> None:
         file.write(text)
 
 
-def _read(path: Path) -> dict[str, str]:
+def _read(path: Path) -> Keys:
+    """Return the keys of a file; the secret one is empty if the file has none."""
+    # Imported here, since it takes 10 ms, and few sockets have keys.
+    from zmq.auth import load_certificate
+
     try:
-        found = dict(_LINE.findall(path.read_text("utf-8")))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is no text"
-        raise KeysError(
-            path, f"No key can be read from {path}: {reason}. epypes.transport.make_keys makes one."
-        ) from error
-    if "public" not in found or not all(_KEY.fullmatch(key) for key in found.values()):
+        keys = [(key or b"").decode("ascii", "replace") for key in load_certificate(path)]
+    except OSError as error:
+        text = f"No key can be read from {path}: {error.strerror or 'there is no such file'}."
+        raise KeysError(path, f"{text} epypes.transport.make_keys makes one.") from error
+    except ValueError:
+        keys = [""]
+    if not _KEY.fullmatch(keys[0]) or not all(_KEY.fullmatch(key) for key in keys if key):
         raise KeysError(path, f"{path} is no key file. epypes.transport.make_keys makes one.")
-    return found
+    return Keys(*keys)

@@ -25,11 +25,10 @@ from time import monotonic
 from typing import Any, Final, TypeVar
 
 import zmq
-from zmq.backend import zmq_poll
 
 from epypes.transport.address import address_error, check_port
-from epypes.transport.zeromq.connection_guard import HANDSHAKE_MS, ConnectionGuard, GuardThread
-from epypes.transport.zeromq.curve import AllowList, ZapHandler
+from epypes.transport.zeromq.connection_guard import CHECK_S, HANDSHAKE_MS, ConnectionGuard
+from epypes.transport.zeromq.curve import CurveOptions, ZapHandler
 
 Socket = zmq.Socket[bytes]
 # Reads some of what has arrived, and returns whether there is more.
@@ -80,29 +79,17 @@ class OwnedSocket:
     # What the poller watches: the socket, or the file descriptor of one that other threads send on, which the poller
     # must not touch. Such a descriptor gives one signal for all that has arrived, so unfinished reads are kept in mind.
     source: Socket | int
+    security: CurveOptions
     guard: ConnectionGuard | None = None
-    allow_list: AllowList | None = None
     tick: Callable[[], None] | None = None
     tick_s: float = float("inf")
     due_s: float = float("inf")
-
-
-def has_arrived(opened: Socket) -> bool:
-    """Return whether a socket can be read.
-
-    To be asked after other calls on the socket: they may have used up the signal by which its file descriptor wakes
-    the I/O thread.
-    """
-    # Not socket.get(EVENTS), which holds the interpreter's lock while libzmq takes in subscriptions: for 19 s if a peer
-    # sends 20,000 of 1 kB.
-    return bool(zmq_poll([(opened, _POLLIN)], 0))
 
 
 class IOThread:
     """The thread; its methods other than `submit` are for commands, which run on it."""
 
     def __init__(self) -> None:
-        self.has_ended = False
         self._commands: deque[tuple[Callable[[IOThread], Any], Future[Any]]] = deque()
         self._owned: dict[Socket, OwnedSocket] = {}
         # By source.
@@ -110,7 +97,8 @@ class IOThread:
         self._unfinished: set[Any] = set()
         self._next_due_s = float("inf")
         self._zap: ZapHandler | None = None
-        self._guards = GuardThread()
+        self._is_over = threading.Event()
+        self._guarding: threading.Thread | None = None
         self._context = zmq.Context(io_threads=1)
         self._poller = zmq.Poller()
         self._wake_in, self._wake_out = socket.socketpair()
@@ -119,9 +107,9 @@ class IOThread:
         self._watch(self._wake_out.fileno(), self._run_commands)
         self.thread = threading.Thread(target=self._run, name="epypes-io", daemon=True)
 
-    def submit(self, command: Callable[[IOThread], Any], future: Future[Any]) -> None:
-        """Hand over a command, from any thread."""
-        self._commands.append((command, future))
+    def submit(self, command: Callable[[IOThread], Any], future: Future[Any] | None = None) -> None:
+        """Hand over a command, from any thread; the future gets its result."""
+        self._commands.append((command, future or Future()))
         # If the pipe is full, enough wake-ups are on their way.
         with contextlib.suppress(BlockingIOError):
             self._wake_in.send(b"\0")
@@ -130,12 +118,11 @@ class IOThread:
         self,
         kind: int,
         address: str,
-        bind: bool,
+        security: CurveOptions,
         reader: Reader,
         options: Sequence[tuple[int, int | bytes]],
         *,
         lock: AbstractContextManager[Any] | None = None,
-        allow_list: AllowList | None = None,
         max_message_bytes: int = 0,
         tick: Callable[[], None] | None = None,
         tick_s: float = float("inf"),
@@ -150,8 +137,6 @@ class IOThread:
             Of ZeroMQ, by number, in this order.
         lock
             Held by every thread that touches the socket; None if only the I/O thread does.
-        allow_list
-            Of the keys that may connect, if it is bound with keys.
         max_message_bytes
             Size limit of one message with all its parts, 0 if only subscriptions come; see `connection_guard`.
         tick
@@ -163,35 +148,36 @@ class IOThread:
             ZeroMQ refuses the address.
         """
         check_port(address)
-        if allow_list is not None:
-            self._guard_keys(allow_list)
+        if security.is_guarded:
+            self._require_keys(security)
         new: Socket = self._context.socket(kind)
         guard: ConnectionGuard | None = None
         try:
             # Options count only for what is bound or connected after them.
-            for option, value in [*_OPTIONS.items(), *options]:
+            for option, value in [*_OPTIONS.items(), *security.socket_options(), *options]:
                 new.setsockopt(option, value)
-            if bind and not address.startswith("inproc:"):
+            if security.bind and not address.startswith("inproc:"):
                 # Before it is bound, so that no connection is missed.
-                guard = ConnectionGuard(new, max_message_bytes, self._ask_of(new))
-            (new.bind if bind else new.connect)(address)
+                guard = ConnectionGuard(new, max_message_bytes, self.submit)
+            (new.bind if security.bind else new.connect)(address)
         except (zmq.ZMQError, UnicodeError, ValueError, TypeError) as error:
             if guard is not None:
                 guard.close()
             new.close(linger=0)
             number = getattr(error, "errno", None) or 0
-            raise address_error(address, "bound" if bind else "connected", number, str(error)) from error
-        endpoint = new.getsockopt_string(zmq.LAST_ENDPOINT) if bind else address
+            raise address_error(address, "bound" if security.bind else "connected", number, str(error)) from error
+        endpoint = new.getsockopt_string(zmq.LAST_ENDPOINT) if security.bind else address
         source = new if lock is None else int(new.get(_FD))
-        owned = OwnedSocket(new, endpoint, reader, lock or nullcontext(), source, guard, allow_list, tick, tick_s)
-        owned.due_s = monotonic() + tick_s
-        self._next_due_s = min(self._next_due_s, owned.due_s)
+        due_s = monotonic() + tick_s
+        owned = OwnedSocket(new, endpoint, reader, lock or nullcontext(), source, security, guard, tick, tick_s, due_s)
+        self._next_due_s = min(self._next_due_s, due_s)
         self._owned[new] = owned
         if guard is not None:
             guard.endpoint = endpoint
             self._watch(guard.descriptor, guard.update)
-            if endpoint.startswith("tcp:"):
-                self._guards.add(guard)
+            if endpoint.startswith("tcp:") and self._guarding is None:
+                self._guarding = threading.Thread(target=self._check_guards, name="epypes-guard", daemon=True)
+                self._guarding.start()
         self._watch(source, reader)
         self._unfinished.add(source)
         return owned
@@ -207,12 +193,11 @@ class IOThread:
             self._unwatch(owned.source)
             if owned.guard is not None:
                 self._unwatch(owned.guard.descriptor)
-                self._guards.remove(owned.guard)
                 owned.guard.close()
             with owned.lock:
                 _close(owned)
-            if owned.allow_list is not None and self._zap is not None:
-                self._zap.allow_lists.pop(owned.allow_list.domain, None)
+            if self._zap is not None:
+                self._zap.guarded.pop(owned.security.domain, None)
         return not self._owned
 
     def close_all(self) -> None:
@@ -229,50 +214,48 @@ class IOThread:
         self._readers.pop(source, None)
         self._unfinished.discard(source)
 
-    def _guard_keys(self, allow_list: AllowList) -> None:
+    def _require_keys(self, security: CurveOptions) -> None:
         # The handler stays until the thread ends: its address may not be free at once, and a socket that is guarded
         # meanwhile would have no handler.
         if self._zap is None:
             self._zap = ZapHandler(self._context)
-            self._watch(self._zap.descriptor, self._zap.read)
-        self._zap.allow_lists[allow_list.domain] = allow_list
+            self._watch(self._zap.socket, self._zap.read)
+        self._zap.guarded[security.domain] = security
 
-    def _ask_of(self, new: Socket) -> Callable[[Callable[[bool], None]], object]:
-        """Return what has a guard's question answered on this thread: whether nothing is left to be read."""
-
-        def ask(answer: Callable[[bool], None]) -> None:
-            def look(thread: IOThread) -> None:
-                if new in self._owned:
-                    answer(not has_arrived(new))
-
-            self.submit(look, Future())
-
-        return ask
+    def _check_guards(self) -> None:
+        """Bound what connections may cost, on a thread that needs no socket's lock; see `connection_guard`."""
+        checked_s = monotonic()
+        while not self._is_over.wait(CHECK_S):
+            now_s = monotonic()
+            for owned in list(self._owned.values()):
+                if owned.guard is not None:
+                    owned.guard.check(now_s - checked_s)
+            checked_s = now_s
 
     def _run(self) -> None:
         try:
-            while not self._may_end():
+            while self._owned or self._commands or not self._may_end():
                 for source, _ in self._poller.poll(self._wait_ms()):
                     self._read(source)
                 if self._unfinished or self._next_due_s <= monotonic():
                     self._catch_up()
         finally:
-            self._guards.join()
+            self._is_over.set()
+            if self._guarding is not None:
+                self._guarding.join()
             if self._zap is not None:
-                self._zap.close()
+                self._zap.socket.close()
             self._context.term()
             self._wake_in.close()
             self._wake_out.close()
 
     def _may_end(self) -> bool:
-        """Return whether it has neither sockets nor commands; from then on it takes no more."""
-        if self._owned or self._commands:
-            return False
+        """Return whether it has no commands; from then on it takes no more."""
         with _process.lock:
-            self.has_ended = not self._commands
-            if self.has_ended and _process.current is self:
+            may_end = not self._commands
+            if may_end and _process.current is self:
                 _process.current = None
-        return self.has_ended
+        return may_end
 
     def _wait_ms(self) -> int | None:
         if self._unfinished:
@@ -289,9 +272,9 @@ class IOThread:
         try:
             if reader is not None and reader():
                 self._unfinished.add(source)
-        except BaseException as error:
+        except BaseException:
             # A reader counts what it can't read; this is a bug of ours, and must not stop the other sockets.
-            _log_error("a reader failed", error)
+            log.exception("a reader failed")
 
     def _catch_up(self) -> None:
         now_s = monotonic()
@@ -299,10 +282,7 @@ class IOThread:
             for owned in list(self._owned.values()):
                 if owned.tick is not None and owned.due_s <= now_s:
                     owned.due_s = now_s + owned.tick_s
-                    try:
-                        owned.tick()
-                    except BaseException as error:
-                        _log_error("a tick failed", error)
+                    owned.tick()
                     self._unfinished.add(owned.source)
             self._next_due_s = min((owned.due_s for owned in self._owned.values()), default=float("inf"))
         unfinished, self._unfinished = self._unfinished, set()
@@ -404,7 +384,7 @@ def soon(command: Callable[[IOThread], object]) -> None:
     """Have a command run without waiting; the garbage collector may call this in any thread, anywhere."""
     current = _process.current
     if current is not None:
-        current.submit(command, Future())
+        current.submit(command)
 
 
 def _close_at_exit() -> None:
@@ -430,9 +410,3 @@ def _close(owned: OwnedSocket) -> None:
     owned.socket.close()
     monitor.poll(_CLOSE_MS)
     monitor.close(linger=0)
-
-
-def _log_error(text: str, error: BaseException) -> None:
-    # A log handler of the user's may raise anything as well.
-    with contextlib.suppress(BaseException):
-        log.error(text, exc_info=error)

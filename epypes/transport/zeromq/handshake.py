@@ -1,4 +1,4 @@
-"""Joining without loss, and heartbeats: a handshake between a subscriber and a publisher on a private topic.
+"""The handshake of a subscriber and a publisher on a private topic: joining without loss, and heartbeats.
 
 A subscription takes its time to reach the publisher, and what is published meanwhile is lost without a trace. So a
 subscriber also subscribes to a private topic, and the publisher answers on exactly that topic. ZeroMQ sends a peer's
@@ -55,6 +55,7 @@ class Subscriptions:
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
+        # By topic: a peer may take back what it has never had, or was refused.
         self._counts: Counter[bytes] = Counter()
         self._identity = uuid.uuid4().bytes
 
