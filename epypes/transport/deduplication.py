@@ -10,7 +10,7 @@ import hashlib
 import os
 import threading
 import weakref
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,7 +18,8 @@ from epypes.transport.channel import Delivery
 
 # Acknowledges, rejects or returns one delivery; see `Delivery.settle`.
 Settler = Callable[[str, str], object]
-MOST_ANSWERED: Final = 100_000
+# So many ids of settled messages are remembered; the oldest are forgotten.
+_MOST_ANSWERED: Final = 100_000
 # Other programs give messages any ids; so many long ones would fill the memory.
 _LONGEST: Final = 128
 
@@ -27,8 +28,8 @@ _LONGEST: Final = 128
 class _Outcome:
     """How a message was settled: why it was rejected, None if it was not, and over which connection."""
 
-    reason: str | None = None
-    connection: object = None
+    reason: str | None
+    connection: object
 
 
 class _InFlight:
@@ -51,11 +52,6 @@ class Deduplication:
 
     Any thread may call it.
 
-    Parameters
-    ----------
-    most_answered
-        How many ids of settled messages are remembered; the oldest are forgotten.
-
     Attributes
     ----------
     duplicates
@@ -64,11 +60,10 @@ class Deduplication:
         How many messages were rejected.
     """
 
-    def __init__(self, most_answered: int = MOST_ANSWERED) -> None:
+    def __init__(self) -> None:
         # Re-entrant, since a signal's handler may settle anywhere.
         self._lock = threading.RLock()
         self._process = os.getpid()
-        self._most_answered = most_answered
         self._in_flight: weakref.WeakValueDictionary[str, _InFlight] = weakref.WeakValueDictionary()
         # In the order of time.
         self._answered: dict[str, _Outcome] = {}
@@ -135,19 +130,12 @@ class Deduplication:
         for settler in older:
             settler("ack", "")
 
-    def answered(self, ids: Iterable[str]) -> None:
-        """Take note that other consumers have answered these; what is in flight or was settled here stays that."""
-        with self._lock:
-            for key in map(_key, ids):
-                if key not in self._in_flight and key not in self._answered:
-                    self._remember(key, _Outcome())
-
     def _remember(self, key: str, outcome: _Outcome) -> None:
         if not key:
             return
         self._answered.pop(key, None)
         self._answered[key] = outcome
-        if len(self._answered) > self._most_answered:
+        if len(self._answered) > _MOST_ANSWERED:
             del self._answered[next(iter(self._answered))]
 
 

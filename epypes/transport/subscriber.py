@@ -9,7 +9,7 @@ import os
 import queue as queues
 import threading
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, Protocol, Self, get_args
@@ -37,7 +37,8 @@ _NO_DELIVERY: Final = Delivery(())
 _FIELDS: Final = tuple(field.name for field in dataclasses.fields(Envelope))
 # A header of this size holds some 10,000 values, which take about 20 ms to decode: too long for the I/O thread.
 _LARGE_HEADER_BYTES: Final = 32 * 1024
-_MOST_LARGE: Final = 256
+# What a message that waits takes beside its frames, about.
+_OVERHEAD_BYTES: Final = 512
 # How long an ordered subscriber waits for a missing envelope: ZeroMQ sends none again, and a broker delivers the event
 # of a killed consumer again after some 5 s.
 _HOLD_S: Final = 1.0
@@ -297,10 +298,6 @@ class Subscriber(Endpoint):
         if self._channel is not None:
             self._channel.resume()
 
-    def answered(self, ids: Iterable[str]) -> None:
-        """Take note that other consumers have answered these: if they are delivered later they are duplicates."""
-        self._inbox.deduplication.answered(ids)
-
     def wait_joined(self, timeout_s: float = 5.0, publishers: int = 1) -> bool:
         """Return whether publishers have confirmed the subscription: what they send from then on is not lost.
 
@@ -381,7 +378,7 @@ class Inbox:
         # Held while a message is handled: on the thread of the channel, the one of large messages, or a timer's.
         # Re-entrant, since the queue of the user may stop the subscriber.
         self._handling = threading.RLock()
-        self._large = _LargeMessages(self._handle)
+        self._large = _LargeMessages(self._handle, self._limits.total_bytes)
 
     @property
     def dead_letters(self) -> int:
@@ -396,7 +393,7 @@ class Inbox:
         self._channel, self._keeps = channel, channel.keeps_messages
         self._starts += 1
         self.losses.begin()
-        self._large = _LargeMessages(self._handle)
+        self._large = _LargeMessages(self._handle, self._limits.total_bytes)
         self.is_over = False
 
     def abandon(self) -> None:
@@ -426,7 +423,7 @@ class Inbox:
         """Take a delivery; called by the channel."""
         if self._is_zeromq:
             frames, large = delivery.frames, self._large
-            if (len(frames) > 1 and len(frames[1]) > _LARGE_HEADER_BYTES) or large.handled != large.accepted:
+            if (len(frames) > 1 and len(frames[1]) > _LARGE_HEADER_BYTES) or large.is_busy:
                 if not large.put(delivery):
                     self._count_rejected("too many at once", "Large messages come faster than they are decoded.")
                 return
@@ -590,26 +587,38 @@ class Inbox:
 class _LargeMessages:
     """Messages with large headers, and those behind them: handled in order, on a thread that starts with the first.
 
+    Parameters
+    ----------
+    handle
+        Called with each.
+    most_bytes
+        Of all that wait; a single message may always wait.
+
     Attributes
     ----------
-    accepted, handled
-        How many messages; while they differ, what comes must wait for its turn.
     thread
         None before the first message.
     """
 
-    def __init__(self, handle: Callable[[Delivery], None]) -> None:
-        self._handle = handle
+    def __init__(self, handle: Callable[[Delivery], None], most_bytes: int) -> None:
+        self._handle, self._most_bytes = handle, most_bytes
         # Its put may be called by the garbage collector.
         self._waiting: queues.SimpleQueue[Delivery | None] = queues.SimpleQueue()
-        self.accepted = self.handled = 0
+        # Written by one thread each.
+        self._accepted_bytes = self._handled_bytes = 0
         self.thread: threading.Thread | None = None
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a message waits or is being handled: what comes after it must wait for its turn."""
+        return self._accepted_bytes != self._handled_bytes
 
     def put(self, delivery: Delivery) -> bool:
         """Hand over a message; return False if too many wait already. On the I/O thread."""
-        if self.accepted - self.handled >= _MOST_LARGE:
+        size = _size(delivery)
+        if self.is_busy and self._accepted_bytes - self._handled_bytes + size > self._most_bytes:
             return False
-        self.accepted += 1
+        self._accepted_bytes += size
         self._waiting.put(delivery)
         if self.thread is None:
             # Where the system has no thread to give just now, the next message asks for it again.
@@ -624,10 +633,19 @@ class _LargeMessages:
 
     def _run(self) -> None:
         while (delivery := self._waiting.get()) is not None:
-            self._handle(delivery)
+            size = _size(delivery)
+            try:
+                self._handle(delivery)
+            except BaseException:
+                # What can't be read is counted; this is a fault of ours, and must not stop the others.
+                log.exception("a message could not be handled")
             # Not kept in memory while the next one is waited for.
             del delivery
-            self.handled += 1
+            self._handled_bytes += size
+
+
+def _size(delivery: Delivery) -> int:
+    return sum(map(len, delivery.frames)) + _OVERHEAD_BYTES
 
 
 class _Delivered:

@@ -224,6 +224,30 @@ def test_large_messages_are_not_decoded_on_the_io_thread_and_the_order_is_kept(p
         assert noting.items.get(timeout=WAIT_S)[0] == "last"
 
 
+def test_large_messages_that_come_faster_than_they_are_decoded_are_dropped_beyond_a_bound_and_counted(peer):
+    class Held:
+        def __init__(self):
+            self.go_on, self.items = threading.Event(), []
+
+        def put(self, item, *, block):
+            assert self.go_on.wait(WAIT_S)
+            self.items.append(item.id)
+
+    held = Held()
+    with ZMQSubscriber(LOCAL, held, bind=True, max_message_bytes=2 * MB) as sub:
+        sender = peer(zmq.XPUB)
+        sender.connect(sub.address)
+        assert sender.recv() == b"\x01"
+        for number in range(5):
+            large = Envelope("large", {"bytes": bytes(600_000)}, id=str(number))
+            sender.send_multipart(encode(large, inline_below=MB))
+        wait_until(lambda: sub.rejected == {"too many at once": 2})
+        held.go_on.set()
+        wait_until(lambda: held.items == ["0", "1", "2"])
+        sender.send_multipart(encode(Envelope("small", id="5")))
+        wait_until(lambda: held.items[-1] == "5")
+
+
 def test_stop_waits_for_the_message_that_is_being_decoded_and_nothing_comes_after_it(peer):
     class Held:
         def __init__(self):
