@@ -113,7 +113,8 @@ def check_counts(counts):
     assert sum(counted["answered"] + counted["failed"] for counted in counts) >= COUNT // 2
 
 
-@on("nats")
+# RabbitMQ delivers again at once; NATS waits 5 s for the acknowledgement of each replica that was killed.
+@on("rabbitmq")
 def test_an_event_that_takes_down_each_replica_is_a_dead_letter_that_can_be_opened(bundle, brokered):
     sub = brokered.address("deadly.events", create=True, attempts=2)
     pub = brokered.address("deadly.answers", create=True)
@@ -132,42 +133,6 @@ def test_an_event_that_takes_down_each_replica_is_a_dead_letter_that_can_be_open
     with pytest.warns(UserWarning, match="none was run"):
         opened = ep.load_failure("event-0", bundle)
     assert (opened["number"], opened["kind"]) == (0, KILLS_PARENT)
-
-
-@on("rabbitmq")
-def test_a_change_of_hyperparameters_reaches_all_replicas_with_one_revision(bundle, brokered):
-    sub = brokered.address("tuned.events", create=True)
-    pub = brokered.address("tuned.answers", create=True)
-    outbox = ep.Mailbox("block")
-    with replicas(bundle, sub, pub) as members, Reader(pub) as reader, ep.Publisher(sub, outbox):
-        controls = [control(member) for member in members]
-        gains = {controls[0].parameters().revision: 2}
-
-        def is_answered() -> bool:
-            """Whether there is an answer of the last revision; others still wait to be answered."""
-            return reader.look() > 0 and max(gains) in {answer.revision for answer in reader.answers}
-
-        for number in range(300):
-            if number in (60, 120, 180):
-                until(is_answered, lambda: f"{reader.look()} answers")
-                gain = number // 10
-                gains[controls[number // 60 - 1].set(gain=gain).revision] = gain
-            outbox.put(event(number))
-        until(lambda: reader.look() >= 300, lambda: f"{reader.look()} answers of 300")
-        last = max(gains)
-        until(lambda: {found.parameters().revision for found in controls} == {last}, "all to have the last revision")
-        assert {found.parameters().entries["gain"]["value"] for found in controls} == {gains[last]}
-        begun = reader.look()
-        for number in range(300, 360):
-            outbox.put(event(number))
-        until(lambda: reader.look() >= 360, lambda: f"{reader.look()} answers of 360")
-        assert {answer.revision for answer in reader.answers[begun:]} == {last}
-        for found in controls:
-            found.close()
-    assert len(gains) == 4
-    for answer in reader.answers:
-        assert int(answer.parts["result"][1]) == gains[answer.revision]
-    assert {answer.revision for answer in reader.answers} == set(gains)
 
 
 def status(url):
@@ -215,9 +180,9 @@ def test_every_replica_describes_all_and_shows_a_killed_one_as_lost_also_to_newc
             until(lambda: first.group()["replicas"] == last.group()["replicas"] == 3, last.group)
             until(lambda: last.group()["agree"], last.group)
             until(lambda: [each["replica"] for each in last.group()["lost"]] == ["3"], last.group)
-        # One of the same name takes its place, as a supervisor starts it; the newcomer was killed.
+        # One of the same name takes its place, as a supervisor starts it.
         with replicas(bundle, sub, pub, names=["3"]):
-            until(lambda: [each["replica"] for each in first.group()["lost"]] == ["again"], first.group)
+            until(lambda: "3" not in [each["replica"] for each in first.group()["lost"]], first.group)
 
 
 def test_replicas_agree_again_after_their_broker_was_killed(bundle, nats):
