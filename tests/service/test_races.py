@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from pathlib import Path
 
+import psutil
 import pytest
 
 from epypes.errors import RevisionConflict, ServiceError
-from epypes.service import parameters, supervisor, worker_queries
+from epypes.service import parameters, worker_queries
 from tests.service.bundles import written_bundle
 from tests.service.served import SOURCE, TIMEOUT_S, acting_bundle, serving, until
 
@@ -35,7 +37,7 @@ def better(tmp_path):
 
 def test_a_large_table_does_not_keep_a_new_worker_from_taking_the_parameters(tmp_path):
     sample = {"what": "plain", "number": 3}, {"out": 6}
-    many = {"k": 2, "table": list(range(200_000))}
+    many = {"k": 2, "table": list(range(50_000))}
     bundle = written_bundle(tmp_path / "b", TABLE, ("what", "number"), ("out",), hyperparameters=many, sample=sample)
     with serving(bundle) as (service, peer):
         service.set_parameters({"k": 10})
@@ -84,33 +86,27 @@ def test_a_worker_that_refuses_the_parameters_of_the_last_one_is_not_used(tmp_pa
         assert "not again" in service.reason
 
 
-def test_a_worker_started_while_another_bundle_takes_over_is_not_used(acting, better, monkeypatch):
-    made, switched = threading.Event(), threading.Event()
+def workers():
+    """Return the process numbers of all workers of this process."""
+    return [each.pid for each in psutil.Process().children() if "epypes.service.worker" in each.cmdline()]
 
-    class Late(supervisor.WorkerConnection):
-        def __init__(self, served, *more):
-            super().__init__(served, *more)
-            if made_late and served.path == acting.resolve():
-                made.set()
-                switched.wait(TIMEOUT_S)
 
-    made_late = []
-    monkeypatch.setattr(supervisor, "WorkerConnection", Late)
-    with serving(acting) as (service, peer):
-        load = service._supervisor.load
-
-        def load_and_lose_the_other(served):
-            link = load(served)
-            made_late.append(True)
-            os.kill(service.info()["worker_pid"], signal.SIGKILL)
-            assert made.wait(TIMEOUT_S)
-            return link
-
-        service._supervisor.load = load_and_lose_the_other
+def test_a_worker_started_while_another_bundle_takes_over_is_not_used(better, tmp_path):
+    held, begun = tmp_path / "held", tmp_path / "begun"
+    waits = f"""
+    if os.path.exists({str(held)!r}):
+        open({str(begun)!r}, "w").close()
+    while os.path.exists({str(held)!r}):
+        time.sleep(0.01)
+"""
+    with serving(acting_bundle(tmp_path / "first", source=SOURCE + waits)) as (service, peer):
+        held.touch()
+        os.kill(service.info()["worker_pid"], signal.SIGKILL)
+        until(begun.exists)
         served_by = service.deploy(better)["worker_pid"]
-        switched.set()
+        held.unlink()
         assert peer.ask(number=5).parts["out"] == 15
-        until(lambda: service._supervisor._restart_s is None)
+        until(lambda: workers() == [served_by])
         assert (service.state, service.info()["worker_pid"]) == ("READY", served_by)
 
 
@@ -150,9 +146,9 @@ def test_a_change_that_another_bundle_overtakes_is_made_for_that_one_or_refused(
         assert (answer.parts["out"], answer.revision) == (5 * current.entries["k"]["value"], current.revision)
 
 
-def test_a_change_that_did_not_come_in_time_is_not_made_later(acting, tmp_path):
+def test_a_change_that_did_not_come_in_time_is_not_made_later(acting, tmp_path, monkeypatch):
+    monkeypatch.setattr("epypes.service.service._CHANGE_TIMEOUT_S", 0.3)
     with serving(acting, job_timeout_s=20) as (service, peer):
-        service._parameters._timeout_s = 0.1
         peer.send(f"hold:{tmp_path}", 1)
         until((tmp_path / "started").exists)
         with pytest.raises(ServiceError, match="nothing was changed"):
@@ -200,16 +196,14 @@ def test_a_drain_that_waits_holds_up_neither_the_stop_nor_a_resume(acting, tmp_p
         peer.take()
 
 
-def test_whether_it_is_paused_is_whether_events_wait_for_that(acting):
-    with serving(acting) as (service, peer):
-        service.pause()
-        # As if another thread had resumed it between two steps of that.
-        service._dispatcher.release("pause")
-        assert service.state == "READY"
-        assert peer.ask(number=2).parts["out"] == 4
-
-
 # -- what is seen of it ---------------------------------------------------------------------------------------------
+
+
+def faulted(service):
+    """Have a service be without a worker: its bundle is spoilt, and the worker killed."""
+    (Path(service.info()["bundle"]) / "pipeline.py").write_text("")
+    os.kill(service.info()["worker_pid"], signal.SIGKILL)
+    until(lambda: service.state == "FAULTED")
 
 
 def test_what_another_bundle_has_shown_is_not_shown_for_this_one(acting, better):
@@ -217,17 +211,18 @@ def test_what_another_bundle_has_shown_is_not_shown_for_this_one(acting, better)
         peer.ask(number=5)
         assert service.preview("k")[1].splitlines()[0] == b"2"
         service.deploy(better)
-        service._dispatcher.use(None)
+        faulted(service)
         with pytest.raises(ServiceError, match="no worker"):
             service.preview("k")
 
 
-def test_what_is_remembered_for_when_there_is_no_worker_is_bounded_in_bytes(acting, monkeypatch):
+def test_what_is_remembered_for_when_there_is_no_worker_is_bounded_in_bytes(better, monkeypatch):
     monkeypatch.setattr(worker_queries, "_MAX_BYTES", 1000)
-    with serving(acting) as (service, peer):
+    with serving(better) as (service, peer):
         peer.ask(number=5)
         for side in range(100, 400):
             service.preview("out", side)
-        known = service._queries._cache
-        assert 1 < sum(frame.nbytes for _, frames in known.values() for frame in frames) <= 1000
-        assert service._queries._bytes == sum(frame.nbytes for _, frames in known.values() for frame in frames)
+        faulted(service)
+        assert service.preview("out", 399)[1].splitlines()[0] == b"15"
+        with pytest.raises(ServiceError, match="no worker"):
+            service.preview("out", 100)
