@@ -18,6 +18,7 @@ import epypes as ep
 from epypes.bundle.seal import seal
 from epypes.errors import AddressError, BundleError, RemoteFailure, ServiceError
 from epypes.service import Client, Service, call
+from epypes.service.serving import serve
 from epypes.service.state_file import ServiceState, StateLock, running_at, state_file
 from epypes.wire import Envelope, encode
 from tests.colours import red_image, red_runner
@@ -104,19 +105,29 @@ def local():
 
 @pytest.mark.slow
 def test_a_service_in_another_process_answers_with_what_the_notebook_computed(edge_bundle, photograph):
+    """It is served once at a time, and a call to one that is stopped is not waited for without end."""
     expected = cv2.Canny(cv2.medianBlur(photograph, 5), 70, 200)
     with running(edge_bundle.path) as process:
         assert process.ready.startswith("READY")
         with Client(edge_bundle.path, timeout_s=TIMEOUT_S) as client:
             answers = [client.call({"image": photograph}) for _ in range(3)]
-        for answer in answers:
-            assert np.array_equal(answer.tokens["edges"], expected)
-            assert set(answer.timings_ns) == {"smooth", "canny"}
-            assert 0 < answer.overhead_ns < answer.total_ns < answer.round_trip_ns
+            for answer in answers:
+                assert np.array_equal(answer.tokens["edges"], expected)
+                assert set(answer.timings_ns) == {"smooth", "canny"}
+                assert 0 < answer.overhead_ns < answer.total_ns < answer.round_trip_ns
+            with pytest.raises(ServiceError, match=f"is being served already, by process {process.pid} at tcp://"):
+                serve(edge_bundle.path, ANY, ANY)
+            client.timeout_s = 0.5
+            process.send_signal(signal.SIGSTOP)
+            try:
+                with pytest.raises(ServiceError, match="did not answer within 0.5 s"):
+                    client.call({"image": photograph})
+            finally:
+                process.send_signal(signal.SIGCONT)
         process.send_signal(signal.SIGTERM)
         out, err = process.communicate(timeout=TIMEOUT_S)
         assert process.returncode == 0, err
-        assert "STOPPED received 3, answered 3, failed 0, dropped 0, retried 0, dead_letters 0" in out
+        assert "STOPPED received 4, answered 4, failed 0, dropped 0, retried 0, dead_letters 0" in out
     assert read_state(edge_bundle.path) is None
 
 
@@ -177,51 +188,23 @@ def test_a_port_in_use_is_named_and_nothing_is_left_behind(edge_bundle):
     assert str(port) in done.stderr
     assert "Traceback" not in done.stderr
     assert read_state(edge_bundle.path) is None
-    with running(edge_bundle.path, "--sub", f"tcp://127.0.0.1:{port}") as process:
-        assert f"tcp://127.0.0.1:{port}" in process.ready
+    with Service(edge_bundle.path, f"tcp://127.0.0.1:{port}") as service:
+        assert service.service_state.sub == f"tcp://127.0.0.1:{port}"
 
 
 @pytest.mark.slow
-def test_a_bundle_is_served_once(edge_bundle):
-    with running(edge_bundle.path) as process:
-        done = run_cli("serve", edge_bundle.path)
-        assert done.returncode == 1
-        assert f"is being served already, by process {process.pid} at tcp://127.0.0.1:" in done.stderr
-
-
-@pytest.mark.slow
-def test_a_killed_service_is_not_taken_for_a_running_one(edge_bundle, photograph):
-    with running(edge_bundle.path) as process:
-        process.kill()
-        process.wait(TIMEOUT_S)
-        assert state_file(edge_bundle.path).read_text()
-        with pytest.raises(ServiceError, match="No service runs for .* Start one: epypes serve"):
-            call(edge_bundle.path, {"image": photograph})
-    with running(edge_bundle.path):
-        assert call(edge_bundle.path, {"image": photograph}, timeout_s=TIMEOUT_S).tokens["edges"].any()
-
-
-@pytest.mark.slow
-def test_a_service_that_is_killed_while_it_works_is_told_to_the_caller(edge_bundle, photograph):
+def test_a_killed_service_is_an_error_at_once_and_is_not_taken_for_a_running_one(edge_bundle, photograph):
     with running(edge_bundle.path) as process, Client(edge_bundle.path, timeout_s=TIMEOUT_S) as client:
         client.call({"image": photograph})
         process.kill()
         process.wait(TIMEOUT_S)
         with pytest.raises(ServiceError, match="ended before it answered"):
             client.call({"image": photograph})
-
-
-@pytest.mark.slow
-def test_a_stopped_service_makes_the_call_time_out(edge_bundle, photograph):
-    with running(edge_bundle.path) as process, Client(edge_bundle.path, timeout_s=TIMEOUT_S) as client:
-        client.call({"image": photograph})
-        client.timeout_s = 1.0
-        process.send_signal(signal.SIGSTOP)
-        try:
-            with pytest.raises(ServiceError, match="did not answer within 1 s"):
-                client.call({"image": photograph})
-        finally:
-            process.send_signal(signal.SIGCONT)
+        assert state_file(edge_bundle.path).read_text()
+        with pytest.raises(ServiceError, match="No service runs for .* Start one: epypes serve"):
+            call(edge_bundle.path, {"image": photograph})
+    with running(edge_bundle.path):
+        assert call(edge_bundle.path, {"image": photograph}, timeout_s=TIMEOUT_S).tokens["edges"].any()
 
 
 @pytest.mark.slow

@@ -314,7 +314,7 @@ def rss(process):
     return process.memory_info().rss
 
 
-def test_two_thousand_events_leave_nothing_behind(inverting, tmp_path):
+def test_a_thousand_events_leave_nothing_behind(inverting, tmp_path):
     image, bad = np.full((500, 500), 14, np.uint8), np.full((500, 500), 13, np.uint8)
     with ready_worker(inverting, tmp_path) as front:
         process = psutil.Process(front.process.pid)
@@ -326,10 +326,10 @@ def test_two_thousand_events_leave_nothing_behind(inverting, tmp_path):
                     front.ask("svg")
                     front.values("image", "inverted")
 
-        some(400)
+        some(200)
         before, files = rss(process), process.num_fds()
-        some(2_000)
-        # Each event has 0.5 MB of images: were one in fifty kept, this would be 20 MB.
+        some(1_000)
+        # Each event has 0.5 MB of images: were one in twenty-five kept, this would be 20 MB.
         assert rss(process) - before < 10_000_000
         assert process.num_fds() == files
 
