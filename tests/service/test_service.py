@@ -20,6 +20,7 @@ from epypes.errors import AddressError, BundleError, RemoteFailure, ServiceError
 from epypes.service import Client, Service, call
 from epypes.service.serving import serve
 from epypes.service.state_file import ServiceState, StateLock, running_at, state_file
+from epypes.store import Store
 from epypes.wire import Envelope, encode
 from tests.colours import red_image, red_runner
 from tests.service.bundles import written_bundle
@@ -104,10 +105,10 @@ def local():
 
 
 @pytest.mark.slow
-def test_a_service_in_another_process_answers_with_what_the_notebook_computed(edge_bundle, photograph):
+def test_a_service_in_another_process_answers_with_what_the_notebook_computed(edge_bundle, photograph, tmp_path):
     """It is served once at a time, and a call to one that is stopped is not waited for without end."""
     expected = cv2.Canny(cv2.medianBlur(photograph, 5), 70, 200)
-    with running(edge_bundle.path) as process:
+    with running(edge_bundle.path, "--store", str(tmp_path / "events.sqlite")) as process:
         assert process.ready.startswith("READY")
         with Client(edge_bundle.path, timeout_s=TIMEOUT_S) as client:
             answers = [client.call({"image": photograph}) for _ in range(3)]
@@ -129,6 +130,9 @@ def test_a_service_in_another_process_answers_with_what_the_notebook_computed(ed
         assert process.returncode == 0, err
         assert "STOPPED received 4, answered 4, failed 0, dropped 0, retried 0, dead_letters 0" in out
     assert read_state(edge_bundle.path) is None
+    with Store(tmp_path / "events.sqlite") as store:
+        rows = store.series("events", *store.names("events")).rows()
+        assert [row["outcome"] for row in rows] == ["answered"] * 4
 
 
 @pytest.mark.slow

@@ -3,9 +3,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import signal
-import subprocess
-import sys
 import threading
 import time
 from contextlib import contextmanager
@@ -18,9 +15,8 @@ import pytest
 
 from epypes.bundle.seal import seal
 from epypes.display.views.jsonview import from_json
-from epypes.service.packing import MARK, unpack
-from epypes.service.worker_connection import frame_sockets
-from epypes.wire import Envelope, decode, encode
+from epypes.service.packing import unpack
+from epypes.wire import Envelope, decode
 from tests.service.bundles import written_bundle
 from tests.service.workers import TIMEOUT_S, ready_worker, worker_of
 
@@ -30,10 +26,7 @@ pytestmark = pytest.mark.slow
 SOURCE = '''
     """A graph whose functions do what they are told."""
 
-    import ctypes
     import os
-    import re
-    import signal
     import subprocess
     import sys
     import time
@@ -94,11 +87,6 @@ SOURCE = '''
         return "held"
 
 
-    def regex():
-        open(os.environ["STARTED"], "w").close()
-        return re.match(r"(a+)+$", "a" * 60 + "b")
-
-
     ACTIONS = {
         "fail": fail,
         "exit": lambda: sys.exit(3),
@@ -109,11 +97,6 @@ SOURCE = '''
         "object": object,
         "say": say,
         "hold": hold,
-        "regex": regex,
-        "kill": lambda: os.kill(os.getpid(), signal.SIGKILL),
-        "segv": lambda: ctypes.string_at(0),
-        "signals": lambda: [str(signal.getsignal(number)) for number in (signal.SIGINT, signal.SIGTERM)],
-        "pid": os.getpid,
         "zeros": lambda: np.zeros((400, 400), np.uint8),
     }
 
@@ -177,8 +160,6 @@ def test_a_worker_is_ready_when_the_bundle_computes_what_was_recorded(shared):
         (lambda text: text.replace("{what} {k}", "{what}-{k}"), "token 'out': expected 'plain 2', got 'plain-2'"),
         (lambda text: text + "import no_such_module\n", r"No module named 'no_such_module'"),
         (lambda text: text + "sys.exit(0)\n", r"failed at pipeline.py, line \d+: sys.exit\(0\): SystemExit: 0"),
-        (lambda text: text + "1 +\n", "SyntaxError"),
-        (lambda text: text.replace("func_io", "func_oi"), "defines no 'func_io'"),
         (lambda text: text.replace('return f"{what} {k}"', "fail()"), "not with me.*In function 'act'"),
     ],
 )
@@ -191,18 +172,6 @@ def test_a_bundle_that_does_not_compute_what_was_recorded_is_refused(acting, tmp
     with worker_of(folder, tmp_path) as front:
         header, _ = front.receive("refused")
         assert any(re.search(reason, found) for found in header["reasons"]), header
-        assert front.process.wait(TIMEOUT_S) == 1
-
-
-@pytest.mark.parametrize("name", ["pipeline.py", "pipeline.toml", "samples/run_1.npz"])
-def test_a_bundle_with_a_changed_file_is_refused(acting, tmp_path, name):
-    folder = tmp_path / "changed"
-    shutil.copytree(acting, folder)
-    with (folder / name).open("ab") as file:
-        file.write(b"\n")
-    with worker_of(folder, tmp_path) as front:
-        header, _ = front.receive("refused")
-        assert f"{name} was changed" in header["reasons"][0]
         assert front.process.wait(TIMEOUT_S) == 1
 
 
@@ -318,22 +287,6 @@ def test_events_are_done_in_their_order_by_one_slot(shared):
 
 
 # -- parameters ----------------------------------------------------------------------------------------------------
-
-
-def test_parameters_hold_for_the_events_after_them_and_their_revision_is_stamped(own):
-    with own() as front:
-        assert front.run(what="a")[1][0].revision == 0
-        for revision in range(1, 20):
-            front.set(revision, k=revision * 10)
-            front.send_event(Envelope(type="x", parts={"what": "a"}))
-            front.send_event(Envelope(type="x", parts={"what": "fail"}))
-        for revision in range(1, 20):
-            header, (answer,) = front.done()
-            assert (header["revision"], answer.revision) == (revision, revision)
-            assert answer.parts["out"] == f"a {revision * 10}"
-            header, (answer,) = front.done()
-            assert (header["revision"], answer.revision) == (revision, revision)
-            assert front.receive("parameters")[0]["revision"] == revision
 
 
 def test_parameters_are_refused_all_or_none_with_the_reason_of_each(own):
@@ -520,19 +473,6 @@ def test_a_function_that_fails_with_new_parameters_is_told_to_who_asked(tmp_path
         assert front.ask("run", tokens=["y"], revision=7)[0]["reason"] == "unknown revision"
 
 
-def test_what_runs_is_told_while_a_function_computes(own):
-    with own() as front:
-        seq = front.send_event(Envelope(type="x", parts={"what": "hold"}))
-        until(front.started.exists)
-        header, _ = front.ask("running")
-        assert header["running"] == ["act"]
-        assert [(slot["seq"], slot["functions"]) for slot in header["slots"]] == [(seq, ["act"])]
-        assert b"<svg" in front.ask("svg")[1][0], "others are answered too"
-        front.release.touch()
-        assert front.done()[1][0].parts["out"] == "held"
-        assert front.ask("running")[0]["running"] == []
-
-
 def test_too_many_questions_are_refused_and_none_is_left_without_answer(own):
     with own() as front:
         front.run(what="zeros")
@@ -569,76 +509,7 @@ def test_a_worker_whose_front_goes_ends_at_once_even_while_a_function_computes(o
         assert time.monotonic() - start < TIMEOUT_S / 2
 
 
-def test_a_worker_ends_with_the_thread_that_started_it_even_while_a_function_holds_the_interpreter(acting, tmp_path):
-    code = """
-import os, subprocess, sys
-channel, started = int(sys.argv[1]), sys.argv[3]
-worker = subprocess.Popen([sys.executable, "-I", "-m", "epypes.service.worker", sys.argv[1], sys.argv[2]],
-                          pass_fds=[channel], env={**os.environ, "STARTED": started})
-print(worker.pid, flush=True)
-sys.stdin.read()
-"""
-    ours, theirs = frame_sockets()
-    started = tmp_path / "started"
-    with theirs:
-        parent = subprocess.Popen(
-            [sys.executable, "-I", "-c", code, str(theirs.fileno()), str(acting), str(started)],
-            pass_fds=[theirs.fileno()],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-        )
-    try:
-        worker = psutil.Process(int(parent.stdout.readline()))
-        ours.send({"kind": "event", "seq": 1, "raw": False}, encode(Envelope(type="x", parts={"what": "regex"})))
-        until(started.exists)
-        # Its channel stays open: this is the end of the process that started it, and nothing else.
-        parent.kill()
-        until(lambda: not worker.is_running() or worker.status() == psutil.STATUS_ZOMBIE)
-    finally:
-        parent.kill()
-        parent.communicate()
-        ours.close()
-
-
-def test_a_worker_says_where_it_is_while_a_function_holds_the_interpreter(own):
-    with own() as front:
-        front.send_event(Envelope(type="x", parts={"what": "regex"}))
-        until(front.started.exists)
-        front.process.send_signal(signal.SIGUSR1)
-        text = until(lambda: "in regex" in front.faults.read_text() and front.faults.read_text())
-        assert re.search(r'File ".*/pipeline.py", line \d+ in regex', text)
-        front.process.kill()
-
-
-@pytest.mark.parametrize(("what", "number"), [("kill", signal.SIGKILL), ("segv", signal.SIGSEGV)])
-def test_an_event_that_kills_the_worker_is_the_end_of_the_channel(own, what, number):
-    with own() as front:
-        front.send_event(Envelope(type="x", parts={"what": what}))
-        with pytest.raises(EOFError):
-            front.done()
-        assert front.process.wait(TIMEOUT_S) == -number
-        if what == "segv":
-            assert re.search(
-                r"Segmentation fault.*Current thread.*in string_at.*in act", front.faults.read_text(), re.S
-            )
-
-
-def test_signals_for_the_front_do_not_end_its_worker(own):
-    with own() as front:
-        for number in (signal.SIGINT, signal.SIGTERM) * 3:
-            front.process.send_signal(number)
-        assert front.run(what="a")[1][0].parts["out"] == "a 2"
-
-
-@pytest.mark.parametrize("message", [b"garbage " * 9, MARK + b"\xff" * 40], ids=["garbage", "too many"])
-def test_a_worker_that_cannot_understand_its_front_ends_with_2(own, message):
-    with own() as front:
-        front.channel._socket.sendall(message)
-        assert front.process.wait(TIMEOUT_S) == 2
-        assert "can't be understood" in front.stderr.read_text()
-
-
-@pytest.mark.parametrize("header", [{"kind": "nonsense"}, {}, {"kind": "event"}, {"kind": "ask"}])
+@pytest.mark.parametrize("header", [{"kind": "nonsense"}, {"kind": "event"}])
 def test_a_worker_that_is_told_what_it_does_not_know_ends_with_2(own, header):
     with own() as front:
         front.channel.send(header)
