@@ -20,9 +20,10 @@ from epypes.transport.address import parse_address
 from tests.apart import apart
 from tests.brokers.nats import MAX_PAYLOAD, PASSWORD, server
 from tests.transport.channels import WAIT_S, Receiver, Sender, body
-from tests.transport.peers import line_of, process, wait_until
-from tests.transport.test_channels import KILLED
+from tests.transport.peers import wait_until
+from tests.transport.test_channels import impatient
 
+__all__ = ["impatient"]
 pytestmark = pytest.mark.slow
 
 
@@ -95,40 +96,12 @@ def program_that_says(greeting):
         assert not thread.is_alive()
 
 
-@pytest.fixture
-def impatient(monkeypatch):
-    """Intervals that are shorter than a user's, so that the tests of them are."""
-    for interval, value_s in {"ACK_WAIT_S": 1.0, "_REQUEST_S": 1.0, "_PING_S": 0.5, "_PROGRESS_S": 0.25}.items():
-        monkeypatch.setattr(f"epypes.transport.brokers.nats.{interval}", value_s)
-
-
-def test_what_is_acknowledged_is_gone(opened, name, by_hand):
-    opened(Sender).send(b"x")
-    receiver = opened(Receiver)
-    receiver.next().ack()
-    receiver.channel.close()
-    state = by_hand(lambda jetstream: jetstream.stream_info(name.replace(".", "_"))).state
-    assert state.messages == 0
-
-
-def test_what_a_killed_consumer_held_is_delivered_again_after_the_acknowledgement_wait(impatient, opened, nats, name):
-    # The first consumer decides how long the server waits for an acknowledgement.
-    opened(Receiver).channel.close()
-    opened(Sender).send(b"x", id="1")
-    with process(KILLED, nats.address(name), "1") as consumer:
-        assert {line_of(consumer), line_of(consumer)} == {"open", "holds"}
-        consumer.kill()
-        consumer.wait()
-    delivery = opened(Receiver).next()
-    assert (delivery.id, delivery.attempt) == ("1", 2)
-
-
 def test_what_takes_long_is_not_delivered_again(impatient, opened):
     sender, worker, other = opened(Sender), opened(Receiver, prefetch=1), None
     sender.send(b"x")
     delivery = worker.next()
     other = opened(Receiver, prefetch=1)
-    assert other.is_quiet(2.5)
+    assert other.is_quiet(1.5)
     delivery.ack()
     sender.send(b"y")
     worker.channel.close()
@@ -140,7 +113,7 @@ def test_the_last_of_a_window_comes_however_late_it_is_sent(impatient, opened):
     for _ in range(3):
         sender.send(b"early")
         receiver.next()
-    assert receiver.is_quiet(2.5)
+    assert receiver.is_quiet(1.2)
     sender.send(b"late")
     assert body(receiver.next()) == b"late"
 
