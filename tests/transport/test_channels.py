@@ -157,11 +157,11 @@ def test_a_message_over_the_limit_of_the_channel_is_refused(queue, opened):
 def test_what_is_sent_before_or_after_the_consumer_came_arrives_in_order(queue, opened, is_early):
     made = opened(Sender, queue) if is_early else opened(Receiver, queue, prefetch=8)
     sender = made if is_early else opened(Sender, queue)
-    for number in range(200):
+    for number in range(100):
         sender.channel.send([b"%d" % number])
     wait_until(lambda: sender.channel.waiting == 0, WAIT_S)
     receiver = opened(Receiver, queue, prefetch=8) if is_early else made
-    for number in range(200):
+    for number in range(100):
         delivery = receiver.next()
         assert body(delivery) == b"%d" % number
         delivery.ack()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import queue
 import subprocess
 import sys
-import threading
 
 import numpy as np
 import pytest
@@ -150,21 +149,6 @@ def test_a_queue_whose_get_wants_to_end_the_process_is_counted_as_failed():
         out.put(b"x")
         wait_until(lambda: pub.sent == 1)
         assert pub.rejected == {"queue failed": 1}
-
-
-def test_what_is_queued_is_sent_at_the_stop_though_the_queue_can_not_tell_its_size(monkeypatch):
-    class Unsized(queue.Queue):
-        def qsize(self):
-            raise NotImplementedError
-
-    raised, out = [], Unsized()
-    monkeypatch.setattr(threading, "excepthook", raised.append)
-    pub = ZMQPublisher(LOCAL, out).start()
-    for _ in range(100):
-        out.put(b"x")
-    pub.stop()
-    assert pub.sent == 100
-    assert not raised
 
 
 def test_a_queue_whose_put_wants_to_end_the_process_is_counted_and_the_other_sockets_live():
