@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import pytest
 
 import epypes as ep
@@ -135,15 +132,7 @@ def test_an_event_that_takes_down_each_replica_is_a_dead_letter_that_can_be_open
     assert (opened["number"], opened["kind"]) == (0, KILLS_PARENT)
 
 
-def status(url):
-    """Return what ``epypes status`` prints."""
-    done = subprocess.run(
-        [sys.executable, "-m", "epypes.cli", "status", url], capture_output=True, text=True, timeout=60, check=True
-    )
-    return done.stdout
-
-
-def test_every_replica_describes_all_and_shows_a_killed_one_as_lost_also_to_newcomers(bundle, nats):
+def test_every_replica_describes_all_and_shows_a_killed_one_as_lost_also_to_newcomers(bundle, nats, epypes):
     sub, pub = nats.address("described.events", create=True), nats.address("described.answers", create=True)
     outbox = ep.Mailbox("block")
     with (
@@ -161,7 +150,7 @@ def test_every_replica_describes_all_and_shows_a_killed_one_as_lost_also_to_newc
         assert first.set(gain=5).revision == 1
         until(lambda: third.parameters().revision == 1, third.group)
         until(lambda: first.group()["agree"], first.group)
-        shown = status(first.url)
+        shown = epypes("status", first.url).stdout
         assert "Group: replicas 3, ready 3" in shown
         assert f"process {members[2].process.pid}" in shown
         members[2].kill()
@@ -169,10 +158,10 @@ def test_every_replica_describes_all_and_shows_a_killed_one_as_lost_also_to_newc
         until(lambda: first.group()["lost"], first.group)
         (lost,) = first.group()["lost"]
         assert (lost["state"], lost["pid"], lost["counts"]["failed"]) == ("LOST", members[2].process.pid, 0)
-        (line,) = (line for line in status(first.url).splitlines() if "LOST" in line)
+        (line,) = (line for line in epypes("status", first.url).stdout.splitlines() if "LOST" in line)
         assert line.startswith("- 3: LOST (no heartbeat for ")
         assert " s, and it did not stop in order; its counts are of then), " in line
-        assert "Group: replicas 2, ready 2, lost 1, all with" in status(first.url)
+        assert "Group: replicas 2, ready 2, lost 1, all with" in epypes("status", first.url).stdout
         with replicas(bundle, sub, pub, names=["again"]) as (newcomer,), control(newcomer) as last:
             # It is ready at once; its events wait until it has the parameters of the others.
             until(lambda: last.parameters().revision == 1, last.group)
