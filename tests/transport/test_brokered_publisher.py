@@ -194,51 +194,6 @@ def test_no_put_waits_for_a_publisher_that_was_forgotten(broker, address):
 # The paper's pipelines between them
 
 
-def halves(x):
-    if x % 10 == 7:
-        raise ValueError(f"{x} is odd")
-    return x / 2
-
-
-@pytest.mark.slow
-def test_every_event_is_answered_once_or_a_dead_letter_though_the_broker_goes_away(broker):
-    requests, answers = f"memory://{broker}/requests?create=true", f"memory://{broker}/answers?create=true"
-    out, q_in, q_out, collected = queue.Queue(), queue.Queue(), ep.Mailbox("block", 8), queue.Queue()
-
-    def f_out(view):
-        return Envelope("half", {"half": view["halves"]}, id=view.event.id, correlation_id=view.event.id)
-
-    graph = ep.CompGraph.from_functions(halves)
-    pipe = ep.FullPipeline("half", graph, q_in, q_out, lambda event: {"x": event.parts["x"]}, f_out)
-    pipe.on_error = lambda failure: None
-    found = {}
-    with (
-        Publisher(requests, out) as robot,
-        Subscriber(requests, q_in) as sub,
-        Publisher(answers, q_out) as pub,
-        Subscriber(answers, collected) as collector,
-        pipe,
-    ):
-        for number in range(200):
-            out.put(Envelope("request", {"x": number}, id=f"event {number}"))
-        for wanted in (60, 120):
-            while len(found) < wanted:
-                answer = take(collected)
-                found[answer.correlation_id] = answer.parts["half"]
-                answer.ack()
-            with away(broker):
-                wait_until(lambda: not (sub.is_connected or collector.is_connected))
-        while len(found) < 180:
-            answer = take(collected)
-            assert answer.correlation_id not in found
-            found[answer.correlation_id] = answer.parts["half"]
-            answer.ack()
-        wait_until(lambda: sub.dead_letters == 20)
-        assert (robot.sent, sub.received, pub.sent, pipe.failed) == (200, 200, 180, 20)
-    assert found == {f"event {number}": number / 2 for number in range(200) if number % 10 != 7}
-    assert queued(requests) == queued(answers) == []
-
-
 def test_an_answer_that_is_not_confirmed_leaves_its_event_to_be_delivered_again(broker):
     requests, answers = f"memory://{broker}a/requests?create=true", f"memory://{broker}b/answers?create=true"
     q_in, q_out = queue.Queue(), ep.Mailbox("block", 8)

@@ -18,6 +18,8 @@ from epypes.errors import AddressError, BrokerError, MessageError
 from epypes.transport import memory
 from epypes.transport.address import open_channel, parse_address
 from epypes.transport.channel import ChannelOptions
+from tests.brokers import mosquitto as mosquitto_servers
+from tests.brokers import nats as nats_servers
 from tests.transport.channels import WAIT_S, Receiver, Sender, body
 from tests.transport.peers import line_of, process, wait_until
 
@@ -575,6 +577,31 @@ def test_a_message_larger_than_the_broker_takes_is_refused_and_the_next_goes_out
     assert refused.value.reason == "too large"
     sender.send(b"a")
     assert body(receiver.next()) == b"a"
+
+
+@pytest.fixture(params=at("rabbitmq", "nats", "mosquitto"))
+def encrypted(request, certificates):
+    """Each of the real servers, with encryption: a function that gives addresses of it."""
+    if request.param == "rabbitmq":
+        rabbitmq = request.getfixturevalue("rabbitmq")
+        yield lambda name, **options: rabbitmq.address(name, scheme="amqps", **options)
+        return
+    module = {"nats": nats_servers, "mosquitto": mosquitto_servers}[request.param]
+    with module.server(tls=(certificates / "cert.pem", certificates / "key.pem")) as server:
+        yield server.address
+
+
+# paho leaves the socket of a handshake that fails to the garbage collector.
+@pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
+def test_an_encrypted_broker_is_checked_by_its_certificate(encrypted, certificates, name, opened, tmp_path):
+    address = encrypted(name, create=True, ca=certificates / "ca.pem")
+    receiver = opened(Receiver, address)
+    opened(Sender, address).send(b"secret" * 100_000)
+    assert body(receiver.next()) == b"secret" * 100_000
+    with pytest.raises(BrokerError, match=r"can't be trusted.*\?ca=FILE"):
+        Sender(encrypted(name))
+    with pytest.raises(BrokerError, match="can't be read from .*nowhere"):
+        Sender(encrypted(name, ca=tmp_path / "nowhere"))
 
 
 def test_an_unencrypted_broker_on_another_machine_is_warned_of_once(server, name, opened, caplog):

@@ -248,22 +248,6 @@ def test_what_is_too_large_is_refused_and_whatever_can_be_sent_can_be_rejected(n
         assert len(body(opened(Receiver, parse_address(address).dead_letters).next())) == 2_800
 
 
-# paho leaves the socket of a handshake that fails to the garbage collector.
-@pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
-def test_an_encrypted_broker_is_checked_by_its_certificate(certificates, name, opened, tmp_path):
-    with servers.server(tls=(certificates / "cert.pem", certificates / "key.pem")) as server:
-        address = server.address(name, create=True, ca=certificates / "ca.pem")
-        receiver = opened(Receiver, address)
-        opened(Sender, address).send(b"secret" * 100_000)
-        assert body(receiver.next()) == b"secret" * 100_000
-        with pytest.raises(BrokerError, match=r"can't be trusted.*\?ca=FILE"):
-            Sender(server.address(name))
-        with pytest.raises(BrokerError, match="can't be read from .*nowhere"):
-            Sender(server.address(name, ca=tmp_path / "nowhere"))
-        with pytest.raises(BrokerError):
-            Sender(server.address(name).replace("mqtts:", "mqtt:"), timeout_s=2.0)
-
-
 def test_a_silent_broker_is_lost(name, opened, monkeypatch):
     # The least that mosquitto takes; the broker gives up after one and a half of it, the client after two.
     monkeypatch.setattr("epypes.transport.brokers.mqtt._KEEP_ALIVE_S", 1)

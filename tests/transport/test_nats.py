@@ -18,7 +18,7 @@ import pytest
 from epypes.errors import BrokerError, MessageError
 from epypes.transport.address import parse_address
 from tests.apart import apart
-from tests.brokers.nats import MAX_PAYLOAD, PASSWORD, server
+from tests.brokers.nats import PASSWORD, server
 from tests.transport.channels import WAIT_S, Receiver, Sender, body
 from tests.transport.peers import wait_until
 from tests.transport.test_channels import impatient
@@ -186,14 +186,9 @@ def test_one_stream_may_keep_events_answers_and_dead_letters_of_one_id(opened, n
         opened(Receiver, f"{name}.out", group="in", create=False, dead=f"{name}.dead")
 
 
-@pytest.mark.parametrize(
-    ("credentials", "text"),
-    [("epypes:wrong@", "refuses the user 'epypes' with this password"), ("", "refuses a connection without a user")],
-)
-def test_refused_credentials_are_an_error_without_the_password(nats, credentials, text):
-    with pytest.raises(BrokerError, match=text) as refused:
-        Sender(f"nats://{credentials}127.0.0.1:{nats.port}/a")
-    assert "wrong" not in str(refused.value)
+def test_a_connection_without_a_user_is_refused(nats):
+    with pytest.raises(BrokerError, match="refuses a connection without a user"):
+        Sender(f"nats://127.0.0.1:{nats.port}/a")
     assert PASSWORD not in str(parse_address(nats.address("a")))
 
 
@@ -218,15 +213,6 @@ def test_a_server_without_jetstream_is_an_error_for_queues_alone(opened):
 def test_a_name_that_can_not_be_a_subject_is_an_error(opened, subject):
     with pytest.raises(BrokerError, match="is no subject of NATS"):
         opened(Sender, subject.replace(" ", "%20"))
-
-
-def test_a_message_larger_than_the_server_takes_is_refused_and_the_next_one_goes_out(opened):
-    sender, receiver = opened(Sender), opened(Receiver)
-    with pytest.raises(MessageError, match=r"8,388,608 at most. Raise max_payload") as refused:
-        sender.send(bytes(MAX_PAYLOAD), id="large")
-    assert refused.value.reason == "too large"
-    sender.send(bytes(MAX_PAYLOAD - 1_000), id="fits")
-    assert receiver.next().id == "fits"
 
 
 def test_what_a_stream_refuses_is_an_error_or_waits(opened, name, by_hand, caplog):
@@ -300,18 +286,6 @@ def test_a_server_that_talks_nonsense_is_an_error(caplog):
     with program_that_says(info) as (port, _), pytest.raises(BrokerError, match="what answers there is no NATS server"):
         Sender(f"nats://127.0.0.1:{port}/a?kind=broadcast")
     assert not caplog.records
-
-
-def test_an_encrypted_server_is_checked_by_the_named_certificates(opened, certificates):
-    with server(tls=(certificates / "cert.pem", certificates / "key.pem")) as encrypted:
-        receiver = opened(Receiver, "a", at=encrypted, ca=certificates / "ca.pem")
-        opened(Sender, "a", at=encrypted, ca=certificates / "ca.pem").send(b"x" * 100_000, id="1")
-        assert receiver.next().id == "1"
-        receiver.channel.close()
-        with pytest.raises(BrokerError, match=r"can't be trusted: .*\?ca=FILE"):
-            opened(Sender, "a", at=encrypted)
-        with pytest.raises(BrokerError, match="can't be read from /nowhere"):
-            opened(Sender, "a", at=encrypted, ca="/nowhere")
 
 
 def test_a_server_that_does_not_encrypt_gets_no_password(certificates):

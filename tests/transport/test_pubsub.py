@@ -100,39 +100,12 @@ def test_a_publisher_of_2019_is_understood(peer):
         assert not sub.wait_joined(0.01)
 
 
-def test_a_second_subscription_keeps_the_first_one_going(peer):
-    out, into = queue.Queue(), queue.Queue()
-    with ZMQPublisher(LOCAL, out, "t") as pub, ZMQSubscriber(pub.address, into, "t") as sub:
-        assert sub.wait_joined(WAIT_S)
-        with ZMQSubscriber(pub.address, queue.Queue(), "t") as other:
-            assert other.wait_joined(WAIT_S)
-        for number in range(20):
-            out.put(Envelope("x", {"n": number}))
-        assert [into.get(timeout=WAIT_S).parts["n"] for _ in range(20)] == list(range(20))
-        assert pub.wait_for_subscriber(0.0)
-
-
 def test_a_publisher_knows_when_the_last_subscriber_has_gone():
     with ZMQPublisher(LOCAL, queue.Queue()) as pub:
         assert not pub.wait_for_subscriber(0.0)
         with ZMQSubscriber(pub.address, queue.Queue(), "a"), ZMQSubscriber(pub.address, queue.Queue(), "a"):
             assert pub.wait_for_subscriber(WAIT_S)
         wait_until(lambda: not pub.wait_for_subscriber(0.0))
-
-
-def test_garbage_is_counted_and_the_next_message_arrives(peer, caplog):
-    into = queue.Queue()
-    with ZMQSubscriber(LOCAL, into, bind=True) as sub:
-        socket = peer(zmq.XPUB)
-        socket.connect(sub.address)
-        assert socket.recv() == b"\x01"
-        for garbage in ([b"a", b"b"], [b"/", b"\xff\xff"], [b"", b"", b""], [b"/"] * 3, [b"x"] * 5):
-            socket.send_multipart(garbage)
-        socket.send_multipart(encode(Envelope("good")))
-        assert into.get(timeout=WAIT_S).type == "good"
-        assert sub.rejected == {"bad topic": 3, "no envelope": 2}
-        assert sub.received == 1
-    assert "rejected a message (bad topic)" in caplog.text
 
 
 def test_a_refused_oversized_message_names_its_size_and_the_limit(caplog):
@@ -197,25 +170,16 @@ def test_a_port_in_use_is_named_with_a_way_out(kind):
         assert caught.value.address == pub.address
 
 
-@pytest.mark.parametrize("address", ["", "127.0.0.1:5555", "tcp://127.0.0.1", "tcp://127.0.0.1:99999", "nope://x"])
 @pytest.mark.parametrize("bind", [True, False])
-def test_a_malformed_address_is_an_address_error(address, bind):
-    with pytest.raises(AddressError):
-        ZMQPublisher(address, queue.Queue(), bind=bind).start()
+def test_a_malformed_address_is_an_address_error(bind):
+    for address in ("", "127.0.0.1:5555", "tcp://127.0.0.1", "tcp://127.0.0.1:99999", "nope://x"):
+        with pytest.raises(AddressError):
+            ZMQPublisher(address, queue.Queue(), bind=bind).start()
 
 
 def test_an_address_of_another_machine_is_an_address_error():
     with pytest.raises(AddressError, match="no such address"):
         ZMQPublisher("tcp://192.0.2.1:5555", queue.Queue(), insecure=True).start()
-
-
-@pytest.mark.parametrize("kind", [ZMQPublisher, ZMQSubscriber])
-@pytest.mark.parametrize("address", ["tcp://*:5555", "tcp://0.0.0.0:5555", "tcp://10.0.0.1:5555", "tcp://eth0:5555"])
-def test_binding_for_other_machines_must_be_asked_for(kind, address):
-    with pytest.raises(AddressError, match="insecure=True"):
-        kind(address, queue.Queue(), bind=True)
-    kind(address, queue.Queue(), bind=True, insecure=True)
-    kind(address, queue.Queue(), bind=False)
 
 
 def test_a_topic_that_is_none_is_refused_at_once():
