@@ -55,6 +55,11 @@ FAILING = '''
         pass
 
 
+    class Speechless(Exception):
+        def __str__(self):
+            raise RuntimeError("no text")
+
+
     def fail(what):
         if what == "good":
             return what
@@ -62,6 +67,14 @@ FAILING = '''
             return object()
         if what == "exit":
             raise SystemExit(0)
+        if what == "interrupt":
+            raise KeyboardInterrupt
+        if what == "speechless":
+            raise Speechless
+        if what == "memory":
+            raise MemoryError("no room")
+        if what == "recursion":
+            return fail(what)
         error = Odd({"half a pair": "\\ud800 bad", "long": "x" * 10**7}.get(what, ""))
         error.__notes__ = {"number": [1], "long": ["note " * 10_000]}.get(what)
         raise error
@@ -299,6 +312,10 @@ def test_whatever_a_function_raises_or_returns_is_answered_and_the_service_goes_
     failures = {
         "object": "Function 'f_out' failed in the service: MessageError",
         "exit": "SystemExit",
+        "interrupt": "KeyboardInterrupt",
+        "memory": "MemoryError: no room",
+        "speechless": "Speechless: .its message can't be had",
+        "recursion": "RecursionError: maximum recursion depth",
         "half a pair": "Function 'fail' failed in the service: Odd",
         "long": "Function 'fail' failed in the service: Odd",
         "number": "Function 'fail' failed in the service: Odd",

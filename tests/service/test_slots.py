@@ -207,35 +207,6 @@ def test_slots_work_on_as_many_events_at_once_as_there_are(meeting, tmp_path):
             assert all(header["failure"] is None for header, _ in done)
 
 
-def test_parameters_wait_until_no_slot_works_and_hold_for_all_events_after_them(tmp_path):
-    source = """
-        import time
-
-
-        def scaled(x, k):
-            time.sleep(x / 1000)
-            return k
-
-
-        func_dict = {"scaled": scaled}
-        func_io = {"scaled": (("x", "k"), "y")}
-    """
-    sample = {"x": 0}, {"y": 1}
-    bundle = written_bundle(tmp_path / "b", source, ["x"], ["y"], hyperparameters={"k": 1}, sample=sample)
-    with ready_worker(bundle, tmp_path, "--threads", "3") as front:
-        expected = {}
-        for revision in range(1, 30):
-            front.set(revision, k=revision * 100)
-            for number in range(revision % 5):
-                seq = front.send_event(Envelope(type="x", parts={"x": (revision * 7 + number * 3) % 11}))
-                expected[seq] = revision
-        for _ in range(len(expected)):
-            header, (answer,) = front.done()
-            revision = expected.pop(header["seq"])
-            assert (header["revision"], answer.revision, answer.parts["y"]) == (revision, revision, revision * 100)
-        assert not expected
-
-
 # -- what a worker keeps -------------------------------------------------------------------------------------------
 
 IMAGES = """
