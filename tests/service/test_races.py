@@ -217,12 +217,12 @@ def test_what_another_bundle_has_shown_is_not_shown_for_this_one(acting, better)
 
 
 def test_what_is_remembered_for_when_there_is_no_worker_is_bounded_in_bytes(better, monkeypatch):
-    monkeypatch.setattr(worker_queries, "_MAX_BYTES", 1000)
+    monkeypatch.setattr(worker_queries, "_MAX_BYTES", 50)
     with serving(better) as (service, peer):
         peer.ask(number=5)
-        for side in range(100, 400):
+        for side in range(100, 120):
             service.preview("out", side)
         faulted(service)
-        assert service.preview("out", 399)[1].splitlines()[0] == b"15"
+        assert service.preview("out", 119)[1].splitlines()[0] == b"15"
         with pytest.raises(ServiceError, match="no worker"):
             service.preview("out", 100)
