@@ -101,11 +101,14 @@ def test_frames_that_kill_the_worker_one_after_another_are_put_aside_and_the_ser
 
 
 def test_events_that_do_not_return_one_after_another_are_reported_and_the_service_stays_up(acting, quick):
-    with serving(acting, mailbox_size=100, job_timeout_s=0.1) as (_, peer):
+    states = []
+    with serving(acting, mailbox_size=100, job_timeout_s=0.1) as (service, peer):
+        service.listen(lambda kind, data: states.append(data["state"]) if kind == "state" else None)
         for number in range(5):
             peer.send("sleep:100", number)
         assert all("did not return within 0.1 s" in answer.failure.message for answer in peer.take(5))
         assert peer.ask_until_answered(number=4).parts["out"] == 8
+    assert "FAULTED" not in states
 
 
 def test_a_worker_that_ends_as_soon_as_it_is_ready_is_a_fault_and_everybody_is_told(acting, tmp_path, quick):
