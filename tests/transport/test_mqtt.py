@@ -145,7 +145,7 @@ def test_channels_that_make_the_same_queue_at_the_same_moment_do_not_disturb_eac
 
 
 def test_what_a_consumer_was_still_fetching_from_a_session_when_it_ended_reaches_the_next_one(opened, queue):
-    ids = list(map(str, range(300)))
+    ids = list(map(str, range(120)))
     sender, outcomes = opened(Sender, queue), []
     for known_as in ids:
         sender.channel.send([b"a"], id=known_as, confirmed=outcomes.append)
@@ -178,7 +178,7 @@ def test_what_a_consumer_was_fetching_from_a_session_when_the_broker_was_killed_
     name, opened, monkeypatch
 ):
     monkeypatch.setattr(mqtt, "_ANSWER_S", 0.5)
-    ids = list(map(str, range(300)))
+    ids = list(map(str, range(120)))
     with servers.server() as server:
         address = server.address(name, create=True)
         sender, outcomes = opened(Sender, address), []
