@@ -173,8 +173,9 @@ def test_a_service_that_was_drained_twice_resumes_where_it_was(acting, tmp_path)
         assert service.service_state.sub == sub
         (tmp_path / "release").touch()
         assert service.drain()
+        assert service.state == "DRAINING"
         service.resume()
-        assert service.service_state.sub == sub
+        assert (service.state, service.service_state.sub) == ("READY", sub)
         peer.take()
         assert peer.ask(number=2).parts["out"] == 4
 

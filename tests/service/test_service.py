@@ -33,19 +33,13 @@ ANY = "tcp://127.0.0.1:*"
 IMAGES = '''
     """Functions of images that a service must stand."""
 
-    import numpy as np
 
-    BUFFER = np.zeros((1000, 1000), np.uint8)
-
-
-    def reuse(image):
-        if image.shape != BUFFER.shape:
-            return image + 1
-        return np.add(image, 1, out=BUFFER)
+    def brighten(image):
+        return image + 1
 
 
-    func_dict = {"reuse": reuse}
-    func_io = {"reuse": ("image", "out")}
+    func_dict = {"brighten": brighten}
+    func_io = {"brighten": ("image", "out")}
 '''
 FAILING = '''
     """Failures that a service must stand."""
@@ -285,16 +279,6 @@ def test_load_pipeline_gives_the_pipeline_that_serve_runs(edge_bundle, photograp
 
 
 @pytest.mark.slow
-def test_an_event_whose_function_writes_into_a_constant_array_fails_and_the_next_is_answered(local, image_bundle):
-    local(image_bundle)
-    with Client(image_bundle, timeout_s=TIMEOUT_S) as client:
-        for value in range(3):
-            with pytest.raises(RemoteFailure, match="output array is read-only"):
-                client.call({"image": np.full((1000, 1000), value, np.uint8)})
-            assert (client.call({"image": np.full((3, 3), value, np.uint8)}).tokens["out"] == value + 1).all()
-
-
-@pytest.mark.slow
 def test_threads_that_share_a_client_each_get_their_own_answer(local, image_bundle):
     local(image_bundle)
     with Client(image_bundle, timeout_s=TIMEOUT_S) as client, ThreadPoolExecutor(4) as pool:
@@ -352,21 +336,6 @@ def test_every_event_is_answered_dropped_ones_and_those_that_wait_at_the_stop_to
         assert all(answer.failure is None for answer in rest)
     expected = {"received": 30, "answered": 9, "failed": 0, "dropped": 21, "rejected": 0}
     assert {name: service.counts()[name] for name in expected} == expected
-
-
-@pytest.mark.slow
-def test_what_can_not_be_finished_in_time_is_answered_at_the_stop_with_the_function_that_it_is_in(acting, tmp_path):
-    with serving(acting) as (service, peer):
-        peer.send(f"hold:{tmp_path}", 0)
-        until((tmp_path / "started").exists)
-        for number in (1, 2):
-            peer.send(number=number)
-        until(lambda: service.counts()["waiting"] == 2)
-        service.stop(0.3)
-        answers = {answer.correlation_id: answer.failure for answer in peer.take(3)}
-        assert "the service stops while it is in act" in answers[peer.sent[0]].message
-        assert all("the service stops" in answers[waited].message for waited in peer.sent[1:])
-    assert (service.counts()["failed"], service.counts()["dropped"]) == (1, 2)
 
 
 def test_a_state_file_that_somebody_wrote_into_is_not_believed(edge_bundle, photograph):

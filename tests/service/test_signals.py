@@ -68,16 +68,21 @@ def _accepts(state):
 
 
 def test_what_does_not_return_is_reported_within_the_drain_and_the_exit_is_0(acting, tmp_path):
-    with served_apart(acting, "--drain-timeout", "0.5") as (process, peer):
+    with served_apart(acting, "--drain-timeout", "0.5", "--mailbox-size", "1") as (process, peer):
         worker = worker_of(process)
         peer.send(f"hold:{tmp_path}", 1)
         until((tmp_path / "started").exists)
+        for number in (2, 3):
+            peer.send(number=number)
+        # That the second is dropped tells that the last has come.
+        assert peer.take()[0].correlation_id == peer.sent[1]
         process.send_signal(signal.SIGTERM)
-        (answer,) = peer.take()
-        assert "the service stops while it is in act" in answer.failure.message
+        answers = {answer.correlation_id: answer.failure.message for answer in peer.take(2)}
+        assert "the service stops while it is in act" in answers[peer.sent[0]]
+        assert "the service stops" in answers[peer.sent[2]]
         out, err = ended(process)
         assert process.returncode == 0, err
-        assert "received 1, answered 0, failed 1" in out
+        assert "received 3, answered 0, failed 1, dropped 2" in out
         assert not worker.is_running()
 
 

@@ -164,49 +164,6 @@ def test_parameters_that_a_pipeline_of_its_own_refuses_are_set_in_no_slot(owning
         assert {front.run(text="a")[1][0].parts["repeated"] for _ in range(9)} == {"aaa"}
 
 
-# -- side by side --------------------------------------------------------------------------------------------------
-
-MEETING = '''
-    import os
-    import threading
-    import time
-
-
-
-    def meet(place):
-        """Return when as many have come as are told."""
-        folder, name, count = place.split("|")
-        open(os.path.join(folder, name), "w").close()
-        while len(os.listdir(folder)) < int(count):
-            time.sleep(0.002)
-        return threading.current_thread().name
-
-
-    func_dict = {"meet": meet}
-    func_io = {"meet": ("place", "thread")}
-'''
-
-
-@pytest.fixture
-def meeting(tmp_path):
-    place = tmp_path / "sample"
-    place.mkdir()
-    sample = {"place": f"{place}|a|1"}, {"thread": "MainThread"}
-    return written_bundle(tmp_path / "meeting", MEETING, ["place"], ["thread"], sample=sample)
-
-
-def test_slots_work_on_as_many_events_at_once_as_there_are(meeting, tmp_path):
-    with ready_worker(meeting, tmp_path, "--threads", "3") as front:
-        for turn in range(3):
-            folder = tmp_path / f"turn{turn}"
-            folder.mkdir()
-            for number in range(3):
-                front.send_event(Envelope(type="x", parts={"place": f"{folder}|{number}|3"}))
-            done = [front.done() for _ in range(3)]
-            assert {header["seq"] for header, _ in done} == {turn * 3 + 1, turn * 3 + 2, turn * 3 + 3}
-            assert all(header["failure"] is None for header, _ in done)
-
-
 # -- what a worker keeps -------------------------------------------------------------------------------------------
 
 IMAGES = """

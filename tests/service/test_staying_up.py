@@ -239,21 +239,6 @@ def test_a_paused_service_keeps_events_and_goes_on_with_them(acting):
         assert [answer.parts["out"] for answer in peer.take(3)] == [4, 6, 8]
 
 
-def test_a_drained_service_takes_no_more_until_it_resumes(acting):
-    with serving(acting) as (service, peer):
-        sub = service.service_state.sub
-        peer.send(number=1)
-        until(lambda: service.counts()["received"] == 1)
-        assert service.drain()
-        assert service.state == "DRAINING"
-        assert peer.take()[0].parts["out"] == 2
-        service.resume()
-        assert service.state == "READY"
-        assert service.service_state.sub == sub
-        with peer_of(service) as other:
-            assert other.ask(number=2).parts["out"] == 4
-
-
 # -- its parameters -------------------------------------------------------------------------------------------------
 
 

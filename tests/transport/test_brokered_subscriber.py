@@ -9,11 +9,8 @@ import contextlib
 import gc
 import itertools
 import logging
-import os
 import pickle
 import queue
-import subprocess
-import sys
 import threading
 
 import pytest
@@ -495,45 +492,3 @@ def test_a_subscriber_is_stopped_by_its_listener(broker, address):
     with away(broker):
         wait_until(lambda: not [thread for thread in threads() if thread.name.startswith("epypes from")])
     sub.stop()
-
-
-FORKS = """
-import os, queue, epypes as ep
-from epypes.transport.publisher import Publisher
-from epypes.transport.subscriber import Subscriber
-out, plain, q = ep.Mailbox("block", 8), queue.Queue(), queue.Queue()
-pubs = [Publisher("memory://b/q?create=true", taken).start() for taken in (out, plain)]
-sub = Subscriber("memory://b/q", q).start()
-out.put(b"x")
-item = q.get(timeout=60)
-pid = os.fork()
-if pid == 0:
-    try:
-        out.put(b"lost")
-        os._exit(1)
-    except ep.errors.BrokerError:
-        pass
-    item.reject("it is the parent's")
-    assert sub.dead_letters == 0
-    for endpoint in (*pubs, sub):
-        endpoint.stop()
-        assert not endpoint.is_connected
-    with sub, Publisher("memory://c/q?create=true", queue.Queue()):
-        pass
-    os._exit(7)
-assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 7
-out.put(b"y")
-assert q.get(timeout=60) == b"y"
-item.ack()
-for endpoint in (*pubs, sub):
-    endpoint.stop()
-print("fine")
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
-def test_a_forked_child_has_no_running_endpoints_and_the_parents_go_on():
-    command = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", FORKS]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert done.stdout == "fine\n", done.stderr
