@@ -13,7 +13,7 @@ PYTEST := $(BIN)/pytest -n $(PROCESSES) -p schemathesis.pytest.plugin -p nbval.p
 # Hundreds of interpreters are started by the tests: each would compile all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test soak test-matrix lab bench fix clean
+.PHONY: demo test soak test-matrix lab bench schema fix clean
 
 demo: $(VENV)/.all
 	$(BIN)/epypes demo notebooks/01_edge_detection.ipynb --name runner --output edges --to demo-output
@@ -41,6 +41,11 @@ lab: $(VENV)/.all
 
 bench: $(VENV)/.bench
 	$(BIN)/python -m tests.benchmarks
+
+# After a change in proto/: the messages, as epypes/wire/protobuf.py loads them.
+schema: $(VENV)/.test
+	$(BIN)/python -m grpc_tools.protoc -Iproto --include_imports --descriptor_set_out=epypes/wire/schema.binpb \
+		epypes2019/messages.proto epypes/v1/envelope.proto
 
 fix: $(VENV)/.test
 	$(BIN)/ruff check --fix .

@@ -274,10 +274,11 @@ def _read(function: Callable[..., Any]) -> tuple[inspect.Signature, Mapping[str,
 def _marked_hints(function: Callable[..., Any]) -> Mapping[str, Any]:
     """Return the hints of a function that has a mark, else none."""
     plain = _unwrapped(function)
-    if not isinstance(plain, FunctionType | MethodType):
+    is_declared = not isinstance(plain, type) and "__annotations__" in getattr(plain, "__dict__", ())
+    if not is_declared and not isinstance(plain, FunctionType | MethodType):
         return {}
     hints = hints_of(plain)
-    if not hints or isinstance(plain, MethodType):
+    if not hints or not isinstance(plain, FunctionType):
         return hints if _has_mark(hints) else {}
     marked = _MARKED.get(plain)
     if marked is None:

@@ -16,7 +16,7 @@ from epypes.cli.terminal import err, out
 from epypes.errors import ServiceError
 
 if TYPE_CHECKING:
-    from epypes.service.failures.record import FailureRecord
+    from epypes.service.failures.record import FailedEvent
 
 _MOST_CHARACTERS: Final = 200
 
@@ -72,18 +72,18 @@ def _follow(source: str | None, as_json: bool, keys: Path | None, allow: list[Pa
         return
 
 
-def _when(record: FailureRecord) -> str:
+def _when(record: FailedEvent) -> str:
     when = datetime.fromtimestamp(record.when_ns / 1e9).astimezone()
     is_today = when.date() == datetime.now().astimezone().date()
     return f"{when:%H:%M:%S}" if is_today else f"{when:%Y-%m-%d %H:%M}"
 
 
-def _raised(record: FailureRecord) -> str:
+def _raised(record: FailedEvent) -> str:
     summary = record.summary if record.kind == "raised" else f"{record.kind}: {record.text}"
     return summary[:_MOST_CHARACTERS]
 
 
-def _print_table(records: Sequence[FailureRecord]) -> None:
+def _print_table(records: Sequence[FailedEvent]) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 

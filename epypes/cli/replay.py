@@ -10,7 +10,7 @@ import typer
 from epypes.cli.terminal import out
 
 if TYPE_CHECKING:
-    from epypes.service.failures.record import FailureRecord
+    from epypes.service.failures.record import FailedEvent
     from epypes.service.failures.reproduce import Reproduction
 
 
@@ -46,7 +46,7 @@ def replay(
         raise typer.Exit(1)
 
 
-def _sentence(record: FailureRecord, found: Reproduction) -> str:
+def _sentence(record: FailedEvent, found: Reproduction) -> str:
     """Tell what became of the event, and what that was before."""
     if found.ending == "fine":
         return f"{record.id} is fine now: no function fails. It was {record.function!r}: {record.summary}."

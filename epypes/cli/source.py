@@ -43,15 +43,14 @@ def states_of(source: str, replica: str = "") -> list[ServiceState]:
     ServiceError
         None runs for this bundle, or at this address.
     """
-    from epypes.service.ops.client import running_services
-    from epypes.service.state_file import running_at
+    from epypes.service.state_file import read_states, running_at
 
     if is_url(source):
         at = running_at(source)
         found = [] if at is None else [at]
         way_out = "Is it another user's, or another machine's?"
     else:
-        found, way_out = running_services(_bundle(source), replica), f"Start it: epypes serve {source}"
+        found, way_out = read_states(_bundle(source), replica), f"Start it: epypes serve {source}"
     if not found:
         named = f" as replica {replica!r}" if replica else ""
         raise ServiceError(source, f"No service of yours runs for {source}{named}. {way_out}")

@@ -104,8 +104,6 @@ class Dispatcher:
         Whether the supervisor must be woken up by the next event.
     answered_in_row
         How many events were answered since a worker last died.
-    on_answered
-        Called with the id of each event that is done, without the lock; it returns at once.
     """
 
     def __init__(self, options: Options, results: ResultPublisher, provenance: Callable[[], Provenance]) -> None:
@@ -113,7 +111,6 @@ class Dispatcher:
         self.changed, self._room = threading.Condition(self.lock), threading.Condition(self.lock)
         self.is_closed = self.is_unwatched = False
         self.answered_in_row = 0
-        self.on_answered: Callable[[str], object] = lambda event_id: None
         self._policy, self._size, self._slots = options.mailbox_policy, options.capacity, options.threads
         self._retries = options.retries
         # A broker keeps events while there is no room, and confirms their answers: they are in flight until then.
@@ -472,7 +469,6 @@ class Dispatcher:
             event.delivery.reject(result.failure.summary)
         else:
             event.delivery.ack()
-            self.on_answered(event.id)
         # Only now: a thread that waits until nothing is in flight may close the connection then.
         with self.lock:
             if self._unconfirmed.pop(event.seq, None) is not None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from time import monotonic
 from typing import Any, Final
@@ -218,10 +218,6 @@ class EventInput:
     def trouble(self) -> str:
         """Why the broker is not connected; empty if it is."""
         return self._not_open or _named(self.address, self._subscriber.trouble)
-
-    def answered(self, ids: Iterable[str]) -> None:
-        """Note that other replicas have answered events: they are duplicates if they are delivered again."""
-        self._subscriber.answered(ids)
 
     def counts(self) -> dict[str, int]:
         """Return ``rejected``, and ``lost`` for a socket, ``duplicates`` and ``reconnects`` for a broker."""

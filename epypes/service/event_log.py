@@ -12,7 +12,7 @@ from epypes.store.later import SeriesWriter
 
 if TYPE_CHECKING:
     from epypes.service.dispatcher import AcceptedEvent
-    from epypes.service.failures.record import FailureRecord
+    from epypes.service.failures.record import FailedEvent
     from epypes.service.options import Options
 
 _log = logging.getLogger("epypes.service")
@@ -42,7 +42,7 @@ class EventLog:
         self._options, self._provenance, self._began_ns = options, provenance, time_ns()
         self._writer = None if options.store is None else SeriesWriter(options.store, KIND, name)
 
-    def keep(self, entry: AcceptedEvent, result: Result, failure: FailureRecord | None) -> None:
+    def keep(self, entry: AcceptedEvent, result: Result, failure: FailedEvent | None) -> None:
         """Have a row of an event written; returns at once and raises nothing."""
         if self._writer is not None:
             row = _row(entry, result, failure, self._provenance().digest)
@@ -60,7 +60,7 @@ class EventLog:
             _log.warning("%d rows of events could not be stored in time", self._writer.counts()["waiting"])
 
 
-def _row(entry: AcceptedEvent, result: Result, failure: FailureRecord | None, digest: str) -> dict[str, Any]:
+def _row(entry: AcceptedEvent, result: Result, failure: FailedEvent | None, digest: str) -> dict[str, Any]:
     now_ns = time_ns()
     row = {
         "seq": entry.seq,
@@ -77,7 +77,7 @@ def _row(entry: AcceptedEvent, result: Result, failure: FailureRecord | None, di
     return row if failure is None else {**row, **_of_failure(failure, result)}
 
 
-def _of_failure(failure: FailureRecord, result: Result) -> dict[str, Any]:
+def _of_failure(failure: FailedEvent, result: Result) -> dict[str, Any]:
     """Return what a row has besides if the event failed; ``failure`` is the id to open it by."""
     dropped = failure.kind == "dropped"
     return {

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import Counter, deque
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from collections import Counter
+from dataclasses import asdict, dataclass
 from time import monotonic
 from typing import Any, Final
 
-from epypes.service.replica_messages import Heartbeat, Member
+from epypes.service.replica_messages import Heartbeat
 
 # Three heartbeats may be lost before a replica counts as gone.
 _SILENT_AFTER_S: Final = 3.5
@@ -23,71 +22,56 @@ _HELD_UP_S: Final = 2.0
 _GRACE_S: Final = 10.0
 _LOST_FOR_S: Final = 600.0
 _MAX_MEMBERS: Final = 1_000
-_MAX_LOST: Final = 50
 
 _log = logging.getLogger("epypes.service")
 
 
-@dataclass(frozen=True, slots=True)
-class _Heard:
-    member: Member
+@dataclass(slots=True)
+class _Member:
+    """A replica: its last heartbeat, when that came, and whether the replica went silent since."""
+
+    heartbeat: Heartbeat
     heard_s: float
-    is_joining: bool = False
+    is_lost: bool = False
 
 
 class Membership:
-    """The other replicas that one replica has heard of.
+    """The other replicas that one replica has heard of."""
 
-    Parameters
-    ----------
-    own_id
-        Of this replica, which is never among the others.
-    """
-
-    def __init__(self, own_id: str) -> None:
-        self._own_id, self._lock = own_id, threading.Lock()
-        self._members: dict[str, _Heard] = {}
-        self._lost: dict[str, _Heard] = {}
-        self._left: deque[str] = deque(maxlen=_MAX_MEMBERS)
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._members: dict[str, _Member] = {}
         self._looked_s = self._certain_from_s = 0.0
 
-    def hear(self, heartbeat: Heartbeat) -> Member | None:
-        """Take a heartbeat of another replica; return what its last one said, None if the replica is new.
+    def hear(self, heartbeat: Heartbeat) -> Heartbeat | None:
+        """Take a heartbeat of another replica; return its last one, None if the replica is new.
 
         A group that is full takes no new one.
         """
-        member, now_s = heartbeat.member, monotonic()
         with self._lock:
-            known = self._members.get(member.id)
+            known = self._members.get(heartbeat.id)
             if known is None and len(self._members) >= _MAX_MEMBERS:
-                return member
-            self._members[member.id] = _Heard(member, now_s, heartbeat.is_joining)
-            self._lost.pop(member.id, None)
-            for lost, silent_ms in heartbeat.lost:
-                is_known = lost.id == self._own_id or lost.id in self._members or lost.id in self._left
-                if not is_known and len(self._lost) < _MAX_LOST:
-                    self._lost.setdefault(lost.id, _Heard(lost, now_s - silent_ms / 1e3))
-        if known is None:
-            _log.info("%s is in the group", label(member))
+                return heartbeat
+            self._members[heartbeat.id] = _Member(heartbeat, monotonic())
+        if known is None or known.is_lost:
+            _log.info("%s is in the group", label(heartbeat))
             return None
-        return known.member
+        return known.heartbeat
 
-    def forget(self, member_id: str) -> None:
+    def forget(self, replica_id: str) -> None:
         """Forget a replica that has stopped in order."""
         with self._lock:
-            self._left.append(member_id)
-            self._lost.pop(member_id, None)
-            known = self._members.pop(member_id, None)
+            known = self._members.pop(replica_id, None)
         if known is not None:
-            _log.info("%s has left the group", label(known.member))
+            _log.info("%s has left the group", label(known.heartbeat))
 
-    def look_for_lost(self, own: Member, is_away: bool) -> list[tuple[Member, int]]:
-        """Return the members that went silent, and for how many milliseconds; called with each own heartbeat.
+    def look_for_lost(self, own: Heartbeat, is_away: bool) -> None:
+        """Find the members that went silent; called with each own heartbeat.
 
         Parameters
         ----------
         own
-            This replica: one that has its name, on its machine, was replaced by it.
+            Of this replica: one that has its name, on its machine, was replaced by it.
         is_away
             Whether the broker is not connected.
         """
@@ -96,68 +80,66 @@ class Membership:
             self._certain_from_s = now_s + _GRACE_S
         self._looked_s = now_s
         with self._lock:
-            silent = [each for each in self._members.values() if now_s - each.heard_s > _SILENT_AFTER_S]
+            members = [*self._members.values()]
+            silent = [each for each in members if not each.is_lost and now_s - each.heard_s > _SILENT_AFTER_S]
             newly_lost = silent if now_s >= self._certain_from_s else []
             for each in newly_lost:
-                self._lost[each.member.id] = self._members.pop(each.member.id)
-            present = {_place(own), *(_place(each.member) for each in self._members.values())}
-            recent = {
-                key: each
-                for key, each in self._lost.items()
-                if now_s - each.heard_s <= _LOST_FOR_S and _place(each.member) not in present
-            }
-            self._lost = dict([*recent.items()][-_MAX_LOST:])
-            lost = [*self._lost.values()]
+                each.is_lost = True
+            present = {_place(own), *(_place(each.heartbeat) for each in members if not each.is_lost)}
+            for each in members:
+                if each.is_lost and (now_s - each.heard_s > _LOST_FOR_S or _place(each.heartbeat) in present):
+                    del self._members[each.heartbeat.id]
         for each in newly_lost:
-            _log.warning("%s is gone: no heartbeat for %.1f s", label(each.member), now_s - each.heard_s)
-        return [(each.member, int((now_s - each.heard_s) * 1e3)) for each in lost]
+            _log.warning("%s is gone: no heartbeat for %.1f s", label(each.heartbeat), now_s - each.heard_s)
 
-    def serving(self, digest: str) -> list[tuple[Member, bool]]:
-        """Return the others that serve a bundle, and whether each is still joining."""
+    def serving(self, digest: str) -> list[Heartbeat]:
+        """Return the last heartbeats of the others that serve a bundle."""
         with self._lock:
-            members = [*self._members.values()]
-        return [(each.member, each.is_joining) for each in members if each.member.digest == digest]
+            found = [each.heartbeat for each in self._members.values() if not each.is_lost]
+        return [heartbeat for heartbeat in found if heartbeat.digest == digest]
 
-    def describe(self, own: Member) -> dict[str, Any]:
+    def describe(self, own: Heartbeat) -> dict[str, Any]:
         """Return the fields of `Replicas.describe` that are about members, this replica among them."""
         now_s = monotonic()
         with self._lock:
-            members, lost = [_Heard(own, now_s), *self._members.values()], [*self._lost.values()]
-        present = [each for each in _by_name(members) if now_s - each.heard_s <= _SILENT_AFTER_S]
+            members = sorted([_Member(own, now_s), *self._members.values()], key=_order)
+        lost = [each for each in members if each.is_lost]
+        present = [each for each in members if not each.is_lost and now_s - each.heard_s <= _SILENT_AFTER_S]
+        heartbeats = [each.heartbeat for each in present]
         counts: Counter[str] = Counter()
-        for each in present:
-            counts.update(each.member.counts)
+        for heartbeat in heartbeats:
+            counts.update(heartbeat.counts)
         return {
             "replicas": len(present),
-            "ready": sum(each.member.state == "READY" for each in present),
+            "ready": sum(heartbeat.state == "READY" for heartbeat in heartbeats),
             "counts": dict(counts),
-            "agree": len({(each.member.digest, each.member.revision) for each in present}) <= 1,
+            "agree": len({(heartbeat.digest, heartbeat.revision) for heartbeat in heartbeats}) <= 1,
             "members": [_describe(each, now_s, own.id) for each in present],
-            "lost": [_describe(_as_lost(each, now_s), now_s, own.id) for each in _by_name(lost)],
+            "lost": [_describe(each, now_s, own.id) for each in lost],
         }
 
 
-def label(member: Member) -> str:
+def label(heartbeat: Heartbeat) -> str:
     """Return how log lines name a replica."""
-    return f"replica {member.replica} at {member.host}"
+    return f"replica {heartbeat.replica} at {heartbeat.host}"
 
 
-def _describe(heard: _Heard, now_s: float, own_id: str) -> dict[str, Any]:
-    found = asdict(heard.member)
-    is_self = found.pop("id") == own_id
-    del found["author"]
+def _describe(member: _Member, now_s: float, own_id: str) -> dict[str, Any]:
     # A heartbeat may have come since `now_s`.
-    return {**found, "heard_s": round(max(now_s - heard.heard_s, 0.0), 3), "is_self": is_self}
+    silent_s = max(now_s - member.heard_s, 0.0)
+    found = asdict(member.heartbeat)
+    is_self = found.pop("id") == own_id
+    del found["author"], found["kind"]
+    if member.is_lost:
+        text = f"no heartbeat for {silent_s:.1f} s, and it did not stop in order; its counts are of then"
+        found |= {"state": "LOST", "reason": text}
+    return {**found, "heard_s": round(silent_s, 3), "is_self": is_self}
 
 
-def _as_lost(heard: _Heard, now_s: float) -> _Heard:
-    text = f"no heartbeat for {now_s - heard.heard_s:.1f} s, and it did not stop in order; its counts are of then"
-    return replace(heard, member=replace(heard.member, state="LOST", reason=text))
+def _order(member: _Member) -> tuple[int, str, str]:
+    heartbeat = member.heartbeat
+    return len(heartbeat.replica), heartbeat.replica, heartbeat.id
 
 
-def _by_name(heard: Iterable[_Heard]) -> list[_Heard]:
-    return sorted(heard, key=lambda each: (len(each.member.replica), each.member.replica, each.member.id))
-
-
-def _place(member: Member) -> tuple[str, str]:
-    return member.replica, member.host
+def _place(heartbeat: Heartbeat) -> tuple[str, str]:
+    return heartbeat.replica, heartbeat.host

@@ -1,4 +1,4 @@
-"""Messages between the replicas of a bundle: JSON objects, checked field by field when they are received.
+"""Messages between the replicas of a bundle: JSON objects, validated by pydantic when they are received.
 
 A peer on the broker can publish anything on the broadcast address: what is no message of this version raises
 MessageError, and text that a terminal will show has no control characters.
@@ -7,30 +7,34 @@ MessageError, and text that a terminal will show has no control characters.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Final
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import AfterValidator, Field, StringConstraints, TypeAdapter, ValidationError
 
 from epypes.errors import MessageError
 
-VERSION: Final = 2
-# Ids in one message; more are sent in the next one. With the longest ids it is still below the limit of bytes.
-MAX_IDS: Final = 250
-# Longer ids are not sent: the broker's own redelivery count covers them.
-MAX_ID_CHARACTERS: Final = 256
 _MAX_BYTES: Final = 1024**2
-_MAX_CHARACTERS: Final = 2_000
-_MAX_ITEMS: Final = 1_000
 # The largest number of a message: JSON readers of other languages hold it exactly.
 MAX_INTEGER: Final = 2**53
 
+
+def _printable(text: str) -> str:
+    # `epypes status` prints it: a terminal obeys control characters, and can't show half of a surrogate pair.
+    return "".join(character if character.isprintable() else " " for character in text)
+
+
+_Text = Annotated[str, StringConstraints(max_length=2_000), AfterValidator(_printable)]
+_Count = Annotated[int, Field(ge=0, le=MAX_INTEGER)]
+_MANY: Final = Field(max_length=1_000)
 # Revision and author of hyperparameters.
 Version = tuple[int, str]
 
 
 @dataclass(frozen=True, slots=True)
-class Member:
-    """What a replica publishes of itself with each heartbeat.
+class Heartbeat:
+    """A replica is alive: what it publishes of itself every second.
 
     Attributes
     ----------
@@ -52,19 +56,20 @@ class Member:
         Why it does not compute with the newest parameters; empty if it does.
     """
 
-    id: str
-    replica: str = ""
-    host: str = ""
-    pid: int = 0
-    name: str = ""
-    digest: str = ""
-    revision: int = 0
-    author: str = ""
-    state: str = ""
-    reason: str = ""
-    counts: Mapping[str, int] = field(default_factory=dict)
-    http: str = ""
-    trouble: str = ""
+    id: _Text
+    replica: _Text = ""
+    host: _Text = ""
+    pid: _Count = 0
+    name: _Text = ""
+    digest: _Text = ""
+    revision: _Count = 0
+    author: _Text = ""
+    state: _Text = ""
+    reason: _Text = ""
+    counts: Annotated[Mapping[_Text, _Count], _MANY] = field(default_factory=dict)
+    http: _Text = ""
+    trouble: _Text = ""
+    kind: Literal["heartbeat"] = "heartbeat"
 
     @property
     def version(self) -> Version:
@@ -73,27 +78,11 @@ class Member:
 
 
 @dataclass(frozen=True, slots=True)
-class Heartbeat:
-    """A replica is alive.
-
-    Attributes
-    ----------
-    is_joining
-        Whether it does not know yet which parameters the others compute with.
-    lost
-        Members that it has missed lately, and how many milliseconds ago it heard each: newcomers can't know them.
-    """
-
-    member: Member
-    is_joining: bool = False
-    lost: Sequence[tuple[Member, int]] = ()
-
-
-@dataclass(frozen=True, slots=True)
 class Goodbye:
     """A replica stops in order."""
 
-    id: str
+    id: _Text
+    kind: Literal["goodbye"] = "goodbye"
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,10 +101,11 @@ class ParameterSet:
         By token, as in pipeline.toml.
     """
 
-    digest: str
-    revision: int
-    author: str
-    values: Mapping[str, Mapping[str, Any]]
+    digest: _Text
+    revision: _Count
+    author: _Text
+    values: Annotated[Mapping[str, Mapping[str, Any]], _MANY]
+    kind: Literal["parameters"] = "parameters"
 
     @property
     def version(self) -> Version:
@@ -135,33 +125,26 @@ class ParameterQuery:
         Of the bundle.
     """
 
-    id: str
-    digest: str
+    id: _Text
+    digest: _Text
+    kind: Literal["query"] = "query"
+
+
+ReplicaMessage = Heartbeat | Goodbye | ParameterSet | ParameterQuery
 
 
 @dataclass(frozen=True, slots=True)
-class Answered:
-    """A replica has answered events; one that is delivered again is a duplicate."""
-
-    id: str
-    events: Sequence[str]
+class _Versioned:
+    message: Annotated[ReplicaMessage, Field(discriminator="kind")]
+    version: Literal[3]
 
 
-ReplicaMessage = Heartbeat | Goodbye | ParameterSet | ParameterQuery | Answered
-_KINDS: Final[Mapping[str, type[ReplicaMessage]]] = {
-    "heartbeat": Heartbeat,
-    "goodbye": Goodbye,
-    "parameters": ParameterSet,
-    "query": ParameterQuery,
-    "answered": Answered,
-}
-_NAMES: Final = {message_type: name for name, message_type in _KINDS.items()}
+_DOCUMENT: Final = TypeAdapter(_Versioned)
 
 
 def encode_message(message: ReplicaMessage) -> bytes:
     """Return a message as it is published."""
-    document = {"v": VERSION, "kind": _NAMES[type(message)], **asdict(message)}
-    return json.dumps(document, separators=(",", ":")).encode()
+    return json.dumps(asdict(_Versioned(message, 3)), separators=(",", ":")).encode()
 
 
 def decode_message(data: bytes | memoryview) -> ReplicaMessage:
@@ -175,67 +158,7 @@ def decode_message(data: bytes | memoryview) -> ReplicaMessage:
     if len(data) > _MAX_BYTES:
         raise MessageError("too large", f"A message of {len(data):,} bytes; between replicas {_MAX_BYTES:,} is most.")
     try:
-        document = json.loads(bytes(data), parse_constant=_refuse_constant)
-        if document["v"] != VERSION:
-            raise ValueError(f"version {document['v']!r:.20}")
-        return _READERS[document["kind"]](document)
-    except (ValueError, TypeError, LookupError, RecursionError) as error:
-        text = f"This is no message between replicas (version {VERSION}): {error!r:.200}."
+        return _DOCUMENT.validate_json(bytes(data), strict=True).message
+    except ValidationError as error:
+        text = f"This is no message between replicas of this version: {error!r:.200}."
         raise MessageError("bad replica message", text) from error
-
-
-def _refuse_constant(name: str) -> None:
-    raise ValueError(f"JSON has no {name}")
-
-
-def _read_member(document: Any) -> Member:
-    readers: dict[str, Callable[[Any], Any]] = {"int": _integer, "str": _text, "Mapping[str, int]": _counts}
-    return Member(**{each.name: readers[str(each.type)](document[each.name]) for each in fields(Member)})
-
-
-def _read_heartbeat(document: Any) -> Heartbeat:
-    lost = [(_read_member(member), _integer(silent_ms)) for member, silent_ms in _items(document["lost"])]
-    return Heartbeat(_read_member(document["member"]), document["is_joining"] is True, lost)
-
-
-def _read_parameters(document: Any) -> ParameterSet:
-    values = _items(document["values"], dict)
-    if not all(isinstance(value, dict) for value in values.values()):
-        raise TypeError("values")
-    return ParameterSet(_text(document["digest"]), _integer(document["revision"]), _text(document["author"]), values)
-
-
-_READERS: Final[Mapping[str, Callable[[Any], ReplicaMessage]]] = {
-    "heartbeat": _read_heartbeat,
-    "goodbye": lambda document: Goodbye(_text(document["id"])),
-    "parameters": _read_parameters,
-    "query": lambda document: ParameterQuery(_text(document["id"]), _text(document["digest"])),
-    "answered": lambda document: Answered(_text(document["id"]), [*map(_short, _items(document["events"]))]),
-}
-
-
-def _items(value: Any, kind: type[list[Any] | dict[str, Any]] = list) -> Any:
-    if type(value) is not kind or len(value) > _MAX_ITEMS:
-        raise TypeError(f"{value!r:.40} is no {kind.__name__} of at most {_MAX_ITEMS} items")
-    return value
-
-
-def _integer(value: Any) -> int:
-    if type(value) is not int or not 0 <= value <= MAX_INTEGER:
-        raise TypeError(f"{value!r:.40} is no count")
-    return int(value)
-
-
-def _short(value: Any) -> str:
-    if type(value) is not str or len(value) > _MAX_CHARACTERS:
-        raise TypeError(f"{value!r:.40} is no short text")
-    return str(value)
-
-
-def _text(value: Any) -> str:
-    # `epypes status` prints it: a terminal obeys control characters, and can't show half of a surrogate pair.
-    return "".join(character if character.isprintable() else " " for character in _short(value))
-
-
-def _counts(value: Any) -> dict[str, int]:
-    return {_text(name): _integer(count) for name, count in _items(value, dict).items()}

@@ -18,8 +18,8 @@ import os
 import socket
 import threading
 import uuid
-from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from time import monotonic
 from typing import Any, Final
 
@@ -27,13 +27,8 @@ from epypes.errors import BrokerError, MessageError, ServiceError
 from epypes.service.membership import Membership, label
 from epypes.service.parameters import ParameterControl, Parameters, value_of
 from epypes.service.replica_messages import (
-    MAX_ID_CHARACTERS,
-    MAX_IDS,
-    MAX_INTEGER,
-    Answered,
     Goodbye,
     Heartbeat,
-    Member,
     ParameterQuery,
     ParameterSet,
     ReplicaMessage,
@@ -46,20 +41,44 @@ from epypes.transport.address import Address
 from epypes.transport.channel import Delivery
 
 HEARTBEAT_S: Final = 1.0
-# After this time every other replica has published a heartbeat; one that has joined answers that of a newcomer at once.
+# After this time every other replica has published a heartbeat.
 _GATHERING_S: Final = 1.25
 # Events wait no longer than this for the parameters of the others.
 _JOIN_TIMEOUT_S: Final = 5.0
-_BATCH_S: Final = 0.1
 _RETRY_S: Final = 0.25
 _CLOSE_S: Final = 1.0
 _MAX_BUNDLES: Final = 100
-_MAX_UNSENT_IDS: Final = 100_000
 # Longer texts are cut: a heartbeat is small.
 _MAX_TEXT: Final = 500
-_NONE: Final[Version] = (0, "")
 
 _log = logging.getLogger("epypes.service")
+
+
+@dataclass(slots=True)
+class _BundleParameters:
+    """What a replica knows of the parameters of one bundle.
+
+    Attributes
+    ----------
+    newest
+        The newest set that was published.
+    settled
+        The version of the last set that the worker has taken or refused.
+    refusal
+        Why the worker has refused it; empty if it has taken it.
+    """
+
+    newest: ParameterSet | None = None
+    settled: Version = (0, "")
+    refusal: str = ""
+
+    @property
+    def version(self) -> Version:
+        return (0, "") if self.newest is None else self.newest.version
+
+    @property
+    def is_behind(self) -> bool:
+        return self.version > (0, "") and self.version != self.settled
 
 
 class Replicas:
@@ -70,11 +89,9 @@ class Replicas:
     address
         The broadcast address of the group, beside the queue; None for a service without a broker.
     facts
-        Returns the fields of `Member` that the service knows: replica, name, state, reason, counts, http.
+        Returns the fields of `Heartbeat` that the service knows: replica, name, state, reason, counts, http.
     parameters
         The hyperparameters of this replica.
-    on_answered
-        Called with ids of events that another replica has answered.
     on_joined
         Called once after `start`, on a thread of this object: the parameters that the other replicas compute with are
         taken over, or were not to be had in time. Events must wait until then.
@@ -92,26 +109,22 @@ class Replicas:
         address: Address | None,
         facts: Callable[[], Mapping[str, Any]],
         parameters: ParameterControl,
-        on_answered: Callable[[Iterable[str]], object],
         on_joined: Callable[[], object],
     ) -> None:
         self._address, self._facts, self._parameters = address, facts, parameters
-        self._on_answered, self._on_joined = on_answered, on_joined
+        self._on_joined = on_joined
         self.is_shared, self.is_joining = address is not None, False
         self._changed = threading.Condition()
         # Held while parameters are changed and published: a set of another replica is taken before or after that.
         self._setting = threading.Lock()
         self._threads: list[threading.Thread] = []
-        self._newest: dict[str, ParameterSet] = {}
-        # By digest of the bundle: what this replica computes with, and what its worker has refused, and why.
-        self._applied: dict[str, Version] = {}
-        self._refused: dict[str, tuple[Version, str]] = {}
+        # By digest of the bundle; with the lock `_changed`.
+        self._bundles: dict[str, _BundleParameters] = {}
         self._reset()
 
     def _reset(self) -> None:
         self._id = uuid.uuid4().hex
-        self._membership = Membership(self._id)
-        self._unsent: deque[str] = deque(maxlen=_MAX_UNSENT_IDS)
+        self._membership = Membership()
         self._subscriber: Subscriber | None = None
         self._publisher: Publisher | None = None
         self._unreached = "" if self._address is None else f"{self._address} has not been reached yet."
@@ -155,7 +168,6 @@ class Replicas:
         try:
             if self._connect(subscriber, publisher):
                 self._take_part()
-                self._publish_answered()
                 self._publish(Goodbye(self._id))
         except Exception as error:
             _log.exception("this replica takes no part in its group any more")
@@ -187,18 +199,11 @@ class Replicas:
             if self._is_beat_due or monotonic() >= beat_s:
                 self._is_beat_due, beat_s = False, monotonic() + HEARTBEAT_S
                 self._beat()
-            self._publish_answered()
             with self._changed:
-                self._changed.wait_for(self._is_work_due, max(beat_s - monotonic(), 0.0))
-                if self._unsent:
-                    # More answers may follow, and go into the same message.
-                    self._changed.wait_for(self._has_ended, _BATCH_S)
+                self._changed.wait_for(lambda: self._is_over or self._is_beat_due, max(beat_s - monotonic(), 0.0))
 
     def _has_ended(self) -> bool:
         return self._is_over
-
-    def _is_work_due(self) -> bool:
-        return self._is_over or self._is_beat_due or (bool(self._unsent) and not self._away)
 
     def _beat_soon(self) -> None:
         with self._changed:
@@ -227,15 +232,15 @@ class Replicas:
 
     def _beat(self) -> None:
         self._introduce()
-        member = self._member()
-        lost = self._membership.look_for_lost(member, bool(self._away))
-        self._publish(Heartbeat(member, self.is_joining, lost))
+        heartbeat = self._heartbeat()
+        self._membership.look_for_lost(heartbeat, bool(self._away))
+        self._publish(heartbeat)
 
     def _introduce(self) -> None:
         """Publish the revision that this bundle has gone on with here, after a deploy, if no other replica knows it."""
         digest, current = self._parameters.snapshot()
         with self._changed:
-            is_new = current.revision > self._version(digest)[0]
+            is_new = current.revision > self._bundle(digest).version[0]
         if is_new:
             self._announce(digest, current)
 
@@ -243,23 +248,10 @@ class Replicas:
         values = {token: value_of(entry) for token, entry in current.entries.items()}
         new = ParameterSet(digest, current.revision, self._id, values)
         with self._changed:
-            self._applied[digest] = new.version
             self._keep(new)
+            self._settle(new)
         self._publish(new)
         self._beat_soon()
-
-    def _publish_answered(self) -> None:
-        while self._unsent and not self._away:
-            with self._changed:
-                ids = [self._unsent.popleft() for _ in range(min(len(self._unsent), MAX_IDS))]
-            self._publish(Answered(self._id, ids))
-
-    def answered(self, event_id: str) -> None:
-        """Have the other replicas know that this one has answered an event; returns at once."""
-        if self.is_shared and 0 < len(event_id) <= MAX_ID_CHARACTERS:
-            with self._changed:
-                self._unsent.append(event_id)
-                self._changed.notify_all()
 
     # -- receiving ----------------------------------------------------------------------------------------------------
 
@@ -273,45 +265,52 @@ class Replicas:
             return
         if isinstance(message, ParameterQuery):
             with self._changed:
-                newest = self._newest.get(message.digest)
+                newest = self._bundle(message.digest).newest
             if message.id == self._id and newest is not None:
                 self._publish(newest)
         elif isinstance(message, ParameterSet):
             with self._changed:
                 self._keep(message)
         elif isinstance(message, Heartbeat):
-            if message.member.id != self._id:
+            if message.id != self._id:
                 self._heard(message)
-        elif message.id == self._id:
-            return
-        elif isinstance(message, Goodbye):
+        elif message.id != self._id:
             self._membership.forget(message.id)
-        else:
-            self._on_answered(message.events)
+
+    def _bundle(self, digest: str) -> _BundleParameters:
+        """Return what is known of a bundle; the lock is held."""
+        known = self._bundles.pop(digest, None) or _BundleParameters()
+        self._bundles[digest] = known
+        if len(self._bundles) > _MAX_BUNDLES:
+            del self._bundles[next(iter(self._bundles))]
+        return known
 
     def _keep(self, new: ParameterSet) -> None:
         """Remember a set of parameters if it is the newest of its bundle; the lock is held."""
-        if new.version > self._version(new.digest):
-            self._newest.pop(new.digest, None)
-            self._newest[new.digest] = new
-            if len(self._newest) > _MAX_BUNDLES:
-                del self._newest[next(iter(self._newest))]
+        known = self._bundle(new.digest)
+        if new.version > known.version:
+            known.newest = new
             self._changed.notify_all()
 
+    def _settle(self, new: ParameterSet, refusal: str = "") -> None:
+        """Remember that the worker has taken or refused a set; the lock is held."""
+        known = self._bundle(new.digest)
+        known.settled, known.refusal = new.version, refusal
+
     def _heard(self, heartbeat: Heartbeat) -> None:
-        member, known = heartbeat.member, self._membership.hear(heartbeat)
+        known = self._membership.hear(heartbeat)
         with self._changed:
-            is_newer = member.version > self._version(member.digest)
+            is_newer = heartbeat.version > self._bundle(heartbeat.digest).version
             self._changed.notify_all()
         if known is None:
             # The newcomer need not wait for the next one.
             self._beat_soon()
-        is_name_new = known is None or known.name != member.name
-        if is_name_new and member.name != (name := self._facts()["name"]):
+        is_name_new = known is None or known.name != heartbeat.name
+        if is_name_new and heartbeat.name != (name := self._facts()["name"]):
             text = "%s serves another bundle from the same queue, %s, and this one serves %s: each takes events of the"
-            _log.warning(f"{text} other. Give each bundle a queue of its own.", label(member), member.name, name)
+            _log.warning(f"{text} other. Give each bundle a queue of its own.", label(heartbeat), heartbeat.name, name)
         if is_newer:
-            self._publish(ParameterQuery(member.id, member.digest))
+            self._publish(ParameterQuery(heartbeat.id, heartbeat.digest))
 
     # -- hyperparameters ----------------------------------------------------------------------------------------------
 
@@ -333,10 +332,7 @@ class Replicas:
             self._apply_newest()
             before = self._parameters.current
             with self._changed:
-                at_least = self._version(self._parameters.digest)[0] + 1
-            if at_least > MAX_INTEGER:
-                text = f"Revision {at_least - 1} is the last one that replicas can read. Write the parameters back."
-                raise ServiceError(self._parameters.digest, text)
+                at_least = self._bundle(self._parameters.digest).version[0] + 1
             changed = self._parameters.set(values, revision, at_least)
             digest, current = self._parameters.snapshot()
             # Otherwise another bundle has been deployed since.
@@ -350,22 +346,15 @@ class Replicas:
         The caller takes them over: it deploys that bundle.
         """
         with self._changed:
-            found = self._newest.get(digest)
+            found = self._bundle(digest).newest
             if found is None:
                 return None
-            self._applied[digest] = found.version
+            self._settle(found)
             return found.revision, found.values
-
-    def _version(self, digest: str) -> Version:
-        """Return the newest version of a bundle's parameters that is known; the lock is held."""
-        newest = self._newest.get(digest)
-        return _NONE if newest is None else newest.version
 
     def _is_behind(self) -> bool:
         """Whether newer parameters are to be taken over; the lock is held."""
-        digest = self._parameters.digest
-        refused, _ = self._refused.get(digest, (_NONE, ""))
-        return self._version(digest) not in (_NONE, self._applied.get(digest), refused)
+        return self._bundle(self._parameters.digest).is_behind
 
     def _follow(self) -> None:
         """Have the worker take newer parameters, one set after the other."""
@@ -398,19 +387,18 @@ class Replicas:
             There is no worker just now, or it is busy.
         """
         with self._changed:
-            newest = self._newest.get(self._parameters.digest)
-            if newest is None or not self._is_behind():
+            known = self._bundle(self._parameters.digest)
+            newest = known.newest
+            if newest is None or not known.is_behind:
                 return
         problems = self._parameters.follow(newest.digest, newest.revision, newest.values)
-        with self._changed:
-            if problems:
-                why = " ".join(f"{token!r}: {problem}" for token, problem in problems.items())
-                text = f"The worker refuses revision {newest.revision} of the other replicas. {why}"[:_MAX_TEXT]
-                self._refused[newest.digest] = newest.version, text
-            else:
-                self._applied[newest.digest] = newest.version
+        refusal = ""
         if problems:
-            _log.error("%s", text)
+            why = " ".join(f"{token!r}: {problem}" for token, problem in problems.items())
+            refusal = f"The worker refuses revision {newest.revision} of the other replicas. {why}"[:_MAX_TEXT]
+            _log.error("%s", refusal)
+        with self._changed:
+            self._settle(newest, refusal)
         self._beat_soon()
 
     def _look_at_joining(self) -> None:
@@ -421,32 +409,22 @@ class Replicas:
                 return
             self.is_joining = False
         self._on_joined()
-        # Newcomers may wait for that.
-        self._beat_soon()
 
     def _may_join(self) -> bool:
         """Whether events need not wait for the parameters of the others; the lock is held."""
         now_s, connected_s, digest = monotonic(), self._connected_s, self._parameters.digest
-        others = self._membership.serving(digest)
-        is_known = all(member.version <= self._version(digest) for member, _ in others) and not self._is_behind()
         has_gathered = connected_s is not None and now_s - connected_s > _GATHERING_S
-        is_answered = any(not is_joining for _, is_joining in others)
-        return (is_known and (has_gathered or is_answered)) or now_s > self._join_until_s
+        known = self._bundle(digest)
+        is_known = all(each.version <= known.version for each in self._membership.serving(digest))
+        return (has_gathered and is_known and not known.is_behind) or now_s > self._join_until_s
 
     # -- description --------------------------------------------------------------------------------------------------
 
-    @property
-    def _refusal(self) -> str:
-        """Why the newest parameters are not computed with; empty if they are."""
-        digest = self._parameters.digest
-        with self._changed:
-            refused, text = self._refused.get(digest, (_NONE, ""))
-            return text if refused == self._version(digest) else ""
-
-    def _member(self) -> Member:
+    def _heartbeat(self) -> Heartbeat:
         digest, current = self._parameters.snapshot()
         with self._changed:
-            revision, author = self._applied.get(digest, _NONE)
+            known = self._bundle(digest)
+            (revision, author), refusal = known.settled, known.refusal
         about: dict[str, Any] = {
             **self._facts(),
             "id": self._id,
@@ -455,13 +433,13 @@ class Replicas:
             "digest": digest,
             "revision": current.revision,
             # If they differ, the revision is about to be announced.
-            "author": author if revision == current.revision else "",
-            "trouble": self._refusal,
+            "author": author if revision == current.revision and not refusal else "",
+            "trouble": refusal,
         }
         cut: dict[str, Any] = {
             key: value[:_MAX_TEXT] if isinstance(value, str) else value for key, value in about.items()
         }
-        return Member(**cut)
+        return Heartbeat(**cut)
 
     def describe(self) -> dict[str, Any]:
         """Return the group as this replica knows it, JSON-ready.
@@ -475,7 +453,7 @@ class Replicas:
             ``rejected``: how many messages were no messages between replicas; ``members`` and ``lost``: a dict for
             each.
         """
-        own, subscriber = self._member(), self._subscriber
+        own, subscriber = self._heartbeat(), self._subscriber
         return {
             "is_shared": self.is_shared,
             "trouble": self._away or own.trouble,

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.errors import MailboxOverflow, MessageError, ServiceError
 from epypes.run import Failure
-from epypes.service.failures.record import FAILURE_TOPIC, FailureRecord
+from epypes.service.failures.record import FAILURE_TOPIC, FailedEvent
 from epypes.transport.channel import Confirmed
 from epypes.transport.throttle import Throttle
 from epypes.wire import EncodedEnvelope, failure_event
@@ -69,7 +69,7 @@ class Result:
     """
 
     answers: Sequence[EncodedEnvelope | bytes]
-    failure: FailureRecord | None = None
+    failure: FailedEvent | None = None
     revision: int = 0
     total_ns: int = 0
     durations_ns: Mapping[str, int] = field(default_factory=dict)
@@ -147,8 +147,8 @@ def exhausted_result(event: AcceptedEvent, provenance: Provenance) -> Result:
     return failed_result(event, ServiceError(provenance.bundle, text), provenance, "exhausted", is_dead=True)
 
 
-def _record(event: AcceptedEvent, known: Mapping[str, Any], provenance: Provenance, kind: FailureKind) -> FailureRecord:
-    return FailureRecord(
+def _record(event: AcceptedEvent, known: Mapping[str, Any], provenance: Provenance, kind: FailureKind) -> FailedEvent:
+    return FailedEvent(
         event_id=event.id,
         kind=known.get("kind") or kind,
         attempt=event.attempts,
@@ -325,7 +325,7 @@ class ResultPublisher:
             data = {"seq": event.seq, "event_id": event.id, "revision": result.revision}
             self.notify("run", {**data, "total_ns": result.total_ns})
 
-    def _report_failure(self, event: AcceptedEvent, result: Result, failure: FailureRecord) -> FailureRecord:
+    def _report_failure(self, event: AcceptedEvent, result: Result, failure: FailedEvent) -> FailedEvent:
         self._log_failure(failure)
         # In a storm dropped events would fill the store's memory with images of no interest.
         kept = self._store.keep(failure, None if failure.kind == "dropped" else event.stored)
@@ -339,7 +339,7 @@ class ResultPublisher:
         self.notify("failure", asdict(kept))
         return kept
 
-    def _log_failure(self, failure: FailureRecord) -> None:
+    def _log_failure(self, failure: FailedEvent) -> None:
         if failure.kind == "dropped":
             # In a storm a line for each would take longer than the answer.
             self._throttle.warning("dropped", failure.summary)

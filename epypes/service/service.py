@@ -15,7 +15,7 @@ from epypes.service.deploy import Deployer
 from epypes.service.dispatcher import Dispatcher
 from epypes.service.endpoints import Endpoints, group_address
 from epypes.service.event_log import EventLog
-from epypes.service.failures.record import FailureRecord
+from epypes.service.failures.record import FailedEvent
 from epypes.service.failures.store import FailureStore, failures_folder
 from epypes.service.lifecycle import Lifecycle, State
 from epypes.service.options import ANY_PORT, Options
@@ -94,11 +94,9 @@ class Service:
             group_address(given),
             self._facts,
             self._parameters,
-            self._endpoints.events.answered,
             lambda: self._dispatcher.release(_JOINING),
         )
         self._parameters.newest = self._replicas.newest
-        self._dispatcher.on_answered = self._replicas.answered
         self._started_ns = 0
         self._lock = threading.Lock()
 
@@ -144,6 +142,7 @@ class Service:
             self.token_file,
             self.options.replica,
             self.options.shows_failures,
+            str(self._supervisor.bundle.path),
         )
 
     def stop(self, timeout_s: float | None = None) -> None:
@@ -402,7 +401,7 @@ class Service:
         """Return tokens of the last completed run, or of one with this revision, as one packed Envelope."""
         return self._queries.run(tokens, revision)
 
-    def failure_records(self, limit: int | None = None) -> list[FailureRecord]:
+    def failure_records(self, limit: int | None = None) -> list[FailedEvent]:
         """Return the records of failures, the newest first."""
         return self.failure_store.records(limit)
 

@@ -13,22 +13,20 @@ import json
 import os
 import re
 import tempfile
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from time import monotonic, sleep
+from time import sleep
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Final, NoReturn, Self
 
 from epypes.errors import ServiceError
 
 REPLICA: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,39}")
 _MOST_REPLICAS: Final = 1_000
 # A reader holds the lock for some microseconds; a lock that is held longer is a service's.
-_LOCK_TIMEOUT_S: Final = 1.0
+_LOCK_TRIES: Final = 25
 _LOCK_RETRY_S: Final = 0.02
-_LOCK_TRIES: Final = 3
-# Fields that an earlier version did not write.
-_MAY_HAVE: Final = ("failures", "http", "token_file", "replica")
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +51,8 @@ class ServiceState:
         Name among the services of the bundle; empty for a service that stands alone.
     shows_failures
         Whether commands show the address of failures.
+    bundle
+        The folder that it serves now: not the one that it was started with once another one was deployed.
     """
 
     pid: int
@@ -64,6 +64,7 @@ class ServiceState:
     token_file: str = ""
     replica: str = ""
     shows_failures: bool = True
+    bundle: str = ""
 
 
 def state_file(bundle: str | Path, replica: str = "") -> Path:
@@ -102,16 +103,16 @@ class StateLock:
             text = f"A replica can't be called {replica!r:.60}. Take at most 40 letters, digits, '.', '_' and '-'."
             raise ServiceError(bundle, text)
         self.replica = replica
-        self._file = os.open(state_file(bundle, replica), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        deadline = monotonic() + _LOCK_TIMEOUT_S
-        while not self._locked():
-            running = _read(state_file(bundle, replica))
-            if running or monotonic() > deadline:
-                os.close(self._file)
-                by = f"by process {running.pid} at {running.sub}" if running else "by a process that is starting"
-                named = f" as replica {replica!r}" if replica else ""
-                raise ServiceError(bundle, f"{bundle} is being served already{named}, {by}. Stop that one first.")
+        path = state_file(bundle, replica)
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        for _ in range(_LOCK_TRIES):
+            if _can_lock(self._file, fcntl.LOCK_EX):
+                break
+            if running := _read(path):
+                self._refuse(bundle, f"by process {running.pid} at {running.sub}")
             sleep(_LOCK_RETRY_S)
+        else:
+            self._refuse(bundle, "by a process that is starting")
         self._write("")
 
     @classmethod
@@ -124,17 +125,14 @@ class StateLock:
             There are too many.
         """
         for number in range(1, _MOST_REPLICAS + 1):
-            if _is_free(state_file(bundle, str(number))):
-                with contextlib.suppress(ServiceError):  # another one was faster
-                    return cls(bundle, str(number))
+            with contextlib.suppress(ServiceError):
+                return cls(bundle, str(number))
         raise ServiceError(bundle, f"{bundle} has {_MOST_REPLICAS} replicas on this machine already. Stop some first.")
 
-    def _locked(self) -> bool:
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            return False
-        return True
+    def _refuse(self, bundle: str | Path, by: str) -> NoReturn:
+        os.close(self._file)
+        named = f" as replica {self.replica!r}" if self.replica else ""
+        raise ServiceError(bundle, f"{bundle} is being served already{named}, {by}. Stop that one first.")
 
     def publish(self, state: ServiceState) -> None:
         """Write the state into the file."""
@@ -157,11 +155,17 @@ class StateLock:
 
 
 def read_states(bundle: str | Path, replica: str = "") -> list[ServiceState]:
-    """Return the states of the running services of a bundle: of all replicas, or of one by its name."""
+    """Return the states of this user's running services of a bundle: of all replicas, or of one by its name.
+
+    A service is found by the bundle that it was started with; else by the one that it serves now.
+    """
     alone = state_file(bundle)
-    found = [alone, *sorted(alone.parent.glob(f"{alone.stem}.*.json"), key=_order)]
-    files = [state_file(bundle, replica)] if replica else found
-    return [state for file in files if (state := _read(file)) is not None]
+    started = [alone, *sorted(alone.parent.glob(f"{alone.stem}.*.json"), key=_order)]
+    found = [_read(file) for file in ([state_file(bundle, replica)] if replica else started)]
+    folder = str(Path(bundle).resolve())
+    return [state for state in found if state is not None] or [
+        state for state in _running() if state.bundle == folder and replica in ("", state.replica)
+    ]
 
 
 def _order(file: Path) -> tuple[int, str]:
@@ -173,51 +177,32 @@ def _order(file: Path) -> tuple[int, str]:
 def running_at(http: str) -> ServiceState | None:
     """Return the state of this user's service with this HTTP address, or None if there is none."""
     wanted = http.rstrip("/")
-    found = (_read(file) for file in _folder().glob("*.json"))
-    return next((state for state in found if state is not None and state.http.rstrip("/") == wanted), None)
+    return next((state for state in _running() if state.http.rstrip("/") == wanted), None)
 
 
-def _is_free(path: Path) -> bool:
-    """Whether no service holds the lock of a state file; a reader holds it for a moment."""
-    for _ in range(_LOCK_TRIES):
-        try:
-            with path.open("a", encoding="utf-8") as file:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                return True
-        except OSError:
-            if _read(path) is not None:
-                return False
-            sleep(_LOCK_RETRY_S)
-    return False
+def _running() -> Iterator[ServiceState]:
+    """Yield the states of all running services of this user."""
+    for file in sorted(_folder().glob("*.json")):
+        if (state := _read(file)) is not None:
+            yield state
 
 
 def _read(path: Path) -> ServiceState | None:
+    """Return the state in a file; None if no service holds its lock, or has published a state yet."""
     try:
         with path.open(encoding="utf-8") as file:
-            if _can_lock(file.fileno()):
+            if _can_lock(file.fileno(), fcntl.LOCK_SH):
                 return None
-            text = file.read()
-        return _state(json.loads(text)) if text.strip() else None
+            entries = json.load(file)
+        known = {each.name: entries[each.name] for each in fields(ServiceState) if each.name in entries}
+        return ServiceState(**known)
     except (FileNotFoundError, ValueError, TypeError):
         return None
 
 
-def _state(entries: object) -> ServiceState:
-    """Return a state; raise TypeError for other JSON in the file."""
-    if not isinstance(entries, dict):
-        raise TypeError
-    given: dict[str, Any] = {key: entries.get(key) for key in ("sub", "pub", "digest")}
-    given |= {key: entries.get(key, "") for key in _MAY_HAVE}
-    pid = entries.get("pid")
-    if not isinstance(pid, int) or not all(isinstance(text, str) for text in given.values()):
-        raise TypeError
-    return ServiceState(pid, **given, shows_failures=entries.get("shows_failures") is not False)
-
-
-def _can_lock(descriptor: int) -> bool:
+def _can_lock(descriptor: int, kind: int) -> bool:
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
     except OSError:
         return False
-    fcntl.flock(descriptor, fcntl.LOCK_UN)
     return True

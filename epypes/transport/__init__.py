@@ -10,9 +10,8 @@ from epypes.optional import optional_import
 if TYPE_CHECKING:
     from epypes.transport.address import check_bind, is_loopback, is_loopback_host
     from epypes.transport.mcap import RecordingInfo, recording_info
-    from epypes.transport.player import Player
     from epypes.transport.publisher import Publisher, ZMQPublisher
-    from epypes.transport.recording import Recorder
+    from epypes.transport.recording import Player, Recorder
     from epypes.transport.subscriber import Subscriber, ZMQSubscriber
     from epypes.transport.zeromq.curve import Keys, make_keys, read_keys
 
@@ -35,7 +34,7 @@ __all__ = [
 
 _HOME = {
     "Keys": "zeromq.curve",
-    "Player": "player",
+    "Player": "recording",
     "Publisher": "publisher",
     "Recorder": "recording",
     "RecordingInfo": "mcap",

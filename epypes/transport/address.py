@@ -189,12 +189,13 @@ class Address:
         """The dead-letter queue, where rejected messages are put; that of a dead-letter queue is itself."""
         if self.dead:
             return replace(self, name=self.dead, kind="queue", dead="")
-        return self if self.is_for_dead_letters else self.beside("dead", "queue")
+        is_one = self.name.endswith("/dead" if self.scheme.startswith("mqtt") else ".dead")
+        return self if is_one else self.beside("dead", "queue")
 
     @property
-    def is_for_dead_letters(self) -> bool:
-        """Whether this is a dead-letter queue itself: a message that is rejected there stays there."""
-        return not self.dead and self.name.endswith("/dead" if self.scheme.startswith("mqtt") else ".dead")
+    def has_dead_letters(self) -> bool:
+        """Whether rejected messages go into another queue; those of a dead-letter queue stay there."""
+        return self.kind == "queue" and self.dead_letters.name != self.name
 
 
 def parse_address(address: str | Address) -> Address:

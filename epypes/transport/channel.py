@@ -132,7 +132,7 @@ class Channel(Protocol):
     Attributes
     ----------
     prefetch
-        See `ChannelOptions`; may be set while it is open.
+        See `ChannelOptions`.
     """
 
     prefetch: int

@@ -7,7 +7,6 @@ connection.
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import threading
 from collections import deque
@@ -17,8 +16,8 @@ from typing import Final
 
 from epypes.errors import BrokerError
 from epypes.transport.address import Address, parse_address
-from epypes.transport.brokers.channel import BrokerChannel
-from epypes.transport.brokers.message import IncomingMessage, OutgoingMessage, unpacked
+from epypes.transport.brokers.channel import BrokerChannel, BrokerSession
+from epypes.transport.brokers.message import IncomingMessage, OutgoingMessage, unpack
 from epypes.transport.channel import ChannelOptions, Delivery
 
 
@@ -62,41 +61,28 @@ def away(host: str) -> Iterator[None]:
         broker.is_away = False
 
 
-class MemorySession:
-    """A connection to a broker in this process; see `epypes.transport.brokers.channel.BrokerSession`."""
+class MemorySession(BrokerSession):
+    """A connection to a broker in this process."""
 
     most_header_bytes = 65_536
-    lost: asyncio.Future[str]
 
     def __init__(self, address: Address, timeout_s: float) -> None:
-        self.address, self.timeout_s = address, timeout_s
+        super().__init__(address, timeout_s)
         self._broker = _broker(address.host)
         self._deliver: Callable[[IncomingMessage], object] | None = None
         self._window = self._read = 0
         # In the order of delivery.
         self._unsettled: dict[IncomingMessage, None] = {}
 
-    def check(self, message: OutgoingMessage) -> None:
-        """Take every message."""
-
-    def hint(self, address: Address) -> str:
-        """Return nothing: it always answers."""
-        return ""
-
     def lose_from_outside(self) -> None:
         """Have the connection break; from any thread."""
         loop = self.lost.get_loop()
         with contextlib.suppress(RuntimeError):
-            loop.call_soon_threadsafe(self._lose)
-
-    def _lose(self) -> None:
-        if not self.lost.done():
-            self.lost.set_result("the broker has gone away")
+            loop.call_soon_threadsafe(self.lose, "the broker has gone away")
 
     async def connect(self, window: int) -> None:
         """Connect; the queue is made if the address says so."""
         address, broker = self.address, self._broker
-        self.lost = asyncio.get_running_loop().create_future()
         if broker.is_away:
             raise BrokerError(str(address), f"{address} can't be reached: the broker is away.")
         if address.kind == "queue" and address.name not in broker.queues:
@@ -131,11 +117,6 @@ class MemorySession:
     async def consume(self, deliver: Callable[[IncomingMessage], object], window: int) -> None:
         """Have a function called with what comes."""
         self._deliver, self._window = deliver, window
-        self._hand_out()
-
-    async def set_window(self, window: int) -> None:
-        """Change how many may be unsettled."""
-        self._window = window
         self._hand_out()
 
     async def settle(self, message: IncomingMessage, *, requeue: bool) -> None:
@@ -200,6 +181,6 @@ def queued(address: str | Address) -> list[Delivery]:
     place = parse_address(address)
     found = []
     for stored in [*_broker(place.host).queues.get(place.name, ())]:
-        frames, headers = unpacked(IncomingMessage(stored.body, stored.id, dict(stored.headers)))
+        frames, headers = unpack(IncomingMessage(stored.body, stored.id, dict(stored.headers)))
         found.append(Delivery(frames, stored.id, stored.deliveries, headers))
     return found

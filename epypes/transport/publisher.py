@@ -22,7 +22,7 @@ from epypes.transport.endpoint import ConnectionState, Endpoint
 from epypes.transport.sequences import check_source
 from epypes.transport.throttle import Throttle
 from epypes.wire import EncodedEnvelope, Envelope, Limits, encode, failure_event, new_id, serialized, topic_frame
-from epypes.wire.encoded_envelope import stamped_frames
+from epypes.wire.encoder import stamped_frames
 
 if TYPE_CHECKING:
     from epypes.transport.zeromq.curve import Keys, PublicKey

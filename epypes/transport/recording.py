@@ -1,21 +1,29 @@
-"""The Recorder: published messages into a file, received by the I/O thread and written by a thread of its own."""
+"""Recorder and Player: published messages are written into a file, and published again at the same distances in time.
+
+Both use a thread of their own for the file. It does not keep its Recorder or Player alive: one that is garbage ends.
+"""
 
 from __future__ import annotations
 
+import itertools
+import math
+import queue as queues
 import threading
 import time
 import weakref
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, Self
 
-from epypes.errors import RecordingError, StillRunning
+from epypes.errors import BrokerError, RecordingError, StillRunning
 from epypes.transport.address import parse_address
 from epypes.transport.channel import Delivery, Frames
-from epypes.transport.endpoint import Startable
-from epypes.transport.mcap import RecordingCounts, RecordingWriter
+from epypes.transport.endpoint import Startable, warn_left_running
+from epypes.transport.mcap import BrokenOff, Recorded, RecordingCounts, RecordingWriter, messages
 from epypes.transport.subscriber import ZMQSubscriber
+from epypes.transport.zeromq.channel import ZeroMQChannel
+from epypes.transport.zeromq.curve import CurveOptions, Keys, PublicKey
 
 # What may wait for the disk: some seconds of images, and more than the largest message.
 BACKLOG_BYTES: Final = 512 * 1024**2
@@ -26,10 +34,69 @@ _FLUSH_S: Final = 1.0
 # Share of the time for a stop in which waiting messages are written; then the file is finished without the rest.
 _DRAIN_SHARE: Final = 0.8
 _SLOW, _FAILED = "disk too slow", "disk failed"
+# Few are kept for a subscriber: what is kept at the end must still be sent before the process ends.
+_HIGH_WATER_MARK: Final = 64
+# How often it is checked whether there is a subscriber, and whether the queue of a full one has room again.
+_CHECK_S, _RETRY_S = 0.025, 0.001
+
+
+class _Stopped(Exception):
+    """The player is to stop."""
 
 
 def _nothing() -> None:
     return
+
+
+class _FileThread:
+    """A thread that writes or reads a recording.
+
+    Attributes
+    ----------
+    ended
+        Set when the thread is done with the file.
+    """
+
+    def __init__(self, owner: str, verb: str, path: Path, on_end: Callable[[], None]) -> None:
+        self._owner, self._verb, self._path, self._on_end = owner, verb, path, on_end
+        self._thread: threading.Thread | None = None
+        self._failure: RecordingError | None = None
+        self.ended = threading.Event()
+
+    @property
+    def was_started(self) -> bool:
+        return self._thread is not None
+
+    def is_running(self) -> bool:
+        return self._thread is not None and self._thread.is_alive()
+
+    def _begin(self, work: Callable[[], None]) -> None:
+        name = f"epypes-{self._owner.lower()}"
+        self._thread = threading.Thread(target=self._run, args=(work,), name=name, daemon=True)
+        self._thread.start()
+
+    def _run(self, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except RecordingError as error:
+            self._failure = error
+        except Exception as error:
+            self._failure = RecordingError(self._path, f"{self._owner} {self._path} failed: {error!r}.")
+        finally:
+            self.ended.set()
+            self._on_end()
+
+    def _join(self, timeout_s: float) -> None:
+        """Wait for the end of the thread, but not in its own ``on_end``; raise StillRunning, or what it ended with."""
+        thread = self._thread
+        if thread is None or thread is threading.current_thread():
+            return
+        thread.join(timeout_s)
+        if thread.is_alive():
+            raise StillRunning(f"{self._owner} {self._path}", [self._verb], timeout_s)
+        failure, self._failure = self._failure, None
+        if failure is not None:
+            raise failure
 
 
 class Recorder(Startable):
@@ -93,7 +160,6 @@ class Recorder(Startable):
         # thread does not keep the socket of a recorder that is garbage.
         self._subscriber, self._recording = make()
         self._lock = threading.Lock()
-        self._finalizer: weakref.finalize[Any, Any] | None = None
 
     @property
     def address(self) -> str:
@@ -118,7 +184,7 @@ class Recorder(Startable):
         with self._lock:
             if self._recording.is_running():
                 return self
-            if self._recording.was_started():
+            if self._recording.was_started:
                 self._subscriber, self._recording = self._make()
             # First the socket: an address that is refused must not cost the file that is to be replaced.
             self._subscriber.start()
@@ -127,7 +193,7 @@ class Recorder(Startable):
             except BaseException:
                 self._subscriber.stop()
                 raise
-            self._finalizer = weakref.finalize(self, self._recording.close)
+            weakref.finalize(self, self._recording.close)
         return self
 
     def stop(self, timeout_s: float = 5.0) -> None:
@@ -147,8 +213,6 @@ class Recorder(Startable):
             If a single write takes longer.
         """
         with self._lock:
-            if self._finalizer is not None:
-                self._finalizer.detach()
             subscriber, recording = self._subscriber, self._recording
         subscriber.stop(timeout_s)
         recording.stop(timeout_s)
@@ -166,7 +230,7 @@ class Recorder(Startable):
         return f"<Recorder {str(self.path)[-40:]} {state}: {self.counts}>"
 
 
-class _Recording:
+class _Recording(_FileThread):
     """One recording from its start to its stop: the messages that wait for the disk, and the thread that writes them.
 
     The subscriber puts messages; the thread takes them. A message that finds no room is dropped and counted.
@@ -181,20 +245,18 @@ class _Recording:
         backlog_bytes: int,
         on_end: Callable[[], None],
     ) -> None:
-        self._path, self._about, self._force, self._on_end = path, about, force, on_end
+        super().__init__("Recorder", "write", path, on_end)
+        self._about, self._force = about, force
         self._remaining, self._backlog_bytes = messages, backlog_bytes
         self._waiting: deque[tuple[int, Frames, int]] = deque()
         self._waiting_bytes = 0
         self._counts = RecordingCounts()
         self._is_closed = self._has_failed = False
-        self._failure: RecordingError | None = None
         # A Condition has a re-entrant lock: the finalizer closes in any thread, even in one that holds it.
         self._changed = threading.Condition()
         self._deadline = float("inf")
-        self._thread: threading.Thread | None = None
         # The clocks are read together once: later times differ as those of the monotonic one.
         self._offset_ns = time.time_ns() - time.perf_counter_ns()
-        self.ended = threading.Event()
 
     def put(self, delivery: Delivery, *, block: bool) -> None:
         """Accept the frames of a message, or count them as dropped; called by the subscriber."""
@@ -229,45 +291,27 @@ class _Recording:
 
     def start(self) -> None:
         writer = RecordingWriter(self._path, self._about, self._force)
-        self._thread = threading.Thread(target=self._run, args=(writer,), name="epypes-recorder", daemon=True)
-        self._thread.start()
-
-    def was_started(self) -> bool:
-        return self._thread is not None
-
-    def is_running(self) -> bool:
-        return self._thread is not None and self._thread.is_alive()
+        self._begin(lambda: self._record(writer))
 
     def stop(self, timeout_s: float) -> None:
-        if self._thread is None:
+        if not self.was_started:
             return
         self._deadline = time.monotonic() + timeout_s * _DRAIN_SHARE
         self.close()
-        if self._thread is threading.current_thread():
-            # In on_end: the file is closed already.
-            return
-        self._thread.join(timeout_s)
-        if self._thread.is_alive():
-            raise StillRunning(f"Recorder {self._path}", ["write"], timeout_s)
-        failure, self._failure = self._failure, None
-        if failure is not None:
-            raise failure
+        self._join(timeout_s)
 
-    def _run(self, writer: RecordingWriter) -> None:
+    def _record(self, writer: RecordingWriter) -> None:
         try:
             self._write_all(writer)
             writer.finish(self.counts())
-        except Exception as error:
-            text = f"{self._path} can't be written: {error!r}."
-            self._failure = error if isinstance(error, RecordingError) else RecordingError(self._path, text)
+        except BaseException:
             with self._changed:
                 self._has_failed = True
                 self._drop(_FAILED, writer.pending)
                 self._counts.written = writer.written
+            raise
         finally:
             writer.close()
-            self.ended.set()
-            self._on_end()
 
     def _write_all(self, writer: RecordingWriter) -> None:
         flush_at, is_over = float("inf"), False
@@ -294,3 +338,218 @@ class _Recording:
             self._counts.dropped[reason] += lost
         self._waiting.clear()
         self._waiting_bytes = 0
+
+
+class Player(Startable):
+    """Publishes what a Recorder has written: the same frames, in the same order, at the same distances in time.
+
+    Parameters
+    ----------
+    path
+        The file.
+    address
+        ``"tcp://127.0.0.1:*"`` takes a free port, which `address` then names.
+    bind
+        False to connect to a subscriber that binds.
+    speed
+        2.0 plays twice as fast; 0 as fast as subscribers take it.
+    loop
+        How often it is played; 0 goes on until `stop`.
+    wait
+        Whether nothing is sent before there is a subscriber.
+    insecure
+        True to bind an address that other machines can reach, without keys.
+    keys, allow
+        As for `ZMQPublisher`.
+    on_end
+        Called on the player's thread when everything was sent, or it was stopped, or the file could not be read.
+
+    Raises
+    ------
+    AddressError
+        If ``bind`` is asked for an address that is not loopback, with neither keys nor ``insecure``.
+    KeysError
+        Keys can't be read, or there is no list of allowed keys.
+    ValueError
+        If ``speed`` or ``loop`` is negative.
+
+    Notes
+    -----
+    Start it, or use ``with``. Unlike a publisher it drops nothing: a file can wait for a subscriber that does not keep
+    up, which then delays what comes after. Envelopes keep their ids, epochs, sequence numbers and times.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        address: str = "tcp://127.0.0.1:*",
+        bind: bool = True,
+        *,
+        speed: float = 1.0,
+        loop: int = 1,
+        wait: bool = True,
+        insecure: bool = False,
+        keys: Keys | str | Path | None = None,
+        allow: PublicKey | Collection[PublicKey] | None = None,
+        on_end: Callable[[], None] = _nothing,
+    ) -> None:
+        if not 0 <= speed < math.inf:
+            raise ValueError(f"speed is {speed}; give 1.0, 0.5, 10 ..., or 0 for as fast as possible.")
+        if loop < 0:
+            raise ValueError(f"loop is {loop}; give how often, or 0 for without end.")
+        place = parse_address(address)
+        self._given = place.endpoint
+        binds = bind if place.binds is None else place.binds
+        self._security = CurveOptions.checked(self._given, binds, insecure, keys, allow)
+        self.path = Path(path)
+
+        def make() -> _Playback:
+            channel = ZeroMQChannel(self._given, self._security, high_water_mark=_HIGH_WATER_MARK)
+            return _Playback(self.path, channel, speed, loop, wait, on_end)
+
+        self._make = make
+        self._lock = threading.Lock()
+        self._playing: _Playback | None = None
+
+    @property
+    def address(self) -> str:
+        """The endpoint that is bound, once it is started; before that, the address that was given."""
+        playing = self._playing
+        return self._given if playing is None else playing.channel.address
+
+    @property
+    def sent(self) -> int:
+        """How many messages were handed to ZeroMQ since the start."""
+        playing = self._playing
+        return 0 if playing is None else playing.sent
+
+    def start(self) -> Self:
+        """Open the file and the socket, and begin to play; nothing happens if it plays already.
+
+        Raises
+        ------
+        RecordingError
+            If the file can't be read, is no recording, or holds no message.
+        AddressError
+            If the address can't be bound or understood.
+        """
+        with self._lock:
+            if self._playing is None or not self._playing.is_running():
+                playing = self._make()
+                playing.start()
+                self._playing = playing
+                weakref.finalize(self, _abandon, playing, self._given)
+        return self
+
+    def stop(self, timeout_s: float = 5.0) -> None:
+        """Stop where it is and close the socket; from any thread, as often as you like.
+
+        Parameters
+        ----------
+        timeout_s
+            Longest wait, in seconds.
+
+        Raises
+        ------
+        RecordingError
+            If the file was damaged or broke off. What was whole before that has been sent.
+        StillRunning
+            If reading a single message takes longer.
+        """
+        with self._lock:
+            playing = self._playing
+        if playing is not None:
+            playing.stop(timeout_s)
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Return whether it has ended within ``timeout_s`` seconds: see ``on_end``."""
+        playing = self._playing
+        return playing is not None and playing.ended.wait(timeout_s)
+
+    def wait_for_subscriber(self, timeout_s: float = 5.0) -> bool:
+        """Return whether a subscriber, of any topic, is there within ``timeout_s`` seconds."""
+        playing = self._playing
+        return playing is not None and playing.channel.subscriptions.wait(timeout_s)
+
+    def __repr__(self) -> str:
+        running = self._playing is not None and self._playing.is_running()
+        return f"<Player {str(self.path)[-40:]} {'running' if running else 'stopped'}: {self.sent} sent>"
+
+
+class _Playback(_FileThread):
+    """One playing from its start to its stop: the channel, and the thread that sends."""
+
+    def __init__(
+        self, path: Path, channel: ZeroMQChannel, speed: float, loop: int, wait: bool, on_end: Callable[[], None]
+    ) -> None:
+        super().__init__("Player", "read", path, on_end)
+        self.channel = channel
+        self._speed, self._loop, self._wait = speed, loop, wait
+        # Not an Event: the garbage collector puts into it, in any thread, where a lock could be held already.
+        self._stops: queues.SimpleQueue[None] = queues.SimpleQueue()
+        self.sent = 0
+
+    def start(self) -> None:
+        """Read the first message, then open the socket, then play."""
+        whole = messages(self._path)
+        first = next(whole, None)
+        if first is None:
+            raise RecordingError(self._path, f"{self._path} holds no message.")
+        self.channel.open(None)
+        begun = itertools.chain([first], whole)
+        self._begin(lambda: self._play_all(begun))
+
+    def stop_soon(self) -> None:
+        self._stops.put(None)
+
+    def stop(self, timeout_s: float) -> None:
+        self.stop_soon()
+        self._join(timeout_s)
+
+    def _play_all(self, begun: Iterator[Recorded]) -> None:
+        try:
+            while self._wait and not self.channel.subscriptions.wait(0.0):
+                self._pause(_CHECK_S)
+            self._play(begun)
+            for _ in range(1, self._loop) if self._loop else itertools.count():
+                self._play(messages(self._path))
+        except _Stopped:
+            pass
+        except BrokerError as error:
+            raise RecordingError(self._path, f"{self._path} could not be sent on: {error}") from error
+        finally:
+            self.channel.close()
+
+    def _play(self, recorded: Iterator[Recorded]) -> None:
+        begin_s, first_ns = time.monotonic(), None
+        try:
+            for message in recorded:
+                first_ns = message.time_ns if first_ns is None else first_ns
+                due_s = begin_s + (message.time_ns - first_ns) / 1e9 / self._speed if self._speed else begin_s
+                self._pause(due_s - time.monotonic())
+                # Counted before: a thread that has received it must find it counted.
+                self.sent += 1
+                try:
+                    while not self.channel.send_if_room(message.frames):
+                        self._pause(_RETRY_S)
+                except BaseException:
+                    self.sent -= 1
+                    raise
+        except BrokenOff as error:
+            # What is whole may be played again all the same.
+            self._failure = error
+
+    def _pause(self, seconds: float) -> None:
+        """Wait so long, but no longer than until the player is to stop."""
+        try:
+            self._stops.get(timeout=min(max(0.0, seconds), threading.TIMEOUT_MAX))
+        except queues.Empty:
+            return
+        raise _Stopped
+
+
+def _abandon(playing: _Playback, address: str) -> None:
+    # By the garbage collector or at exit: so no waiting, no locks.
+    if playing.is_running():
+        playing.stop_soon()
+        warn_left_running(f"Player {address}")

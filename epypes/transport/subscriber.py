@@ -181,14 +181,8 @@ class Subscriber(Endpoint):
 
     @property
     def prefetch(self) -> int:
-        """How many messages may be unacknowledged at once; it may be set while the subscriber runs."""
+        """How many messages may be unacknowledged at once."""
         return self._prefetch
-
-    @prefetch.setter
-    def prefetch(self, count: int) -> None:
-        self._prefetch = _checked(count)
-        if self._channel is not None:
-            self._channel.prefetch = count
 
     @property
     def received(self) -> int:

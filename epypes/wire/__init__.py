@@ -9,8 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from epypes.wire.decoder import decode
-    from epypes.wire.encoded_envelope import EncodedEnvelope
+    from epypes.wire.decoder import EncodedEnvelope, decode
     from epypes.wire.encoder import encode, topic_frame
     from epypes.wire.envelope import Envelope, FailureRecord, failure_event, new_id
     from epypes.wire.limits import Limits
@@ -56,8 +55,7 @@ __all__ = [
 ]
 
 _MODULES = {
-    "decoder": ("decode",),
-    "encoded_envelope": ("EncodedEnvelope",),
+    "decoder": ("EncodedEnvelope", "decode"),
     "encoder": ("encode", "topic_frame"),
     "envelope": ("Envelope", "FailureRecord", "failure_event", "new_id"),
     "limits": ("Limits",),

@@ -221,18 +221,20 @@ def read_image(reader: ValueReader, message: Any, path: Path) -> AnyArray:
     """
     import numpy as np
 
-    data, where = reader.stored(message, path), format_path(path)
+    data = reader.stored(message, path)
     width, height, encoding, step = message.width, message.height, message.encoding, message.step
     if encoding not in ENCODINGS:
-        raise MessageError("bad encoding", f"{where} has encoding {encoding[:40]!r}; known are {', '.join(ENCODINGS)}.")
+        raise MessageError(
+            "bad encoding", f"{format_path(path)} has encoding {encoding[:40]!r}; known are {', '.join(ENCODINGS)}."
+        )
     channels, dtype_text = ENCODINGS[encoding]
     dtype = np.dtype(dtype_text)
     row = width * channels * dtype.itemsize
     if row == 0 or height == 0 or step < row:
-        text = f"{where} is {width} x {height} {encoding} with step {step}; a row takes {row} bytes."
+        text = f"{format_path(path)} is {width} x {height} {encoding} with step {step}; a row takes {row} bytes."
         raise MessageError("bad step", text)
     if step * height != data.nbytes:
-        text = f"{where} has {data.nbytes} bytes, but {height} rows of {step} take {step * height}."
+        text = f"{format_path(path)} has {data.nbytes} bytes, but {height} rows of {step} take {step * height}."
         raise MessageError("size differs", text)
     shape = (height, width) if channels == 1 else (height, width, channels)
     strides = (step, channels * dtype.itemsize, dtype.itemsize)[: len(shape)]

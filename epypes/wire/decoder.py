@@ -1,4 +1,4 @@
-"""Decoding: the frames of a multipart message as an Envelope, and Value messages as Python values.
+"""Decoding: the frames of a multipart message as an Envelope, or its header alone; Value messages as Python values.
 
 Nothing in a message is trusted before it is checked; whatever the bytes are, only MessageError is raised.
 """
@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from operator import attrgetter
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from epypes.errors import MessageError
 from epypes.wire.arrays import read_image, read_tensor
-from epypes.wire.encoder import MAX_TOPIC_BYTES, REFUSALS, VERSION
-from epypes.wire.envelope import Envelope, FailureRecord, scalar_fields
-from epypes.wire.limits import DEFAULT_LIMITS, Limits, Path, ValueCounter, format_path
+from epypes.wire.encoder import MAX_TOPIC_BYTES, REFUSALS, VERSION, encode
+from epypes.wire.envelope import SCALAR_FIELDS, Envelope, FailureRecord
+from epypes.wire.limits import DEFAULT_LIMITS, LEADING_FRAMES, Limits, Path, ValueCounter, format_path
 from epypes.wire.opencv_pandas import read_records, read_table
 from epypes.wire.protobuf import message_class
 
@@ -41,54 +40,131 @@ def decode(frames: Sequence[bytes | bytearray | memoryview], limits: Limits = DE
         For anything that `encode` does not make, and nothing else, whatever the bytes are; its ``reason`` is a
         short text to count by.
     """
-    views = [*map(as_view, frames)]
-    header = read_header(views, limits)
-    reader = ValueReader(views[2:], limits)
-    rgb: set[str] = set()
-
-    def read_part(entry: Any) -> Any:
-        value = reader.read_named(entry.value, entry.name)
-        if reader.order == "rgb":
-            rgb.add(entry.name)
-        return value
-
-    def read_attribute(entry: Any) -> Any:
-        return reader.read_named(entry.value, entry.name)
-
+    views = _views(frames)
+    header = _read_header(views, "epypes.v1.Envelope", limits)
+    limits.check_names(header)
+    reader = ValueReader(views[LEADING_FRAMES:], limits)
     try:
+        parts, rgb = reader.read_named(header.parts, "parts")
+        attributes, _ = reader.read_named(header.attributes, "attributes")
         envelope = Envelope(
-            **scalar_fields(header),
-            parts=_by_name(header.parts, "parts", limits, read_part),
-            attributes=_by_name(header.attributes, "attributes", limits, read_attribute),
-            timings=_by_name(header.timings, "timings", limits, attrgetter("duration_ns"), "function"),
-            failure=read_failure(header),
+            **{name: getattr(header, name) for name in SCALAR_FIELDS},
+            parts=parts,
+            attributes=attributes,
+            timings={entry.function: entry.duration_ns for entry in header.timings},
+            failure=_read_failure(header.failure) if header.HasField("failure") else None,
             rgb=rgb,
         )
     except MessageError:
         raise
     except REFUSALS as error:
         raise MessageError("bad message", f"The message can't be decoded: {error}") from error
+    if len(envelope.timings) < len(header.timings):
+        raise _used_twice("a function", "timings")
     reader.check_all_used()
     return envelope
 
 
-def as_view(frame: bytes | bytearray | memoryview) -> memoryview:
-    """Return a frame as a read-only, flat memoryview; raise MessageError if it is not contiguous bytes."""
+class EncodedEnvelope:
+    """A v1 message as its frames, of which only the header is read; made by `read` or `encode`.
+
+    What arrives as frames leaves as frames: a process that routes, numbers or counts messages needs none of their
+    values.
+
+    Attributes
+    ----------
+    frames
+        Topic, header, payloads. Those of `encode` may be the memory of an array: leave the array alone until the frames
+        are sent.
+    failure
+        None, or the failure that the envelope reports.
+    limits
+        The limits that it was checked against.
+    id, type, source, epoch, sequence, acquired_ns, published_ns, correlation_id, revision, bundle_digest, \
+    request_source, request_epoch, request_sequence
+        As in `Envelope`.
+    """
+
+    __slots__ = ("failure", "frames", "limits", *SCALAR_FIELDS)
+
+    frames: tuple[memoryview, ...]
+    failure: FailureRecord | None
+    limits: Limits
+    id: str
+    type: str
+    source: str
+    epoch: int
+    sequence: int
+    acquired_ns: int
+    published_ns: int
+    correlation_id: str
+    revision: int
+    bundle_digest: str
+    request_source: str
+    request_epoch: int
+    request_sequence: int
+
+    @classmethod
+    def read(cls, frames: Sequence[bytes | bytearray | memoryview], limits: Limits = DEFAULT_LIMITS) -> Self:
+        """Return a received message; its values are neither parsed nor checked.
+
+        Parameters
+        ----------
+        frames
+            Topic, header, payloads. They are kept, not copied.
+        limits
+            Sizes and number of frames that are accepted.
+
+        Raises
+        ------
+        MessageError
+            The frame count, a size, the topic, the version or the header is not that of a v1 message.
+        """
+        views = _views(frames)
+        header = _read_header(views, "epypes.v1.Header", limits)
+        made = cls()
+        made.frames, made.limits = tuple(views), limits
+        made.failure = _read_failure(header.failure) if header.HasField("failure") else None
+        for name in SCALAR_FIELDS:
+            setattr(made, name, getattr(header, name))
+        return made
+
+    @classmethod
+    def encode(cls, envelope: Envelope, topic: str = "", *, limits: Limits = DEFAULT_LIMITS) -> Self:
+        """Return an envelope encoded.
+
+        Raises
+        ------
+        MessageError
+            As `epypes.wire.encode`.
+        """
+        return cls.read(encode(envelope, topic, limits=limits), limits)
+
+    def decode(self) -> Envelope:
+        """Return the envelope with its values.
+
+        Raises
+        ------
+        MessageError
+            As `epypes.wire.decode`.
+        """
+        return decode(self.frames, self.limits)
+
+    def __repr__(self) -> str:
+        number = f" #{self.sequence}" if self.sequence else ""
+        return f"<EncodedEnvelope {self.type[:20]!r}{number}: {sum(map(len, self.frames)):,} bytes>"
+
+
+def _views(frames: Sequence[bytes | bytearray | memoryview]) -> list[memoryview]:
     try:
-        return memoryview(frame).toreadonly().cast("B")
+        return [memoryview(frame).toreadonly().cast("B") for frame in frames]
     except (TypeError, ValueError) as error:
         raise MessageError("bad frame", f"A frame must be contiguous bytes: {error}") from error
 
 
-def read_header(views: Sequence[memoryview], limits: Limits) -> Any:
-    """Check the sizes, the topic and the version of a message; return its parsed header.
-
-    Raises
-    ------
-    MessageError
-        The frames are no v1 message, or exceed the limits.
-    """
-    limits.check_sizes([view.nbytes for view in views])
+def _read_header(views: Sequence[memoryview], kind: str, limits: Limits) -> Any:
+    """Check the sizes, the topic and the version of a message; return its header, parsed as a message of a kind."""
+    limits.check_frames(views)
     topic = bytes(views[0][: MAX_TOPIC_BYTES + 1])
     if len(topic) > MAX_TOPIC_BYTES or not topic.endswith(b"/"):
         raise MessageError("bad topic", "The first frame is no topic: it must be short and end in a slash.")
@@ -97,7 +173,7 @@ def read_header(views: Sequence[memoryview], limits: Limits) -> Any:
     except UnicodeDecodeError as error:
         raise MessageError("bad topic", f"The topic is not UTF-8: {error}.") from error
     try:
-        header = message_class("epypes.v1.Envelope").FromString(bytes(views[1]))
+        header = message_class(kind).FromString(bytes(views[1]))
     except Exception as error:
         # Imported here, since an import takes as long as parsing.
         from google.protobuf.message import DecodeError
@@ -111,28 +187,14 @@ def read_header(views: Sequence[memoryview], limits: Limits) -> Any:
     return header
 
 
-def read_failure(header: Any) -> FailureRecord | None:
-    """Return the failure that a header reports, or None."""
-    if not header.HasField("failure"):
-        return None
-    found = header.failure
+def _read_failure(found: Any) -> FailureRecord:
     return FailureRecord(
         found.function, tuple(found.tokens), found.exception, found.message, found.input_id, found.attempt
     )
 
 
-def _by_name(
-    entries: Sequence[Any], kind: str, limits: Limits, read: Callable[[Any], Any], field: str = "name"
-) -> dict[str, Any]:
-    """Read the entries into a dict by the name in a field; each name may occur once."""
-    limits.check_names(len(entries), kind)
-    result: dict[str, Any] = {}
-    for entry in entries:
-        name = getattr(entry, field)
-        if name in result:
-            raise MessageError("name used twice", f"The message has {name[:80]!r} twice among its {kind}.")
-        result[name] = read(entry)
-    return result
+def _used_twice(name: str, kind: str) -> MessageError:
+    return MessageError("name used twice", f"The message has {name} twice among its {kind}.")
 
 
 class ValueReader:
@@ -160,11 +222,26 @@ class ValueReader:
         self.counter = ValueCounter(limits)
         self.order: Order | None = None
 
-    def read_named(self, message: Any, name: str) -> Any:
-        """Return the value with a name of its own, such as a part; raise MessageError if the message has none."""
-        self.order = None
-        self.counter.count((name,))
-        return self.read(message, (name,))
+    def read_named(self, entries: Sequence[Any], kind: str) -> tuple[dict[str, Any], set[str]]:
+        """Return the values of messages with the fields ``name`` and ``value`` by name, and the names of those in RGB.
+
+        Raises
+        ------
+        MessageError
+            A name occurs twice, or a value is none that `epypes.wire.encoder.ValueWriter` writes.
+        """
+        result: dict[str, Any] = {}
+        rgb: set[str] = set()
+        for entry in entries:
+            name = entry.name
+            if name in result:
+                raise _used_twice(repr(name[:80]), kind)
+            self.order = None
+            self.counter.count((name,))
+            result[name] = self.read(entry.value, (name,))
+            if self.order == "rgb":
+                rgb.add(name)
+        return result, rgb
 
     def read(self, message: Any, path: Path) -> Any:
         """Return the value that is at a path; its container has counted it."""

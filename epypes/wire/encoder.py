@@ -53,7 +53,6 @@ def encode(
     topic: str = "",
     inline_below: int = INLINE_BELOW,
     *,
-    rgb: Collection[str] = (),
     limits: Limits = DEFAULT_LIMITS,
 ) -> list[bytes | memoryview]:
     """Return the frames of an envelope: topic, header, payloads.
@@ -68,8 +67,6 @@ def encode(
         The first frame, see `topic_frame`.
     inline_below
         Arrays and bytes of fewer bytes are put into the header. numpy scalars always are.
-    rgb
-        Names of parts in RGB order, beside those that the envelope names itself.
     limits
         The receiver's limits.
 
@@ -87,10 +84,7 @@ def encode(
     frames: list[bytes | memoryview] = [topic_frame(topic)]
     header = message_class("epypes.v1.Envelope")()
     writer = ValueWriter(limits, inline_below)
-    rgb = {*rgb, *envelope.rgb}
-    limits.check_names(len(envelope.parts), "parts")
-    limits.check_names(len(envelope.attributes), "attributes")
-    limits.check_names(len(envelope.timings), "timings")
+    limits.check_names(envelope)
     try:
         header.version = VERSION
         for name in SCALAR_FIELDS:
@@ -103,7 +97,9 @@ def encode(
         if envelope.failure is not None:
             _write_failure(header.failure, envelope.failure)
         for name, value in envelope.parts.items():
-            writer.write_named(header.parts.add(name=name).value, value, str(name), "rgb" if name in rgb else "bgr")
+            writer.write_named(
+                header.parts.add(name=name).value, value, str(name), "rgb" if name in envelope.rgb else "bgr"
+            )
         for name, value in envelope.attributes.items():
             writer.write_named(header.attributes.add(name=name).value, value, str(name))
         frames.append(header.SerializeToString())
@@ -112,8 +108,30 @@ def encode(
     except REFUSALS as error:
         raise MessageError("bad field", f"{envelope!r} has a field that can't be sent: {error}") from error
     frames += [data if isinstance(data, bytes) else flat_bytes(data) for _, data in writer.payloads]
-    limits.check_sizes([len(frame) for frame in frames])
+    limits.check_frames(frames)
     return frames
+
+
+def stamped_frames(
+    frames: Sequence[bytes | memoryview], epoch: int, sequence: int, published_ns: int, limits: Limits = DEFAULT_LIMITS
+) -> tuple[bytes | memoryview, ...]:
+    """Return the frames of an envelope with other values of three fields of its header; no value is touched.
+
+    protobuf merges concatenated messages, so that nothing is parsed or encoded again.
+
+    Raises
+    ------
+    MessageError
+        Of reason ``"bad field"`` for a number that the field can't hold, or ``"too large"``.
+    """
+    try:
+        stamp = message_class("epypes.v1.Header")(epoch=epoch, sequence=sequence, published_ns=published_ns)
+    except REFUSALS as error:
+        raise MessageError("bad field", f"A stamp has a field that can't be sent: {error}") from error
+    topic, header, *payloads = frames
+    stamped = (topic, b"".join((header, stamp.SerializeToString())), *payloads)
+    limits.check_frames(stamped)
+    return stamped
 
 
 def _write_failure(message: Any, failure: FailureRecord) -> None:

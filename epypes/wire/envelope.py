@@ -1,7 +1,7 @@
 """The v1 message as Python objects: Envelope, the failure it may report, and ids of new messages.
 
-A new field needs a line in ``proto/epypes/v1/envelope.proto``, from which ``python -m epypes.wire.compile`` makes the
-schema, one in `SCALAR_FIELDS`, and an attribute of `Envelope` and of `epypes.wire.encoded_envelope.EncodedEnvelope`.
+A new field needs a line in both messages of ``proto/epypes/v1/envelope.proto``, from which ``make schema`` makes
+``schema.binpb``, one in `SCALAR_FIELDS`, and an attribute of `Envelope` and of `epypes.wire.decoder.EncodedEnvelope`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from epypes.run import Failure
 
 # The type of an envelope that reports a failure.
 FAILURE: Final = "epypes.failure"
-# Fields of one name and meaning in Envelope, in EncodedEnvelope and in the protobuf message.
+# Fields of one name and meaning in Envelope, in EncodedEnvelope and in the protobuf messages Envelope and Header.
 SCALAR_FIELDS: Final = (
     "id",
     "type",
@@ -164,11 +164,6 @@ def request_fields(request: Any) -> dict[str, Any]:
         "request_epoch": request.epoch,
         "request_sequence": request.sequence,
     }
-
-
-def scalar_fields(message: Any) -> dict[str, Any]:
-    """Return the SCALAR_FIELDS of an Envelope, an EncodedEnvelope or a protobuf message, by name."""
-    return {name: getattr(message, name) for name in SCALAR_FIELDS}
 
 
 def failure_event(failure: Failure, source: str = "", bundle_digest: str = "") -> Envelope:

@@ -92,29 +92,32 @@ class Limits:
     equal_hashes: int = 64
     depth: int = 24
 
-    def check_sizes(self, sizes: Sequence[int]) -> None:
-        """Check the sizes of a message's frames in bytes: topic, Envelope, payloads.
+    def check_frames(self, frames: Sequence[bytes | memoryview]) -> None:
+        """Check the number and the sizes of a message's frames: topic, Envelope, payloads.
 
         Raises
         ------
         MessageError
             Of reason ``"too few frames"``, ``"too many frames"`` or ``"too large"``.
         """
-        payloads, total = len(sizes) - 2, sum(sizes)
+        payloads, total = len(frames) - LEADING_FRAMES, sum(map(len, frames))
         if payloads < 0:
-            raise MessageError("too few frames", f"{len(sizes)} frames; a v1 message has a topic and an Envelope.")
+            raise MessageError("too few frames", f"{len(frames)} frames; a v1 message has a topic and an Envelope.")
         if payloads > self.frames:
             raise MessageError("too many frames", f"{payloads} payload frames; the limit is {self.frames}.")
         if total > self.total_bytes:
             raise MessageError("too large", f"The message has {total:,} bytes; the limit is {self.total_bytes:,}.")
-        if sizes[1] > self.header_bytes:
-            text = f"The Envelope has {sizes[1]:,} bytes; the limit is {self.header_bytes:,}."
+        if len(frames[1]) > self.header_bytes:
+            text = f"The Envelope has {len(frames[1]):,} bytes; the limit is {self.header_bytes:,}."
             raise MessageError("too large", f"{text} Send long lists as numpy arrays.")
 
-    def check_names(self, count: int, kind: str) -> None:
-        """Check the number of a message's parts, attributes or timings; raise MessageError if there are too many."""
-        if count > self.parts:
-            raise MessageError(f"too many {kind}", f"The message has {count:,} {kind}; the limit is {self.parts:,}.")
+    def check_names(self, message: Any) -> None:
+        """Raise MessageError if an Envelope, or its protobuf message, has too many parts, attributes or timings."""
+        for kind in ("parts", "attributes", "timings"):
+            count = len(getattr(message, kind))
+            if count > self.parts:
+                text = f"The message has {count:,} {kind}; the limit is {self.parts:,}."
+                raise MessageError(f"too many {kind}", text)
 
 
 DEFAULT_LIMITS = Limits()

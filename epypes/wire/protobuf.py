@@ -2,7 +2,7 @@
 
 Generated ``_pb2.py`` files break across versions of protobuf, and they register in the default pool, where a
 user's own ``Image`` would clash with the one of this package. A compiled FileDescriptorSet in a private pool does
-neither. ``python -m epypes.wire.compile`` makes it from ``proto/``.
+neither. ``make schema`` makes it from ``proto/``.
 """
 
 from __future__ import annotations

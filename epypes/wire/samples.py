@@ -120,7 +120,7 @@ def load_sample(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
                 raise ValueError(f"its format is {described['format']!r}, and this version reads {FORMAT}")
             views = [flat_bytes(_read_entry(archive, name)) for name in described["arrays"]]
         reader = ValueReader(views, _LIMITS)
-        inputs, outputs = (dict(_read_side(reader, described[side])) for side in _SIDES)
+        inputs, outputs = (reader.read_named([*_parts(described[side])], side)[0] for side in _SIDES)
         reader.check_all_used()
     except (MessageError, zipfile.BadZipFile, zlib.error, *_BROKEN) as error:
         raise MessageError("bad sample", f"{path} is no sample of EPypes: {error}") from error
@@ -135,13 +135,13 @@ def _read_entry(archive: zipfile.ZipFile, name: str) -> AnyArray:
         return array
 
 
-def _read_side(reader: ValueReader, entries: Any) -> Iterator[tuple[str, Any]]:
+def _parts(entries: Any) -> Iterator[Any]:
+    """Yield the values of a description as protobuf messages, each with its name."""
     with optional_import():
         from google.protobuf.json_format import ParseDict, ParseError
 
     for name, value in entries:
         try:
-            message = ParseDict(value, message_class("epypes.v1.Value")())
+            yield ParseDict({"name": name, "value": value}, message_class("epypes.v1.Part")())
         except ParseError as error:
             raise MessageError("bad sample", f"the description of {name!r} is damaged: {error}") from error
-        yield name, reader.read_named(message, name)

@@ -6,10 +6,10 @@ import pytest
 
 from epypes.service import Service
 from epypes.service.http import HttpServer
-from epypes.service.replica_messages import Goodbye
+from epypes.service.replica_messages import Heartbeat
 from tests.browser.contrast import schemes, unreadable
 from tests.browser.jupyter import open_page
-from tests.service.replicated import lost_replica, publish_to_replicas
+from tests.service.replicated import publish_to_replicas
 from tests.service.served import acting_bundle, until
 from tests.service.test_brokered import line_of
 
@@ -75,8 +75,7 @@ def test_the_page_shows_a_lost_replica(browser, replicas):
     page = open_page(browser, viewport={"width": 1400, "height": 1000})
     try:
         page.goto(first.http)
-        report = lost_replica("2")
-        publish_to_replicas(line.sub, report, Goodbye(report.member.id))
+        publish_to_replicas(line.sub, Heartbeat("silent", replica="2", host="elsewhere", counts={"answered": 0}))
         page.wait_for_selector("#replicas tbody tr:nth-child(2) .badge.error:has-text('LOST')")
         assert "it did not stop in order; its counts are of then" in rows(page)[1][1]
         assert page.locator("#replicas tbody a").count() == 0, "it does not answer"

@@ -10,10 +10,10 @@ import pytest
 
 from epypes.service import Service
 from epypes.service.http import HttpServer
-from epypes.service.replica_messages import Goodbye
+from epypes.service.replica_messages import Heartbeat
 from epypes.service.state_file import StateLock
 from epypes.transport import memory
-from tests.service.replicated import lost_replica, publish_to_replicas
+from tests.service.replicated import publish_to_replicas
 from tests.service.served import acting_bundle, until
 
 pytestmark = pytest.mark.slow
@@ -98,8 +98,8 @@ def test_where_failures_go_besides_is_said_where_somebody_asked_for_it(epypes, a
 
 def test_each_lost_replica_is_one_line_with_its_reason(epypes, acting):
     with replicas("lost", a=(acting, {})) as (first,):
-        reports = [lost_replica(name) for name in ("b", "c")]
-        publish_to_replicas(first.options.sub, *reports, Goodbye(reports[0].member.id))
+        silent = [Heartbeat(name, replica=name, host="elsewhere", counts={"answered": 0}) for name in ("b", "c")]
+        publish_to_replicas(first.options.sub, *silent)
         until(lambda: len(first.group()["lost"]) == 2 and first.group()["replicas"] == 1)
         shown = epypes("status", acting).stdout
     assert "Group: replicas 1, ready 1, lost 2, all with the same bundle and parameters" in shown

@@ -8,7 +8,7 @@ import numpy as np
 
 import epypes as ep
 from epypes.bundle.seal import check_seal
-from epypes.service.failures.record import FailureRecord
+from epypes.service.failures.record import FailedEvent
 from epypes.service.failures.store import FailureStore, failures_folder
 from epypes.wire import Envelope
 
@@ -96,6 +96,6 @@ def keep(bundle, event, **told):
         "digest": check_seal(bundle),
         "hyperparameters": {"by": {"value": 1}, "most": {"value": 90}},
     }
-    kept = store.keep(FailureRecord(**{**record, **told}), event)
+    kept = store.keep(FailedEvent(**{**record, **told}), event)
     assert store.flush()
     return kept.id

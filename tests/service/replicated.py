@@ -8,7 +8,7 @@ import signal
 from contextlib import contextmanager
 
 import epypes as ep
-from epypes.service.replica_messages import Heartbeat, Member, encode_message
+from epypes.service.replica_messages import encode_message
 from epypes.transport.address import parse_address
 from tests.brokers.fleet import fleet
 
@@ -87,9 +87,3 @@ def publish_to_replicas(sub, *messages):
     with ep.Publisher(parse_address(sub).beside("group", "broadcast", create=True)) as publisher:
         for message in messages:
             publisher.send((message if isinstance(message, bytes) else encode_message(message),))
-
-
-def lost_replica(name, host="elsewhere", silent_ms=5_000):
-    """Return the heartbeat of a replica that reports another one as lost."""
-    lost = Member(f"id of {name}", replica=name, host=host, counts={"answered": 0})
-    return Heartbeat(Member("id of the reporter", replica="reporter", host=host), lost=[(lost, silent_ms)])

@@ -121,7 +121,7 @@ class Standing:
                 raise ParametersRefused(self.folder, problems)
             self.entries, self.revision = entries, self.revision + 1
             self.runner.set(**{t: tuple(v) if isinstance(v, list) else v for t, v in values.items()})
-        self.tell("parameters", revision=self.revision)
+        self.tell("parameters", revision=self.revision, parameters=self.entries)
         return self.parameters()
 
     def view(self):

@@ -153,23 +153,6 @@ def test_an_event_that_kills_the_worker_again_and_again_is_a_dead_letter_of_the_
     assert line.left() == 0
 
 
-def test_no_replica_takes_a_dead_letter_of_another_for_done(lasting, more):
-    """The broker may not have heard of it: whoever is delivered it again must put it aside, and not acknowledge it."""
-    line, _ = lasting
-    heard = queue.Queue()
-    with Subscriber(parse_address(line.sub).beside("group", "broadcast"), heard, undecoded=True):
-        dead = line.send("exit", 1)
-        line.take()
-        until(lambda: more("dead_letters") == 1)
-        assert line.dead().id == dead
-        done = line.send()
-        line.take()
-        texts = []
-        while not any(done in text for text in texts):
-            texts.append(b"".join(heard.get(timeout=TIMEOUT_S).frames).decode())
-    assert not any(dead in text for text in texts)
-
-
 def test_an_event_that_was_delivered_too_often_is_put_aside_and_can_be_opened(acting, host):
     with line_of(host) as line:
         sent = line.send("plain", 7)

@@ -13,7 +13,7 @@ from epypes.bundle.seal import seal
 from epypes.display.views.view import view
 from epypes.errors import BundleError, FailureNotKept, NotComputed, RemoteFailure, UnknownName
 from epypes.service import Service
-from epypes.service.failures.record import FailureRecord
+from epypes.service.failures.record import FailedEvent
 from epypes.service.failures.reproduce import reproduce
 from epypes.service.failures.source import failures_of, find_failure
 from epypes.service.failures.store import FailureStore, failures_folder
@@ -192,7 +192,7 @@ def test_an_event_that_is_run_again_fails_is_fine_kills_or_hangs_and_the_caller_
     bright_bundle, value, ending, exception, message
 ):
     record = FailureStore(failures_folder(bright_bundle)).keep(
-        FailureRecord(hyperparameters={"most": {"value": 90}, "gone": {"value": 1}})
+        FailedEvent(hyperparameters={"most": {"value": 90}, "gone": {"value": 1}})
     )
     found = reproduce(record, request(value), bright_bundle, timeout_s=0.5 if value == HANGS else WAIT_S)
     assert (found.ending, found.exception, found.message) == (ending, exception, message)
@@ -213,7 +213,7 @@ def test_a_bundle_whose_module_fails_is_no_reproduction(copy):
         file.write("\nraise RuntimeError('no')\n")
     seal(copy)
     with pytest.raises(BundleError, match="fails: RuntimeError: no"):
-        reproduce(FailureRecord(), request(1), copy)
+        reproduce(FailedEvent(), request(1), copy)
 
 
 @pytest.fixture(scope="session")
@@ -225,13 +225,13 @@ def byte_bundle(tmp_path_factory):
 def test_the_bundles_own_f_in_makes_the_payload_of_a_message_of_2019(byte_bundle):
     failure = keep(byte_bundle, picture(RAISES).tobytes())
     assert ep.load_failure(failure, byte_bundle)["bright"].max() == 95
-    found = reproduce(FailureRecord(), picture(RAISES).tobytes(), byte_bundle)
+    found = reproduce(FailedEvent(), picture(RAISES).tobytes(), byte_bundle)
     assert (found.ending, found.function) == ("failed", "check")
 
 
 @pytest.mark.slow
 def test_an_f_in_that_hangs_is_not_called_in_the_notebook(byte_bundle):
-    found = reproduce(FailureRecord(), b"hangs", byte_bundle, timeout_s=0.5)
+    found = reproduce(FailedEvent(), b"hangs", byte_bundle, timeout_s=0.5)
     assert (found.ending, found.function) == ("stuck", "f_in")
     failure = keep(byte_bundle, b"hangs", kind="stuck", function="f_in")
     with pytest.warns(UserWarning, match="f_in was stuck by this event, so it is not called here"):

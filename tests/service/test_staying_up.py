@@ -204,9 +204,10 @@ def test_a_failed_event_is_told_on_both_sockets_and_its_trace_is_kept(steady):
     while (reported := peer.failures.get(timeout=TIMEOUT_S)).correlation_id != answer.correlation_id:
         pass
     assert reported.failure == answer.failure
-    record = heard.get(timeout=TIMEOUT_S)
+    while (record := heard.get(timeout=TIMEOUT_S))["event_id"] != answer.correlation_id:
+        pass
     forget()
-    assert (record["event_id"], record["message"]) == (answer.correlation_id, "oh no")
+    assert record["message"] == "oh no"
     assert any("raise ValueError(text)" in line for line in record["trace"])
     peer.ask("fail:again")
     assert heard.empty()

@@ -56,11 +56,9 @@ def soon(monkeypatch):
     monkeypatch.setattr("epypes.transport.brokers.channel.REDELIVERY_S", 0.2)
 
 
-def test_what_can_not_be_a_dead_letter_is_delivered_again_and_nothing_else_waits_for_it(
-    rabbitmq, name, opened, by_hand, soon, caplog
-):
+def test_what_can_not_be_a_dead_letter_is_delivered_again_later(rabbitmq, name, opened, by_hand, soon, caplog):
     sender = opened(Sender, rabbitmq.address(name, create=True))
-    receiver = opened(Receiver, rabbitmq.address(name), prefetch=1)
+    receiver = opened(Receiver, rabbitmq.address(name), prefetch=2)
     sender.send(b"keep me", id="spoilt")
     by_hand(lambda channel: channel.queue_delete(f"{name}.dead"))
     spoilt = receiver.next()

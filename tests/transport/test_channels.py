@@ -275,22 +275,6 @@ def test_no_more_are_delivered_than_the_prefetch_window_until_one_is_settled(que
     assert receiver.is_quiet()
 
 
-@counting
-def test_the_prefetch_window_may_be_changed(queue, opened):
-    sender, receiver = opened(Sender, queue), opened(Receiver, queue, prefetch=1)
-    for number in range(9):
-        sender.send(b"%d" % number)
-    held = receiver.take(1)
-    receiver.channel.prefetch = 5
-    held += receiver.take(4)
-    receiver.channel.prefetch = 2
-    for delivery in held:
-        delivery.ack()
-    held += receiver.take(2)
-    assert receiver.is_quiet()
-    assert sorted(map(body, held)) == [b"%d" % number for number in range(7)]
-
-
 def test_a_paused_channel_delivers_nothing_and_what_it_had_delivered_can_be_acknowledged(queue, opened):
     sender, receiver = opened(Sender, queue), opened(Receiver, queue, prefetch=2)
     sender.send(b"a")

@@ -75,11 +75,11 @@ def test_encoded_envelopes_get_the_publishers_topic_and_numbers_and_their_values
     encoded = EncodedEnvelope.encode(Envelope("x", {"n": 1}, source="worker", id="a"), "elsewhere")
     into = queue.SimpleQueue()
     with joined(address, None, into, "cam1") as (pub, _):
-        pub.send(encoded)
-        pub.send(encoded.stamped(9, 9, 9))
-        first, *_ = take(into)
-    assert (first.sequence, first.source, first.parts["n"]) == (1, "worker", 1)
-    assert first.epoch > 9
+        pub.send(encoded, id="a")
+        pub.send(encoded, id="b")
+        received = take(into, 2)
+    assert [(each.sequence, each.source, each.parts["n"]) for each in received] == [(1, "worker", 1), (2, "worker", 1)]
+    assert received[0].epoch > 0
 
 
 def test_send_needs_no_queue_and_confirms_each_message_or_raises(address):

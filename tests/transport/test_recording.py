@@ -391,6 +391,7 @@ def test_stop_works_before_start_and_twice_and_start_works_again(tmp_path):
     recorder.stop()
     recorder.start().start()
     assert recorder.address != LOCAL
+    assert not recorder.wait(0.0)
     recorder.stop()
     recorder.stop()
     with pytest.raises(RecordingError, match="is there already"):

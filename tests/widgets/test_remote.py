@@ -73,9 +73,17 @@ def followers() -> list[threading.Thread]:
     return [thread for thread in threading.enumerate() if thread.name == "epypes-follower"]
 
 
-def is_following(panel: Panel) -> None:
+def is_following(panel: Panel, service: Standing) -> None:
     """Return when the panel hears what the service tells, and has taken what it has heard."""
-    until(lambda: panel._runner._follower is not None and panel._runner._follower.is_open)
+    heard = threading.Event()
+    forget = panel._runner.watch(heard.set)
+
+    def has_heard() -> bool:
+        service.become(service.state, service.reason)
+        return heard.is_set()
+
+    until(has_heard)
+    forget()
     panel.wait(TIMEOUT_S)
 
 
@@ -133,7 +141,7 @@ def test_undo_redo_save_and_load_work(panel: Panel, service: Standing, tmp_path:
 def test_the_picture_follows_the_line_when_nobody_moves_anything(
     panel: Panel, screen: FrontEnd, service: Standing, image: Any
 ) -> None:
-    is_following(panel)
+    is_following(panel, service)
     before = len(screen.frames)
     service.event(image=255 - image)
     until(lambda: len(screen.frames) > before)
@@ -153,7 +161,7 @@ def test_no_more_runs_are_fetched_than_frames_are_painted(
         answers.append(deliver) if is_slow.is_set() else deliver()
 
     screen = FrontEnd(panel, monkeypatch, up=up)
-    is_following(panel)
+    is_following(panel, service)
     panel.wait(TIMEOUT_S)
     is_slow.set()
     before = len(screen.frames)
@@ -174,7 +182,7 @@ def test_no_more_runs_are_fetched_than_frames_are_painted(
 def test_with_live_off_neither_events_nor_values_move_the_picture(
     panel: Panel, screen: FrontEnd, service: Standing, image: Any
 ) -> None:
-    is_following(panel)
+    is_following(panel, service)
     screen.tell("live", on=False)
     panel.wait(TIMEOUT_S)
     before = len(screen.frames)
@@ -188,7 +196,7 @@ def test_with_live_off_neither_events_nor_values_move_the_picture(
 
 
 def test_a_control_follows_what_somebody_else_sets(panel: Panel, screen: FrontEnd, service: Standing) -> None:
-    is_following(panel)
+    is_following(panel, service)
     service.set_parameters({"threshold": 33}, None)
     until(lambda: panel["threshold"] == 33)
     panel.wait(TIMEOUT_S)
@@ -201,7 +209,7 @@ def test_a_control_follows_what_somebody_else_sets(panel: Panel, screen: FrontEn
 def test_what_others_set_under_the_hand_is_told_and_not_overwritten(
     panel: Panel, screen: FrontEnd, service: Standing
 ) -> None:
-    is_following(panel)
+    is_following(panel, service)
     screen.tell("hold", names=["threshold"])
     panel._hand.control("threshold").widget.value = 61
     panel.wait(TIMEOUT_S)
@@ -220,7 +228,7 @@ def test_what_others_set_under_the_hand_is_told_and_not_overwritten(
 
 
 def test_a_conflict_on_another_parameter_sends_the_value_again(panel: Panel, service: Standing) -> None:
-    is_following(panel)
+    is_following(panel, service)
     service.tell = lambda kind, **said: None  # type: ignore[method-assign]  # nobody hears of it before
     service.set_parameters({"gain": 4}, None)
     panel["threshold"] = 60
@@ -234,7 +242,7 @@ def test_a_conflict_on_another_parameter_sends_the_value_again(panel: Panel, ser
 
 
 def test_a_conflict_on_the_same_parameter_is_told_and_the_other_value_stays(panel: Panel, service: Standing) -> None:
-    is_following(panel)
+    is_following(panel, service)
     service.tell = lambda kind, **said: None  # type: ignore[method-assign]
     service.set_parameters({"threshold": 33}, None)
     panel.set(threshold=60, gain=4)
@@ -247,7 +255,7 @@ def test_a_conflict_on_the_same_parameter_is_told_and_the_other_value_stays(pane
 def test_a_failure_on_the_line_marks_its_function_until_an_event_completes(
     panel: Panel, screen: FrontEnd, service: Standing, image: Any
 ) -> None:
-    is_following(panel)
+    is_following(panel, service)
     picture = panel.result
     service.event(image="no image")
     until(lambda: bool(panel.error))
@@ -294,7 +302,7 @@ def test_a_service_that_is_gone_leaves_the_last_picture_and_is_found_again(
         connection = ep.connect(address, token=token)
         panel = tune(connection)
         screen = FrontEnd(panel, monkeypatch)
-        is_following(panel)
+        is_following(panel, service)
         panel.wait(TIMEOUT_S)
         picture = panel.result
     until(lambda: "The picture is the last one" in panel.error)
@@ -311,7 +319,7 @@ def test_a_service_that_is_gone_leaves_the_last_picture_and_is_found_again(
 
 
 def test_a_worker_that_starts_again_is_told(panel: Panel, screen: FrontEnd, service: Standing) -> None:
-    is_following(panel)
+    is_following(panel, service)
     service.become("LOADING", "The worker was killed by signal 9")
     until(lambda: "LOADING: The worker was killed by signal 9" in panel.error)
     panel["threshold"] = 60
@@ -333,7 +341,7 @@ def test_a_service_without_any_event_yet_shows_its_first_one(
         screen = FrontEnd(panel, monkeypatch)
         said = {"kind": "note", "text": "Waiting for the first event at tcp://127.0.0.1:1", "waits": True}
         assert (panel.error, screen.last("note")) == ("", said)
-        is_following(panel)
+        is_following(panel, service)
         service.event(image=image)
         until(lambda: panel.token == "mask")
         panel.wait(TIMEOUT_S)
@@ -351,7 +359,7 @@ def exchange(service: Standing) -> None:
 def test_a_panel_says_that_no_event_has_come_since_a_bundle_was_deployed(
     panel: Panel, screen: FrontEnd, service: Standing, image: Any
 ) -> None:
-    is_following(panel)
+    is_following(panel, service)
     before = panel.result
     exchange(service)
     until(lambda: "No event since the bundle was deployed" in (screen.of("note") or [{"text": ""}])[-1]["text"])
@@ -367,7 +375,7 @@ def test_a_panel_says_that_no_event_has_come_since_a_bundle_was_deployed(
 def test_a_panel_that_is_closed_has_the_last_picture_with_its_values_and_asks_for_nothing(
     panel: Panel, screen: FrontEnd, service: Standing, image: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    is_following(panel)
+    is_following(panel, service)
     panel["threshold"] = 60
     panel.wait(TIMEOUT_S)
     exchange(service)
@@ -384,14 +392,15 @@ def test_a_panel_that_is_closed_has_the_last_picture_with_its_values_and_asks_fo
     service.become("STOPPED")
     screen.tell("stage", token="image")
     screen.tell("set", values={"threshold": 70})
-    assert (len(service.asked), panel.error, followers()) == (asked, "", [])
+    assert (len(service.asked), panel.error) == (asked, "")
+    until(lambda: not followers())
 
 
 def test_a_panel_that_is_closed_leaves_no_thread(panel: Panel, service: Standing) -> None:
-    is_following(panel)
+    is_following(panel, service)
     assert len(followers()) == 1
     panel.close(TIMEOUT_S)
-    assert followers() == []
+    until(lambda: not followers())
 
 
 def test_a_panel_that_is_replaced_listens_no_more_and_shares_its_history(
@@ -405,7 +414,7 @@ def test_a_panel_that_is_replaced_listens_no_more_and_shares_its_history(
     assert list(again.history["threshold"]) == [100, 60]
     assert len(followers()) == 1
     again.close(TIMEOUT_S)
-    assert followers() == []
+    until(lambda: not followers())
     screen.tell("ready")
     assert len(followers()) == 1
 

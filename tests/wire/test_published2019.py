@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -23,7 +24,6 @@ from epypes.wire import (
     parsed,
     serialized,
 )
-from epypes.wire.compile import PROTO_FILES, SCHEMA_PATH, compiled
 
 
 def field(number: int, content: bytes | float) -> bytes:
@@ -243,10 +243,17 @@ def test_an_incomplete_message_is_refused_by_the_sender():
 def test_the_shipped_schema_is_what_proto_says(tmp_path):
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
-    shipped = FileDescriptorSet.FromString(SCHEMA_PATH.read_bytes())
-    fresh = FileDescriptorSet.FromString(compiled(SCHEMA_PATH.parents[2] / "proto"))
-    assert shipped == fresh, "run: python -m epypes.wire.compile"
-    assert sorted(file.name for file in shipped.file) == sorted(PROTO_FILES)
+    root = Path(__file__).parents[2]
+    proto, fresh = root / "proto", tmp_path / "schema.binpb"
+    # Names with a folder: they never clash with a user's own messages.proto.
+    files = sorted(path.relative_to(proto).as_posix() for path in proto.rglob("*.proto"))
+    arguments = [f"-I{proto}", "--include_imports", f"--descriptor_set_out={fresh}", *files]
+    subprocess.run([sys.executable, "-m", "grpc_tools.protoc", *arguments], check=True, timeout=60)
+    shipped = FileDescriptorSet.FromString((root / "epypes/wire/schema.binpb").read_bytes())
+    assert {file.name: file for file in shipped.file} == {
+        file.name: file for file in FileDescriptorSet.FromString(fresh.read_bytes()).file
+    }, "run: make schema"
+    assert sorted(file.name for file in shipped.file) == files
 
 
 USER = """

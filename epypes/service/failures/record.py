@@ -25,7 +25,7 @@ ID: Final = re.compile(f"[{_DIGITS}]{{{_TIME_DIGITS + _RANDOM_DIGITS}}}")
 
 
 @dataclass(frozen=True, slots=True)
-class FailureRecord:
+class FailedEvent:
     """What is known of an event that failed in a service; JSON-ready by ``dataclasses.asdict``.
 
     Attributes
@@ -111,7 +111,7 @@ def _new_id(when_ns: int) -> str:
     return "".join(digits)
 
 
-def with_id(record: FailureRecord) -> FailureRecord:
+def with_id(record: FailedEvent) -> FailedEvent:
     """Return a record with an id and a time, and with long texts cut."""
     when_ns = record.when_ns or time_ns()
     return replace(
@@ -124,7 +124,7 @@ def with_id(record: FailureRecord) -> FailureRecord:
     )
 
 
-def read_record(entries: Any) -> FailureRecord:
+def read_record(entries: Any) -> FailedEvent:
     """Return the record in an object of JSON; keys that a later version adds are left out.
 
     Raises
@@ -140,14 +140,14 @@ def read_record(entries: Any) -> FailureRecord:
         if not isinstance(value, (list, tuple) if isinstance(like, tuple) else type(like)):
             raise ValueError(f"{name!r} is {value!r:.40}")
         given[name] = tuple(map(str, value)) if isinstance(like, tuple) else value
-    record = FailureRecord(**given)
+    record = FailedEvent(**given)
     if not ID.fullmatch(record.id):
         raise ValueError(f"{record.id!r:.40} is no id of a failure")
     return record
 
 
 def values_of(
-    record: FailureRecord, known: Collection[str], enums: Mapping[str, Any] | None = None
+    record: FailedEvent, known: Collection[str], enums: Mapping[str, Any] | None = None
 ) -> tuple[dict[str, Any], str]:
     """Return the values of a record's hyperparameters, and a note on those that the bundle can't take.
 
@@ -172,4 +172,4 @@ def values_of(
     return values, f"{', '.join(map(repr, gone))} can't have the value that failed" if gone else ""
 
 
-_EMPTY: Final[Mapping[str, Any]] = {each.name: getattr(FailureRecord(), each.name) for each in fields(FailureRecord)}
+_EMPTY: Final[Mapping[str, Any]] = {each.name: getattr(FailedEvent(), each.name) for each in fields(FailedEvent)}

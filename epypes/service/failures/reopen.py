@@ -13,7 +13,7 @@ from epypes.bundle.load import Bundle, pipeline_of, read_bundle
 from epypes.errors import RemoteFailure
 from epypes.run import CompGraphRunner
 from epypes.run.stopped import stop_at
-from epypes.service.failures.record import FailureRecord, values_of
+from epypes.service.failures.record import FailedEvent, values_of
 from epypes.service.failures.reproduce import reproduce
 from epypes.service.failures.source import bundle_of, failures_of, find_failure, path_of
 
@@ -86,7 +86,7 @@ def _payload(bundle: Bundle, event: Any) -> Mapping[str, Any]:
     return payload
 
 
-def _run(runner: CompGraphRunner, bundle: Bundle, record: FailureRecord, event: Any) -> str:
+def _run(runner: CompGraphRunner, bundle: Bundle, record: FailedEvent, event: Any) -> str:
     """Run the event; return what differs from the record, nothing if the same function failed in the same way."""
     payload = _payload(bundle, event)
     try:
@@ -108,7 +108,7 @@ def _run(runner: CompGraphRunner, bundle: Bundle, record: FailureRecord, event: 
     return ""
 
 
-def _stop(runner: CompGraphRunner, bundle: Bundle, record: FailureRecord, event: Any) -> str:
+def _stop(runner: CompGraphRunner, bundle: Bundle, record: FailedEvent, event: Any) -> str:
     """Run the event up to the function that failed, which is not called; return a note if that is not possible."""
     if record.kind == "exhausted":
         stop_at(runner, _payload(bundle, event))

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.errors import BundleError, EpypesError
-from epypes.service.failures.record import FailureRecord, read_record, values_of, with_id
+from epypes.service.failures.record import FailedEvent, read_record, values_of, with_id
 from epypes.service.worker_connection import signal_name
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ class Reproduction:
 
 
 def reproduce(
-    record: FailureRecord, event: Envelope | bytes, bundle: str | Path, *, timeout_s: float = TIMEOUT_S
+    record: FailedEvent, event: Envelope | bytes, bundle: str | Path, *, timeout_s: float = TIMEOUT_S
 ) -> Reproduction:
     """Run an event once more, alone in a new interpreter that sees neither the environment nor the current folder.
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from epypes.bundle.seal import check_seal
 from epypes.errors import BundleError, FailureNotKept, ServiceError, UnknownName
-from epypes.service.failures.record import FAILURE_TOPIC, ID, FailureRecord, read_record
+from epypes.service.failures.record import FAILURE_TOPIC, FailedEvent, read_record
 from epypes.service.failures.store import FailureStore, failures_folder
 
 if TYPE_CHECKING:
@@ -28,11 +28,8 @@ _JOIN_TIMEOUT_S: Final = 10.0
 class FailureSource(Protocol):
     """Failures of a store on this machine, or of a service."""
 
-    def records(self, limit: int | None = None) -> Sequence[FailureRecord]:
+    def records(self, limit: int | None = None) -> Sequence[FailedEvent]:
         """Return the records, the newest first."""
-
-    def record(self, failure_id: str) -> FailureRecord:
-        """Return one of them; raise UnknownName or FailureNotKept."""
 
     def event(self, failure_id: str) -> Envelope | bytes:
         """Return the event that failed; raise UnknownName or FailureNotKept."""
@@ -44,11 +41,8 @@ class _ServiceFailures:
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
 
-    def records(self, limit: int | None = None) -> Sequence[FailureRecord]:
+    def records(self, limit: int | None = None) -> Sequence[FailedEvent]:
         return self._connection.failures()[:limit]
-
-    def record(self, failure_id: str) -> FailureRecord:
-        return self._connection.failure(failure_id)[0]
 
     def event(self, failure_id: str) -> Envelope | bytes:
         record, event = self._connection.failure(failure_id)
@@ -73,8 +67,8 @@ class _LocalFailures:
         self._bundle = None if bundle is None else str(bundle.resolve())
         self._own = None if bundle is None else failures_folder(bundle)
 
-    def records(self, limit: int | None = None) -> Sequence[FailureRecord]:
-        found: list[FailureRecord] = []
+    def records(self, limit: int | None = None) -> Sequence[FailedEvent]:
+        found: list[FailedEvent] = []
         for store in self._stores:
             if self._bundle is None or store.folder == self._own:
                 found += store.records(limit)
@@ -82,16 +76,10 @@ class _LocalFailures:
                 found += [record for record in store.records() if record.bundle == self._bundle]
         return sorted(found, key=lambda record: record.id, reverse=True)[:limit]
 
-    def record(self, failure_id: str) -> FailureRecord:
-        return self._store(failure_id).record(failure_id)
-
     def event(self, failure_id: str) -> Envelope | bytes:
-        return self._store(failure_id).event(failure_id)
-
-    def _store(self, failure_id: str) -> FailureStore:
         for store in self._stores:
             if any(record.id == failure_id for record in store.records()):
-                return store
+                return store.event(failure_id)
         raise UnknownName("failure", failure_id, [record.id for record in self.records()], "on this machine")
 
 
@@ -134,7 +122,7 @@ def _connected(source: Any) -> Connection:
     return source
 
 
-def find_failure(failures: FailureSource, given: str) -> FailureRecord:
+def find_failure(failures: FailureSource, given: str) -> FailedEvent:
     """Return a failure by its id, the first or last characters of it, its event's id, or ``latest``.
 
     Of several failures of one event it is the last one.
@@ -142,9 +130,7 @@ def find_failure(failures: FailureSource, given: str) -> FailureRecord:
     Raises
     ------
     UnknownName
-        There is none, or more than one begins or ends so; the nearest are named.
-    FailureNotKept
-        It can't be read.
+        There is none that can be read, or more than one begins or ends so; the nearest are named.
     """
     records = failures.records()
     # An event fails more than once if a broker has delivered it again: the last time, which comes first, is meant.
@@ -155,12 +141,10 @@ def find_failure(failures: FailureSource, given: str) -> FailureRecord:
         return found[0]
     if found:
         raise UnknownName("single failure", given, [record.id for record in found], "but several that begin or end so")
-    if not ID.fullmatch(given):
-        raise UnknownName("failure", given, [record.id for record in records], "here")
-    return failures.record(given)
+    raise UnknownName("failure", given, [record.id for record in records], "here")
 
 
-def bundle_of(record: FailureRecord, given: str | Path | None = None) -> tuple[Path, str]:
+def bundle_of(record: FailedEvent, given: str | Path | None = None) -> tuple[Path, str]:
     """Return the folder of the bundle that failed, and how it has changed since; an empty text if it has not.
 
     Parameters
@@ -194,7 +178,7 @@ def bundle_of(record: FailureRecord, given: str | Path | None = None) -> tuple[P
 # -- from now on ------------------------------------------------------------------------------------------------------
 
 
-def follow_failures(source: Any, *, keys: Any = None, allow: Any = None) -> Iterator[FailureRecord | None]:
+def follow_failures(source: Any, *, keys: Any = None, allow: Any = None) -> Iterator[FailedEvent | None]:
     """Yield None when the failures are heard, then the record of each failure as it happens; goes on without end.
 
     Parameters
@@ -225,12 +209,13 @@ def follow_failures(source: Any, *, keys: Any = None, allow: Any = None) -> Iter
     raise ServiceError(connection.url, f"The service at {connection.url} has ended.")
 
 
-def _follow_sockets(path: Path, **secured: Any) -> Iterator[FailureRecord | None]:
-    from epypes.service.ops.client import running_services, why_unreachable
+def _follow_sockets(path: Path, **secured: Any) -> Iterator[FailedEvent | None]:
+    from epypes.service.ops.client import why_unreachable
+    from epypes.service.state_file import read_states
     from epypes.transport import ZMQSubscriber
     from epypes.wire import Envelope
 
-    states = running_services(path)
+    states = read_states(path)
     if not states:
         raise ServiceError(path, f"No service runs for {path}. Start one: epypes serve {path}")
     received: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -246,7 +231,7 @@ def _follow_sockets(path: Path, **secured: Any) -> Iterator[FailureRecord | None
             try:
                 event = received.get(timeout=_LOOK_S)
             except queue.Empty:
-                if not running_services(path):
+                if not read_states(path):
                     raise ServiceError(path, f"The service of {path} has ended.") from None
                 continue
             if isinstance(event, Envelope) and event.failure is not None:
@@ -263,12 +248,12 @@ def _check_shared(path: Path, address: str) -> None:
         raise ServiceError(path, text)
 
 
-def _record_of(event: Envelope) -> FailureRecord:
+def _record_of(event: Envelope) -> FailedEvent:
     """Return what a failure event says; the rest of the record is in the store, under its id."""
     failure, attributes = event.failure, event.attributes
     if failure is None:
-        return FailureRecord()
-    return FailureRecord(
+        return FailedEvent()
+    return FailedEvent(
         id=str(attributes.get("id", "")),
         event_id=failure.input_id,
         function=failure.function,

@@ -7,8 +7,7 @@ replayed for minutes keeps no other request waiting.
 from __future__ import annotations
 
 import os
-import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -17,11 +16,13 @@ from fastapi import APIRouter, Body, FastAPI, Query, Request, Response
 from fastapi import Path as PathParameter
 from starlette.responses import FileResponse
 from starlette.staticfiles import StaticFiles
+from starlette.types import Lifespan
 
 import epypes
-from epypes.bundle.seal import check_seal
-from epypes.errors import BundleError, DeployRefused
+from epypes.bundle.writeback import WriteBack
+from epypes.errors import BundleError
 from epypes.service import Service
+from epypes.service.failures.record import FailedEvent
 from epypes.service.http import events, graph_routes, models
 from epypes.service.http.metrics import exposed, registry_of
 from epypes.service.http.models import CHANGE_REFUSALS, INVALID, REFUSALS, Responses, ServiceOf, refused
@@ -52,8 +53,8 @@ failures = APIRouter(prefix="/v1/failures", tags=["failures"])
 operation = APIRouter(prefix="/v1", tags=["operation"], dependencies=[NEEDS_TOKEN])
 
 
-def create_app(service: Service) -> FastAPI:
-    """Return the application that answers for a service."""
+def create_app(service: Service, lifespan: Lifespan[FastAPI] | None = None) -> FastAPI:
+    """Return the application that answers for a service; ``lifespan`` is entered on the server's event loop."""
     app = FastAPI(
         title="EPypes service",
         description=_DESCRIPTION,
@@ -63,14 +64,13 @@ def create_app(service: Service) -> FastAPI:
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,
+        lifespan=lifespan,
     )
     app.state.service = service
     app.state.events = events.EventHub(service)
     app.state.registry = registry_of(service)
-    app.state.deploying = threading.Lock()
-    routers = (health, graph_routes.router, parameters, events.router, failures, operation)
-    add_error_handlers(app, routers)
-    for router in routers:
+    add_error_handlers(app)
+    for router in (health, graph_routes.router, parameters, events.router, failures, operation):
         app.include_router(router)
 
     @app.get("/", include_in_schema=False)
@@ -161,18 +161,16 @@ def change_parameters(service: ServiceOf, wanted: models.Change) -> Response:
 
 @parameters.post(
     "/v1/parameters/write-back",
-    response_model=models.WrittenBack,
+    response_model=WriteBack,
     dependencies=[NEEDS_TOKEN],
     responses={
         **CHANGE_REFUSALS,
-        409: refused("A deploy, a rollback or a write-back is running already."),
         422: refused("The bundle can't be written.", models.Invalid),
     },
 )
-def write_back(request: Request, service: ServiceOf, wanted: models.WriteBack) -> Response:
+def write_back(service: ServiceOf, wanted: models.WriteBackRequest) -> Response:
     """Write the parameters into pipeline.toml, or say what would change there; the bundle is replayed and sealed."""
-    done = _alone(request, lambda: service.write_back(dry_run=wanted.dry_run))
-    return json_response({"diff": done.diff, "digest": done.digest})
+    return json_response(asdict(service.write_back(dry_run=wanted.dry_run)))
 
 
 def _number(value: Any, entry: Mapping[str, Any]) -> Any:
@@ -200,7 +198,7 @@ def list_failures(
     return json_response({"failures": [asdict(record) for record in service.failure_records(limit)]})
 
 
-@failures.get("/{id}", response_model=models.Failure, responses=_FAILURE_REFUSALS)
+@failures.get("/{id}", response_model=FailedEvent, responses=_FAILURE_REFUSALS)
 def failure(service: ServiceOf, id: _FailureId) -> Response:  # noqa: A002 - as in the path
     """Say what failed, where, and with which parameters."""
     return json_response(asdict(service.failure_store.record(id)))
@@ -231,24 +229,19 @@ async def access() -> Response:
 
 
 @operation.post("/deploy", response_model=models.Info, responses=_DEPLOY_REFUSALS)
-def deploy(request: Request, service: ServiceOf, wanted: models.Deploy) -> Response:
+def deploy(service: ServiceOf, wanted: models.Deploy) -> Response:
     """Replay another bundle beside the one that is served, and serve it from the next event on."""
-
-    def check_and_deploy() -> dict[str, Any]:
-        # Unlike the methods of Path, these take any text.
-        if not os.path.isabs(wanted.bundle) or not os.path.isdir(wanted.bundle):
-            text = f"{wanted.bundle!r:.300} is no folder on the service's machine. Name a bundle's absolute path."
-            raise BundleError(wanted.bundle, text)
-        check_seal(Path(wanted.bundle))
-        return service.deploy(wanted.bundle)
-
-    return json_response(_alone(request, check_and_deploy))
+    # Unlike the methods of Path, these take any text.
+    if not os.path.isabs(wanted.bundle) or not os.path.isdir(wanted.bundle):
+        text = f"{wanted.bundle!r:.300} is no folder on the service's machine. Name a bundle's absolute path."
+        raise BundleError(wanted.bundle, text)
+    return json_response(service.deploy(wanted.bundle))
 
 
 @operation.post("/rollback", response_model=models.Info, responses=_DEPLOY_REFUSALS)
-def rollback(request: Request, service: ServiceOf) -> Response:
+def rollback(service: ServiceOf) -> Response:
     """Serve the bundle again that was served before this one."""
-    return json_response(_alone(request, service.rollback))
+    return json_response(service.rollback())
 
 
 @operation.post("/pause", response_model=models.Info, responses=CHANGE_REFUSALS)
@@ -270,15 +263,3 @@ def drain(service: ServiceOf, wanted: Annotated[models.Drain | None, Body()] = N
     """Take no more events, and work off those that wait."""
     service.drain((wanted or models.Drain()).timeout_s)
     return json_response(service.info())
-
-
-def _alone(request: Request, function: Callable[[], Any]) -> Any:
-    """Call what exchanges or changes the bundle, one call at a time; another call is refused at once."""
-    lock: threading.Lock = request.app.state.deploying
-    if not lock.acquire(blocking=False):
-        text = "A bundle is being exchanged already. Wait until that has ended, then look at what is served."
-        raise DeployRefused("The bundle", [text])
-    try:
-        return function()
-    finally:
-        lock.release()

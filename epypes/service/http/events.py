@@ -149,7 +149,7 @@ class EventHub:
         """Take an event from a thread of the service, and return at once."""
         if not self._subscriptions or self._loop is None:
             return
-        if kind == "parameters" and "parameters" in data:
+        if kind == "parameters":
             data = {**data, "parameters": with_types(data["parameters"])}
         with suppress(RuntimeError):  # the event loop has ended
             if kind != "run":

@@ -8,6 +8,7 @@ from fastapi import Depends, Request
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from epypes.service import Service
+from epypes.service.failures.record import FailedEvent
 
 Sentence = Annotated[str, Field(description="What is wrong, and the way out.")]
 Revision = Annotated[int, Field(ge=0, description="It rises with every change of the parameters.", examples=[3])]
@@ -148,44 +149,17 @@ class Change(BaseModel):
     values: dict[str, JsonValue] = Field(min_length=1, max_length=1_000, description="New values by token.")
 
 
-class WriteBack(BaseModel):
+class WriteBackRequest(BaseModel):
     """Whether to write the parameters into pipeline.toml, or only to say what would change."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     dry_run: bool = Field(default=True, description="True to say what would change.")
 
 
-class WrittenBack(BaseModel):
-    """What changed, or would change, in pipeline.toml."""
-
-    diff: str = Field(description="A unified diff; empty if nothing changes.")
-    digest: str = Field(description="That of the bundle afterwards.")
-
-
-class Failure(BaseModel):
-    """An event that failed."""
-
-    model_config = ConfigDict(extra="allow")
-    id: str
-    event_id: str
-    function: str
-    tokens: list[str]
-    exception: str
-    message: str
-    trace: list[str]
-    kind: str = Field(description="raised, killed, stuck, dropped or exhausted.", examples=["raised"])
-    attempt: int
-    dead_letter: bool
-    when_ns: int
-    revision: int
-    hyperparameters: Entries
-    has_event: bool = Field(description="Whether the event was kept.")
-
-
 class Failures(BaseModel):
     """Events that failed, the last one first."""
 
-    failures: list[Failure]
+    failures: list[FailedEvent]
 
 
 class Access(BaseModel):
@@ -226,10 +200,7 @@ def content(media_types: list[str], description: str) -> dict[str, Any]:
 
 REFUSALS: Final[Responses] = {
     400: refused("The body is not JSON, or is not whole."),
-    408: refused("The body took too long."),
-    413: refused("The body has more than 64 KB."),
-    415: refused("The Content-Type of the body is not JSON."),
-    431: refused("The address or the headers are too long."),
+    413: {"description": "The body has more than 64 KB."},
     503: {
         **refused("The service can't answer now."),
         "headers": {"Retry-After": {"schema": {"type": "integer"}, "description": "Seconds until the next try."}},

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
-from fastapi import APIRouter, FastAPI, Request, Response
+from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
-from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
 
 from epypes.errors import (
@@ -82,8 +81,8 @@ def parameters_body(parameters: Parameters) -> dict[str, Any]:
     return {"revision": parameters.revision, "parameters": with_types(parameters.entries)}
 
 
-def add_error_handlers(app: FastAPI, routers: Sequence[APIRouter]) -> None:
-    """Have an application, which has these routers, answer every error with a sentence."""
+def add_error_handlers(app: FastAPI) -> None:
+    """Have an application answer every error with a sentence."""
 
     async def on_epypes_error(request: Request, error: Exception) -> Response:
         if isinstance(error, RevisionConflict):
@@ -96,6 +95,8 @@ def add_error_handlers(app: FastAPI, routers: Sequence[APIRouter]) -> None:
 
     async def on_invalid_request(request: Request, error: Exception) -> Response:
         found = error.errors() if isinstance(error, RequestValidationError) else []
+        if any(each["type"] == "json_invalid" for each in found):
+            return refusal(400, f"The body is not JSON: {found[0]['ctx']['error']}.")
         problems = {".".join(map(str, each["loc"])): str(each["msg"]) for each in found}
         listed = "; ".join(f"{place}: {problem}" for place, problem in problems.items())
         return refusal(422, f"This request is not as /openapi.json says. {listed}.", problems=problems)
@@ -107,9 +108,11 @@ def add_error_handlers(app: FastAPI, routers: Sequence[APIRouter]) -> None:
             return refusal(404, f"There is nothing at {path}. Look at / or /openapi.json.")
         if status == 405:
             # Starlette's Allow header names only the methods of the first route with this path.
-            allowed = ", ".join(_methods_of(routers, request.url.path))
-            text = f"{path} does not take {request.method:.20}. Take one of: {allowed}."
-            return refusal(405, text, {"Allow": allowed})
+            methods = [method.upper() for method in request.app.openapi()["paths"].get(request.url.path, ())]
+            headers = {"Allow": ", ".join(sorted(methods))} if methods else getattr(error, "headers", None)
+            return refusal(405, f"{path} does not take {request.method:.20}. Look at /openapi.json.", headers)
+        if status == 413:
+            return refusal(413, "The body is too long. Send less.", {"Connection": "close"})
         return refusal(status, str(getattr(error, "detail", error)), getattr(error, "headers", None))
 
     async def on_bug(request: Request, error: Exception) -> Response:
@@ -119,10 +122,3 @@ def add_error_handlers(app: FastAPI, routers: Sequence[APIRouter]) -> None:
     app.add_exception_handler(RequestValidationError, on_invalid_request)
     app.add_exception_handler(HTTPException, on_http_error)
     app.add_exception_handler(Exception, on_bug)
-
-
-def _methods_of(routers: Sequence[APIRouter], path: str) -> list[str]:
-    routes = [route for router in routers for route in router.routes if isinstance(route, APIRoute)]
-    return sorted({method for route in routes if route.path_regex.match(path) for method in route.methods or ()}) or [
-        "GET"
-    ]

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import queue
 import threading
 from collections import Counter
 from collections.abc import Collection, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic, perf_counter_ns
@@ -15,10 +13,9 @@ from typing import TYPE_CHECKING, Any, Self
 
 from epypes.bundle.load import SETTINGS
 from epypes.bundle.ports import REQUEST, in_order
-from epypes.bundle.seal import check_seal
 from epypes.bundle.settings import read_settings
-from epypes.errors import BundleError, EpypesError, RemoteFailure, ServiceError
-from epypes.service.state_file import ServiceState, read_states, running_at, state_file
+from epypes.errors import RemoteFailure, ServiceError
+from epypes.service.state_file import ServiceState, read_states
 from epypes.transport import Publisher, Subscriber
 from epypes.transport.address import parse_address
 
@@ -29,38 +26,6 @@ if TYPE_CHECKING:
 
 # How often a call looks, while it waits for an answer, whether the service still runs.
 _LOOK_S = 0.2
-_INFO_TIMEOUT_S = 2.0
-
-
-def running_services(bundle: str | Path, replica: str = "") -> list[ServiceState]:
-    """Return the states of this user's running services of a bundle: all replicas, or one by its name.
-
-    A service is found by the bundle that it was started with; and by the one that it serves now, if that was deployed.
-    """
-    return read_states(bundle, replica) or [
-        state for state in _deployed_services(Path(bundle)) if replica in ("", state.replica)
-    ]
-
-
-def _deployed_services(bundle: Path) -> list[ServiceState]:
-    from epypes.service.remote.control import Control
-
-    try:
-        digest = check_seal(bundle)
-    except BundleError:
-        return []
-    found = []
-    for file in sorted(state_file(bundle).parent.glob("*.json")):
-        # A file that is no state, or that of a service that does not answer, is passed over.
-        with suppress(OSError, ValueError, AttributeError, EpypesError):
-            state = json.loads(file.read_text(encoding="utf-8"))
-            running = running_at(state["http"]) if state.get("digest") == digest and state.get("http") else None
-            if running is not None:
-                control = Control(running.http, "", _INFO_TIMEOUT_S)
-                if control.get("/v1/info").get("bundle") == str(bundle.resolve()):
-                    found.append(running)
-                control.close()
-    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,14 +93,15 @@ class Client:
         self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._subscriber = _subscriber_to(path, pub or state.pub, self._answers, keys=keys, allow=allow)
-        self._publisher = _publisher_to(sub or state.sub, self._requests, keys=keys, allow=allow)
+        self._publisher = Publisher(sub or state.sub, self._requests, bind=False, keys=keys, allow=allow)
 
     def __enter__(self) -> Self:
         deadline = monotonic() + self.timeout_s
         try:
             self._subscriber.start()
             self._publisher.start()
-            if not self._has_joined(deadline):
+            is_heard = self._subscriber.wait_joined(self.timeout_s)
+            if not (is_heard and self._publisher.wait_for_subscriber(max(deadline - monotonic(), 0.0))):
                 text = f"The service of {self.path} can't be reached within {self.timeout_s:g} s."
                 raise ServiceError(self.path, f"{text} {why_unreachable(self._has_keys)}")
         except BaseException:
@@ -146,11 +112,6 @@ class Client:
     def __exit__(self, *exception: object) -> None:
         self._publisher.stop()
         self._subscriber.stop()
-
-    def _has_joined(self, deadline_s: float) -> bool:
-        """Wait until events and answers arrive; a broker has confirmed both by now."""
-        is_heard = self._subscriber.wait_joined(self.timeout_s)
-        return is_heard and self._publisher.wait_for_subscriber(max(deadline_s - monotonic(), 0.0))
 
     def _lost(self) -> int:
         return sum(self._subscriber.lost.values())
@@ -199,7 +160,7 @@ class Client:
         refused = self._publisher.rejected - refused_before
         if refused:
             raise ServiceError(self.path, f"The event could not be sent: {', '.join(refused)}.")
-        if not running_services(self.path):
+        if not read_states(self.path):
             raise ServiceError(self.path, f"The service of {self.path} ended before it answered. Look at its log.")
 
 
@@ -227,7 +188,7 @@ def why_unreachable(has_keys: bool) -> str:
 
 
 def _running(path: str | Path) -> ServiceState:
-    state = next(iter(running_services(path)), None)
+    state = next(iter(read_states(path)), None)
     if state is None:
         raise ServiceError(path, f"No service runs for {path}. Start one: epypes serve {path}")
     for address in (state.sub, state.pub):
@@ -249,12 +210,6 @@ def _subscriber_to(path: str | Path, address: str, answers: Any, **secured: Any)
         )
         raise ServiceError(path, text)
     return Subscriber(place, answers, acknowledge="received", **secured)
-
-
-def _publisher_to(address: str, requests: Any, **secured: Any) -> Publisher:
-    """Return the publisher of events to a service."""
-    place = parse_address(address)
-    return Publisher(place, requests, bind=False, **secured)
 
 
 def _read(path: str | Path, answer: Envelope, round_trip_ns: int, rgb: Collection[str]) -> Answer:

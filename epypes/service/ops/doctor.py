@@ -15,6 +15,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
 from time import perf_counter_ns
@@ -22,14 +23,13 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.bundle.seal import check_seal
 from epypes.errors import EpypesError
-from epypes.service.ops.client import running_services
+from epypes.service.state_file import read_states, state_file
 
 if TYPE_CHECKING:
     from packaging.requirements import Requirement
 
 Outcome = Literal["ok", "warning", "failed"]
 
-_OLDEST_PYTHON: Final = (3, 11)
 # A missing extra disables one part of EPypes.
 _EXTRAS: Final = ("notebook", "vision", "serve", "service", "scale", "store", "rabbitmq", "nats", "mqtt")
 _BROWSERS: Final = ("chromium", "chromium-browser", "google-chrome", "firefox", "safari", "microsoft-edge")
@@ -106,8 +106,6 @@ def _shown(address: str) -> str:
 
 def _python() -> Check:
     found = f"{platform.python_implementation()} {platform.python_version()} at {sys.executable}, {platform.machine()}"
-    if sys.version_info < _OLDEST_PYTHON:
-        return Check("Python", "failed", found, "EPypes needs Python 3.11 or newer: make an environment with one.")
     return Check("Python", "ok", found)
 
 
@@ -170,19 +168,13 @@ def _graphviz() -> Check:
     from epypes.display.layout.engine import routed_layout
     from epypes.display.layout.geometry import Box
 
-    engine = "pygraphviz" if _has("pygraphviz") else shutil.which("dot") or "none"
+    engine = "pygraphviz" if find_spec("pygraphviz") else shutil.which("dot") or "none"
     try:
         routed_layout([Box("box", 40, 20), Box("ellipse", 40, 20)], [(0, 1)], frozenset())
     except EpypesError as error:
         way_out = "pip install 'epypes[graphviz]', or your system's package graphviz, if you want graphs drawn."
         return Check("Graphviz", "warning", str(error), way_out)
     return Check("Graphviz", "ok", f"lays out by {engine}")
-
-
-def _has(module: str) -> bool:
-    from importlib.util import find_spec
-
-    return find_spec(module) is not None
 
 
 def _browser() -> Check:
@@ -195,8 +187,6 @@ def _browser() -> Check:
 
 
 def _state_folder() -> Check:
-    from epypes.service.state_file import state_file
-
     folder = state_file(".").parent
     mode = stat.S_IMODE(folder.stat().st_mode)
     if mode & 0o077:
@@ -295,7 +285,7 @@ def _bundle(path: Path) -> Check:
 
 
 def _service(path: Path) -> Check:
-    running = running_services(path)
+    running = read_states(path)
     if not running:
         return Check("service", "warning", "none runs for this bundle", f"epypes serve {path}")
     services = (

@@ -13,8 +13,9 @@ from urllib.parse import quote
 
 from epypes.bundle.entries import plain, written
 from epypes.bundle.ports import in_order
+from epypes.bundle.writeback import WriteBack
 from epypes.errors import EpypesError, ServiceError
-from epypes.service.failures.record import FailureRecord, read_record
+from epypes.service.failures.record import FailedEvent, read_record
 from epypes.service.parameters import Parameters
 from epypes.service.remote.control import Control, Event, read_parameters, split_url
 
@@ -28,22 +29,6 @@ _TOKEN_VARIABLE: Final = "EPYPES_TOKEN"  # noqa: S105 - the name of a variable, 
 _REPLAY_TIMEOUT_S: Final = 300.0
 _INFO_KEYS: Final = ("name", "digest", "state", "func_io", "outputs", "versions")
 _DIGEST_CHARACTERS: Final = 12
-
-
-@dataclass(frozen=True, slots=True)
-class WrittenBack:
-    """What writing back has changed, or would change.
-
-    Attributes
-    ----------
-    diff
-        Of pipeline.toml, as ``diff -u`` writes it; empty if nothing is changed.
-    digest
-        The bundle's, from then on.
-    """
-
-    diff: str
-    digest: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,12 +182,12 @@ class Connection:
         found = self._control.get("/v1/view")
         return found if isinstance(found, dict) else {}
 
-    def failures(self, limit: int = 100) -> list[FailureRecord]:
+    def failures(self, limit: int = 100) -> list[FailedEvent]:
         """Return the records of the last events that failed."""
         body = self._control.get("/v1/failures", limit=limit)
         return [self._record(record) for record in (body.get("failures", []) if isinstance(body, dict) else [])]
 
-    def failure(self, failure_id: str) -> tuple[FailureRecord, Envelope | bytes | None]:
+    def failure(self, failure_id: str) -> tuple[FailedEvent, Envelope | bytes | None]:
         """Return the record of an event that failed, and the event; None if it was not kept."""
         from epypes.service.packing import unpack_event
 
@@ -219,8 +204,7 @@ class Connection:
         ServiceError
             It is gone.
         """
-        with self._control.events() as stream:
-            yield from stream
+        yield from self._control.events()
 
     # -- changing -----------------------------------------------------------------------------------------------
 
@@ -247,7 +231,7 @@ class Connection:
         body = {"revision": revision, "values": entries}
         return read_parameters(self.url, self._control.change("PATCH", "/v1/parameters", body))
 
-    def write_back(self, dry_run: bool = False) -> WrittenBack:
+    def write_back(self, dry_run: bool = False) -> WriteBack:
         """Write the values of the hyperparameters into the bundle's pipeline.toml, and return what was changed.
 
         Parameters
@@ -256,7 +240,7 @@ class Connection:
             Whether to return only what would be changed.
         """
         body = self._control.change("POST", "/v1/parameters/write-back", {"dry_run": dry_run}, _REPLAY_TIMEOUT_S)
-        return WrittenBack(str(body.get("diff", "")), str(body.get("digest", "")))
+        return WriteBack(str(body.get("diff", "")), str(body.get("digest", "")))
 
     def deploy(self, path: str | Path) -> dict[str, Any]:
         """Serve another bundle on the service's machine from the next event on.
@@ -291,7 +275,7 @@ class Connection:
         from epypes.service.remote.runner import RemoteRunner
 
         if self._runner is None:
-            self._runner = RemoteRunner(self, self._control.events)
+            self._runner = RemoteRunner(self)
         return self._runner
 
     def close(self) -> None:
@@ -353,7 +337,7 @@ class Connection:
             raise ServiceError(self.url, f"What answers at {self.url} is no EPypes service. Is the address right?")
         self._info = body
 
-    def _record(self, entries: Any) -> FailureRecord:
+    def _record(self, entries: Any) -> FailedEvent:
         try:
             return read_record(entries)
         except ValueError as error:

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import json
-import logging
-import socket
-import threading
 import weakref
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any, Final, NoReturn
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from typing import Any, Final, NoReturn
 from urllib.parse import parse_qs, urlsplit
 
 from epypes.errors import (
     DeployRefused,
-    EpypesError,
     MessageError,
     NotComputed,
     ParametersRefused,
@@ -27,19 +23,11 @@ from epypes.service.parameters import Parameters
 with optional_import():
     import httpx
 
-if TYPE_CHECKING:
-    from contextlib import AbstractContextManager
-
-_log = logging.getLogger(__name__)
-
 _LOOPBACK: Final = ("localhost", "127.0.0.1", "::1")
 # A service sends its counts each second.
 _SILENCE_S: Final = 5.0
 _MAX_DETAIL_CHARACTERS: Final = 2_000
 _HOW_TO_CHANGE: Final = "Give it here: ep.connect(url, token=...), or set EPYPES_TOKEN."
-_FIRST_WAIT_S: Final = 0.25
-_LAST_WAIT_S: Final = 8.0
-_STOP_TIMEOUT_S: Final = 5.0
 
 Event = tuple[str, dict[str, Any]]
 
@@ -92,9 +80,10 @@ class Control:
         timeout_s = max(timeout_s, self.timeout_s)
         return self._json(path, self._request(method, path, content=content, headers=headers, timeout=timeout_s))
 
-    @contextmanager
-    def events(self) -> Iterator[EventStream]:
-        """Open the stream of server-sent events."""
+    def events(self) -> Iterator[Event]:
+        """Yield the name and the data of each server-sent event, the state of the service first."""
+        from httpx_sse import EventSource, SSEError
+
         timeout = httpx.Timeout(self.timeout_s, read=_SILENCE_S)
         headers = {"Accept": "text/event-stream", "Cache-Control": "no-store"}
         try:
@@ -102,7 +91,13 @@ class Control:
                 if response.status_code != 200:
                     response.read()
                     self._raise_refusal("/v1/events", response)
-                yield EventStream(self.url, response)
+                for event in EventSource(response).iter_sse():
+                    with suppress(ValueError):
+                        data = event.json()
+                        if isinstance(data, dict):
+                            yield event.event, data
+        except SSEError as error:
+            raise ServiceError(self.url, f"{self.url} sends no events: {error}.") from error
         except (httpx.HTTPError, httpx.StreamError) as error:
             self._raise_unreachable(error)
 
@@ -185,116 +180,3 @@ def read_parameters(url: str, body: Any) -> Parameters:
         return Parameters(int(body["revision"]), entries)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ServiceError(url, f"What answers at {url} is no EPypes service: it has no parameters.") from error
-
-
-# -- events -----------------------------------------------------------------------------------------------------------
-
-
-class EventStream:
-    """The server-sent events of a service, while the stream is open."""
-
-    def __init__(self, url: str, response: httpx.Response) -> None:
-        self._url, self._response = url, response
-
-    def __iter__(self) -> Iterator[Event]:
-        """Yield the name and the data of each event."""
-        with optional_import():
-            from httpx_sse import EventSource, SSEError
-
-        try:
-            for event in EventSource(self._response).iter_sse():
-                with suppress(ValueError):
-                    data = event.json()
-                    if isinstance(data, dict):
-                        yield event.event, data
-        except SSEError as error:
-            raise ServiceError(self._url, f"{self._url} sends no events: {error}.") from error
-
-    def close(self) -> None:
-        """End the stream, and a thread that waits for its next event; from any thread."""
-        stream = self._response.extensions.get("network_stream")
-        connection = stream.get_extra_info("socket") if stream is not None else None
-        if connection is not None:
-            with suppress(OSError):
-                connection.shutdown(socket.SHUT_RDWR)
-
-
-class EventFollower:
-    """Reads the events of a service on a thread of its own, and reconnects when the service is gone.
-
-    Parameters
-    ----------
-    open_stream
-        Opens the stream.
-    on_connected
-        Called when the stream is open, before its first event.
-    on_event
-        Called with the name and the data of each event.
-    on_lost
-        Called with the reason when the stream ends, and when it can't be opened.
-
-    Notes
-    -----
-    All are called on its thread, a daemon. Between two attempts it waits 0.25 s, 0.5 s ... 8 s.
-    """
-
-    def __init__(
-        self,
-        open_stream: Callable[[], AbstractContextManager[EventStream]],
-        on_connected: Callable[[], None],
-        on_event: Callable[[str, Mapping[str, Any]], None],
-        on_lost: Callable[[str], None],
-    ) -> None:
-        self._open_stream, self._on_connected = open_stream, on_connected
-        self._on_event, self._on_lost = on_event, on_lost
-        self._lock = threading.Lock()
-        self._stopped = threading.Event()
-        self._stream: EventStream | None = None
-        self.is_open = False
-        self._thread = threading.Thread(target=self._run, name="epypes-follower", daemon=True)
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End the thread; from any thread."""
-        self._stopped.set()
-        with self._lock:
-            if self._stream is not None:
-                self._stream.close()
-        if self._thread is not threading.current_thread() and self._thread.ident is not None:
-            self._thread.join(_STOP_TIMEOUT_S)
-
-    def _run(self) -> None:
-        wait_s = _FIRST_WAIT_S
-        while not self._stopped.is_set():
-            reason = "It ended the connection."
-            try:
-                with self._open_stream() as stream:
-                    self._set_stream(stream)
-                    self._on_connected()
-                    self.is_open = True
-                    wait_s = _FIRST_WAIT_S
-                    for name, data in stream:
-                        if self._stopped.is_set():
-                            break
-                        self._on_event(name, data)
-            except EpypesError as error:
-                reason = str(error)
-            except Exception as error:
-                _log.exception("An event of a service could not be handled")
-                reason = f"{type(error).__name__}: {error}"
-            self._set_stream(None)
-            self.is_open = False
-            if not self._stopped.is_set():
-                with suppress(Exception):
-                    self._on_lost(reason)
-            self._stopped.wait(wait_s)
-            wait_s = min(2 * wait_s, _LAST_WAIT_S)
-
-    def _set_stream(self, stream: EventStream | None) -> None:
-        with self._lock:
-            self._stream = stream
-            if stream is not None and self._stopped.is_set():
-                stream.close()

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
@@ -25,7 +24,7 @@ from epypes.errors import (
 )
 from epypes.run import Run
 from epypes.service.parameters import Parameters
-from epypes.service.remote.control import EventFollower, EventStream, read_parameters
+from epypes.service.remote.control import read_parameters
 from epypes.service.remote.runs import RemoteRuns, ShownRuns, remote_graph
 
 if TYPE_CHECKING:
@@ -35,6 +34,9 @@ _log = logging.getLogger(__name__)
 
 # Tries of a change while the parameters are changed concurrently.
 _MAX_TRIES: Final = 5
+# Between two attempts to reconnect; doubled each time.
+_FIRST_WAIT_S: Final = 0.25
+_LAST_WAIT_S: Final = 8.0
 
 
 class RemoteRunner:
@@ -44,8 +46,6 @@ class RemoteRunner:
     ----------
     connection
         To the service.
-    open_stream
-        Opens the stream of its events.
 
     Attributes
     ----------
@@ -57,14 +57,14 @@ class RemoteRunner:
         The values by token when the connection was made.
     """
 
-    def __init__(self, connection: Connection, open_stream: Callable[[], AbstractContextManager[EventStream]]) -> None:
+    def __init__(self, connection: Connection) -> None:
         self.connection = connection
         info, parameters = connection.info(), connection.parameters()
         self.cg = remote_graph(connection.url, info["func_io"], parameters.entries, _rgb(connection, info))
         self._runs = RemoteRuns(connection, self.cg, parameters, info["outputs"])
         self._shown = ShownRuns()
-        self._open_stream = open_stream
-        self._follower: EventFollower | None = None
+        # Set to end the thread that follows the events; None without a thread.
+        self._end_following: threading.Event | None = None
         self._callbacks: tuple[Callable[[], object], ...] = ()
         self._lock = threading.Lock()
         # What the service has, as far as it is known; what the panel has taken over; what it will be shown next.
@@ -243,7 +243,8 @@ class RemoteRunner:
     def watch(self, callback: Callable[[], object], /) -> Callable[[], None]:
         """Call something without arguments when the service has reported something; return what ends that.
 
-        It is called on a thread of its own, which ends with the last callback.
+        It is called on a thread of its own. When the last callback is gone, that ends at the service's next event: the
+        counts come each second.
         """
 
         # An object of its own for each call, so that one callback may be added twice and removed once.
@@ -252,9 +253,9 @@ class RemoteRunner:
 
         with self._lock:
             self._callbacks = (*self._callbacks, entry)
-            if self._follower is None:
-                self._follower = EventFollower(self._open_stream, self._on_connected, self._on_event, self._on_lost)
-                self._follower.start()
+            if self._end_following is None:
+                ended = self._end_following = threading.Event()
+                threading.Thread(target=self._follow, args=(ended,), name="epypes-follower", daemon=True).start()
 
         def forget() -> None:
             with self._lock:
@@ -271,9 +272,9 @@ class RemoteRunner:
 
     def _stop_following(self) -> None:
         with self._lock:
-            follower, self._follower = self._follower, None
-        if follower is not None:
-            follower.stop()
+            ended, self._end_following = self._end_following, None
+        if ended is not None:
+            ended.set()
         self._lost = ""
 
     def __repr__(self) -> str:
@@ -332,6 +333,29 @@ class RemoteRunner:
 
     # -- what the service reports, on the follower's thread -----------------------------------------------------
 
+    def _follow(self, ended: threading.Event) -> None:
+        wait_s = _FIRST_WAIT_S
+        while not ended.is_set():
+            reason, is_connected = "It ended the connection.", False
+            try:
+                for name, data in self.connection.events():
+                    if ended.is_set():
+                        return
+                    if not is_connected:
+                        is_connected, wait_s = True, _FIRST_WAIT_S
+                        self._on_connected()
+                    self._on_event(name, data)
+            except EpypesError as error:
+                reason = str(error)
+            except Exception as error:
+                _log.exception("An event of a service could not be handled")
+                reason = f"{type(error).__name__}: {error}"
+            if not ended.is_set():
+                self._lost = reason
+                self._notify()
+            ended.wait(wait_s)
+            wait_s = min(2 * wait_s, _LAST_WAIT_S)
+
     def _on_connected(self) -> None:
         info, news = self.connection.info(), self.connection.parameters()
         with self._lock:
@@ -342,10 +366,6 @@ class RemoteRunner:
         self._state, self._lost = (str(info["state"]), str(info.get("reason") or "")), ""
         self._notify()
 
-    def _on_lost(self, reason: str) -> None:
-        self._lost = reason
-        self._notify()
-
     def _on_event(self, name: str, data: Mapping[str, Any]) -> None:
         if name == "run":
             self._failed = None
@@ -354,10 +374,8 @@ class RemoteRunner:
         elif name == "state":
             self._state = str(data.get("state", "")), str(data.get("reason") or "")
         elif name == "parameters":
-            is_whole = "parameters" in data
-            news = read_parameters(self.connection.url, data) if is_whole else self.connection.parameters()
             with self._lock:
-                self._news = news
+                self._news = read_parameters(self.connection.url, data)
         else:
             return
         self._notify()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields
 from types import GenericAlias
@@ -70,7 +70,7 @@ def remote_graph(
             if known:
                 hints[token] = Annotated[Any, Param(**known)]
     io: dict[str, Any] = {name: (_as_tuple(taken), _as_tuple(made)) for name, (taken, made) in func_io.items()}
-    functions = {name: _remote_function(url, name, taken, made, hints) for name, (taken, made) in io.items()}
+    functions = {name: RemoteFunction(url, name, taken, made, hints) for name, (taken, made) in io.items()}
     return CompGraph(functions, io, types=False)
 
 
@@ -78,30 +78,25 @@ def _as_tuple(side: Any) -> Any:
     return tuple(side) if isinstance(side, list) else side
 
 
-def _remote_function(url: str, name: str, inputs: Any, outputs: Any, hints: Mapping[str, Any]) -> Callable[..., Any]:
-    """Return a function that refuses to be called, and declares in its signature what is known of its tokens."""
+class RemoteFunction:
+    """A function of a service: it declares in its signature what is known of its tokens, and can't be called here."""
 
-    def refuse(*values: Any) -> NoReturn:
-        text = f"Function {name!r} runs in the service at {url}, not here. Load its bundle to run it: ep.load(...)."
-        raise ServiceError(url, text)
+    def __init__(self, url: str, name: str, inputs: Any, outputs: Any, hints: Mapping[str, Any]) -> None:
+        taken = () if inputs is None else (inputs,) if isinstance(inputs, str) else inputs
+        made: Any = hints.get(outputs, Any)
+        if isinstance(outputs, tuple):
+            made = GenericAlias(tuple, tuple(hints.get(token, Any) for token in outputs)) if outputs else Any
+        annotations = {f"input_{place}": hints.get(token, Any) for place, token in enumerate(taken)}
+        kind = inspect.Parameter.POSITIONAL_ONLY
+        parameters = [inspect.Parameter(each, kind, annotation=hint) for each, hint in annotations.items()]
+        self._url, self.__name__ = url, name
+        self.__annotations__ = {**annotations, "return": made}
+        self.__signature__ = inspect.Signature(parameters, return_annotation=made)
 
-    taken = () if inputs is None else (inputs,) if isinstance(inputs, str) else inputs
-    made: Any = hints.get(outputs, Any)
-    if isinstance(outputs, tuple):
-        made = GenericAlias(tuple, tuple(hints.get(token, Any) for token in outputs)) if outputs else Any
-    kind = inspect.Parameter.POSITIONAL_ONLY
-    parameters = [
-        inspect.Parameter(
-            token if token.isidentifier() and token[0] != "_" and taken.index(token) == place else f"_{place}",
-            kind,
-            annotation=hints.get(token, Any),
-        )
-        for place, token in enumerate(taken)
-    ]
-    refuse.__name__ = refuse.__qualname__ = name
-    refuse.__annotations__ = {each.name: each.annotation for each in parameters} | {"return": made}
-    refuse.__signature__ = inspect.Signature(parameters, return_annotation=made)  # type: ignore[attr-defined]
-    return refuse
+    def __call__(self, *values: Any) -> NoReturn:
+        """Raise ServiceError."""
+        text = f"Function {self.__name__!r} runs in the service at {self._url}, not here."
+        raise ServiceError(self._url, f"{text} Load its bundle to run it: ep.load(...).")
 
 
 # -- runs -------------------------------------------------------------------------------------------------------------
@@ -185,7 +180,7 @@ class RemoteRuns:
         last
             The last run that completed.
         record
-            As ``FailureRecord``, JSON-ready.
+            As ``FailedEvent``, JSON-ready.
         parameters
             The hyperparameters.
         """

@@ -19,7 +19,7 @@ from shlex import quote
 from typing import Any, Final
 
 import aio_pika
-from aio_pika.abc import AbstractChannel, AbstractIncomingMessage, AbstractQueue
+from aio_pika.abc import AbstractChannel, AbstractIncomingMessage
 from aio_pika.connection import make_url
 from aio_pika.exceptions import (
     AMQPError,
@@ -33,21 +33,17 @@ from aio_pika.exceptions import (
 
 from epypes.errors import BrokerError, MessageError
 from epypes.transport.address import Address
-from epypes.transport.brokers.channel import BrokerChannel, certificates_of, unreachable
-from epypes.transport.brokers.message import IncomingMessage, OutgoingMessage, header_bytes
+from epypes.transport.brokers.channel import BrokerChannel, BrokerSession, certificates_of, unreachable
+from epypes.transport.brokers.message import IncomingMessage, OutgoingMessage
 from epypes.transport.channel import ChannelOptions
 
 # aio-pika takes a broker for gone after three of them, RabbitMQ a client after two.
 _HEARTBEAT_S: Final = 4
 # Quorum queues refuse more.
 _MOST_PREFETCH: Final = 2_000
-# Of what is acknowledged as soon as the handler has it, so many are delivered ahead.
-_AHEAD: Final = 100
 # A consumer of a broadcast that does not keep up loses the oldest messages.
 _BROADCAST_QUEUE: Final[Mapping[str, Any]] = {"x-max-length": 10_000, "x-max-length-bytes": 256 * 1024 * 1024}
 _LONGEST_ID: Final = 255
-# Properties have to fit a frame of AMQP, of 128 KB with RabbitMQ.
-_MOST_HEADER_BYTES: Final = 100_000
 _COUNT: Final = "x-delivery-count"
 # What the broker writes for its own use; a dead letter of ours must not have the deliveries of the queue it was in.
 _OF_THE_BROKER: Final = ("x-delivery-count", "x-death", "x-first-death-", "x-last-death-", "x-stream-offset")
@@ -61,21 +57,17 @@ for _name in ("aio_pika", "aiormq"):
         logging.getLogger(_name).setLevel(logging.CRITICAL)
 
 
-class AmqpSession:
-    """A connection to RabbitMQ; see `epypes.transport.brokers.channel.BrokerSession`."""
+class AmqpSession(BrokerSession):
+    """A connection to RabbitMQ."""
 
-    most_header_bytes = _MOST_HEADER_BYTES
-    lost: asyncio.Future[str]
+    # Properties have to fit a frame of AMQP, of 128 KB with RabbitMQ.
+    most_header_bytes = 100_000
 
     def __init__(self, address: Address, timeout_s: float) -> None:
-        self.address, self.timeout_s = address, timeout_s
+        super().__init__(address, timeout_s)
         self._connection: Any = None
         self._publishing: AbstractChannel | None = None
         self._opening = asyncio.Lock()
-        self._consuming: AbstractChannel | None = None
-        self._queue: AbstractQueue | None = None
-        # How much each consumer lets be unsettled, by its tag: RabbitMQ leaves that as it was when a consumer began.
-        self._consumers: dict[str, int] = {}
         self._deliver: Callable[[IncomingMessage], object] = lambda message: None
 
     def check(self, message: OutgoingMessage) -> None:
@@ -87,16 +79,11 @@ class AmqpSession:
             if len(name.encode()) > _LONGEST_ID:
                 text = f"The header {name[:40]!r}... has a name over {_LONGEST_ID} bytes."
                 raise MessageError("bad header", text)
-        if header_bytes(message.headers) > _MOST_HEADER_BYTES:
-            text = f"The headers of a message take more than {_MOST_HEADER_BYTES:,} bytes."
-            raise MessageError("too large", text)
 
     async def connect(self, window: int) -> None:
         """Connect, and see that the queues are there, or make them."""
         address = self.address
-        self.lost = asyncio.get_running_loop().create_future()
-        self._publishing = self._consuming = None
-        self._consumers.clear()
+        self._publishing = None
         url = make_url(
             host=address.host,
             port=address.port,
@@ -119,9 +106,9 @@ class AmqpSession:
             if not isinstance(error, Exception):
                 raise
             raise self._unreachable(error) from error
-        self._connection.close_callbacks.add(lambda _, error: self._lose(_reason(error)))
+        self._connection.close_callbacks.add(lambda _, error: self.lose(_reason(error)))
         await self._make_sure(address)
-        if _has_dead_letters(address):
+        if address.has_dead_letters:
             await self._make_sure(address.dead_letters)
         if not window:
             # Before the first message, since those that waited for it could be overtaken.
@@ -168,7 +155,7 @@ class AmqpSession:
                 await channel.declare_exchange(address.name, "fanout", passive=passive, durable=True)
                 return
             arguments = {"x-queue-type": "stream" if address.kind == "log" else "quorum"}
-            if _has_dead_letters(address):
+            if address.has_dead_letters:
                 # If the broker itself gives a message up (newer ones do after 20 deliveries), it is kept all the same.
                 letters = address.dead_letters.name
                 arguments |= {"x-dead-letter-exchange": "", "x-dead-letter-routing-key": letters}
@@ -184,10 +171,6 @@ class AmqpSession:
             f"Make it{way_out}, or add ?create=true to the address."
         )
         return BrokerError(str(wanted), text)
-
-    def _lose(self, reason: str) -> None:
-        if not self.lost.done():
-            self.lost.set_result(reason)
 
     def hint(self, address: Address) -> str:
         """Return where to look when RabbitMQ is there and says nothing."""
@@ -239,39 +222,21 @@ class AmqpSession:
         """Have a function called with each message of the queue, broadcast or log."""
         address, self._deliver = self.address, deliver
         try:
-            self._consuming = channel = await self._connection.channel(publisher_confirms=False)
-            channel.close_callbacks.add(lambda _, error: self._lose(_reason(error)))
+            channel = await self._connection.channel(publisher_confirms=False)
+            channel.close_callbacks.add(lambda _, error: self.lose(_reason(error)))
             underlay = await channel.get_underlay_channel()
             deleted = f"the queue {address.name!r} was deleted"
-            underlay.on_consumer_cancel_callbacks.add(lambda frame: self._lose(deleted))
+            underlay.on_consumer_cancel_callbacks.add(lambda frame: self.lose(deleted))
             if address.kind == "broadcast":
-                self._queue = await channel.declare_queue(
-                    exclusive=True, auto_delete=True, arguments=dict(_BROADCAST_QUEUE)
-                )
-                await self._queue.bind(address.name)
+                queue = await channel.declare_queue(exclusive=True, auto_delete=True, arguments=dict(_BROADCAST_QUEUE))
+                await queue.bind(address.name)
             else:
-                self._queue = await channel.get_queue(address.name, ensure=False)
-            await self.set_window(window)
+                queue = await channel.get_queue(address.name, ensure=False)
+            await channel.set_qos(min(window, _MOST_PREFETCH))
+            first: dict[str, Any] = {"x-stream-offset": "first"} if address.kind == "log" else {}
+            await queue.consume(self._take, arguments=first)
         except AMQPError as error:
             raise BrokerError(str(address), f"{address} can't be received from: {_reason(error)}.") from error
-
-    async def set_window(self, window: int) -> None:
-        """See that the consumers let as much be unsettled as the window says: add consumers, or cancel them."""
-        if self._queue is None or self._consuming is None:
-            return
-        if self.address.kind != "queue":
-            window = max(window, _AHEAD)
-        window = min(max(window, 1), _MOST_PREFETCH)
-        # What a cancelled consumer has got can be acknowledged all the same.
-        while sum(self._consumers.values()) > window:
-            tag, _ = self._consumers.popitem()
-            await self._queue.cancel(tag)
-        missing = window - sum(self._consumers.values())
-        if missing:
-            await self._consuming.set_qos(missing)
-            first: dict[str, Any] = {"x-stream-offset": "first"} if self.address.kind == "log" else {}
-            tag = await self._queue.consume(self._take, arguments=first)
-            self._consumers[tag] = missing
 
     async def _take(self, message: AbstractIncomingMessage) -> None:
         headers = {name: _text(value) for name, value in message.headers.items()}
@@ -293,13 +258,9 @@ class AmqpSession:
     async def close(self) -> None:
         """Disconnect; RabbitMQ delivers again what was not acknowledged."""
         connection, self._connection = self._connection, None
-        self._queue = self._consuming = self._publishing = None
+        self._publishing = None
         if connection is not None:
             await connection.close()
-
-
-def _has_dead_letters(address: Address) -> bool:
-    return address.kind == "queue" and address.dead_letters.name != address.name
 
 
 def _reason(error: BaseException | None) -> str:

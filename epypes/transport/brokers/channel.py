@@ -12,6 +12,7 @@ first copies arrive in order; second copies are detected by their ids.
 
 from __future__ import annotations
 
+import abc
 import asyncio
 import contextlib
 import logging
@@ -24,11 +25,18 @@ from collections import deque
 from collections.abc import Callable, Coroutine, Mapping
 from functools import partial
 from time import monotonic
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from epypes.errors import BrokerError, MessageError
 from epypes.transport.address import Address
-from epypes.transport.brokers.message import IncomingMessage, OutgoingMessage, dead_letter, pack, unpacked
+from epypes.transport.brokers.message import (
+    IncomingMessage,
+    OutgoingMessage,
+    dead_letter,
+    header_bytes,
+    pack,
+    unpack,
+)
 from epypes.transport.channel import NO_HEADERS, ChannelOptions, Confirmed, Delivery, Frames, confirm
 
 log = logging.getLogger("epypes.transport")
@@ -39,6 +47,8 @@ _LONGEST_PAUSE_S: Final = 5.0
 # Messages that are published and not confirmed, at most: enough that the network is never waited for, and bounded.
 _MOST_IN_FLIGHT: Final = 64
 _MOST_IN_FLIGHT_BYTES: Final = 32 * 1024**2
+# So many are delivered ahead of what is acknowledged as soon as the handler has it.
+_AHEAD: Final = 100
 # Messages that the broker doesn't keep are dropped when those that wait for the handler take more than this.
 _MOST_BACKLOG_BYTES: Final = 256 * 1024**2
 _MESSAGE_OVERHEAD_BYTES: Final = 1_024
@@ -52,7 +62,7 @@ CLOSING_S: Final = 2.0
 _CLOSING_GRACE_S: Final = 0.5
 
 
-class BrokerSession(Protocol):
+class BrokerSession(abc.ABC):
     """A connection to one broker, for one channel; used on the asyncio thread alone.
 
     Attributes
@@ -60,19 +70,30 @@ class BrokerSession(Protocol):
     address, timeout_s
         See `epypes.transport.channel.ChannelOptions`.
     lost
-        Made by `connect`; done with the reason when the connection is of no more use.
+        Made by the channel before `connect`; done with the reason when the connection is of no more use.
     most_header_bytes
         How much the headers of a message may take.
     """
 
-    address: Address
-    timeout_s: float
     lost: asyncio.Future[str]
     most_header_bytes: int
 
-    def check(self, message: OutgoingMessage) -> None:
+    def __init__(self, address: Address, timeout_s: float) -> None:
+        self.address, self.timeout_s = address, timeout_s
+
+    def lose(self, reason: str) -> None:
+        """Give the connection up: the channel closes it, and connects again."""
+        if not self.lost.done():
+            self.lost.set_result(reason)
+
+    def check(self, message: OutgoingMessage) -> None:  # noqa: B027 - most brokers take any
         """Raise MessageError if the broker can never take a message; on the thread that sends it."""
 
+    def hint(self, address: Address) -> str:
+        """Return where to look if the broker doesn't answer: sentences with a space before them, or nothing."""
+        return ""
+
+    @abc.abstractmethod
     async def connect(self, window: int) -> None:
         """Connect, and see that the address is there, or make it; again after a connection was closed.
 
@@ -87,6 +108,7 @@ class BrokerSession(Protocol):
             The broker can't be reached, refuses, or has no such queue.
         """
 
+    @abc.abstractmethod
     async def publish(self, message: OutgoingMessage) -> None:
         """Send a message; return when the broker has confirmed it.
 
@@ -98,20 +120,17 @@ class BrokerSession(Protocol):
             The broker can never take it.
         """
 
+    @abc.abstractmethod
     async def consume(self, deliver: Callable[[IncomingMessage], object], window: int) -> None:
         """Have a function called with each message that comes, with at most so many unsettled."""
 
-    async def set_window(self, window: int) -> None:
-        """Change how many messages may be unsettled."""
-
+    @abc.abstractmethod
     async def settle(self, message: IncomingMessage, *, requeue: bool) -> None:
         """Acknowledge a message, or have the broker deliver it again."""
 
+    @abc.abstractmethod
     async def close(self) -> None:
         """Disconnect; the broker delivers again what is unsettled. As often as you like; may raise."""
-
-    def hint(self, address: Address) -> str:
-        """Return where to look if the broker doesn't answer: sentences with a space before them, or nothing."""
 
 
 class _EventLoopThread:
@@ -120,6 +139,7 @@ class _EventLoopThread:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._users = 0
+        self._released = asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
 
@@ -127,10 +147,9 @@ class _EventLoopThread:
         """Return the running loop; it runs until each user has called `release`."""
         with self._lock:
             if self._loop is None:
-                self._loop = asyncio.new_event_loop()
-                self._thread = threading.Thread(
-                    target=_run_loop, args=(self._loop,), name="epypes brokers", daemon=True
-                )
+                runner, self._released = asyncio.Runner(loop_factory=asyncio.new_event_loop), asyncio.Event()
+                self._loop, arguments = runner.get_loop(), (runner, self._released)
+                self._thread = threading.Thread(target=_run_loop, args=arguments, name="epypes brokers", daemon=True)
                 self._thread.start()
             self._users += 1
             return self._loop
@@ -139,7 +158,7 @@ class _EventLoopThread:
         with self._lock:
             self._users -= 1
             if not self._users and self._loop is not None:
-                self._loop.call_soon_threadsafe(self._loop.stop)
+                self._loop.call_soon_threadsafe(self._released.set)
                 self._loop = self._thread = None
 
     def is_current(self) -> bool:
@@ -147,24 +166,11 @@ class _EventLoopThread:
         return threading.current_thread() is self._thread
 
 
-def _run_loop(loop: asyncio.AbstractEventLoop) -> None:
-    asyncio.set_event_loop(loop)
+def _run_loop(runner: asyncio.Runner, released: asyncio.Event) -> None:
     # Clients leave tasks behind that fail when a connection breaks; the channel reports the broken connection itself.
-    loop.set_exception_handler(lambda _, context: log.debug("a broker's client: %s", context))
-    try:
-        loop.run_forever()
-        loop.run_until_complete(_cancel_others())
-        loop.run_until_complete(loop.shutdown_default_executor())
-    finally:
-        loop.close()
-
-
-async def _cancel_others() -> None:
-    others = asyncio.all_tasks() - {asyncio.current_task()}
-    for task in others:
-        task.cancel()
-    if others:
-        await asyncio.wait(others, timeout=CLOSING_S)
+    runner.get_loop().set_exception_handler(lambda _, context: log.debug("a broker's client: %s", context))
+    with runner:
+        runner.run(released.wait())
 
 
 _thread = _EventLoopThread()
@@ -197,7 +203,7 @@ class BrokerChannel:
         self.address = str(session.address)
         self.keeps_messages = session.address.kind == "queue"
         self.is_connected, self.trouble, self.reconnects = False, "", 0
-        self._prefetch = options.prefetch
+        self.prefetch = options.prefetch
         self._process = os.getpid()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._handler: Callable[[Delivery], object] | None = None
@@ -205,44 +211,30 @@ class BrokerChannel:
         self._arrived: queue.SimpleQueue[IncomingMessage | None] = queue.SimpleQueue()
         self._resumed = threading.Event()
         self._resumed.set()
-        # Guards what `send` shares with the end: whether it is closed, and what was accepted.
+        # Guards what `send` shares with the asyncio thread: whether it is closed, and what was accepted.
         self._lock = threading.RLock()
         self._is_closed = False
         self._finished = threading.Event()
-        self._accepted: deque[OutgoingMessage] = deque()
-        self._is_waking = False
-        # From here on, of the asyncio thread alone. In the order of sending: what was accepted and is not confirmed.
-        self._unconfirmed: dict[int, OutgoingMessage] = {}
-        self._last_number = self._in_flight = self._in_flight_bytes = 0
+        # In the order of sending: what is not confirmed, and what of it was not published over this connection.
+        self._unconfirmed: dict[OutgoingMessage, None] = {}
+        self._unpublished: deque[OutgoingMessage] = deque()
+        # From here on, of the asyncio thread alone.
+        self._in_flight_bytes = 0
         self._wake, self._progress = asyncio.Event(), asyncio.Event()
         self._main: asyncio.Task[None] | None = None
         self._closing: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._unsettled: set[IncomingMessage] = set()
-        # What could not be put into the dead-letter queue, and waits to be delivered again.
-        self._postponed: set[IncomingMessage] = set()
         self._changed_s = monotonic()
         self._has_warned = self._is_dropping = False
         self._backlog_bytes = 0
-        self._connection = 0
 
     # --- for any thread ---
 
     @property
     def waiting(self) -> int:
         """How many messages were accepted for sending and are not confirmed."""
-        with self._lock:
-            return len(self._accepted) + len(self._unconfirmed)
-
-    @property
-    def prefetch(self) -> int:
-        """The prefetch window; may be set while the channel is open. MQTT takes it at the next connection."""
-        return self._prefetch
-
-    @prefetch.setter
-    def prefetch(self, count: int) -> None:
-        self._prefetch = count
-        self._call(self._update_window)
+        return len(self._unconfirmed)
 
     def open(self, on_delivery: Callable[[Delivery], object] | None) -> None:
         """Connect for the first time; see `epypes.transport.channel.Channel.open`."""
@@ -273,13 +265,18 @@ class BrokerChannel:
         if len(body) > self._options.max_message_bytes:
             text = f"A message of {len(body):,} bytes; the limit is {self._options.max_message_bytes:,}."
             raise MessageError("too large", text)
+        most = self._session.most_header_bytes
+        if headers and header_bytes(carried) > most:
+            raise MessageError(
+                "too large", f"The headers of a message to {self.address} take more than {most:,} bytes."
+            )
         self._session.check(message)
         with self._lock:
             if self._is_closed or self._loop is None or self._process != os.getpid():
                 raise BrokerError(self.address, f"The channel to {self.address} is closed.")
-            self._accepted.append(message)
-            if not self._is_waking:
-                self._is_waking = True
+            self._unconfirmed[message] = None
+            self._unpublished.append(message)
+            if not self._wake.is_set():
                 self._loop.call_soon_threadsafe(self._wake.set)
 
     def pause(self) -> None:
@@ -320,12 +317,12 @@ class BrokerChannel:
             if message is None or self._is_closed:
                 return
             # The broker delivers again what it had delivered over a connection that was lost.
-            if message.connection == self._connection and self._handler is not None:
+            if (message.receipt is None or message in self._unsettled) and self._handler is not None:
                 self._hand_over(message, self._handler)
             self._call(self._shrink_backlog, _size(message))
 
     def _hand_over(self, message: IncomingMessage, handler: Callable[[Delivery], object]) -> None:
-        frames, headers = unpacked(message)
+        frames, headers = unpack(message)
         delivery = Delivery(frames, message.id, message.attempt, headers)
         if self.keeps_messages:
             delivery.settle = partial(self._call, self._settle, message)
@@ -346,16 +343,16 @@ class BrokerChannel:
 
     async def _connect(self) -> None:
         session, timeout_s = self._session, self._options.timeout_s
+        session.lost = asyncio.get_running_loop().create_future()
+        window = self.prefetch if self.keeps_messages else max(self.prefetch, _AHEAD)
         try:
             async with asyncio.timeout(timeout_s):
-                await session.connect(self._window if self._handler is not None else 0)
-                self._connection += 1
-                self.reconnects = self._connection - 1
+                await session.connect(window if self._handler is not None else 0)
+                self.reconnects += self._main is not None
                 self._unsettled.clear()
-                self._postponed.clear()
                 self._changed_s = monotonic()
                 if self._handler is not None:
-                    await session.consume(self._deliver, self._window)
+                    await session.consume(self._deliver, window)
         except BaseException as error:
             await self._disconnect()
             if isinstance(error, TimeoutError):
@@ -405,10 +402,6 @@ class BrokerChannel:
                 task.cancel()
             await asyncio.gather(*helpers, *self._tasks, return_exceptions=True)
 
-    def _lose(self, reason: str) -> None:
-        if not self._session.lost.done():
-            self._session.lost.set_result(reason)
-
     def _report(self, trouble: str) -> None:
         was_connected, self.trouble, self.is_connected = self.is_connected, trouble, not trouble
         listener = self._options.on_connection
@@ -430,41 +423,37 @@ class BrokerChannel:
             # Called here: a task may be cancelled before it begins.
             await work(*args)
         except Exception as error:
-            self._lose(str(error) or repr(error))
+            self._session.lose(str(error) or repr(error))
 
     # --- the asyncio thread: sending ---
 
     async def _send_accepted(self) -> None:
         """Publish what was accepted, and first what an earlier connection left unconfirmed."""
-        self._in_flight = self._in_flight_bytes = 0
-        again = deque(self._unconfirmed.items())
+        self._in_flight_bytes = 0
+        with self._lock:
+            self._unpublished = deque(self._unconfirmed)
         while True:
             self._wake.clear()
-            while self._in_flight < _MOST_IN_FLIGHT and self._in_flight_bytes < _MOST_IN_FLIGHT_BYTES:
-                if again:
-                    number, message = again.popleft()
-                else:
-                    with self._lock:
-                        if not self._accepted:
-                            self._is_waking = False
-                            break
-                        message = self._accepted.popleft()
-                        self._last_number = number = self._last_number + 1
-                        self._unconfirmed[number] = message
-                self._in_flight += 1
+            while self._unpublished and self._has_room_in_flight():
+                message = self._unpublished.popleft()
                 self._in_flight_bytes += len(message.body)
-                self._spawn(self._publish, number, message)
+                self._spawn(self._publish, message)
             await self._wake.wait()
 
-    async def _publish(self, number: int, message: OutgoingMessage) -> None:
+    def _has_room_in_flight(self) -> bool:
+        in_flight = len(self._unconfirmed) - len(self._unpublished)
+        return in_flight < _MOST_IN_FLIGHT and self._in_flight_bytes < _MOST_IN_FLIGHT_BYTES
+
+    async def _publish(self, message: OutgoingMessage) -> None:
+        refused = None
         try:
             await self._until_confirmed(message)
         except MessageError as error:
-            self._confirm(number, error)
-        else:
-            self._confirm(number, None)
-        self._in_flight -= 1
+            refused = error
         self._in_flight_bytes -= len(message.body)
+        self._unconfirmed.pop(message, None)
+        confirm(message.confirmed, refused)
+        self._progress.set()
         self._wake.set()
 
     async def _until_confirmed(self, message: OutgoingMessage) -> None:
@@ -476,25 +465,9 @@ class BrokerChannel:
             text = f"{message.address} did not confirm a message within {timeout_s:g} s: it may have it or not."
             raise BrokerError(self.address, text + session.hint(message.address)) from error
 
-    def _confirm(self, number: int, error: Exception | None) -> None:
-        message = self._unconfirmed.pop(number, None)
-        if message is not None:
-            confirm(message.confirmed, error)
-            self._progress.set()
-
     # --- the asyncio thread: receiving ---
 
-    @property
-    def _window(self) -> int:
-        # Others are delivered while something waits to be put into the dead-letter queue.
-        return self._prefetch + len(self._postponed)
-
-    def _update_window(self) -> None:
-        if self.is_connected and self._handler is not None:
-            self._spawn(self._session.set_window, self._window)
-
     def _deliver(self, message: IncomingMessage) -> None:
-        message.connection = self._connection
         if message.receipt is not None:
             self._unsettled.add(message)
             self._changed_s = monotonic()
@@ -513,16 +486,16 @@ class BrokerChannel:
         self._is_dropping = self._is_dropping and self._backlog_bytes > _MOST_BACKLOG_BYTES // 2
 
     def _settle(self, message: IncomingMessage, verdict: str, reason: str) -> None:
-        if message not in self._unsettled or message.connection != self._connection:
+        if message not in self._unsettled:
             return
         self._changed_s = monotonic()
         if verdict != "reject":
             self._spawn(self._settled, message, verdict == "nack")
-        elif self._address.dead_letters.name == self._address.name:
-            # A dead-letter queue has none of its own: the message stays where it is.
-            self._postpone(message)
-        else:
+        elif self._address.has_dead_letters:
             self._spawn(self._reject, message, reason)
+        else:
+            # This is a dead-letter queue: the message stays where it is.
+            self._redeliver_later(message)
 
     async def _settled(self, message: IncomingMessage, requeue: bool) -> None:
         self._unsettled.discard(message)
@@ -535,25 +508,17 @@ class BrokerChannel:
             if not self._session.lost.done():
                 text = "A message of %s can't be put into the dead-letter queue, and is delivered again in %g s: %s"
                 log.warning(text, self.address, REDELIVERY_S, error)
-                self._postpone(message)
+                self._redeliver_later(message)
         else:
             await self._settled(message, False)
 
-    def _postpone(self, message: IncomingMessage) -> None:
-        self._postponed.add(message)
-        self._update_window()
-        asyncio.get_running_loop().call_later(REDELIVERY_S, self._redeliver, message)
-
-    def _redeliver(self, message: IncomingMessage) -> None:
-        if message in self._postponed:
-            self._postponed.discard(message)
-            self._spawn(self._settled, message, True)
-            self._update_window()
+    def _redeliver_later(self, message: IncomingMessage) -> None:
+        asyncio.get_running_loop().call_later(REDELIVERY_S, self._settle, message, "nack", "")
 
     async def _warn_if_stalled(self) -> None:
         while not self._has_warned:
             await asyncio.sleep(STALLED_S / 2)
-            if len(self._unsettled) >= self._prefetch and monotonic() - self._changed_s > STALLED_S:
+            if len(self._unsettled) >= self.prefetch and monotonic() - self._changed_s > STALLED_S:
                 self._has_warned = True
                 text = (
                     "%s: prefetch limit reached: %d unacknowledged messages, and none was acknowledged for %g s. "
@@ -588,9 +553,9 @@ class BrokerChannel:
             self.is_connected = False
             self._unsettled.clear()
             with self._lock:
-                unsent = [*self._unconfirmed.values(), *self._accepted]
+                unsent = [*self._unconfirmed]
                 self._unconfirmed.clear()
-                self._accepted.clear()
+                self._unpublished.clear()
             why = self.trouble.rstrip(".") or "the channel was closed before the broker had confirmed it"
             for message in unsent:
                 error = BrokerError(self.address, f"A message to {self.address} was not sent: {why}.")

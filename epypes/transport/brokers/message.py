@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import accumulate, pairwise
 from typing import Any, Final
 
 from epypes.errors import MessageError
@@ -25,6 +26,7 @@ _MOST_FRAMES: Final = Limits().frames + LEADING_FRAMES
 # Whatever can be sent can be rejected, too: what goes along with a dead letter takes no more than this.
 REASON_BYTES: Final = 700
 DEAD_LETTER_BYTES: Final = 1_024
+_BAD: Final = "bad frames"
 # Control characters, lone surrogates and Unicode's noncharacters: brokers alter them, or end the connection for them.
 _NOT_TEXT: Final = re.compile(
     "[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff\ufdd0-\ufdef"
@@ -70,8 +72,6 @@ class IncomingMessage:
         What the session settles it by; None if the broker doesn't wait for an acknowledgement.
     origin
         See `OutgoingMessage`.
-    connection
-        Set by the channel: the number of the connection that it came over.
     """
 
     body: bytes | memoryview
@@ -80,7 +80,6 @@ class IncomingMessage:
     attempt: int = 0
     receipt: Any = None
     origin: str = ""
-    connection: int = 0
 
 
 def pack(frames: Frames, id: str, headers: Mapping[str, str]) -> tuple[bytes, dict[str, str]]:  # noqa: A002
@@ -91,20 +90,14 @@ def pack(frames: Frames, id: str, headers: Mapping[str, str]) -> tuple[bytes, di
     MessageError
         There are too few or too many frames, or the id or a header would not arrive as it is at every broker.
     """
-    check_message(frames, id, headers)
-    if len(frames) == 1:
-        only = frames[0]
-        return only if isinstance(only, bytes) else bytes(only), dict(headers)
-    return b"".join(frames), {**headers, SIZES: ",".join(str(len(frame)) for frame in frames)}
-
-
-def check_message(frames: Frames, id: str, headers: Mapping[str, str]) -> None:  # noqa: A002
-    """Raise MessageError for what not every broker can carry; see `pack`."""
     if not 0 < len(frames) <= _MOST_FRAMES:
-        raise MessageError("bad frames", f"A message has 1 to {_MOST_FRAMES:,} frames, not {len(frames):,}.")
+        raise MessageError(_BAD, f"A message has 1 to {_MOST_FRAMES:,} frames, not {len(frames):,}.")
     _check_text("bad id", "The id", id)
     for name, text in headers.items():
         _check_text("bad header", f"The header {name[:40]!r}", text)
+    if len(frames) == 1:
+        return bytes(frames[0]), dict(headers)
+    return b"".join(frames), {**headers, SIZES: ",".join(str(len(frame)) for frame in frames)}
 
 
 def _check_text(reason: str, what: str, text: str) -> None:
@@ -113,38 +106,23 @@ def _check_text(reason: str, what: str, text: str) -> None:
         raise MessageError(reason, f"{what} of a message can't be sent: {wrong}.")
 
 
-def unpack(body: bytes | memoryview, headers: Mapping[str, str]) -> tuple[memoryview, ...]:
-    """Return the frames that a body carries; they share its memory.
+def unpack(message: IncomingMessage) -> tuple[Frames, dict[str, str]]:
+    """Return the frames of a message, which share its memory, and its other headers.
 
-    Raises
-    ------
-    MessageError
-        The header does not fit the body.
+    There are no frames if its sizes don't fit its body; the headers `ERROR` and `ERROR_REASON` say so.
     """
-    whole = memoryview(body).toreadonly()
-    listed = headers.get(SIZES)
+    others = {name: text for name, text in message.headers.items() if name not in (SIZES, ERROR, ERROR_REASON)}
+    whole, listed = memoryview(message.body).toreadonly(), message.headers.get(SIZES)
     if listed is None:
-        return (whole,)
+        return (whole,), others
     parts = listed.split(",", _MOST_FRAMES)
     if len(parts) > _MOST_FRAMES or not all(part.isascii() and part.isdecimal() and len(part) < 12 for part in parts):
-        raise MessageError("bad frames", f"{SIZES} is {listed[:40]!r}, which is no list of sizes.")
-    sizes = [int(part) for part in parts]
-    if sum(sizes) != len(whole):
-        raise MessageError("bad frames", f"{SIZES} lists {sum(sizes):,} bytes; {len(whole):,} came.")
-    frames, begin = [], 0
-    for size in sizes:
-        frames.append(whole[begin : begin + size])
-        begin += size
-    return tuple(frames)
-
-
-def unpacked(message: IncomingMessage) -> tuple[Frames, dict[str, str]]:
-    """Return the frames and the other headers of a message; without frames and with `ERROR` if it can't be unpacked."""
-    others = {name: text for name, text in message.headers.items() if name not in (SIZES, ERROR, ERROR_REASON)}
-    try:
-        return unpack(message.body, message.headers), others
-    except MessageError as error:
-        return (), {**others, ERROR: str(error), ERROR_REASON: error.reason}
+        return (), {**others, ERROR: f"{SIZES} is {listed[:40]!r}, which is no list of sizes.", ERROR_REASON: _BAD}
+    ends = [*accumulate(map(int, parts), initial=0)]
+    if ends[-1] != len(whole):
+        text = f"{SIZES} lists {ends[-1]:,} bytes; {len(whole):,} came."
+        return (), {**others, ERROR: text, ERROR_REASON: _BAD}
+    return tuple(whole[begin:end] for begin, end in pairwise(ends)), others
 
 
 def dead_letter(address: Address, message: IncomingMessage, reason: str, most_header_bytes: int) -> OutgoingMessage:
@@ -157,7 +135,7 @@ def dead_letter(address: Address, message: IncomingMessage, reason: str, most_he
     line = line.encode()[:REASON_BYTES].decode(errors="ignore").strip()
     ours = {REASON: line, FROM: address.name, ATTEMPTS: str(message.attempt)}
     # Without sizes that don't fit the body it is one frame.
-    frames, others = unpacked(message)
+    frames, others = unpack(message)
     sizes = {SIZES: message.headers[SIZES]} if frames and SIZES in message.headers else {}
     headers = {**{name: text for name, text in others.items() if name not in (ERROR, ERROR_REASON)}, **sizes, **ours}
     if header_bytes(headers) > most_header_bytes:

@@ -44,7 +44,7 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from epypes.errors import BrokerError, MessageError
 from epypes.transport.address import Address
-from epypes.transport.brokers.channel import BrokerChannel, certificates_of, unreachable
+from epypes.transport.brokers.channel import BrokerChannel, BrokerSession, certificates_of, unreachable
 from epypes.transport.brokers.message import (
     DEAD_LETTER_BYTES,
     SIZES,
@@ -61,7 +61,6 @@ _KEEP_ALIVE_S: Final = 4
 _KEPT_S: Final = 7 * 24 * 3600
 # Brokers may take no more than a few at a time, and say so when it is too late to tell paho.
 _MOST_IN_FLIGHT: Final = 8
-_AHEAD: Final = 64
 _MOST_UNKEPT: Final = 1_000
 _PATIENCE_MS: Final = 200
 # A consumer that lives answers for its session within this time, also if it has to connect again first.
@@ -69,7 +68,6 @@ _ANSWER_S: Final = 10.0
 # What is retained of a session, and sent to ask whether it has a connection. All else: it has lost its connection.
 _IN_USE, _ENDED, _ASK = b"in use", b"", b"?"
 _LARGEST: Final = 268_000_000
-_MOST_HEADER_BYTES: Final = 65_535
 _REFUSED, _UNHEARD, _TOO_LARGE = 0x80, 0x10, 0x95
 _NO_ACCESS: Final = (0x84, 0x85, 0x86, 0x87, 0x8C)
 _ID: Final = "epypes-id"
@@ -95,7 +93,7 @@ class PahoConnection:
         The largest packet that the broker takes.
     """
 
-    def __init__(self, address: Address, timeout_s: float, session: str = "", window: int = _AHEAD) -> None:
+    def __init__(self, address: Address, timeout_s: float, session: str = "", window: int = 1) -> None:
         self._address, self._timeout_s, self._has_session, self._window = address, timeout_s, bool(session), window
         self._loop = asyncio.get_running_loop()
         self._answers: dict[int, asyncio.Future[int]] = {}
@@ -294,14 +292,14 @@ class PahoConnection:
             self._step(self.client.loop_read)
 
 
-class MqttSession:
-    """A connection to an MQTT 5 broker; see `epypes.transport.brokers.channel.BrokerSession`."""
+class MqttSession(BrokerSession):
+    """A connection to an MQTT 5 broker."""
 
-    most_header_bytes = _MOST_HEADER_BYTES
-    lost: asyncio.Future[str]
+    # A user property takes no longer text; ours among them needs some of it.
+    most_header_bytes = 65_000
 
     def __init__(self, address: Address, timeout_s: float) -> None:
-        self.address, self.timeout_s = address, timeout_s
+        super().__init__(address, timeout_s)
         self._connection: PahoConnection | None = None
         # The name of the consumer's session, which outlives its connections.
         self._session = ""
@@ -316,16 +314,6 @@ class MqttSession:
         self._emptying: set[str] = set()
         self._tasks: set[asyncio.Task[object]] = set()
 
-    def check(self, message: OutgoingMessage) -> None:
-        """Raise MessageError for headers that can be no user properties."""
-        for name, text in message.headers.items():
-            if max(len(name.encode()), len(text.encode())) > _MOST_HEADER_BYTES:
-                raise MessageError("bad header", f"The header {name[:40]!r} is over {_MOST_HEADER_BYTES:,} bytes.")
-
-    def hint(self, address: Address) -> str:
-        """Return nothing: a broker that doesn't answer gives no sign."""
-        return ""
-
     @property
     def _open(self) -> PahoConnection:
         if self._connection is None:
@@ -338,28 +326,23 @@ class MqttSession:
         if is_queue and any(sign in address.name for sign in "#+"):
             text = f"A queue needs a topic without # and +, which {address} has. Write one topic."
             raise BrokerError(str(address), text)
-        self.lost = asyncio.get_running_loop().create_future()
         self._arrived.clear()
         self._held.clear()
-        self._window = window if is_queue else max(window, _AHEAD)
+        self._window = window
         if window and is_queue and not self._session:
             self._session = f"epypes-{secrets.token_hex(8)}"
         made = PahoConnection(address, self.timeout_s, self._session, self._window)
         self._connection = made
         made.on_message = self._take
-        made.lost.add_done_callback(self._lose)
+        made.lost.add_done_callback(lambda lost: self.lose(lost.result()))
         await made.open()
         # A queue of ours keeps what comes before there is a consumer; so does its dead-letter queue.
         kept = [address] if is_queue and address.create else []
-        if window and is_queue and address.dead_letters.name != address.name:
+        if window and address.has_dead_letters:
             kept.append(address.dead_letters)
         for queue in kept:
             if not (window and queue is address) and not await made.publish(_consumers(queue), b"", {}):
                 await self._make_session(queue)
-
-    def _lose(self, lost: asyncio.Future[str]) -> None:
-        if not self.lost.done():
-            self.lost.set_result(lost.result())
 
     async def _make_session(self, address: Address) -> None:
         """Have the broker keep what comes for a queue until there is a consumer.
@@ -412,11 +395,6 @@ class MqttSession:
         for topic in _topics(address):
             await made.subscribe(_shared(address, topic))
         await made.subscribe(_gone(address, "+"), qos=0)
-        self._hand_over()
-
-    async def set_window(self, window: int) -> None:
-        """Hand on as many as the window allows; the broker learns of a change at the next connection."""
-        self._window = window if self.address.kind == "queue" else max(window, _AHEAD)
         self._hand_over()
 
     def _take(self, message: paho.MQTTMessage) -> None:

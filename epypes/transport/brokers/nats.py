@@ -29,7 +29,7 @@ from nats.js.errors import APIError, NoStreamResponseError, NotFoundError, Servi
 
 from epypes.errors import BrokerError, MessageError
 from epypes.transport.address import Address
-from epypes.transport.brokers.channel import BrokerChannel, certificates_of, unreachable
+from epypes.transport.brokers.channel import BrokerChannel, BrokerSession, certificates_of, unreachable
 from epypes.transport.brokers.message import IncomingMessage, OutgoingMessage, header_bytes
 from epypes.transport.channel import ChannelOptions
 
@@ -42,11 +42,7 @@ _REQUEST_S: Final = 4.0
 _PING_S: Final = 2.5
 _DUPLICATES_S: Final = 120.0
 _FORGOTTEN_S: Final = 60.0
-# Messages of a log that are delivered ahead: they are small, and a replay is to be quick.
-_AHEAD: Final = 256
 _ID, _STORED_ID = "epypes-id", "Nats-Msg-Id"
-# The server takes 64 kB, its own first line with them.
-_MOST_HEADER_BYTES: Final = 65_000
 _TOO_LARGE: Final = 10_054
 _SUBJECT: Final = re.compile(r"(?:[^\s.*>]+|\*)(?:\.(?:[^\s.*>]+|\*))*(?:\.>)?|>")
 
@@ -54,14 +50,14 @@ if logging.getLogger("nats").level == logging.NOTSET:
     logging.getLogger("nats").setLevel(logging.CRITICAL)
 
 
-class NatsSession:
-    """A connection to a NATS server; see `epypes.transport.brokers.channel.BrokerSession`."""
+class NatsSession(BrokerSession):
+    """A connection to a NATS server."""
 
-    most_header_bytes = _MOST_HEADER_BYTES
-    lost: asyncio.Future[str]
+    # The server takes 64 kB, its own first line with them.
+    most_header_bytes = 65_000
 
     def __init__(self, address: Address, timeout_s: float) -> None:
-        self.address, self.timeout_s = address, timeout_s
+        super().__init__(address, timeout_s)
         self._client = Client()
         self._stream = self._requests = ""
         self._subscription: Any = None
@@ -82,19 +78,11 @@ class NatsSession:
         for name in message.headers:
             if not name.isascii() or not name.isprintable() or ":" in name or " " in name or not name:
                 raise MessageError("bad header", f"{name!r} can't be the name of a header at {message.address}.")
-        if header_bytes(message.headers) > _MOST_HEADER_BYTES:
-            text = f"The headers of a message to {message.address} take more than {_MOST_HEADER_BYTES:,} bytes."
-            raise MessageError("too large", text)
-
-    def hint(self, address: Address) -> str:
-        """Return nothing: a server that doesn't answer gives no sign."""
-        return ""
 
     async def connect(self, window: int) -> None:
         """Connect once, without the client's own reconnecting, and see that the streams are there, or make them."""
         address = self.address
         _check_names(address)
-        self.lost = asyncio.get_running_loop().create_future()
         self._held.clear()
         self._open_requests.clear()
         self._expected = 0
@@ -111,10 +99,10 @@ class NatsSession:
         async def failed(error: Exception) -> None:
             errors.append(error)
             if self._client.is_connected and not isinstance(error, SlowConsumerError):
-                self._lose(f"the server refuses: {_said(error)}" if "permissions" in str(error) else _gone(error))
+                self.lose(f"the server refuses: {_said(error)}" if "permissions" in str(error) else _gone(error))
 
         async def closed() -> None:
-            self._lose(_gone(self._client.last_error))
+            self.lose(_gone(self._client.last_error))
 
         host = f"[{address.host}]" if ":" in address.host else address.host
         options: dict[str, Any] = {"tls": certificates} if certificates is not None else {}
@@ -156,17 +144,13 @@ class NatsSession:
         address, jetstream = self.address, self._client.jetstream(timeout=self.timeout_s)
         try:
             self._stream = await _stream_of(jetstream, address)
-            if address.kind == "queue" and address.dead_letters.name != address.name:
+            if address.has_dead_letters:
                 await _stream_of(jetstream, address.dead_letters)
         except ServiceUnavailableError as error:
             text = f"{address} can't keep messages: JetStream is off there. Start the server with it: nats-server -js."
             raise BrokerError(str(address), text) from error
         except APIError as error:
             raise BrokerError(str(address), f"{address} refuses: {_said(error)}.") from error
-
-    def _lose(self, reason: str) -> None:
-        if not self.lost.done():
-            self.lost.set_result(reason)
 
     async def publish(self, message: OutgoingMessage) -> None:
         """Send a message; return when its stream has it, or for a broadcast when the server has read it."""
@@ -211,8 +195,8 @@ class NatsSession:
         self._requests = f"$JS.API.CONSUMER.MSG.NEXT.{self._stream}.{consumer}"
         self._inbox = self._client.new_inbox()
         self._subscription = await self._client.subscribe(f"{self._inbox}.*", cb=self._take, **unbounded)
-        self._progress_s = min(_PROGRESS_S, ack_wait_s / 4)
-        await self.set_window(window)
+        self._progress_s, self._window = min(_PROGRESS_S, ack_wait_s / 4), window
+        await self._request(least=1)
 
     async def _find_consumer(self) -> tuple[str, float]:
         """Return the name of the consumer that is pulled from, and how long it waits for an acknowledgement."""
@@ -236,12 +220,6 @@ class NatsSession:
             raise BrokerError(str(address), f"{what} is no pull consumer with explicit acknowledgements.")
         return address.group, found.ack_wait or ACK_WAIT_S
 
-    async def set_window(self, window: int) -> None:
-        """Ask for more messages, if there is room for more."""
-        self._window = max(window, 1) if self.address.kind == "queue" else _AHEAD
-        if self._requests:
-            await self._request(least=1)
-
     async def _request(self, least: int) -> None:
         """Ask for as many messages as there is room for, if that is enough."""
         now_s = monotonic()
@@ -264,7 +242,7 @@ class NatsSession:
             await asyncio.sleep(self._progress_s)
             if not self._client.is_connected:
                 # The client calls back only when all that it had to send was taken, which may never be.
-                self._lose(_gone(self._client.last_error))
+                self.lose(_gone(self._client.last_error))
             elif self._requests:
                 for message in tuple(self._held.values()) if self.address.kind == "queue" else ():
                     await message.in_progress()
@@ -289,7 +267,7 @@ class NatsSession:
         if number.isdecimal() and self._open_requests.pop(int(number), 0.0):
             self._expected = max(self._expected - int(headers.get("Nats-Pending-Messages", "0")), 0)
         if status == "503" or "deleted" in description:
-            self._lose("the stream is gone, or the consumer that it is received by")
+            self.lose("the stream is gone, or the consumer that it is received by")
         else:
             await self._request(least=1)
 

@@ -170,7 +170,7 @@ def test_a_bundle_that_was_changed_since_its_promotion_is_none(changing, edge_bu
     folder = shutil.copytree(edge_bundle.path, tmp_path / "broken")
     (folder / "pipeline.py").write_text("import os\n")
     answer = changing.post("/v1/deploy", json={"bundle": str(folder)})
-    assert answer.status_code == 422
+    assert answer.status_code == 409
     assert "pipeline.py was changed" in answer.json()["detail"]
     done = epypes("deploy", tmp_path / "nothing", "--http", http.url)
     assert done.returncode == 1
@@ -220,10 +220,9 @@ def test_while_a_bundle_is_deployed_another_one_is_refused_and_all_else_is_answe
             )
             first.start()
             until((tmp_path / "begun").exists)
-            assert client.post("/v1/deploy", json={"bundle": str(slow)}).status_code == 409
-            refused = client.post("/v1/rollback")
-            assert refused.status_code == 409
-            assert "exchanged already" in refused.json()["detail"]
+            for refused in (client.post("/v1/deploy", json={"bundle": str(slow)}), client.post("/v1/rollback")):
+                assert refused.status_code == 503
+                assert "running already" in refused.json()["detail"]
             assert client.get("/readyz").status_code == 200
             assert client.post("/v1/pause").status_code == 200
             assert client.post("/v1/resume").status_code == 200
