@@ -1,7 +1,7 @@
 """The home of accepted events: which event the worker gets next, and what happens when it is done or the worker dies.
 
-An event waits in the mailbox, is with the worker, is done and held until the events before it are resolved, or waits
-to be tried again. All of that changes under one lock. Nothing is published and no listener is called while the lock is
+An event waits in the mailbox, is with the worker, waits to be tried again, or is done and held until the events before
+it are resolved. All of that changes under one lock. Nothing is published and no listener is called while the lock is
 held: results queue for `publish`, which every caller that has changed anything calls when it has released the lock.
 """
 
@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from time import perf_counter_ns
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from epypes.errors import ServiceError
 from epypes.service.result_publisher import (
@@ -31,6 +31,7 @@ from epypes.service.result_publisher import (
 )
 
 if TYPE_CHECKING:
+    from epypes.service.frame_socket import WorkerMessage
     from epypes.service.options import Options
     from epypes.service.worker_connection import HangReport, WorkerConnection
     from epypes.transport.channel import Delivery
@@ -63,6 +64,8 @@ class AcceptedEvent:
         How often it was given to a worker.
     deaths
         How often the worker died while this was all that it worked on.
+    is_suspect
+        Whether a worker died while it had this event: then it is tried alone.
     result
         What is published; None until it is resolved.
     """
@@ -74,6 +77,7 @@ class AcceptedEvent:
     started_ns: int = 0
     attempts: int = 0
     deaths: int = 0
+    is_suspect: bool = False
     result: Result | None = None
 
     @property
@@ -100,19 +104,17 @@ class Dispatcher:
         The lock, and the condition on it that is notified when anything changes.
     is_closed
         Whether a broker's events are left with it.
-    is_unwatched
-        Whether the supervisor must be woken up by the next event.
     answered_in_row
-        How many events were answered since a worker last died.
+        How many events were answered since a worker last ended.
     """
 
     def __init__(self, options: Options, results: ResultPublisher, provenance: Callable[[], Provenance]) -> None:
         self.lock = threading.RLock()
         self.changed, self._room = threading.Condition(self.lock), threading.Condition(self.lock)
-        self.is_closed = self.is_unwatched = False
+        self.is_closed = self._is_idle = False
         self.answered_in_row = 0
         self._policy, self._size, self._slots = options.mailbox_policy, options.capacity, options.threads
-        self._retries = options.retries
+        self._max_deaths = options.retries
         # A broker keeps events while there is no room, and confirms their answers: they are in flight until then.
         self._has_broker, self._is_confirmed = options.has_broker, options.is_confirmed
         self._results, self._provenance = results, provenance
@@ -122,11 +124,9 @@ class Dispatcher:
         self._last_seq = 0
         self._totals: Counter[str] = Counter()
         self._waiting: deque[AcceptedEvent] = deque()
-        # To be tried again: events that did not cause the end of the worker, and suspects, which are tried alone.
-        self._again: list[AcceptedEvent] = []
-        self._suspects: list[AcceptedEvent] = []
+        # Events to be tried again, suspects first.
+        self._retry: list[AcceptedEvent] = []
         self._running: dict[int, AcceptedEvent] = {}
-        self._is_alone = False
         # Events that were given to a worker at least once, in the order of acceptance, until they are released.
         self._begun: dict[int, AcceptedEvent] = {}
         self._unconfirmed: dict[int, AcceptedEvent] = {}
@@ -151,19 +151,15 @@ class Dispatcher:
             event = self._accepted(delivery)
             if self._why_refused:
                 self._drop(event, self._why_refused)
-            elif self._is_next_taken():
-                # So it needs no room.
-                self._waiting.append(event)
-            elif len(self._waiting) >= self._size and self._policy == "fault":
-                self._drop(event, overflow_reason(self._policy, self._size))
             else:
-                while len(self._waiting) >= self._size:
-                    self._drop(self._waiting.popleft(), overflow_reason(self._policy, self._size))
                 self._waiting.append(event)
-            self._assign()
-            if self.is_unwatched:
+                self._assign()
+                while len(self._waiting) > self._size:
+                    surplus = self._waiting.pop() if self._policy == "fault" else self._waiting.popleft()
+                    self._drop(surplus, overflow_reason(self._policy, self._size))
+            if self._is_idle:
                 # Restart the job time-out: the worker is not idle any more.
-                self.is_unwatched = False
+                self._is_idle = False
                 self.changed.notify_all()
         if self._to_publish:
             self.publish()
@@ -174,8 +170,7 @@ class Dispatcher:
             event = self._accepted(delivery)
             event.attempts = max(delivery.attempt, 1) - 1
             event.result = exhausted_result(event, self._provenance())
-            self._count(event, event.result)
-            self._to_publish.append(partial(self._results.publish, event, event.result, self._settled))
+            self._release(event, event.result)
         self.publish()
 
     def _accepted(self, delivery: Delivery) -> AcceptedEvent:
@@ -188,25 +183,13 @@ class Dispatcher:
     def _drop(self, event: AcceptedEvent, reason: str) -> None:
         """Drop an event, which is published at once and not in the order of acceptance."""
         self._totals["dropped"] += 1
-        result = dropped_result(event, reason, self._provenance())
-        self._to_publish.append(partial(self._results.publish, event, result, self._settled))
+        event.result = dropped_result(event, reason, self._provenance())
+        self._to_publish.append(partial(self._results.publish, event, event.result, self._settled))
 
     def _has_room(self) -> bool:
         """Whether an event that comes now is neither dropped nor has another one dropped."""
-        if self.is_closed or self._why_refused:
-            return False
-        return self._is_next_taken() or self._waiting_count() + len(self._unconfirmed) < self._size
-
-    def _is_next_taken(self) -> bool:
-        """Whether the worker gets an event that comes now before another one comes."""
-        return not self._waiting and not self._again and self._may_begin()
-
-    def _may_begin(self) -> bool:
-        if self._connection is None or self._holds or self._suspects or self._is_alone:
-            return False
-        held = len(self._begun) - len(self._running) - len(self._again)
-        is_free = len(self._running) < self._slots and held < _MAX_AHEAD * self._slots
-        return is_free and len(self._unconfirmed) < _MAX_UNCONFIRMED
+        is_open = not (self.is_closed or self._why_refused)
+        return is_open and self._waiting_count() + len(self._unconfirmed) < self._size
 
     # -- to the worker ------------------------------------------------------------------------------------------------
 
@@ -251,74 +234,66 @@ class Dispatcher:
     def _assign(self) -> None:
         """Give the worker what it is free for. With the lock held."""
         connection = self._connection
-        while connection is not None and not self._holds and (event := self._next()) is not None:
+        while connection is not None and (self._waiting or self._retry) and (event := self._next()) is not None:
             self._totals["retried"] += event.attempts > 0
             event.attempts += 1
             event.started_ns = perf_counter_ns()
             self._running[event.seq] = self._begun[event.seq] = event
             try:
-                connection.post({"kind": "event", "seq": event.seq}, event.delivery.frames)
+                connection.post_event(event.seq, event.delivery.frames)
             except MemoryError as error:
                 self._resolve(event, failed_result(event, error, self._provenance(), "raised"))
         if self._has_broker and self._has_room():
             self._room.notify_all()
 
     def _next(self) -> AcceptedEvent | None:
-        """Return the event that the worker gets next.
+        """Return the event that the worker gets next; None if it is not free, or events wait.
 
         A suspect is taken when nothing else is worked on, and nothing is taken beside it.
         """
-        if self._suspects:
-            if self._running:
-                return None
-            self._is_alone = True
-            return self._suspects.pop(0)
-        if self._again and not self._is_alone and len(self._running) < self._slots:
-            return self._again.pop(0)
-        if self._waiting and not self._again and self._may_begin():
-            return self._waiting.popleft()
-        return None
+        running = self._running
+        if self._holds or len(running) >= self._slots or any(event.is_suspect for event in running.values()):
+            return None
+        if self._retry:
+            return None if self._retry[0].is_suspect and running else self._retry.pop(0)
+        is_ahead = len(self._begun) - len(running) >= _MAX_AHEAD * self._slots
+        if not self._waiting or is_ahead or len(self._unconfirmed) >= _MAX_UNCONFIRMED:
+            return None
+        return self._waiting.popleft()
 
     # -- from the worker ----------------------------------------------------------------------------------------------
 
-    def done(self, connection: WorkerConnection, header: Mapping[str, Any], frames: Sequence[memoryview]) -> None:
+    def done(self, connection: WorkerConnection, message: WorkerMessage) -> None:
         """Take a worker's ``done`` message. An event that timed out meanwhile has been answered already."""
         with self.lock:
-            event = self._running.get(header["seq"]) if connection is self._connection else None
-        if event is None:
-            return
-        result = worker_result(event, header, frames, self._locked_provenance)
-        with self.lock:
-            self._resolve(event, result)
+            event = self._running.get(message.number) if connection is self._connection else None
+            if event is None:
+                return
+            self._resolve(event, worker_result(event, message, self._provenance))
             self.answered_in_row += 1
             self._assign()
-            self._wake_idle()
+            self._wake_waiting()
         self.publish()
-
-    def _locked_provenance(self) -> Provenance:
-        with self.lock:
-            return self._provenance()
 
     def _resolve(self, event: AcceptedEvent, result: Result) -> None:
         """Note the result of an event that the worker has, and release what is resolved in the order of acceptance."""
         if self._running.pop(event.seq, None) is None:
             return
-        self._is_alone = False
         event.result = result
         while self._begun:
             eldest = next(iter(self._begun.values()))
             if eldest.result is None:
                 return
             del self._begun[eldest.seq]
-            self._count(eldest, eldest.result)
-            self._to_publish.append(partial(self._results.publish, eldest, eldest.result, self._settled))
+            self._release(eldest, eldest.result)
 
-    def _count(self, event: AcceptedEvent, result: Result) -> None:
-        """Count an event that is released; one whose answer a broker confirms is in flight until then."""
+    def _release(self, event: AcceptedEvent, result: Result) -> None:
+        """Have a result published and counted; if a broker confirms it, it is in flight until then."""
         if self._is_confirmed:
             self._unconfirmed[event.seq] = event
         else:
             self._totals[result.outcome] += 1
+        self._to_publish.append(partial(self._results.publish, event, result, self._settled))
 
     def worker_died(self, ending: str, died_in: Sequence[str]) -> None:
         """Note that the worker died by itself, or of one of its events; they are tried again, or are dead letters."""
@@ -327,46 +302,54 @@ class Dispatcher:
             running = list(self._running.values())
             if len(running) == 1:
                 running[0].deaths += 1
-            dead = [event for event in running if event.deaths > self._retries]
-            self._put_back([event for event in running if event not in dead], self._suspects)
-            for event in dead:
-                function = died_in[0] if died_in else ""
-                self._resolve(event, dead_letter_result(event, ending, function, self._provenance()))
-            self.changed.notify_all()
+            for event in running:
+                event.is_suspect = True
+                if event.deaths > self._max_deaths:
+                    function = died_in[0] if died_in else ""
+                    self._resolve(event, dead_letter_result(event, ending, function, self._provenance()))
+            self._put_back()
 
     def worker_ended(self) -> None:
         """Note that the front itself ended the worker: its events are tried again."""
         with self.lock:
-            self._connection = None
-            # An event that is tried alone stays a suspect.
-            self._put_back(list(self._running.values()), self._suspects if self._is_alone else self._again)
-            self.changed.notify_all()
+            self._connection, self.answered_in_row = None, 0
+            self._put_back()
 
-    def _put_back(self, events: list[AcceptedEvent], target: list[AcceptedEvent]) -> None:
-        for event in events:
-            del self._running[event.seq]
-        target += events
-        target.sort(key=lambda event: event.seq)
-        self._is_alone = self._is_alone and bool(self._running)
+    def _put_back(self) -> None:
+        """Have events of a worker that is gone tried again."""
+        self._retry += self._running.values()
+        self._retry.sort(key=lambda event: (not event.is_suspect, event.seq))
+        self._running.clear()
+        self.changed.notify_all()
 
     # -- events that take too long ------------------------------------------------------------------------------------
 
-    def overdue(self, timeout_ns: int) -> list[AcceptedEvent]:
+    def overdue(self, timeout_s: float) -> list[AcceptedEvent]:
         """Return the events that the worker has had for longer than this."""
         with self.lock:
             now_ns = perf_counter_ns()
-            return [event for event in self._running.values() if now_ns - event.started_ns >= timeout_ns]
+            return [event for event in self._running.values() if now_ns - event.started_ns >= timeout_s * 1e9]
 
-    def due_in_s(self, timeout_ns: int) -> float | None:
-        """Return in how many seconds an event will have timed out; None if there is none. With the lock held."""
+    def due_in_s(self, timeout_s: float) -> float | None:
+        """Return in how many seconds an event will have timed out; None if there is none. With the lock held.
+
+        The supervisor, which waits for so long, is woken up by the next event if there is none.
+        """
         starts = [event.started_ns for event in self._running.values()] if self._connection is not None else []
-        return max(min(starts) + timeout_ns - perf_counter_ns(), 0) / 1e9 if starts else None
+        self._is_idle = not starts
+        return max(min(starts) / 1e9 + timeout_s - perf_counter_ns() / 1e9, 0.0) if starts else None
 
-    def stuck(self, report: HangReport, overdue: Sequence[int], timeout_ns: int) -> list[int] | None:
-        """Return which overdue events are stuck; None if the worker may go on. With the lock held.
+    def fail_stuck(self, report: HangReport, overdue: Sequence[int], timeout_s: float) -> str | None:
+        """Answer overdue events that are stuck with a failure that names the function; the worker gets nothing more.
 
         An event may have waited in the worker for a change of parameters: its time begins when it is begun. If the
-        worker works on none of them it is held up by something else, and is ended without blaming an event.
+        worker works on none of them it is held up by something else, and is ended without blaming an event. With the
+        lock held.
+
+        Returns
+        -------
+        str or None
+            The function that did not return, empty if that can't be known; None if the worker may go on.
         """
         events = [event for seq in overdue if (event := self._running.get(seq)) is not None]
         now_ns = perf_counter_ns()
@@ -375,22 +358,20 @@ class Dispatcher:
                 event.started_ns = now_ns - report.elapsed_ns[event.seq]
             elif report.elapsed_ns:
                 event.started_ns = now_ns
-        late = [event for event in events if now_ns - event.started_ns >= timeout_ns]
+        late = [event for event in events if now_ns - event.started_ns >= timeout_s * 1e9]
         if not late:
             return None
-        is_blamed = not report.has_answered or bool(report.elapsed_ns)
-        return [event.seq for event in late if is_blamed or event.attempts > self._retries + 1]
-
-    def fail_stuck(self, stuck: Sequence[int], functions: Mapping[int, str], timeout_s: float) -> None:
-        """Answer stuck events with a failure that names the function; the worker gets nothing more. With the lock."""
-        provenance = self._provenance()
-        for event in [event for seq in stuck if (event := self._running.get(seq)) is not None]:
-            function = functions[event.seq]
-            where = f"Function {function!r}" if function else "The worker"
-            text = f"{where} did not return within {timeout_s:g} s; the worker is replaced."
-            error = ServiceError(provenance.bundle, text)
-            self._resolve(event, failed_result(event, error, provenance, "stuck", function=function))
+        is_blamed, provenance, named = not report.has_answered or bool(report.elapsed_ns), self._provenance(), ""
+        for event in late:
+            if is_blamed or event.attempts > self._max_deaths + 1:
+                function = report.functions[event.seq]
+                where = f"Function {function!r}" if function else "The worker"
+                text = f"{where} did not return within {timeout_s:g} s; the worker is replaced."
+                error = ServiceError(provenance.bundle, text)
+                self._resolve(event, failed_result(event, error, provenance, "stuck", function=function))
+                named = named or function
         self._connection = None
+        return named
 
     def give_up(self, reason: str, functions: Mapping[int, str] | None = None) -> int:
         """Answer all that is not resolved with a failure of this reason; return how many events that were.
@@ -400,12 +381,8 @@ class Dispatcher:
         with self.lock:
             if self._has_broker:
                 returned = [*self._unconfirmed.values(), *self._begun.values(), *self._waiting]
-                for kept in (
-                    *(self._waiting, self._again, self._suspects),
-                    *(self._running, self._begun, self._unconfirmed),
-                ):
+                for kept in (self._waiting, self._retry, self._running, self._begun, self._unconfirmed):
                     kept.clear()
-                self._is_alone = False
                 self._totals["given_back"] += len(returned)
                 for event in returned:
                     event.delivery.nack()
@@ -415,10 +392,8 @@ class Dispatcher:
             self._waiting.clear()
             for event in waiting:
                 self._drop(event, reason)
-            for event in (*self._again, *self._suspects):
-                self._running[event.seq] = event
-            self._again.clear()
-            self._suspects.clear()
+            self._running |= {event.seq: event for event in self._retry}
+            self._retry.clear()
             begun = sorted(self._running.values(), key=lambda event: event.seq)
             for event in begun:
                 function = (functions or {}).get(event.seq, "")
@@ -474,7 +449,7 @@ class Dispatcher:
             if self._unconfirmed.pop(event.seq, None) is not None:
                 self._totals[result.outcome] += 1
                 self._assign()
-                self._wake_idle()
+                self._wake_waiting()
 
     # -- waiting and counting -----------------------------------------------------------------------------------------
 
@@ -487,9 +462,9 @@ class Dispatcher:
             finally:
                 self._waiting_threads -= 1
 
-    def _wake_idle(self) -> None:
-        # Only if a thread waits for it: otherwise every event would wake up the supervisor.
-        if self._waiting_threads and not self._running:
+    def _wake_waiting(self) -> None:
+        # Only if a thread is in `wait_for`: otherwise every event would wake up the supervisor.
+        if self._waiting_threads:
             self.changed.notify_all()
 
     @property
@@ -503,12 +478,12 @@ class Dispatcher:
         return not (self._begun or self._waiting or self._unconfirmed)
 
     def _waiting_count(self) -> int:
-        return len(self._waiting) + len(self._again) + len(self._suspects)
+        return len(self._waiting) + len(self._retry)
 
     @property
     def in_flight(self) -> int:
         """How many events the worker has, or has done while an earlier one is not, or whose answer is unconfirmed."""
-        return len(self._begun) - len(self._again) - len(self._suspects) + len(self._unconfirmed)
+        return len(self._begun) - len(self._retry) + len(self._unconfirmed)
 
     def counts(self) -> dict[str, int]:
         """Return the counts: received is the sum of all others but ``retried`` and ``redelivered``."""

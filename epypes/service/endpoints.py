@@ -260,7 +260,12 @@ class AnswerOutput:
         """Close it; what was published still leaves, as far as that is possible in time."""
         self._publisher.stop(timeout_s)
 
-    def publish(self, answer: EncodedEnvelope | bytes, id: str, confirmed: Confirmed) -> None:  # noqa: A002
+    def publish(
+        self,
+        answer: EncodedEnvelope | bytes,
+        id: str = "",  # noqa: A002
+        confirmed: Confirmed = lambda error: None,
+    ) -> None:
         """Publish an answer under an id; returns at once. A ZeroMQ socket confirms what it has taken."""
         if self._publisher.waiting >= _MAX_UNCONFIRMED:
             # Events that no broker keeps may be any number.
@@ -297,16 +302,8 @@ class Endpoints:
         Where events come from, where answers go, and where failures are published.
     """
 
-    def __init__(
-        self,
-        options: Options,
-        accept: Callable[[Delivery, bool, float | None], object],
-        on_exhausted: Callable[[Delivery], object],
-        on_change: Callable[[], object],
-    ) -> None:
-        self.events = EventInput(options, accept, on_exhausted, on_change)
-        self.answers = AnswerOutput(options.pub, options, on_change)
-        self.failures = AnswerOutput(options.failures, options, on_change)
+    def __init__(self, events: EventInput, answers: AnswerOutput, failures: AnswerOutput) -> None:
+        self.events, self.answers, self.failures = events, answers, failures
 
     def start(self) -> None:
         """Open them; those that peers may wait for first.

@@ -39,7 +39,12 @@ def pack(frames: Sequence[BytesLike]) -> bytes:
     """
     sizes = [memoryview(frame).nbytes for frame in frames]
     _check_limits(len(sizes), sum(sizes))
-    return b"".join([struct.pack(f"<4sI{len(sizes)}Q", MARK, len(sizes), *sizes), *frames])
+    return b"".join([table_of(sizes), *frames])
+
+
+def table_of(sizes: Sequence[int]) -> bytes:
+    """Return the table of frames of these sizes."""
+    return struct.pack(f"<4sI{len(sizes)}Q", MARK, len(sizes), *sizes)
 
 
 def unpack(data: BytesLike) -> list[memoryview]:

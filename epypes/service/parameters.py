@@ -400,16 +400,16 @@ class ParameterControl:
             self._pending = wanted
             return connection
 
-    def settled(self, connection: WorkerConnection, header: Mapping[str, Any]) -> None:
+    def settled(self, connection: WorkerConnection, answer: Mapping[str, Any]) -> None:
         """Take a worker's answer to a change; called on its receiving thread, before events that come after it."""
         with self._dispatcher.lock:
             pending = self._pending
             if connection is not self._dispatcher.connection or pending is None:
                 return
-            if header.get("revision") != pending.revision:
+            if answer["revision"] != pending.revision:
                 return
             self._pending = None
-            if header["kind"] == "parameters":
+            if not (answer["problems"] or answer["is_withdrawn"]):
                 changes = differing_values(self.current.entries, self.current.entries, pending.entries)
                 _log.info("parameters, revision %d: %s", pending.revision, "; ".join(changes))
                 self._change(pending)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from epypes.errors import MailboxOverflow, MessageError, ServiceError
 from epypes.run import Failure
 from epypes.service.failures.record import FAILURE_TOPIC, FailedEvent
+from epypes.store.later import SeriesWriter
 from epypes.transport.channel import Confirmed
 from epypes.transport.throttle import Throttle
 from epypes.wire import EncodedEnvelope, failure_event
@@ -24,8 +25,10 @@ from epypes.wire.envelope import request_fields
 
 if TYPE_CHECKING:
     from epypes.service.dispatcher import AcceptedEvent
-    from epypes.service.event_log import EventLog
+    from epypes.service.endpoints import AnswerOutput
     from epypes.service.failures.store import FailureStore
+    from epypes.service.frame_socket import WorkerMessage
+    from epypes.service.options import Options
 
 Outcome = Literal["answered", "failed", "dead_letters"]
 FailureKind = Literal["raised", "killed", "stuck", "dropped", "exhausted"]
@@ -34,6 +37,8 @@ Listener = Callable[[str, dict[str, Any]], None]
 
 # Log texts of an event that failed outside of its graph.
 _FAILED: Final = {"f_in": "could not be read (f_in)", "f_out": "has an answer that could not be given (f_out)"}
+# Of the series that the event log is in.
+_KIND: Final = "events"
 _RECORDED: Final = ("function", "tokens", "exception", "message", "trace")
 # Upper bounds of the latency histogram in seconds: from a trivial graph to the longest job time-outs.
 BOUNDS_S: Final = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
@@ -85,18 +90,17 @@ class Result:
 # -- results, by cause ------------------------------------------------------------------------------------------------
 
 
-def worker_result(
-    event: AcceptedEvent, header: Mapping[str, Any], frames: Sequence[memoryview], provenance: Callable[[], Provenance]
-) -> Result:
+def worker_result(event: AcceptedEvent, message: WorkerMessage, provenance: Callable[[], Provenance]) -> Result:
     """Return the result of a worker's ``done`` message."""
+    done, frames = message.content, message.frames
     answers: list[EncodedEnvelope | bytes] = []
     begin = 0
-    for count in header.get("answers", ()):
+    for count in done["answers"]:
         own, begin = frames[begin : begin + count], begin + count
         answers.append(bytes(own[0]) if count == 1 else EncodedEnvelope.read(own))
-    failure = header.get("failure")
+    failure = done["failure"]
     record = _record(event, failure, provenance(), "raised") if failure else None
-    return Result(answers, record, header.get("revision", 0), header.get("total_ns", 0), header.get("durations_ns", {}))
+    return Result(answers, record, done["revision"], done["total_ns"], done["durations_ns"])
 
 
 def failed_result(
@@ -214,6 +218,79 @@ class LatencyHistogram:
         return Latency(BOUNDS_S, counts, sum(counts), self._total_ns / 1e9, self._computing_ns / 1e9, functions_s)
 
 
+# -- event log -------------------------------------------------------------------------------------------------------
+
+
+class EventLog:
+    """A row of each event, in the series ``events`` of the bundle's name; nothing waits for the database.
+
+    Parameters
+    ----------
+    options
+        Of the service: the store, which is a path or a URL or None, and the name of the replica.
+    name
+        Of the bundle.
+    provenance
+        Returns what events are worked on with.
+
+    Raises
+    ------
+    StoreError
+        There can be no such database. One that is away is reported in the log.
+    """
+
+    def __init__(self, options: Options, name: str, provenance: Callable[[], Provenance]) -> None:
+        self._options, self._provenance, self._began_ns = options, provenance, time_ns()
+        self._writer = None if options.store is None else SeriesWriter(options.store, _KIND, name)
+
+    def keep(self, event: AcceptedEvent, result: Result, failure: FailedEvent | None) -> None:
+        """Have a row of an event written; returns at once and raises nothing."""
+        if self._writer is not None:
+            row = _row(event, result, failure, self._provenance().digest)
+            if self._options.has_broker:
+                row |= {"deliveries": event.delivery.attempt, "replica": self._options.replica}
+            self._writer.append(f"{self._began_ns}-{event.seq}", row)
+
+    def counts(self) -> Mapping[str, int]:
+        """Return how many rows were written, skipped and so on, as `SeriesWriter.counts`; none without a store."""
+        return {} if self._writer is None else self._writer.counts()
+
+    def close(self, timeout_s: float) -> None:
+        """Write all rows that wait; those that are not written in time are reported in the log. More may follow."""
+        if self._writer is not None and not self._writer.close(timeout_s):
+            _log.warning("%d rows of events could not be stored in time", self._writer.counts()["waiting"])
+
+
+def _row(event: AcceptedEvent, result: Result, failure: FailedEvent | None, digest: str) -> dict[str, Any]:
+    now_ns = time_ns()
+    row = {
+        "seq": event.seq,
+        "event_id": event.id,
+        "outcome": "answered",
+        "received_ns": now_ns - (perf_counter_ns() - event.accepted_ns),
+        "answered_ns": now_ns,
+        "total_ns": result.total_ns,
+        "times_ns": dict(result.durations_ns),
+        "attempts": event.attempts,
+        "revision": result.revision,
+        "digest": digest,
+    }
+    return row if failure is None else {**row, **_of_failure(failure, result)}
+
+
+def _of_failure(failure: FailedEvent, result: Result) -> dict[str, Any]:
+    """Return what a row has besides if the event failed; ``failure`` is the id to open it by."""
+    dropped = failure.kind == "dropped"
+    return {
+        "outcome": "dropped" if dropped else result.outcome.removesuffix("s"),
+        "failure": failure.id,
+        "function": failure.function,
+        "exception": failure.exception,
+        "message": failure.message,
+        "digest": failure.digest,
+    }
+
+
 # -- publishing -------------------------------------------------------------------------------------------------------
 
 
@@ -222,10 +299,8 @@ class ResultPublisher:
 
     Parameters
     ----------
-    publish_answer
-        Publishes an answer under an id, and calls back when it is confirmed or can't be sent.
-    publish_failure
-        Publishes a failure event on the address of failures.
+    answers, failures
+        Where answers go, and where failures are published.
     store
         Returns where failures are kept.
     event_log
@@ -236,13 +311,13 @@ class ResultPublisher:
 
     def __init__(
         self,
-        publish_answer: Callable[[EncodedEnvelope | bytes, str, Confirmed], object],
-        publish_failure: Callable[[EncodedEnvelope], object],
+        answers: AnswerOutput,
+        failures: AnswerOutput,
         store: FailureStore,
         event_log: EventLog,
         provenance: Callable[[], Provenance],
     ) -> None:
-        self._publish_answer, self._publish_failure = publish_answer, publish_failure
+        self._answers, self._failures = answers, failures
         self._store, self._event_log, self._provenance = store, event_log, provenance
         self._listeners: list[Listener] = []
         self.latency = LatencyHistogram()
@@ -288,7 +363,7 @@ class ResultPublisher:
         for number, answer in enumerate(result.answers, 1):
             # Numbered, so that the second answer is no duplicate of the first.
             own_id = f"{event.id}/{number}" if event.id and number > 1 else event.id
-            self._publish_answer(answer, own_id, confirmed)
+            self._answers.publish(answer, own_id, confirmed)
 
     def _confirmed(
         self,
@@ -335,7 +410,7 @@ class ResultPublisher:
             if isinstance(answer, EncodedEnvelope) and answer.failure is not None:
                 envelope = answer.decode()
                 envelope = replace(envelope, attributes={**envelope.attributes, **more})
-                self._publish_failure(EncodedEnvelope.encode(envelope, FAILURE_TOPIC))
+                self._failures.publish(EncodedEnvelope.encode(envelope, FAILURE_TOPIC))
         self.notify("failure", asdict(kept))
         return kept
 

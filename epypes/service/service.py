@@ -13,15 +13,14 @@ from typing import TYPE_CHECKING, Any, Final, Self
 from epypes.service.bundle_info import read_bundle_info
 from epypes.service.deploy import Deployer
 from epypes.service.dispatcher import Dispatcher
-from epypes.service.endpoints import Endpoints, group_address
-from epypes.service.event_log import EventLog
+from epypes.service.endpoints import AnswerOutput, Endpoints, EventInput, group_address
 from epypes.service.failures.record import FailedEvent
 from epypes.service.failures.store import FailureStore, failures_folder
 from epypes.service.lifecycle import Lifecycle, State
 from epypes.service.options import ANY_PORT, Options
 from epypes.service.parameters import ParameterControl, Parameters
 from epypes.service.replicas import Replicas
-from epypes.service.result_publisher import Latency, Listener, Provenance, ResultPublisher
+from epypes.service.result_publisher import EventLog, Latency, Listener, Provenance, ResultPublisher
 from epypes.service.sd_notify import notify
 from epypes.service.state_file import ServiceState
 from epypes.service.supervisor import Supervisor
@@ -71,15 +70,12 @@ class Service:
         self.http = self.token_file = ""
         self.failure_store = FailureStore(failures_folder(bundle.path))
         self.event_log = EventLog(given, bundle.settings.name, self._provenance)
-        self._results = ResultPublisher(
-            lambda *answer: self._endpoints.answers.publish(*answer),
-            lambda failure: self._endpoints.failures.publish(failure, "", lambda error: None),
-            self.failure_store,
-            self.event_log,
-            self._provenance,
-        )
+        answers = AnswerOutput(given.pub, given, self._changed)
+        failures = AnswerOutput(given.failures, given, self._changed)
+        self._results = ResultPublisher(answers, failures, self.failure_store, self.event_log, self._provenance)
         self._dispatcher = Dispatcher(given, self._results, self._provenance)
-        self._endpoints = Endpoints(given, self._dispatcher.accept, self._dispatcher.accept_exhausted, self._changed)
+        events = EventInput(given, self._dispatcher.accept, self._dispatcher.accept_exhausted, self._changed)
+        self._endpoints = Endpoints(events, answers, failures)
         change_timeout_s = min(given.job_timeout_s, _CHANGE_TIMEOUT_S)
         self._parameters = ParameterControl(bundle, self._dispatcher, self._results.notify, change_timeout_s)
         self._lifecycle = Lifecycle(self._dispatcher, self._endpoints, self._results, lambda: self._supervisor.health)
@@ -209,7 +205,7 @@ class Service:
         health = self._supervisor.health
         if health.fault or health.stuck:
             return health.fault or f"{health.stuck}."
-        overdue = self._dispatcher.overdue(int(self.job_timeout_s * 1e9))
+        overdue = self._dispatcher.overdue(self.job_timeout_s)
         return f"An event has been worked on for more than {self.job_timeout_s:g} s." if overdue else ""
 
     def ready(self) -> str:

@@ -6,6 +6,7 @@ One thread, which lives as long as the service: the system ends a worker with th
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -16,9 +17,10 @@ from epypes.bundle.replay import REPLAY_TIMEOUT_S
 from epypes.errors import ServiceError
 from epypes.service.bundle_info import BundleInfo
 from epypes.service.dispatcher import Dispatcher
+from epypes.service.frame_socket import WorkerMessage
 from epypes.service.parameters import ParameterControl, others_than
 from epypes.service.sd_notify import Watchdog
-from epypes.service.worker_connection import SETTLING, Message, WorkerConnection
+from epypes.service.worker_connection import WorkerConnection
 from epypes.service.worker_health import DEATHS_BEFORE_FAULT, RESTART_PAUSE_S, WorkerHealth
 
 _END_TIMEOUT_S: Final = 2.0
@@ -67,7 +69,7 @@ class Supervisor:
         self.is_rewritten = False
         self.worker: WorkerConnection | None = None
         self._dispatcher, self._threads = dispatcher, threads
-        self._timeout_s, self._timeout_ns = job_timeout_s, int(job_timeout_s * 1e9)
+        self._timeout_s = job_timeout_s
         self._parameters, self._on_change = parameters, on_change
         self._changed = dispatcher.changed
         self._to_start: deque[tuple[BundleInfo, list[WorkerConnection | Exception]]] = deque()
@@ -76,8 +78,6 @@ class Supervisor:
         self._is_ending = False
         self._thread: threading.Thread | None = None
         self._watchdog = Watchdog()
-        # `Dispatcher.answered_in_row` when the last worker ended.
-        self._answered_before = 0
 
     def start(self) -> None:
         """Start the thread, and a worker of the bundle."""
@@ -115,10 +115,10 @@ class Supervisor:
     def _run(self) -> None:
         while True:
             with self._changed:
-                job = self._next()
-                while job is None:
-                    self._changed.wait(self._wait_s())
-                    job = self._next()
+                due_in_s, job = self._next()
+                while due_in_s is None or due_in_s > 0:
+                    self._changed.wait(due_in_s)
+                    due_in_s, job = self._next()
             if self._is_ending:
                 return
             try:
@@ -127,40 +127,22 @@ class Supervisor:
             except Exception:
                 _log.exception("a step of the supervisor failed; the supervisor goes on")
 
-    def _wait_s(self) -> float | None:
-        """Return how long to wait if nothing changes; None for ever. With the lock held."""
-        now_s = monotonic()
-        due_in_s = self._dispatcher.due_in_s(self._timeout_ns)
-        self._dispatcher.is_unwatched = due_in_s is None
-        waits = [due_in_s, self._watchdog.due_in_s()]
-        if self._restart_s is not None:
-            waits.append(self._restart_s - now_s)
-        if self._is_loading:
-            waits.append(self._loading_until_s - now_s)
-        known = [wait for wait in waits if wait is not None]
-        return max(min(known), 0.0) if known else None
-
-    def _next(self) -> Callable[[], object] | None:
-        """Return what must be done now, None if nothing. With the lock held."""
-        now_s = monotonic()
+    def _next(self) -> tuple[float | None, Callable[[], object]]:
+        """Return what must be done next, and in how many seconds; None for never. With the lock held."""
         if self._is_ending:
-            return _nothing
-        if (sign_due_in_s := self._watchdog.due_in_s()) is not None and sign_due_in_s <= 0:
-            return self._watchdog.send
-        if self._to_start:
-            return self._start_for_deploy
+            return 0.0, _nothing
+        now_s = monotonic()
         if self.worker is None and self._restart_s is None and not self.health.is_final:
             # The last attempt to start one has failed.
             self._restart_s = now_s + RESTART_PAUSE_S
-        if self._restart_s is not None and self._restart_s <= now_s:
-            self._restart_s = None
-            return self._start_again
-        due_in_s = self._dispatcher.due_in_s(self._timeout_ns)
-        if self._dispatcher.connection is not None and due_in_s is not None and due_in_s <= 0:
-            return self._end_stuck
-        if self._is_loading and self._loading_until_s <= now_s:
-            return self._end_loading
-        return None
+        jobs: list[tuple[float | None, Callable[[], object]]] = [
+            (self._watchdog.due_in_s(), self._watchdog.send),
+            (0.0 if self._to_start else None, self._start_for_deploy),
+            (None if self._restart_s is None else self._restart_s - now_s, self._start_again),
+            (self._dispatcher.due_in_s(self._timeout_s), self._end_stuck),
+            (self._loading_until_s - now_s if self._is_loading else None, self._end_loading),
+        ]
+        return min(jobs, key=lambda job: math.inf if job[0] is None else job[0])
 
     @property
     def _is_loading(self) -> bool:
@@ -168,7 +150,7 @@ class Supervisor:
 
     def _start_again(self) -> None:
         with self._changed:
-            bundle = self.bundle
+            bundle, self._restart_s = self.bundle, None
         try:
             connection = WorkerConnection(bundle, self._threads, self._on_message, self._on_end)
         except (OSError, MemoryError, RuntimeError) as error:
@@ -198,18 +180,16 @@ class Supervisor:
 
     # -- messages of a worker, on its receiving thread -----------------------------------------------------------------
 
-    def _on_message(self, connection: WorkerConnection, message: Message) -> None:
-        header, frames = message
-        kind = header.get("kind")
-        if kind == "done":
-            self._dispatcher.done(connection, header, frames)
-        elif kind in SETTLING:
-            self._parameters.settled(connection, header)
+    def _on_message(self, connection: WorkerConnection, message: WorkerMessage) -> None:
+        if message.kind == "done":
+            self._dispatcher.done(connection, message)
+        elif message.kind == "parameters":
+            self._parameters.settled(connection, message.content)
             with self._changed:
                 if connection is self.worker and connection is not self._dispatcher.connection:
-                    self._confirmed(connection, header.get("problems") or {})
+                    self._confirmed(connection, message.content["problems"])
             self._dispatcher.publish()
-        elif kind == "ready":
+        elif message.kind == "ready":
             with self._changed:
                 if connection is self.worker:
                     self._begin(connection)
@@ -271,9 +251,7 @@ class Supervisor:
     def _over(self, connection: WorkerConnection) -> None:
         """Note that the worker is gone. With the lock held."""
         self.worker = None
-        in_row = self._dispatcher.answered_in_row
-        answered = in_row if in_row > self._answered_before else 0
-        self._answered_before = in_row
+        answered = self._dispatcher.answered_in_row
         if connection.status == "refused":
             self._dispatcher.worker_ended()
             self._fault(" ".join(connection.reasons))
@@ -282,7 +260,7 @@ class Supervisor:
             self._died(self.health.stuck or connection.process.ending, answered, has_cause=True)
         else:
             # An event that kills workers becomes a dead letter in the end: such deaths must not make a fault.
-            has_event, self._answered_before = bool(self._dispatcher.running), 0
+            has_event = bool(self._dispatcher.running)
             self._dispatcher.worker_died(connection.process.ending, connection.process.died_in)
             self._died(connection.process.ending, answered, has_cause=has_event)
 
@@ -322,18 +300,16 @@ class Supervisor:
 
     def _end_stuck(self) -> None:
         connection = self._dispatcher.connection
-        overdue = [event.seq for event in self._dispatcher.overdue(self._timeout_ns)]
+        overdue = [event.seq for event in self._dispatcher.overdue(self._timeout_s)]
         if connection is None or not overdue:
             return
         report = connection.hang_report(overdue)
         with self._changed:
-            stuck = self._dispatcher.stuck(report, overdue, self._timeout_ns)
-            if stuck is None:
+            function = self._dispatcher.fail_stuck(report, overdue, self._timeout_s)
+            if function is None:
                 # They were done, or have not taken so long, and the worker goes on.
                 return
-            self._dispatcher.fail_stuck(stuck, report.functions, self._timeout_s)
-            named = next((name for seq in stuck if (name := report.functions[seq])), "")
-            where = f"Function {named!r}" if named else "The worker"
+            where = f"Function {function!r}" if function else "The worker"
             how = " The process was stopped." if connection.process.is_stopped else ""
             self.health.stuck = f"{where} did not return within {self._timeout_s:g} s.{how} The worker is replaced"
             connection.is_dismissed = True

@@ -1,14 +1,8 @@
-"""The front's connection to one worker process: frames over a socket pair, and the process at its other end.
-
-A message is a table (see `packing`), a header as JSON, and frames. Frames are never joined: the kernel takes them
-where they are, and the reader allocates each once, when its size has been checked. When one side ends, whatever the
-cause, the other reads the end of the stream at once.
-"""
+"""The front's connection to one worker process, and the process at its other end."""
 
 from __future__ import annotations
 
 import contextlib
-import io
 import itertools
 import json
 import logging
@@ -16,13 +10,11 @@ import os
 import queue
 import re
 import signal
-import socket
-import struct
 import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic, sleep
@@ -30,7 +22,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from epypes.bundle.load import MODULE
 from epypes.errors import MessageError, ServiceError
-from epypes.service.packing import HEAD, MARK, BytesLike
+from epypes.service.frame_socket import ControlSocket, FrameSocket, WorkerMessage, buffers_of
+from epypes.service.packing import BytesLike
 from epypes.service.sd_notify import VARIABLES
 from epypes.service.standard_error import STANDARD_ERROR
 
@@ -39,30 +32,14 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("epypes.service")
 
-Message = tuple[dict[str, Any], list[memoryview]]
 WorkerStatus = Literal["loading", "ready", "refused", "gone"]
 
-MAX_HEADER_BYTES: Final = 1024**2
-# Of one message: an event's answers may be several Envelopes.
-_MAX_FRAMES: Final = 16_384
-_MAX_BYTES: Final = 1024**3
-# Shared memory does not avoid the copy: a new segment per frame takes four times as long (8 ms for 8 MB, against 2 ms
-# here), and one that is used again must wait until the last array of the worker that looks into it is gone.
-# Asked for; the system gives what it allows. With 4 MB a frame of 1 MB takes 0.23 ms, with 0.2 MB 0.25 to 0.4 ms.
-_BUFFER_BYTES: Final = 4 * 1024**2
-# Messages up to this size are read at once, and sent by the caller's thread if the kernel takes them without waiting.
-_SMALL_BYTES: Final = 64 * 1024
-# The most buffers that one sendmsg takes.
-_MAX_BUFFERS: Final = 1_024
-_SENT_DIRECTLY: Final = socket.MSG_NOSIGNAL | socket.MSG_DONTWAIT
-
-ASK_TIMEOUT_S: Final = 2.0
+# How long a query may take.
+_QUERY_TIMEOUT_S: Final = 2.0
 # How long a worker may take to report whether a change that timed out was made.
 _WITHDRAW_TIMEOUT_S: Final = 0.5
 # How long a worker that seems to hang may take to report what it runs.
 _HANG_REPORT_TIMEOUT_S: Final = 0.5
-# Kinds of messages that settle a change of parameters.
-SETTLING: Final = ("parameters", "parameters_refused", "parameters_withdrawn")
 
 _LINES_KEPT: Final = 20
 _READ_BYTES: Final = 64 * 1024
@@ -73,173 +50,6 @@ _MAX_TRACE_BYTES: Final = 256 * 1024
 # How long a process may take to end once its socket has.
 _END_TIMEOUT_S: Final = 1.0
 _FRAME: Final = re.compile(r'^  File "(?P<file>.*)", line \d+ in (?P<name>\S+)$')
-
-_to_json: Final = json.JSONEncoder(separators=(",", ":")).encode
-_from_json: Final = json.JSONDecoder().decode
-
-
-def frame_sockets() -> tuple[FrameSocket, socket.socket]:
-    """Return one end of a new connection, and the socket for the process at its other end."""
-    ours, theirs = socket.socketpair()
-    for end in (ours, theirs):
-        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
-        end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
-    return FrameSocket(ours), theirs
-
-
-class FrameSocket:
-    """One end of a connected pair of stream sockets, which carries headers and frames.
-
-    Parameters
-    ----------
-    end
-        The socket; it is closed by `close`.
-    """
-
-    def __init__(self, end: socket.socket) -> None:
-        end.setblocking(True)
-        self._socket = end
-        self._sending, self._receiving = threading.Lock(), threading.Lock()
-        self._reader = io.BufferedReader(io.FileIO(end.fileno(), closefd=False), _SMALL_BYTES)
-
-    def send(self, header: Mapping[str, Any], frames: Sequence[BytesLike] = ()) -> None:
-        """Send a message, from any thread; wait for as long as the other side does not read.
-
-        When it returns, the frames' memory may be written to again.
-
-        Parameters
-        ----------
-        header
-            What json takes.
-        frames
-            Contiguous bytes.
-
-        Raises
-        ------
-        EOFError
-            The other side is gone.
-        MessageError
-            The header or the frames are larger than the reader accepts; nothing was sent.
-        """
-        left = buffers_of(header, frames)
-        with self._sending:
-            self._send_all(left)
-
-    def send_at_once(self, left: list[memoryview]) -> list[memoryview]:
-        """Send as much of a message as the kernel takes without waiting; return the rest.
-
-        No other thread may send on this end until the rest is sent, by `send_rest`.
-
-        Raises
-        ------
-        EOFError
-            The other side is gone.
-        """
-        with self._sending:
-            try:
-                sent = self._socket.sendmsg(left[:_MAX_BUFFERS], (), _SENT_DIRECTLY)
-                return _after(left, sent) if sent < sum(map(len, left)) else []
-            except BlockingIOError:
-                return left
-            except OSError as error:
-                raise EOFError("The other side of the connection is gone.") from error
-
-    def send_rest(self, left: list[memoryview]) -> None:
-        """Send buffers of `buffers_of`, or what `send_at_once` has left of them; as `send`."""
-        with self._sending:
-            self._send_all(left)
-
-    def _send_all(self, left: list[memoryview]) -> None:
-        try:
-            while left:
-                sent = self._socket.sendmsg(left[:_MAX_BUFFERS], (), socket.MSG_NOSIGNAL)
-                left = _after(left, sent) if sent < sum(map(len, left)) else []
-        except OSError as error:
-            raise EOFError("The other side of the connection is gone.") from error
-        except BaseException:
-            # Half a message may be sent: what came after it could not be understood.
-            self._end()
-            raise
-
-    def receive(self) -> Message:
-        """Wait for a message, and return its header and its frames, read-only; called by one thread.
-
-        Raises
-        ------
-        EOFError
-            The other side is gone, or this one was closed.
-        MessageError
-            The bytes are no message. What comes after them can't be understood: close the connection.
-        """
-        with self._receiving:
-            try:
-                # The reader allocates the bytes without filling them, and reads large ones in place.
-                read = self._reader.read
-                mark, count = HEAD.unpack(read(HEAD.size))
-                if mark != MARK or not 0 < count <= _MAX_FRAMES:
-                    raise MessageError("no frames", f"No message begins with {mark!r} and {count:,} frames.")
-                sizes = struct.unpack(f"<{count}Q", read(8 * count))
-                total = sum(sizes)
-                if sizes[0] > MAX_HEADER_BYTES or total > _MAX_BYTES:
-                    raise MessageError("too large", f"A header of {sizes[0]:,} bytes in a message of {total:,} bytes.")
-                if total <= _SMALL_BYTES:
-                    block, ends = memoryview(read(total)), [*itertools.accumulate(sizes, initial=0)]
-                    frames = [*map(block.__getitem__, map(slice, ends, ends[1:]))]
-                else:
-                    frames = [memoryview(read(size)) for size in sizes]
-            except MessageError:
-                raise
-            except (OSError, ValueError, struct.error) as error:
-                # The table is cut off, or the file is closed.
-                raise EOFError("The connection is closed.") from error
-        if sum(map(len, frames)) < total:
-            raise EOFError("The other side of the connection is gone.")
-        try:
-            header = _from_json(str(frames.pop(0), "utf-8"))
-        except (ValueError, RecursionError) as error:
-            raise MessageError("no header", f"The header of a message is no JSON: {error}.") from error
-        if not isinstance(header, dict):
-            raise MessageError("no header", f"The header of a message is an object, not a {type(header).__name__}.")
-        return header, frames
-
-    def close(self) -> None:
-        """End both directions, and wake up threads that read or send; may be called twice, from any thread."""
-        self._end()
-        # The descriptor may be another file's once it is closed, so no thread may be in a call on it.
-        with self._sending, self._receiving:
-            self._reader.close()
-            self._socket.close()
-
-    def close_in_forks(self) -> None:
-        """Close it in forked child processes, or the other side would not see this process end."""
-        os.register_at_fork(after_in_child=self._socket.close)
-
-    def _end(self) -> None:
-        with contextlib.suppress(OSError):  # it has ended already
-            self._socket.shutdown(socket.SHUT_RDWR)
-
-
-def buffers_of(header: Mapping[str, Any], frames: Sequence[BytesLike] = ()) -> list[memoryview]:
-    """Return a message as buffers to send; raise MessageError if the reader would refuse it."""
-    head = _to_json(header).encode()
-    if len(head) > MAX_HEADER_BYTES:
-        raise MessageError("too large", f"A header of {len(head):,} bytes; the limit is {MAX_HEADER_BYTES:,}.")
-    views = [memoryview(part).cast("B") for part in (head, *frames)]
-    sizes = [*map(len, views)]
-    if len(sizes) > _MAX_FRAMES or sum(sizes) > _MAX_BYTES:
-        text = f"{len(sizes):,} frames of {sum(sizes):,} bytes; the limits are {_MAX_FRAMES:,} and"
-        raise MessageError("too large", f"{text} {_MAX_BYTES:,}.")
-    table = struct.pack(f"<4sI{len(sizes)}Q", MARK, len(sizes), *sizes)
-    return [memoryview(table), *filter(len, views)]
-
-
-def _after(buffers: list[memoryview], sent: int) -> list[memoryview]:
-    """Return what is left of the buffers when so many bytes of them are sent."""
-    for place, buffer in enumerate(buffers):
-        if sent < len(buffer):
-            return [buffer[sent:], *buffers[place + 1 :]]
-        sent -= len(buffer)
-    return []
 
 
 class WorkerProcess:
@@ -261,19 +71,22 @@ class WorkerProcess:
         self._lines: deque[str] = deque(maxlen=_LINES_KEPT)
         # The system may be short of descriptors, memory or threads at any of these.
         with contextlib.ExitStack() as given, contextlib.ExitStack() as kept:
-            self.socket, theirs = frame_sockets()
+            self.socket, theirs = FrameSocket.pair()
             kept.callback(self.socket.close)
             given.callback(theirs.close)
+            self.control, their_control = ControlSocket.pair()
+            kept.callback(self.control.close)
+            given.callback(their_control.close)
             self._traces = os.memfd_create("epypes-traces")
             kept.callback(os.close, self._traces)
             output, standard_error = os.pipe()
             kept.callback(os.close, output)
             given.callback(os.close, standard_error)
-            inherited = [theirs.fileno(), self._traces]
             command = [sys.executable, "-I", "-m", "epypes.service.worker"]
+            sockets = [str(theirs.fileno()), str(their_control.fileno())]
             self.process = subprocess.Popen(  # noqa: S603 - this interpreter, our own module
-                [*command, str(inherited[0]), str(bundle), "--threads", str(threads), "--faults", str(inherited[1])],
-                pass_fds=inherited,
+                [*command, *sockets, str(bundle), "--threads", str(threads), "--faults", str(self._traces)],
+                pass_fds=[theirs.fileno(), their_control.fileno(), self._traces],
                 stdin=subprocess.DEVNULL,
                 stdout=standard_error,
                 stderr=standard_error,
@@ -310,6 +123,7 @@ class WorkerProcess:
             return
         self._last_traces = self._read_traces(0)
         self.socket.close()
+        self.control.close()
         # Its last output may be on the way; a process that it has started may hold the pipe open for longer.
         self._output.join(0.2)
         # Once: later the number may be that of another file.
@@ -430,8 +244,8 @@ class HangReport:
 class WorkerConnection:
     """A worker process, and the messages between it and the front.
 
-    No method but `ask`, `change_parameters` and `dismiss` waits: a thread sends what the kernel does not take at once,
-    another one receives.
+    No method but `query`, `change_parameters` and `dismiss` waits: a thread sends what the kernel does not take at
+    once, another one receives.
 
     Parameters
     ----------
@@ -440,7 +254,7 @@ class WorkerConnection:
     threads
         How many events it works on at once.
     on_message
-        Called on the receiving thread with the connection and each message that does not answer an `ask`.
+        Called on the receiving thread with the connection and each message, but the answers to queries.
     on_end
         Called there at the end, when the process is gone.
 
@@ -449,7 +263,7 @@ class WorkerConnection:
     status
         ``"loading"`` until the worker has proved the bundle or refused it.
     about
-        Its ``ready`` message: functions, report.
+        The contents of its ``ready`` message: functions, report.
     reasons
         Why it refused the bundle.
     is_dismissed
@@ -460,7 +274,7 @@ class WorkerConnection:
         self,
         bundle: BundleInfo,
         threads: int,
-        on_message: Callable[[WorkerConnection, Message], None],
+        on_message: Callable[[WorkerConnection, WorkerMessage], None],
         on_end: Callable[[WorkerConnection], None],
     ) -> None:
         self.bundle = bundle
@@ -470,18 +284,18 @@ class WorkerConnection:
         self.is_dismissed = False
         self._on_message, self._on_end = on_message, on_end
         self._posting = threading.Lock()
-        # Buffers that the kernel has not taken; while there are any, later messages queue behind them.
-        self._unsent: deque[list[memoryview]] = deque()
-        self._wake: queue.SimpleQueue[bool] = queue.SimpleQueue()
+        # Buffers that the kernel has not taken, None at the end; while there are any, later messages queue behind them.
+        self._unsent: queue.SimpleQueue[list[memoryview] | None] = queue.SimpleQueue()
+        self._unsent_count = 0
         self._is_over = False
         self._numbers = itertools.count(1)
-        self._asked: dict[tuple[str, int], queue.SimpleQueue[Message | None]] = {}
+        self._answers: dict[int, queue.SimpleQueue[WorkerMessage | None]] = {}
         self.process = WorkerProcess(bundle.path, threads)
         try:
             for target, name in ((self._send, "to"), (self._receive, "from")):
                 threading.Thread(target=target, name=f"epypes {name} worker", daemon=True).start()
         except BaseException:
-            self._wake.put(False)
+            self._unsent.put(None)
             self.process.kill()
             self.process.close()
             raise
@@ -493,57 +307,68 @@ class WorkerConnection:
 
     # -- sending ------------------------------------------------------------------------------------------------------
 
-    def post(self, header: Mapping[str, Any], frames: Sequence[BytesLike] = ()) -> None:
+    def post_event(self, seq: int, frames: Sequence[BytesLike]) -> None:
+        """Give the worker an event; returns at once."""
+        self._post(WorkerMessage("event", seq, frames=frames))
+
+    def post_parameters(self, revision: int, values: Mapping[str, Any], number: int | None = None) -> None:
+        """Have it take values of hyperparameters as soon as it works on no event; a message reports whether it has."""
+        number = next(self._numbers) if number is None else number
+        # Not in the contents, which are bounded: a table may be large.
+        self._post(WorkerMessage("parameters", number, {"revision": revision}, [json.dumps(values).encode()]))
+
+    def _post(self, message: WorkerMessage) -> None:
         """Send a message after those before it; returns at once. To a worker that is gone nothing is sent."""
         try:
-            left = buffers_of(header, frames)
+            left = buffers_of(message)
         except MessageError as error:
             # Only an event can be as large, and the subscriber has checked its size.
             _log.error("a message to the worker was not sent: %s", error)
             return
         with self._posting:
-            if not self._unsent and sum(map(len, left)) <= _SMALL_BYTES:
+            if not self._unsent_count:
                 try:
-                    left = self.process.socket.send_at_once(left)
+                    left = self.process.socket.send_buffers(left, is_waiting=False)
                 except EOFError:
                     return
-                if not left:
-                    return
-            self._unsent.append(left)
-            if len(self._unsent) == 1:
-                self._wake.put(True)
+            if left:
+                self._unsent_count += 1
+                self._unsent.put(left)
 
     def _send(self) -> None:
-        while self._wake.get():
-            left: list[memoryview] | None = self._unsent[0]
-            while left is not None:
-                try:
-                    self.process.socket.send_rest(left)
-                except EOFError:
-                    return
-                except BaseException:
-                    # Memory may be short. What the worker has not got is given to the next one.
-                    _log.exception("the worker can't be sent messages, so it is ended")
-                    self.process.kill()
-                    return
-                # An event may be large: its memory must not be held until another one comes.
-                with self._posting:
-                    self._unsent.popleft()
-                    left = self._unsent[0] if self._unsent else None
+        while (left := self._unsent.get()) is not None:
+            try:
+                self.process.socket.send_buffers(left)
+            except EOFError:
+                return
+            except BaseException:
+                # Memory may be short. What the worker has not got is given to the next one.
+                _log.exception("the worker can't be sent messages, so it is ended")
+                self.process.kill()
+                return
+            # An event may be large: its memory must not be held until another one comes.
+            left.clear()
+            with self._posting:
+                self._unsent_count -= 1
 
-    # -- questions ----------------------------------------------------------------------------------------------------
+    # -- requests -----------------------------------------------------------------------------------------------------
 
-    def ask(self, what: str, timeout_s: float = ASK_TIMEOUT_S, **more: Any) -> Message:
-        """Send a question to the worker, and wait for the answer.
+    def query(self, what: str, timeout_s: float = _QUERY_TIMEOUT_S, **more: Any) -> WorkerMessage:
+        """Send a query to the worker, and wait for the answer.
+
+        Values of a revision may be computed for it, by a slot; everything else is answered while functions run.
 
         Raises
         ------
         ServiceError
             It is gone, or does not answer in time.
         """
-        number = next(self._numbers)
-        with self._answers_to(("answer", number)) as answers:
-            self.post({"kind": "ask", "ask": number, "what": what, **more})
+        with self._request() as (number, answers):
+            message = WorkerMessage("query", number, {"what": what, **more})
+            if "revision" in more:
+                self._post(message)
+            else:
+                self.process.control.send(message)
             try:
                 return self._answer(answers, timeout_s)
             except queue.Empty:
@@ -558,41 +383,38 @@ class WorkerConnection:
         ServiceError
             It is gone, or works on an event for longer than ``timeout_s``.
         """
-        with self._answers_to(("parameters", revision)) as answers:
-            self.post_parameters(revision, values)
+        with self._request() as (number, answers):
+            self.post_parameters(revision, values, number)
             try:
-                header, _ = self._answer(answers, timeout_s)
+                answer = self._answer(answers, timeout_s)
             except queue.Empty:
-                self.post({"kind": "withdraw", "revision": revision})
+                self.process.control.send(WorkerMessage("withdraw", number, {"revision": revision}))
                 try:
-                    header, _ = self._answer(answers, _WITHDRAW_TIMEOUT_S)
+                    answer = self._answer(answers, _WITHDRAW_TIMEOUT_S)
                 except queue.Empty:
                     text = (
                         f"The worker does not answer; the outcome is unknown. If it goes on before it is replaced, the "
                         f"change may still be made, as revision {revision}: read the parameters then."
                     )
                     raise ServiceError(self.bundle.path, text) from None
-        if header["kind"] == "parameters_withdrawn":
+        if answer.content["is_withdrawn"]:
             text = f"The worker works on an event for longer than {timeout_s:g} s, so nothing was changed. Try again."
             raise ServiceError(self.bundle.path, text)
-        return dict(header.get("problems") or {})
-
-    def post_parameters(self, revision: int, values: Mapping[str, Any]) -> None:
-        """Have it take values of hyperparameters as soon as it works on no event; a message reports whether it has."""
-        # Not in the header, which is bounded: a table may be large.
-        self.post({"kind": "parameters", "revision": revision}, [json.dumps(values).encode()])
+        return dict(answer.content["problems"])
 
     @contextlib.contextmanager
-    def _answers_to(self, key: tuple[str, int]) -> Any:
-        answers = self._asked[key] = queue.SimpleQueue()
+    def _request(self) -> Iterator[tuple[int, queue.SimpleQueue[WorkerMessage | None]]]:
+        """Yield the number of a new request, and the queue of its answers: None when the worker is gone."""
+        number = next(self._numbers)
+        answers = self._answers[number] = queue.SimpleQueue()
         try:
             if self._is_over:
                 answers.put(None)
-            yield answers
+            yield number, answers
         finally:
-            del self._asked[key]
+            del self._answers[number]
 
-    def _answer(self, answers: queue.SimpleQueue[Message | None], timeout_s: float) -> Message:
+    def _answer(self, answers: queue.SimpleQueue[WorkerMessage | None], timeout_s: float) -> WorkerMessage:
         answer = answers.get(timeout=timeout_s)
         if answer is None:
             raise ServiceError(self.bundle.path, "The worker is gone, and is started again. Try again in a moment.")
@@ -601,13 +423,13 @@ class WorkerConnection:
     def hang_report(self, seqs: Sequence[int]) -> HangReport:
         """Return what the worker runs for some events: by its answer, or by faulthandler if it does not answer."""
         try:
-            header, _ = self.ask("running", _HANG_REPORT_TIMEOUT_S)
+            answer = self.query("running", _HANG_REPORT_TIMEOUT_S)
         except ServiceError:
             # A function holds the interpreter's lock, or the process is stopped.
             names = self.process.functions_by_trace()
             known = [name for name in names if name in self.about.get("functions", ())] or list(names)
             return HangReport(dict.fromkeys(seqs, ", ".join(dict.fromkeys(known))), {}, has_answered=False)
-        slots: list[Mapping[str, Any]] = list(header.get("slots", ()))
+        slots: list[Mapping[str, Any]] = list(answer.content["slots"])
         functions = dict.fromkeys(seqs, "") | {slot["seq"]: ", ".join(slot["functions"]) for slot in slots}
         return HangReport(functions, {slot["seq"]: slot["ns"] for slot in slots}, has_answered=True)
 
@@ -621,37 +443,34 @@ class WorkerConnection:
             pass
         except BaseException:
             _log.exception("the worker's messages can't be understood, so it is ended")
-        self._wake.put(False)
+        self._unsent.put(None)
         self.process.close()
         if self.status != "refused":
             self.status = "gone"
         self._is_over = True
-        for answers in list(self._asked.values()):
+        for answers in list(self._answers.values()):
             answers.put(None)
         self._on_end(self)
 
-    def _take(self, message: Message) -> None:
-        header = message[0]
-        kind = header.get("kind")
-        if kind == "answer":
-            answers = self._asked.get(("answer", header.get("ask") or 0))
-        else:
-            answers = self._asked.get(("parameters", header.get("revision") or 0)) if kind in SETTLING else None
-            if kind == "ready":
-                self.about, self.status = header, "ready"
-            elif kind == "refused":
-                self.reasons, self.status = tuple(map(str, header.get("reasons") or ["It gave no reason."])), "refused"
+    def _take(self, message: WorkerMessage) -> None:
+        if message.kind == "ready":
+            self.about, self.status = message.content, "ready"
+        elif message.kind == "refused":
+            self.reasons, self.status = tuple(message.content["reasons"]), "refused"
+        if message.kind != "answer":
             # A change of parameters is noted before anything that comes after it is read.
             self._on_message(self, message)
-        if answers is not None:
+        if message.kind != "done" and (answers := self._answers.get(message.number)) is not None:
             answers.put(message)
 
     def dismiss(self, timeout_s: float) -> None:
-        """Let it finish its events and end; kill it if that takes longer than ``timeout_s``."""
+        """Let it finish its events and end; kill it if it still loads, or if that takes longer than ``timeout_s``."""
         self.is_dismissed = True
-        self.post({"kind": "end"})
-        if not self.process.wait(timeout_s):
-            self.process.kill()
+        if self.status != "loading":
+            self._post(WorkerMessage("end"))
+            if self.process.wait(timeout_s):
+                return
+        self.process.kill()
 
     def kill(self) -> None:
         """End it at once, by the front: its events are not to blame."""

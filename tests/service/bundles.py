@@ -1,4 +1,4 @@
-"""How does a test make a bundle of source text, of functions that no notebook would promote?"""
+"""Bundles of source text, of functions that no notebook would promote."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How do tests start a service in a process of its own?"""
+"""A service in a process of its own."""
 
 from __future__ import annotations
 

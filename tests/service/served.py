@@ -1,4 +1,4 @@
-"""How do tests serve a bundle whose function does what an event says, and talk to it?"""
+"""A served bundle whose function does what an event says, and a peer of it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.transport.peers import wait_until
 TIMEOUT_S = 60.0
 
 SOURCE = '''
-    """A graph whose function does what it is told."""
+    """A graph whose function does what an event says."""
 
     import os
     import re
@@ -35,6 +35,7 @@ SOURCE = '''
         open(os.path.join(folder, "started"), "w").close()
         while not os.path.exists(os.path.join(folder, "release")):
             time.sleep(0.002)
+        open(os.path.join(folder, "over"), "w").close()
 
 
     def hold_once(folder):
@@ -81,12 +82,18 @@ def acting_bundle(folder, *, k=2, source=SOURCE, expected=6, inputs=("what", "nu
     return written_bundle(folder, source, inputs, outputs, hyperparameters={"k": k}, sample=sample)
 
 
+def gated_bundle(folder, gate, **more):
+    """Write a bundle of the function that no worker can load while the file ``gate`` exists."""
+    waiting = f"\n    while os.path.exists({str(gate)!r}):\n        time.sleep(0.005)\n"
+    return acting_bundle(folder, source=SOURCE + waiting, **more)
+
+
 def event(what="plain", number=1):
     return Envelope(type="x", parts={"what": what, "number": number})
 
 
 class Peer:
-    """Who sends events to a service and gets its answers and failures."""
+    """Sends events to a service and gets its answers and failures."""
 
     def __init__(self, requests, answers, failures):
         self.requests, self.answers, self.failures = requests, answers, failures

@@ -1,4 +1,4 @@
-"""What a deploy, a rollback and a write-back tell, and what is found afterwards."""
+"""What a deploy, a rollback and a write-back report, and what is found afterwards."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def own(acting, tmp_path):
     return shutil.copytree(acting, tmp_path / "own")
 
 
-def test_values_that_a_deploy_replaces_are_told(acting, better):
+def test_values_that_a_deploy_replaces_are_reported(acting, better):
     with serving(acting) as (service, _):
         service.set_parameters({"k": 14})
         assert service.deploy(better)["changed"] == ["k 14 -> 3 (tuned, not written back)"]
@@ -52,15 +52,15 @@ def test_failures_of_a_bundle_that_was_deployed_are_found_by_its_path_and_by_the
 
 def test_values_that_were_written_back_are_those_of_the_bundle_that_is_served(own, better, caplog):
     caplog.set_level("INFO", "epypes.service")
-    told = []
+    deployed = []
     with serving(own) as (service, peer):
-        service.listen(lambda kind, data: told.append(data) if kind == "deployed" else None)
+        service.listen(lambda kind, data: deployed.append(data) if kind == "deployed" else None)
         before = service.info()["digest"]
         service.set_parameters({"k": 10})
         written = service.write_back()
         assert "+value = 10" in written.diff
         assert service.info()["digest"] == written.digest != before
-        assert [data["digest"] for data in told] == [written.digest]
+        assert [data["digest"] for data in deployed] == [written.digest]
         os.kill(service.info()["worker_pid"], signal.SIGKILL)
         assert peer.ask(number=2).parts["out"] == 20
         assert service.deploy(better)["changed"] == ["k 10 -> 3"]
@@ -128,6 +128,6 @@ def _has_ended(pid):
 @pytest.mark.parametrize(
     "options", [{"threads": 0}, {"threads": 65}, {"job_timeout_s": math.inf}, {"job_timeout_s": math.nan}]
 )
-def test_what_a_service_can_not_be_run_with_is_said(acting, options):
+def test_what_a_service_can_not_be_run_with_is_refused(acting, options):
     with pytest.raises(ServiceError, match="events at once|number of seconds"):
         Service(acting, **options)

@@ -68,7 +68,7 @@ def test_what_was_dropped_has_a_row_too(acting, tmp_path):
     assert found == {1: "answered", 2: "dropped", 3: "answered"}
 
 
-def test_a_database_that_is_held_up_holds_no_answer_up_and_is_told_in_the_metrics(acting, tmp_path, caplog):
+def test_a_database_that_is_held_up_holds_no_answer_up_and_is_seen_in_the_metrics(acting, tmp_path, caplog):
     path = tmp_path / "events.sqlite"
     Store(path).close()
     other = sqlite3.connect(path, isolation_level=None)

@@ -1,4 +1,4 @@
-"""A service short of file descriptors, memory or luck with its workers: it stays, says so in few lines, and recovers."""
+"""A service short of file descriptors, memory or luck with its workers: it stays, logs that in few lines, and recovers."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ def test_a_service_in_another_process_answers_with_what_the_notebook_computed(ed
 
 
 @pytest.mark.slow
-def test_a_function_that_fails_is_told_to_the_caller_and_the_service_goes_on(local, edge_bundle, photograph):
+def test_a_function_that_fails_is_reported_to_the_caller_and_the_service_goes_on(local, edge_bundle, photograph):
     service = local(edge_bundle.path)
     with pytest.raises(RemoteFailure, match="Function 'smooth' failed in the service: error") as error:
         call(edge_bundle.path, {"image": np.zeros((0, 0), np.uint8)}, timeout_s=TIMEOUT_S)
@@ -338,7 +338,7 @@ def test_every_event_is_answered_dropped_ones_and_those_that_wait_at_the_stop_to
     assert {name: service.counts()[name] for name in expected} == expected
 
 
-def test_a_state_file_without_a_state_is_not_believed(edge_bundle, photograph):
+def test_a_state_file_with_other_contents_is_ignored(edge_bundle, photograph):
     with StateLock(edge_bundle.path):
         for text in ("", "{", "[1]", '{"pid": 1, "http": 3}'):
             state_file(edge_bundle.path).write_text(text)

@@ -135,8 +135,8 @@ def test_a_front_that_is_killed_takes_its_worker_along(acting, tmp_path):
 
 
 @pytest.fixture
-def told(tmp_path, monkeypatch):
-    """Returns a function that gives what systemd has been told since."""
+def notified(tmp_path, monkeypatch):
+    """Returns a function that gives what systemd has been sent since."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
         receiver.bind(str(tmp_path / "notify"))
         receiver.setblocking(False)
@@ -153,19 +153,19 @@ def told(tmp_path, monkeypatch):
         yield read
 
 
-def test_systemd_is_told_how_it_is(acting, told, tmp_path, monkeypatch):
+def test_systemd_is_notified_of_the_state(acting, notified, tmp_path, monkeypatch):
     monkeypatch.setenv("WATCHDOG_USEC", "2000000")
     with Service(acting) as service:
         lines = []
-        until(lambda: lines.extend(told()) or {"READY=1", "WATCHDOG=1"} <= set(lines))
+        until(lambda: lines.extend(notified()) or {"READY=1", "WATCHDOG=1"} <= set(lines))
         wrong = acting_bundle(tmp_path / "wrong", expected=7)
         with pytest.raises(DeployRefused):
             service.deploy(wrong)
-        lines = [line.partition("=")[0] for line in told() if not line.startswith("WATCHDOG")]
+        lines = [line.partition("=")[0] for line in notified() if not line.startswith("WATCHDOG")]
         assert lines == ["RELOADING", "MONOTONIC_USEC", "READY"]
         environment = psutil.Process(service.info()["worker_pid"]).environ()
         assert not {"NOTIFY_SOCKET", "WATCHDOG_USEC"} & environment.keys()
-    assert "STOPPING=1" in told()
+    assert "STOPPING=1" in notified()
 
 
 def test_a_socket_of_systemd_that_is_not_there_is_no_trouble(monkeypatch, tmp_path):
@@ -175,7 +175,7 @@ def test_a_socket_of_systemd_that_is_not_there_is_no_trouble(monkeypatch, tmp_pa
         assert not notify("READY=1")
 
 
-def test_a_standard_error_that_nobody_reads_holds_nothing_up(acting):
+def test_a_standard_error_that_is_not_read_holds_nothing_up(acting):
     with served_apart(acting) as (process, peer):
         # More than a pipe holds, of the front's own log lines and of what the worker prints.
         for _ in range(60):

@@ -157,20 +157,25 @@ def test_parameters_that_a_pipeline_of_its_own_refuses_are_set_in_no_slot(owning
 """
     with ready_worker(owning(body), tmp_path, "--threads", "3") as front:
         front.set(1, times=9)
-        assert front.receive("parameters_refused")[0]["problems"] == {"times": "the third does not"}
+        assert front.changed()["problems"] == {"times": "the third does not"}
         assert {front.run(text="a")[1][0].parts["repeated"] for _ in range(9)} == {"aa"}
         front.set(2, times=3)
-        assert front.receive("parameters")
+        assert not front.changed()["problems"]
         assert {front.run(text="a")[1][0].parts["repeated"] for _ in range(9)} == {"aaa"}
 
 
 # -- what a worker keeps -------------------------------------------------------------------------------------------
 
 IMAGES = """
+    import ctypes
+
     import numpy as np
 
 
     def invert(image):
+        if image.size == 1:
+            # What the allocator holds for later is no memory that the worker needs.
+            ctypes.CDLL(None).malloc_trim(0)
         if image[0, 0] == 13:
             raise ValueError("unlucky")
         return 255 - image
@@ -196,7 +201,8 @@ def test_large_images_go_through_a_worker_unchanged_one_after_another(inverting,
         expected = {}
         for image, value in zip(images * 3, sums * 3, strict=True):
             expected[front.send_event(Envelope(type="x", parts={"image": image}))] = value
-            if len(expected) == 4:
+            # A worker reads when a slot is free, and this front does not read while it sends.
+            if len(expected) == 2:
                 header, (answer,) = front.done()
                 assert hashlib.sha256(answer.parts["inverted"].tobytes()).hexdigest() == expected.pop(header["seq"])
 
@@ -214,7 +220,7 @@ def test_a_thousand_events_leave_nothing_behind(inverting, tmp_path):
             for number in range(count):
                 front.run(image=bad if number % 4 == 3 else image)
                 if number % 50 == 0:
-                    front.ask("svg")
+                    front.query("svg")
                     front.values("image", "inverted")
 
         some(200)
@@ -231,13 +237,13 @@ def test_a_worker_keeps_no_more_of_large_events_than_the_last_run_of_each_slot(i
         before = rss(process)
         for _ in range(8):
             front.run(image=np.full((5000, 4000), 14, np.uint8))
-            front.ask("svg")
+            front.query("svg")
         # An event and its run are 40 MB; the run before it is there until the next one has ended.
         largest = rss(process)
         assert largest - before < 120_000_000
         for _ in range(3):
             front.run(image=np.full((1, 1), 14, np.uint8))
-        assert largest - rss(process) > 30_000_000
+        assert largest - rss(process) > 60_000_000
 
 
 def test_a_page_that_asks_all_the_time_has_each_picture_made_once_per_run(inverting, tmp_path):
@@ -245,9 +251,9 @@ def test_a_page_that_asks_all_the_time_has_each_picture_made_once_per_run(invert
         front.run(image=np.full((2000, 2000), 14, np.uint8))
         process = psutil.Process(front.process.pid)
         for what, more in (("svg", {}), ("view", {}), ("preview", {"token": "inverted", "max_side_px": 512})):
-            first = front.ask(what, **more)[1]
+            first = front.query(what, **more)[1]
             before = sum(process.cpu_times()[:2])
-            assert all(front.ask(what, **more)[1] == first for _ in range(100))
+            assert all(front.query(what, **more)[1] == first for _ in range(100))
             assert sum(process.cpu_times()[:2]) - before < 0.2
     assert Path(front.stderr).read_text() == ""
 

@@ -129,7 +129,7 @@ def test_events_that_do_not_return_one_after_another_are_reported_and_the_servic
     assert "FAULTED" not in states
 
 
-def test_a_worker_that_ends_as_soon_as_it_is_ready_is_a_fault_and_everybody_is_told(acting, tmp_path, quick):
+def test_a_worker_that_ends_as_soon_as_it_is_ready_is_a_fault_and_is_reported(acting, tmp_path, quick):
     dying = "\n    import threading\n    threading.Timer(0.2, os._exit, [9]).start()\n"
     bundle = acting_bundle(tmp_path / "dying", source=SOURCE + dying)
     with Service(bundle) as service, peer_of(service) as peer:

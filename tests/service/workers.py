@@ -1,4 +1,4 @@
-"""How do tests drive a worker process, as a front does?"""
+"""A worker process, driven as a front drives it."""
 
 from __future__ import annotations
 
@@ -10,34 +10,34 @@ import threading
 from contextlib import contextmanager
 from itertools import count
 
+from epypes.service.frame_socket import ControlSocket, FrameSocket, WorkerMessage
 from epypes.service.packing import unpack
-from epypes.service.worker_connection import frame_sockets
 from epypes.wire import Envelope, decode, encode
 
 TIMEOUT_S = 60.0
 
 
 class Front:
-    """The other end of a worker's channel; a watchdog kills a worker that does not answer."""
+    """The other end of a worker's sockets; a watchdog kills a worker that does not answer."""
 
-    def __init__(self, channel, process, faults):
-        self.channel, self.process, self.faults = channel, process, faults
-        self.seqs, self.asks = count(1), count(1)
+    def __init__(self, channel, control, process, faults):
+        self.channel, self.control, self.process, self.faults = channel, control, process, faults
+        self.seqs, self.numbers = count(1), count(1)
         self.waiting = []
 
     def receive(self, kind):
-        """Return the next message of a kind; others wait for whoever wants them."""
+        """Return the next message of a kind; others are kept for later calls."""
         for place, message in enumerate(self.waiting):
-            if message[0]["kind"] == kind:
+            if message.kind == kind:
                 return self.waiting.pop(place)
         watchdog = threading.Timer(TIMEOUT_S, self.process.kill)
         watchdog.start()
         try:
             while True:
                 message = self.channel.receive()
-                if message[0]["kind"] == kind:
+                if message.kind == kind:
                     return message
-                assert message[0]["kind"] != "refused", message[0]
+                assert message.kind != "refused", message
                 self.waiting.append(message)
         finally:
             watchdog.cancel()
@@ -45,18 +45,18 @@ class Front:
     def send_event(self, event):
         seq = next(self.seqs)
         frames = [event] if isinstance(event, bytes) else encode(event)
-        self.channel.send({"kind": "event", "seq": seq}, frames)
+        self.channel.send(WorkerMessage("event", seq, frames=frames))
         return seq
 
     def done(self):
-        """Return the header of the next event that is done, and its answers."""
-        header, frames = self.receive("done")
-        answers, left = [], list(frames)
-        for size in header["answers"]:
+        """Return the contents of the next ``done`` message with its ``seq``, and the answers."""
+        message = self.receive("done")
+        answers, left = [], list(message.frames)
+        for size in message.content["answers"]:
             mine, left = left[:size], left[size:]
             answers.append(bytes(mine[0]) if size == 1 else decode(mine))
         assert not left
-        return header, answers
+        return {"seq": message.number, **message.content}, answers
 
     def run(self, **parts):
         """Have one event worked on."""
@@ -66,53 +66,65 @@ class Front:
         return header, answers
 
     def set(self, revision, **values):
-        self.send_parameters(revision, {k: {"value": v} for k, v in values.items()})
+        return self.send_parameters(revision, {k: {"value": v} for k, v in values.items()})
 
     def send_parameters(self, revision, values):
-        self.channel.send({"kind": "parameters", "revision": revision}, [json.dumps(values).encode()])
+        number = next(self.numbers)
+        frames = [json.dumps(values).encode()]
+        self.channel.send(WorkerMessage("parameters", number, {"revision": revision}, frames))
+        return number
 
-    def send_ask(self, what, **content):
-        ask = next(self.asks)
-        self.channel.send({"kind": "ask", "ask": ask, "what": what, **content})
-        return ask
+    def changed(self):
+        """Return the contents of the next answer to a change of parameters."""
+        return self.receive("parameters").content
 
-    def ask(self, what, **content):
-        ask = self.send_ask(what, **content)
-        header, frames = self.receive("answer")
-        assert header["ask"] == ask
-        return header, [bytes(frame) for frame in frames]
+    def send_query(self, what, **content):
+        message = WorkerMessage("query", next(self.numbers), {"what": what, **content})
+        (self.channel if "revision" in content else self.control).send(message)
+        return message.number
+
+    def query(self, what, **content):
+        number = self.send_query(what, **content)
+        answer = self.receive("answer")
+        assert answer.number == number
+        return answer.content, [bytes(frame) for frame in answer.frames]
 
     def values(self, *tokens, **content):
-        header, frames = self.ask("run", tokens=list(tokens), **content)
+        header, frames = self.query("run", tokens=list(tokens), **content)
         assert "error" not in header, header
         return decode(unpack(frames[0]))
 
+    def close(self):
+        self.channel.close()
+        self.control.close()
+
     def end(self):
-        self.channel.send({"kind": "end"})
+        self.channel.send(WorkerMessage("end"))
         return self.process.wait(TIMEOUT_S)
 
 
 @contextmanager
 def worker_of(bundle, tmp_path, *options, environment=None):
     """Start a worker; yield its front before it is ready. It is gone when the block ends."""
-    channel, theirs = frame_sockets()
+    (channel, theirs), (control, their_control) = FrameSocket.pair(), ControlSocket.pair()
     faults = tmp_path / "faults.txt"
-    with faults.open("wb") as file, (tmp_path / "stderr.txt").open("wb") as stderr, theirs:
-        command = [sys.executable, "-I", "-m", "epypes.service.worker", str(theirs.fileno()), str(bundle)]
+    with faults.open("wb") as file, (tmp_path / "stderr.txt").open("wb") as stderr, theirs, their_control:
+        sockets = theirs.fileno(), their_control.fileno()
+        command = [sys.executable, "-I", "-m", "epypes.service.worker", *map(str, sockets), str(bundle)]
         process = subprocess.Popen(
             [*command, "--faults", str(file.fileno()), *options],
-            pass_fds=[theirs.fileno(), file.fileno()],
+            pass_fds=[*sockets, file.fileno()],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=stderr,
             env={**os.environ, **(environment or {})},
         )
-    front = Front(channel, process, faults)
+    front = Front(channel, control, process, faults)
     front.stderr = tmp_path / "stderr.txt"
     try:
         yield front
     finally:
-        channel.close()
+        front.close()
         try:
             process.wait(TIMEOUT_S)
         except subprocess.TimeoutExpired:
@@ -128,5 +140,5 @@ def worker_of(bundle, tmp_path, *options, environment=None):
 def ready_worker(bundle, tmp_path, *options, **more):
     """Start a worker and wait until it is ready."""
     with worker_of(bundle, tmp_path, *options, **more) as front:
-        front.ready, _ = front.receive("ready")
+        front.ready = front.receive("ready").content
         yield front

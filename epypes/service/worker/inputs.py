@@ -1,115 +1,127 @@
-"""The queue of a worker: events and jobs for whichever slot is free, and changes of parameters between them.
+"""The inputs of a worker's slots: events and queries, and changes of parameters between them.
 
-A change waits until no slot works, and what came after it waits for the change.
+A free slot reads the next message itself; the others wait for their turn to read. So a message that comes after a
+change of parameters is read when the change is made, and a change is made when no slot works.
 """
 
 from __future__ import annotations
 
+import json
+import logging
+import os
 import queue
 import threading
-from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Callable, Mapping
+from time import sleep
+from typing import Any, Final, NoReturn
 
+from epypes.errors import MessageError
+from epypes.service.frame_socket import FrameSocket, WorkerMessage
+
+NOT_UNDERSTOOD: Final = 2
+FRONT_GONE: Final = 3
 # As in EventLoop, whose threads poll once everything has ended.
 _ENDED_POLL_S: Final = 0.05
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class WorkerEvent:
-    """An event: its number, and its frames; one frame is a message of 2019."""
-
-    seq: int
-    frames: list[memoryview]
+_log: Final = logging.getLogger("epypes.service")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Job:
-    """Something else that runs the user's functions, so a slot does it; it must not raise."""
+class Inputs:
+    """What the front gives to the slots.
 
-    run: Callable[[], object]
+    Parameters
+    ----------
+    front
+        The socket to the front.
+    apply
+        Sets parameters: called with their revision and their values, while no slot works; returns problems by token.
 
+    Attributes
+    ----------
+    has_ended
+        Set when the front has sent that nothing more comes.
+    """
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ParameterChange:
-    """A change of parameters, made while no slot works; it must not raise."""
-
-    revision: int
-    apply: Callable[[], object]
-
-
-class InputQueue:
-    """Events, jobs and changes that wait for the slots."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
+    def __init__(self, front: FrameSocket, apply: Callable[[int, Mapping[str, Any]], Mapping[str, str]]) -> None:
+        self._front, self._apply = front, apply
+        self.has_ended = threading.Event()
+        self._reading, self._lock = threading.Lock(), threading.Lock()
         self._changed = threading.Condition(self._lock)
-        self._items: deque[WorkerEvent | Job | ParameterChange] = deque()
         self._working = 0
-        self._has_ended = False
+        # Numbers of changes: the last that was made, refused or skipped, and those that are not to be made.
+        self._settled, self._withdrawn = 0, set[int]()
 
-    def put(self, item: WorkerEvent | Job | ParameterChange) -> None:
-        """Add an item."""
-        with self._lock:
-            self._items.append(item)
-            self._changed.notify()
+    def take(self, block: bool = True) -> WorkerMessage:
+        """Wait for an event, or a query that runs functions; the slot works on it until `finished` is called.
 
-    def take(self, block: bool = True) -> WorkerEvent | Job:
-        """Wait for an item to work on; the slot works on it until `finished` is called.
+        The process ends if the front is gone, or can't be understood.
 
         Raises
         ------
         queue.Empty
-            Everything has ended: nothing waits, and nothing will come. Without ``block``: nothing waits now.
+            There will be none; without ``block``: there is none now.
         """
-        with self._lock:
-            while True:
-                item = self._next()
-                if item is not None:
-                    self._working += 1
-                    return item
-                if not block:
+        if not self._reading.acquire(block):
+            raise queue.Empty
+        try:
+            while not self.has_ended.is_set():
+                if not block and not self._front.is_readable():
                     raise queue.Empty
-                if self._has_ended and not self._items:
-                    self._changed.wait(_ENDED_POLL_S)
-                    raise queue.Empty
-                self._changed.wait()
-
-    def _next(self) -> WorkerEvent | Job | None:
-        """Return what may be worked on now, having made the changes that come before it."""
-        while self._items:
-            item = self._items[0]
-            if isinstance(item, ParameterChange):
-                if self._working:
-                    return None
-                self._items.popleft()
-                item.apply()
-            else:
-                return self._items.popleft()  # type: ignore[return-value]  # it is the item above
-        return None
-
-    def withdraw(self, revision: int) -> bool:
-        """Remove a change that has not been made; return whether it was there."""
-        with self._lock:
-            changes = (item for item in self._items if isinstance(item, ParameterChange))
-            found = next((item for item in changes if item.revision == revision), None)
-            if found is not None:
-                self._items.remove(found)
-                # What came after it need not wait any more.
-                self._changed.notify_all()
-            return found is not None
+                message = self._front.receive()
+                if message.kind in ("event", "query"):
+                    with self._lock:
+                        self._working += 1
+                    return message
+                self._settle(message)
+        except queue.Empty:
+            raise
+        except EOFError:
+            os._exit(FRONT_GONE)
+        except BaseException as error:  # without its slots the worker would be deaf
+            not_understood(error)
+        finally:
+            self._reading.release()
+        sleep(_ENDED_POLL_S)
+        raise queue.Empty
 
     def finished(self) -> None:
         """Note that a slot is free again."""
         with self._lock:
             self._working -= 1
-            if not self._working and self._items:
-                # A change may have waited for this; then what came after it is for all slots.
-                self._changed.notify_all()
+            self._changed.notify()
 
-    def end(self) -> None:
-        """Let slots end once nothing waits any more."""
+    def _settle(self, message: WorkerMessage) -> None:
+        if message.kind == "parameters":
+            self._change(message)
+        elif message.kind == "end":
+            self.has_ended.set()
+        else:
+            raise MessageError("unknown kind", f"The front has sent a message of kind {message.kind!r}.")
+
+    def _change(self, message: WorkerMessage) -> None:
+        """Set parameters when no slot works, unless the change is withdrawn; what comes after it is not read before."""
+        revision, number = message.content["revision"], message.number
         with self._lock:
-            self._has_ended = True
-            self._changed.notify_all()
+            self._changed.wait_for(lambda: not self._working or number in self._withdrawn)
+            self._settled = number
+            if number in self._withdrawn:
+                self._withdrawn.remove(number)
+                return
+            problems = self._apply(revision, json.loads(bytes(message.frames[0])))
+            answer = {"revision": revision, "problems": problems, "is_withdrawn": False}
+            self._front.send(WorkerMessage("parameters", number, answer))
+
+    def withdraw(self, message: WorkerMessage) -> None:
+        """Have a change not made, and send that; one that was made or refused was answered already."""
+        with self._lock:
+            if message.number > self._settled:
+                self._withdrawn.add(message.number)
+                self._changed.notify()
+                answer = {"revision": message.content["revision"], "problems": {}, "is_withdrawn": True}
+                self._front.send(WorkerMessage("parameters", message.number, answer))
+
+
+def not_understood(error: BaseException) -> NoReturn:
+    """End the process: what comes after a message that can't be understood can't be understood either."""
+    _log.error("a message of the front can't be understood: %r", error)
+    os._exit(NOT_UNDERSTOOD)

@@ -10,8 +10,8 @@ from __future__ import annotations
 import logging
 import os
 import traceback
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from time import perf_counter_ns
@@ -25,9 +25,10 @@ from epypes.pipeline import FullPipeline, Pipeline
 from epypes.pipeline.answering import Answering
 from epypes.pipeline.reactive import SinkPipeline
 from epypes.run import Failure, Run
+from epypes.service.frame_socket import FrameSocket, WorkerMessage
 from epypes.service.packing import BytesLike
-from epypes.service.worker.inputs import InputQueue, WorkerEvent
-from epypes.service.worker_connection import FrameSocket
+from epypes.service.worker.answers import CompletedRun, QueryAnswerer
+from epypes.service.worker.inputs import Inputs
 from epypes.wire import Envelope, decode, encode, failure_event, serialized
 from epypes.wire.envelope import request_fields
 
@@ -39,15 +40,6 @@ _EPYPES_FOLDER: Final = str(Path(epypes.__file__).parent)
 _log: Final = logging.getLogger("epypes.service")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CompletedRun:
-    """A completed run, the id of its event, and the revision of its parameters."""
-
-    run: Run
-    event_id: str
-    revision: int
-
-
 class Slot:
     """One pipeline of a worker, and the queues at its ends.
 
@@ -57,23 +49,18 @@ class Slot:
         Whose pipeline it is.
     inputs
         Where events come from.
-    socket
-        To the front.
+    front
+        Where results go.
     parameters
         Whose revision a run begins with.
-    on_completed
-        Called on the slot's thread with each run that has completed; must return at once.
+    answers
+        Gets each run that has completed.
     """
 
     def __init__(
-        self,
-        bundle: Bundle,
-        inputs: InputQueue,
-        socket: FrameSocket,
-        parameters: SlotParameters,
-        on_completed: Callable[[CompletedRun], object],
+        self, bundle: Bundle, inputs: Inputs, front: FrameSocket, parameters: SlotParameters, answers: QueryAnswerer
     ) -> None:
-        self._inputs, self._socket, self._parameters, self._on_completed = inputs, socket, parameters, on_completed
+        self._inputs, self._front, self._parameters, self._answers = inputs, front, parameters, answers
         self._digest = bundle.digest
         self._work: _Work | None = None
         self._pid = os.getpid()
@@ -113,14 +100,16 @@ class Slot:
             os._exit(0)
         self._finish()
         while True:
-            item = self._inputs.take(block)
-            if not isinstance(item, WorkerEvent):
-                item.run()
+            message = self._inputs.take(block)
+            if message.kind == "query":
+                self._answers.answer_by_rerun(message)
                 self._inputs.finished()
                 continue
-            self._work = work = _Work(item.seq, self._parameters.revision, self.pipeline.runner.last)
+            before, revision = self.pipeline.runner.last, self._parameters.revision
+            self._work = work = _Work(message.number, revision, before, stamp={"revision": revision})
             try:
-                event = bytes(item.frames[0]) if len(item.frames) == 1 else decode(item.frames)
+                frames = message.frames
+                event = bytes(frames[0]) if len(frames) == 1 else decode(frames)
             except Exception as error:
                 self._failed(Failure("f_in", self.pipeline.runner.free_source_tokens, {}, error))
                 self._finish()
@@ -167,7 +156,7 @@ class Slot:
         if run is work.before:
             run = None
         if run is not None and run.failure is None:
-            self._on_completed(CompletedRun(run, work.event_id, work.revision))
+            self._answers.note(CompletedRun(run, work.event_id, work.revision))
         try:
             self._send(work, run)
         except MessageError as error:
@@ -183,32 +172,39 @@ class Slot:
         if work.failure is not None:
             event = failure_event(work.failure, self.pipeline.name, self._digest)
             answers = [*answers, _answer(event, work.stamp)]
-        header = {
-            "kind": "done",
-            "seq": work.seq,
+        content = {
             "revision": work.revision,
             "failure": None if work.failure is None else _describe_failure(work.failure),
             "total_ns": perf_counter_ns() - work.start_ns,
-            "durations_ns": {} if run is None else dict(run.report.durations_ns),
+            "durations_ns": {} if run is None else run.report.durations_ns,
             # How many frames belong to each: one of 2019, or those of an envelope.
             "answers": [*map(len, answers)],
         }
-        self._socket.send(header, [*chain.from_iterable(answers)])
+        self._front.send(WorkerMessage("done", work.seq, content, [*chain.from_iterable(answers)]))
 
 
+@dataclass(slots=True, eq=False)
 class _Work:
-    """The event that is worked on, and its answers so far."""
+    """The event that is worked on, and its answers so far.
 
-    __slots__ = ("answers", "before", "event_id", "failure", "revision", "seq", "stamp", "start_ns")
+    Attributes
+    ----------
+    revision
+        Of the parameters that it is computed with.
+    before
+        The last run before it.
+    stamp
+        Fields of every envelope that answers it.
+    """
 
-    def __init__(self, seq: int, revision: int, before: Run | None) -> None:
-        self.seq, self.revision, self.before = seq, revision, before
-        self.event_id = ""
-        # Fields of every envelope that answers it.
-        self.stamp: dict[str, Any] = {"revision": revision}
-        self.answers: list[list[BytesLike]] = []
-        self.failure: Failure | None = None
-        self.start_ns = perf_counter_ns()
+    seq: int
+    revision: int
+    before: Run | None
+    event_id: str = ""
+    stamp: dict[str, Any] = field(default_factory=dict)
+    answers: list[list[BytesLike]] = field(default_factory=list)
+    failure: Failure | None = None
+    start_ns: int = field(default_factory=perf_counter_ns)
 
 
 def _answer(item: Any, stamp: Mapping[str, Any]) -> list[BytesLike]:
@@ -287,6 +283,8 @@ class SlotParameters:
 
     Attributes
     ----------
+    trial
+        The pipeline that answers no events.
     pipelines
         Of the slots.
     revision
@@ -294,7 +292,7 @@ class SlotParameters:
     """
 
     def __init__(self, trial: Pipeline, enums: Mapping[str, Any]) -> None:
-        self._trial, self._enums = trial, enums
+        self.trial, self._enums = trial, enums
         self.pipelines: Sequence[Pipeline] = ()
         self.revision = 0
 
@@ -319,14 +317,14 @@ class SlotParameters:
         return problems
 
     def _tried(self, values: Mapping[str, Any]) -> dict[str, str]:
-        before, problems = self._trial.runner.hyperparameters, {}
+        before, problems = self.trial.runner.hyperparameters, {}
         for token, value in values.items():
             try:
-                self._trial.set(**{token: value})
+                self.trial.set(**{token: value})
             except BaseException as error:  # a value's own comparison may raise whatever it likes
                 problems[token] = _text_of(error)
         if problems:
-            self._trial.runner.set(**before)
+            self.trial.runner.set(**before)
         return problems
 
     def _set(self, values: Mapping[str, Any]) -> dict[str, str]:
@@ -336,7 +334,7 @@ class SlotParameters:
             for pipeline in self.pipelines:
                 pipeline.set(**values)
         except BaseException as error:  # see above
-            for pipeline, its_values in zip((self._trial, *self.pipelines), (before[0], *before), strict=True):
+            for pipeline, its_values in zip((self.trial, *self.pipelines), (before[0], *before), strict=True):
                 pipeline.runner.set(**its_values)
             token = getattr(error, "token", None)
             return {name: _text_of(error) for name in values if token not in values or name == token}
