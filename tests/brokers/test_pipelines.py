@@ -12,7 +12,7 @@ from tests.brokers.traffic import KILLS, PLAIN, RAISES, Reader, dead_letters, ev
 
 pytestmark = pytest.mark.slow
 
-COUNT = 400
+COUNT = 200
 REPLICA = ("-m", "tests.brokers.replica")
 
 

@@ -12,7 +12,7 @@ import pytest
 import epypes as ep
 from epypes.errors import ServiceError
 from epypes.service.state_file import ServiceState, StateLock, read_states
-from tests.service.processes import run_cli, running
+from tests.service.processes import running
 from tests.service.served import TIMEOUT_S, acting_bundle, event, until
 from tests.service.states import read_state
 
@@ -56,12 +56,12 @@ def test_two_replicas_of_one_name_and_names_that_are_no_file_names_are_refused(t
 
 
 @pytest.mark.slow
-def test_a_replica_that_says_nothing_keeps_nobody_from_hearing_of_the_others(acting):
+def test_a_replica_that_says_nothing_keeps_nobody_from_hearing_of_the_others(acting, epypes):
     with StateLock(acting, "1") as mute, StateLock(acting, "2") as other:
         mute.publish(state(11, http="http://127.0.0.1:1", replica="1"))
         other.publish(state(12, replica="2"))
-        told = read_out("status", acting)
-        alone = run_cli("status", acting, "--replica", "1")
+        told = epypes("status", acting).stdout
+        alone = epypes("status", acting, "--replica", "1")
     assert "SILENT" in told
     assert re.search(r"^- 1: SILENT \(.+process 11$", told, re.MULTILINE)
     assert re.search(r"^- 2: RUNNING, .+process 12, no --http$", told, re.MULTILINE)
@@ -69,7 +69,7 @@ def test_a_replica_that_says_nothing_keeps_nobody_from_hearing_of_the_others(act
 
 
 @pytest.mark.slow
-def test_all_replicas_are_stopped_though_one_is_late_and_one_has_just_ended(acting):
+def test_all_replicas_are_stopped_though_one_is_late_and_one_has_just_ended(acting, epypes):
     sleeping, deaf = ["sleep", "100"], ["bash", "-c", "trap '' TERM; echo deaf; read line"]
     ended = subprocess.Popen(["true"])
     ended.wait()
@@ -82,21 +82,15 @@ def test_all_replicas_are_stopped_though_one_is_late_and_one_has_just_ended(acti
         for number, process in enumerate((ended, late, last), 1):
             lock = held.enter_context(StateLock(acting, str(number)))
             lock.publish(state(process.pid, replica=str(number)))
-        done = run_cli("stop", acting, "--timeout", "1")
+        done = epypes("stop", acting, "--timeout", "1")
         late.stdin.close()
         assert last.wait(TIMEOUT_S) == -signal.SIGTERM
     assert (done.returncode, done.stdout.count("STOPPED")) == (1, 2)
     assert f"Process {late.pid}, which serves {acting}, has not ended within 1 s" in done.stderr
 
 
-def read_out(*arguments):
-    done = run_cli(*arguments)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 @pytest.mark.slow
-def test_three_replicas_on_a_real_broker_are_told_apart_and_stopped_together(acting, nats, tmp_path):
+def test_three_replicas_on_a_real_broker_are_told_apart_and_stopped_together(acting, nats, tmp_path, epypes):
     secret = tmp_path / "password"
     secret.write_text(nats.password)
     open_address = nats.address("three.events", create=True)
@@ -122,23 +116,23 @@ def test_three_replicas_on_a_real_broker_are_told_apart_and_stopped_together(act
         assert answered == {each.id for each in sent}
 
         def counted():
-            return [found["counts"] for found in json.loads(read_out("status", acting, "--json"))]
+            return [found["counts"] for found in json.loads(epypes("status", acting, "--json").stdout)]
 
         until(lambda: sum(counts["answered"] for counts in counted()) == 60)
         assert all(counts["answered"] for counts in counted()), "all have had some"
-        told = read_out("status", acting)
+        told = epypes("status", acting).stdout
         assert told.count(": READY, ") == 3
         assert "- c: READY, " in told
         assert "failures at" not in told + first.ready
         assert "0 redelivered, 0 duplicates, 0 given back" in told
-        assert read_out("status", acting, "--replica", "2").count(f"READY {acting}") == 1
-        assert "replica 'x'" in run_cli("status", acting, "--replica", "x").stderr
+        assert epypes("status", acting, "--replica", "2").stdout.count(f"READY {acting}") == 1
+        assert "replica 'x'" in epypes("status", acting, "--replica", "x").stderr
         for found in read_states(acting):
             with ep.connect(found.http) as service:
                 assert "password_file" not in json.dumps(service.info())
-        assert "would take answers from it" in run_cli("call", acting, "what=x", "number=y").stderr + refused(acting)
-        assert f"STOPPED {acting}, replica 2" in read_out("stop", acting, "--replica", "2")
-        stopped = read_out("stop", acting)
+        assert "would take answers from it" in epypes("call", acting, "what=x", "number=y").stderr + refused(acting)
+        assert f"STOPPED {acting}, replica 2" in epypes("stop", acting, "--replica", "2").stdout
+        stopped = epypes("stop", acting).stdout
         assert ("replica 1" in stopped, "replica 2" in stopped, "replica c" in stopped) == (True, False, True)
         said = [process.communicate(timeout=TIMEOUT_S) for process in (first, second, third)]
     assert nats.password not in str(said)
@@ -154,25 +148,6 @@ def refused(bundle):
 
 
 @pytest.mark.slow
-def test_a_replica_that_is_killed_has_its_events_answered_by_another(acting, nats, tmp_path):
-    where = [nats.address(f"killed.{name}", create=True) for name in ("events", "answers")]
-    requests, answers = queue.Queue(), queue.Queue()
-    with running(acting, "--sub", where[0], "--pub", where[1]) as doomed:
-        assert doomed.ready.startswith("READY")
-        with ep.Publisher(where[0], requests), ep.Subscriber(where[1], answers, acknowledge="received"):
-            requests.put(event(f"hold_once:{tmp_path}", 21))
-            until((tmp_path / "seen").exists)
-            doomed.send_signal(signal.SIGKILL)
-            doomed.wait(TIMEOUT_S)
-            with running(acting, "--sub", where[0], "--pub", where[1]) as other:
-                assert "(replica 1)" in other.ready, "the name is free again"
-                assert answers.get(timeout=TIMEOUT_S).parts["out"] == 42
-                out = read_out("stop", acting) and other.communicate(timeout=TIMEOUT_S)[0]
-    assert "answered 1" in out
-    assert "redelivered 1" in out
-
-
-@pytest.mark.slow
 def test_a_caller_gets_its_answer_where_answers_are_for_all(acting, nats):
     where = [nats.address("called.events", create=True), nats.address("called.answers", kind="broadcast")]
     from epypes.service import Client
@@ -184,9 +159,9 @@ def test_a_caller_gets_its_answer_where_answers_are_for_all(acting, nats):
 
 
 @pytest.mark.slow
-def test_a_wrong_password_is_said_without_it(acting, nats):
+def test_a_wrong_password_is_said_without_it(acting, nats, epypes):
     address = nats.address("events", create=True).replace(f"{nats.user}:", f"{nats.user}:wrong")
-    done = run_cli("serve", acting, "--sub", address)
+    done = epypes("serve", acting, "--sub", address)
     assert done.returncode == 1
     assert "nats://epypes@127.0.0.1" in done.stderr
     assert "wrong" not in done.stderr.replace("wrong password", "").replace("password is wrong", "")

@@ -30,3 +30,11 @@ def edge_bundle(tmp_path_factory, photograph):
 def acting(tmp_path_factory):
     """A bundle whose function does what an event says, and returns a number times a hyperparameter."""
     return acting_bundle(tmp_path_factory.mktemp("bundles") / "acting")
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Services of this process pause only shortly before they start a worker again; each death is an early one."""
+    monkeypatch.setattr("epypes.service.worker_health.RESTART_PAUSE_S", 0.01)
+    monkeypatch.setattr("epypes.service.worker_health._FAULT_PAUSE_S", 0.5)
+    monkeypatch.setattr("epypes.service.worker_health._SOON_S", 60.0)

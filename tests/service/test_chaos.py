@@ -114,7 +114,7 @@ def test_nothing_is_lost_uncounted_and_order_is_kept(bundles, poison):
             reports.wait_joined(WAIT_S)
             received = Received(outlet, answers, failures)
             publisher = subprocess.Popen(
-                [sys.executable, "-m", "tests.service.chaos_publisher", state.sub, str(poison), str(ENOUGH), "4"],
+                [sys.executable, "-m", "tests.service.chaos_publisher", state.sub, str(poison), str(ENOUGH), "3"],
                 cwd=ROOT,
                 stdout=subprocess.PIPE,
                 text=True,
@@ -127,24 +127,24 @@ def test_nothing_is_lost_uncounted_and_order_is_kept(bundles, poison):
                     goal = received.number() + count
                     until(lambda: received.number() >= goal, f"{count} more answers")
 
-                pass_by(200)
+                pass_by(100)
                 until(lambda: has_killed(control), "a worker to kill")
-                pass_by(300)
+                pass_by(150)
                 publisher.send_signal(signal.SIGSTOP)
                 until(lambda: is_idle(control), "idleness while nobody publishes")
                 publisher.send_signal(signal.SIGCONT)
-                for gain in range(2, 30):
+                for gain in range(2, 18):
                     pass_by(10)
                     gains[changed(control, gain)] = gain
                 with pytest.raises(EpypesError, match="differ"):
                     control.deploy(bad)
-                pass_by(200)
+                pass_by(100)
                 assert control.info()["bundle"] == str(first)
                 digest = control.deploy(good)["digest"]
-                pass_by(200)
+                pass_by(100)
                 assert received.answers[-1].bundle_digest == digest
                 gains[control.parameters().revision] = 1
-                for gain in range(40, 50):
+                for gain in range(40, 48):
                     pass_by(10)
                     gains[changed(control, gain)] = gain
                 counted = control.info()
@@ -198,7 +198,7 @@ def check_counts(counts, sent, received):
     """Every event that came in has come out once, as what it was counted."""
     assert counts["received"] == sum(counts[name] for name in ("answered", "failed", "dropped", "dead_letters")), counts
     assert counts["received"] <= sent
-    assert counts["received"] > 1_000
+    assert counts["received"] > 700
     ids = Counter(answer.correlation_id for answer in received.answers)
     assert len(received.answers) == counts["received"]
     assert set(ids.values()) == {1}
@@ -234,4 +234,4 @@ def check_revisions(received, gains, digest):
             number, gain, product = map(int, answer.parts["result"])
             assert gain == gains[answer.revision], answer
             assert product == number * gain + (7 if answer.bundle_digest == digest else 0)
-    assert len({answer.revision for answer in received.answers}) > 20
+    assert len({answer.revision for answer in received.answers}) > 15

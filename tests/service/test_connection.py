@@ -76,7 +76,7 @@ def test_what_is_no_service_of_ours_is_said_to_be_none(body):
             pass
 
     with http.server.HTTPServer(("127.0.0.1", 0), Other) as other:
-        thread = threading.Thread(target=other.serve_forever)
+        thread = threading.Thread(target=other.serve_forever, args=(0.01,))
         thread.start()
         try:
             with pytest.raises(ServiceError, match="is no EPypes service"):

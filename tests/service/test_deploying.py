@@ -13,7 +13,7 @@ from epypes.bundle.seal import check_seal, seal
 from epypes.errors import DeployRefused, ServiceError, UnknownName
 from epypes.service import Service
 from epypes.service.failures.source import failures_of, find_failure
-from tests.service.processes import run_cli, running
+from tests.service.processes import running
 from tests.service.served import SOURCE, acting_bundle, serving, until
 from tests.service.states import read_state
 
@@ -85,16 +85,15 @@ def test_values_that_were_written_back_are_those_of_the_bundle_that_is_served(ow
         assert any(line.startswith(begin) for line in lines), begin
 
 
-def test_a_service_is_found_by_the_bundle_it_was_started_with_and_by_the_one_that_was_deployed(acting, better):
+def test_a_service_is_found_by_the_bundle_it_was_started_with_and_by_the_one_that_was_deployed(acting, better, epypes):
     with running(acting, "--http", "127.0.0.1:0"):
         state = read_state(acting)
-        assert "No service of yours runs" in run_cli("status", better).stderr
-        done = run_cli("deploy", better, "--http", state.http)
-        assert "k 2 -> 3" in done.stdout
+        assert "No service of yours runs" in epypes("status", better).stderr
+        assert "k 2 -> 3" in epypes("deploy", better, "--http", state.http).stdout
         until(lambda: read_state(acting).digest == check_seal(better))
         for bundle in (acting, better):
-            assert run_cli("status", bundle).stdout.startswith(f"READY {better}")
-            answered = run_cli("call", bundle, 'what="plain"', "number=5")
+            assert epypes("status", bundle).stdout.startswith(f"READY {better}")
+            answered = epypes("call", bundle, 'what="plain"', "number=5")
             assert answered.stdout.startswith("out = 15"), answered.stderr
 
 

@@ -11,8 +11,7 @@ from epypes.errors import StoreError
 from epypes.service import Service
 from epypes.service.http.metrics import exposed, registry_of
 from epypes.store import Store
-from tests.service.processes import running
-from tests.service.served import TIMEOUT_S, peer_at, peer_of, serving, until
+from tests.service.served import TIMEOUT_S, peer_of, serving, until
 from tests.store.postgres import server
 
 pytestmark = pytest.mark.slow
@@ -117,21 +116,6 @@ def test_a_service_without_a_store_has_no_such_metrics(acting):
 def test_a_service_with_a_store_that_can_never_be_is_not_started(acting):
     with pytest.raises(StoreError, match="SQLAlchemy knows no 'nosuch'"):
         Service(acting, store="nosuch://host/db")
-
-
-def test_a_service_of_the_command_line_stores_its_events(acting, tmp_path):
-    from tests.service.states import read_state
-
-    path = tmp_path / "events.sqlite"
-    with running(acting, "--store", str(path)) as process:
-        state = read_state(acting)
-        with peer_at(state.sub, state.pub, state.failures) as peer:
-            peer.ask()
-        process.terminate()
-        process.communicate(timeout=TIMEOUT_S)
-        assert process.returncode == 0
-    (row,) = rows_of(path)
-    assert row["outcome"] == "answered"
 
 
 def test_a_server_that_dies_and_comes_back_has_all_rows_and_no_answer_waited(acting, caplog):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.service.bundles import written_bundle
-from tests.service.test_signals import served_apart
+from tests.service.served import serving
 
 SOURCE = """
     import functools
@@ -36,11 +36,10 @@ SOURCE = """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("threads", [1, 2])
-def test_an_event_that_changes_what_outlives_it_fails_and_the_next_answers_are_as_before(threads, tmp_path):
+def test_an_event_that_changes_what_outlives_it_fails_and_the_next_answers_are_as_before(tmp_path):
     sample = {"what": "plain", "x": 1}, {"y": 1001}
     bundle = written_bundle(tmp_path / "b", SOURCE, ["what", "x"], ["y"], sample=sample)
-    with served_apart(bundle, "--threads", str(threads)) as (_, peer):
+    with serving(bundle, threads=2) as (_, peer):
         for _ in range(4):
             answers = {}
             for x, what in enumerate(["plain", "list", "plain", "array", "plain", "cached", "plain"]):

@@ -76,7 +76,7 @@ def test_a_bundle_with_ports_of_its_own_answers_2019_messages_in_their_kind(owni
         assert (answer.type, answer.parts["repeated"], answer.revision) == ("own", "z", 3)
 
 
-@pytest.mark.parametrize(("count", "answers"), [(0, []), (1, ["abab"]), (3, ["abab0", "abab1", "abab2"])])
+@pytest.mark.parametrize(("count", "answers"), [(0, []), (3, ["abab0", "abab1", "abab2"])])
 def test_a_pipeline_may_answer_an_event_as_often_as_it_likes_and_it_is_done_once(owning, tmp_path, count, answers):
     body = f"""
     def put(self, answer, view):
@@ -164,115 +164,6 @@ def test_parameters_that_a_pipeline_of_its_own_refuses_are_set_in_no_slot(owning
         assert {front.run(text="a")[1][0].parts["repeated"] for _ in range(9)} == {"aaa"}
 
 
-# -- side by side --------------------------------------------------------------------------------------------------
-
-MEETING = '''
-    import os
-    import threading
-    import time
-
-
-
-    def meet(place):
-        """Return when so many calls have begun."""
-        folder, name, count = place.split("|")
-        open(os.path.join(folder, name), "w").close()
-        while len(os.listdir(folder)) < int(count):
-            time.sleep(0.002)
-        return threading.current_thread().name
-
-
-    func_dict = {"meet": meet}
-    func_io = {"meet": ("place", "thread")}
-'''
-
-
-@pytest.fixture
-def meeting(tmp_path):
-    place = tmp_path / "sample"
-    place.mkdir()
-    sample = {"place": f"{place}|a|1"}, {"thread": "MainThread"}
-    return written_bundle(tmp_path / "meeting", MEETING, ["place"], ["thread"], sample=sample)
-
-
-def test_slots_work_on_as_many_events_at_once_as_there_are(meeting, tmp_path):
-    with ready_worker(meeting, tmp_path, "--threads", "3") as front:
-        for turn in range(3):
-            folder = tmp_path / f"turn{turn}"
-            folder.mkdir()
-            for number in range(3):
-                front.send_event(Envelope(type="x", parts={"place": f"{folder}|{number}|3"}))
-            done = [front.done() for _ in range(3)]
-            assert {header["seq"] for header, _ in done} == {turn * 3 + 1, turn * 3 + 2, turn * 3 + 3}
-            assert all(header["failure"] is None for header, _ in done)
-
-
-def test_parameters_wait_until_no_slot_works_and_hold_for_all_events_after_them(tmp_path):
-    source = """
-        import time
-
-
-        def scaled(x, k):
-            time.sleep(x / 1000)
-            return k
-
-
-        func_dict = {"scaled": scaled}
-        func_io = {"scaled": (("x", "k"), "y")}
-    """
-    sample = {"x": 0}, {"y": 1}
-    bundle = written_bundle(tmp_path / "b", source, ["x"], ["y"], hyperparameters={"k": 1}, sample=sample)
-    with ready_worker(bundle, tmp_path, "--threads", "3") as front:
-        expected = {}
-        for revision in range(1, 30):
-            front.set(revision, k=revision * 100)
-            for number in range(revision % 5):
-                seq = front.send_event(Envelope(type="x", parts={"x": (revision * 7 + number * 3) % 11}))
-                expected[seq] = revision
-        for _ in range(len(expected)):
-            header, (answer,) = front.done()
-            revision = expected.pop(header["seq"])
-            assert (header["revision"], answer.revision, answer.parts["y"]) == (revision, revision, revision * 100)
-        assert not expected
-
-
-def test_what_is_run_again_for_a_query_runs_in_no_more_threads_than_there_are_slots(tmp_path):
-    source = """
-        import threading
-        import time
-
-        busy = threading.Lock()
-
-
-        def alone(x, k):
-            if not busy.acquire(blocking=False):
-                raise RuntimeError("two at once")
-            try:
-                time.sleep(0.002)
-                return x * k
-            finally:
-                busy.release()
-
-
-        func_dict = {"alone": alone}
-        func_io = {"alone": (("x", "k"), "y")}
-    """
-    sample = {"x": 2}, {"y": 4}
-    bundle = written_bundle(tmp_path / "b", source, ["x"], ["y"], hyperparameters={"k": 2}, sample=sample)
-    with ready_worker(bundle, tmp_path) as front:
-        front.run(x=1)
-        numbers = set()
-        for revision in range(1, 40):
-            front.set(revision, k=revision)
-            numbers.add(front.send_query("run", tokens=["y"], revision=revision))
-            front.send_event(Envelope(type="x", parts={"x": 3}))
-        for _ in range(1, 40):
-            assert front.done()[0]["failure"] is None
-        answers = [front.receive("answer") for _ in numbers]
-        assert {answer.number for answer in answers} == numbers
-        assert not [answer.content for answer in answers if "error" in answer.content]
-
-
 # -- what a worker keeps -------------------------------------------------------------------------------------------
 
 IMAGES = """
@@ -320,7 +211,7 @@ def rss(process):
     return process.memory_info().rss
 
 
-def test_two_thousand_events_leave_nothing_behind(inverting, tmp_path):
+def test_a_thousand_events_leave_nothing_behind(inverting, tmp_path):
     image, bad = np.full((500, 500), 14, np.uint8), np.full((500, 500), 13, np.uint8)
     with ready_worker(inverting, tmp_path) as front:
         process = psutil.Process(front.process.pid)
@@ -332,10 +223,10 @@ def test_two_thousand_events_leave_nothing_behind(inverting, tmp_path):
                     front.query("svg")
                     front.values("image", "inverted")
 
-        some(400)
+        some(200)
         before, files = rss(process), process.num_fds()
-        some(2_000)
-        # Each event has 0.5 MB of images: were one in fifty kept, this would be 20 MB.
+        some(1_000)
+        # Each event has 0.5 MB of images: were one in twenty-five kept, this would be 20 MB.
         assert rss(process) - before < 10_000_000
         assert process.num_fds() == files
 

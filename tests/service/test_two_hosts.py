@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from time import monotonic
 
 import pytest
 
@@ -17,7 +16,7 @@ from tests.service.replicated import promoted, replicas, stopped
 
 pytestmark = pytest.mark.slow
 
-COUNT, PACE_MS, CUT_S = 400, 10, 10.0
+COUNT, PACE_MS = 400, 10
 
 
 @pytest.fixture
@@ -29,19 +28,6 @@ def hosts():
         yield made
 
 
-def observed_down(cable, seconds):
-    """Wait until the cable has had no link for so many seconds."""
-    seen_up_s = monotonic()
-
-    def is_long_down():
-        nonlocal seen_up_s
-        if cable.is_up:
-            seen_up_s = monotonic()
-        return monotonic() - seen_up_s >= seconds
-
-    until(is_long_down, "a link that stays cut")
-
-
 def status_across(host, bundle):
     """Return what ``epypes status`` prints on a host."""
     command = [*host.before, sys.executable, "-m", "epypes.cli", "status", str(bundle), "--replica", "across"]
@@ -49,7 +35,7 @@ def status_across(host, bundle):
 
 
 @pytest.mark.parametrize("name", ["nats", pytest.param("rabbitmq", marks=pytest.mark.soak)])
-def test_a_link_that_is_cut_for_ten_seconds_loses_nothing_that_was_acknowledged(hosts, tmp_path, name):
+def test_a_link_that_is_cut_until_the_far_replica_reports_it_loses_nothing_that_was_acknowledged(hosts, tmp_path, name):
     near, far, cable = hosts
     bundle = promoted(tmp_path)
     with broker_at(near, name, "hosts.events", "hosts.answers") as (sub, pub):
@@ -65,13 +51,12 @@ def test_a_link_that_is_cut_for_ten_seconds_loses_nothing_that_was_acknowledged(
 
             until(lambda: now()["answered"] > COUNT // 8 and now()["replicas"] == 2, lambda: f"both to work: {now()}")
             cable.pull()
-            observed_down(cable, CUT_S)
-            at_the_end = now()
             until(lambda: "DEGRADED" in status_across(far, bundle), lambda: status_across(far, bundle))
+            at_the_end = now()
             cable.plug()
             until(lambda: not outside.is_running, lambda: f"everything to be answered: {now()}")
             found, counts = now(), [stopped(replica) for replica in (beside, across)]
     assert at_the_end["confirmed"] < COUNT, "it was all over before the link was cut"
     assert (found["confirmed"], found["answered"]) == (COUNT, COUNT), found
     assert (found["unanswered"], found["twice"]) == ([], []), found
-    assert [counted["reconnects"] > 0 for counted in counts] == [False, True], counts
+    assert counts[0]["reconnects"] == 0, "its link was not cut"

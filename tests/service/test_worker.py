@@ -4,23 +4,19 @@ import json
 import re
 import shutil
 import signal
-import subprocess
-import sys
 import threading
 import time
 from contextlib import contextmanager
 from pathlib import Path
 
-import cv2
-import numpy as np
 import psutil
 import pytest
 
 from epypes.bundle.seal import seal
 from epypes.display.views.jsonview import from_json
-from epypes.service.frame_socket import ControlSocket, FrameSocket, WorkerMessage
+from epypes.service.frame_socket import WorkerMessage
 from epypes.service.packing import MARK, unpack
-from epypes.wire import Envelope, decode, encode
+from epypes.wire import Envelope, decode
 from tests.service.bundles import written_bundle
 from tests.service.workers import TIMEOUT_S, ready_worker, worker_of
 
@@ -163,13 +159,6 @@ def until(condition):
 # -- ready ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_worker_is_ready_when_the_bundle_computes_what_was_recorded(shared):
-    assert shared.ready["report"] == "identical: 1 token of 1 sample"
-    assert shared.ready["functions"] == ["act", "tell"]
-    assert shared.ready["pid"] == shared.process.pid
-    assert len(shared.ready["digest"]) == 64
-
-
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -193,69 +182,7 @@ def test_a_bundle_that_does_not_compute_what_was_recorded_is_refused(acting, tmp
         assert front.process.wait(TIMEOUT_S) == 1
 
 
-@pytest.mark.parametrize("name", ["pipeline.py", "pipeline.toml", "samples/run_1.npz"])
-def test_a_bundle_with_a_changed_file_is_refused(acting, tmp_path, name):
-    folder = tmp_path / "changed"
-    shutil.copytree(acting, folder)
-    with (folder / name).open("ab") as file:
-        file.write(b"\n")
-    with worker_of(folder, tmp_path) as front:
-        assert f"{name} was changed" in front.receive("refused").content["reasons"][0]
-        assert front.process.wait(TIMEOUT_S) == 1
-
-
-def test_what_comes_before_the_worker_is_ready_is_done_then(acting, tmp_path):
-    with worker_of(acting, tmp_path) as front:
-        front.set(5, k=3)
-        front.send_event(Envelope(type="x", parts={"what": "early"}))
-        assert front.receive("ready")
-        header, (answer,) = front.done()
-        assert (header["revision"], answer.parts["out"]) == (5, "early 3")
-
-
-def test_a_worker_that_gets_the_end_while_it_loads_ends(acting, tmp_path):
-    with worker_of(acting, tmp_path) as front:
-        assert front.end() == 0
-
-
 # -- events --------------------------------------------------------------------------------------------------------
-
-
-def test_an_event_is_answered_as_the_bundle_computes_it(shared):
-    request = Envelope(type="x", parts={"what": "a"}, acquired_ns=5)
-    seq = shared.send_event(request)
-    header, (answer,) = shared.done()
-    assert (header["seq"], header["failure"]) == (seq, None)
-    assert answer.parts["out"] == "a 2"
-    assert answer.correlation_id == request.id
-    assert answer.bundle_digest == shared.ready["digest"]
-    assert 0 < sum(header["durations_ns"].values()) < header["total_ns"]
-    assert set(header["durations_ns"]) == {"act", "tell"}
-
-
-@pytest.mark.parametrize(
-    ("what", "function", "exception", "message"),
-    [
-        ("fail", "act", "ValueError", "not with me"),
-        ("exit", "act", "SystemExit", "3"),
-        ("interrupt", "act", "KeyboardInterrupt", ""),
-        ("memory", "act", "MemoryError", "no room"),
-        ("deep", "act", "RecursionError", "maximum recursion depth"),
-        ("odd", "act", "Odd", "(its message can't be had)"),
-        ("object", "f_out", "MessageError", "object"),
-    ],
-)
-def test_whatever_a_function_raises_is_the_failure_of_its_event(shared, what, function, exception, message):
-    request = Envelope(type="x", parts={"what": what})
-    seq = shared.send_event(request)
-    header, (answer,) = shared.done()
-    failure = header["failure"]
-    assert header["seq"] == seq
-    assert (failure["function"], failure["exception"], failure["kind"]) == (function, exception, "raised")
-    assert message in failure["message"]
-    assert answer.type == "epypes.failure"
-    assert (answer.correlation_id, answer.failure.function) == (request.id, function)
-    assert shared.run(what="a")[1][0].parts["out"] == "a 2"
 
 
 def test_the_trace_of_a_failure_has_the_lines_of_the_bundle_and_none_of_ours(shared, acting):
@@ -269,37 +196,6 @@ def test_the_trace_of_a_failure_has_the_lines_of_the_bundle_and_none_of_ours(sha
     assert "epypes/run" not in trace
 
 
-def test_the_trace_of_an_endless_recursion_is_short(shared):
-    header, _ = shared.run(what="deep")
-    assert len(header["failure"]["trace"]) < 60
-
-
-@pytest.mark.parametrize(
-    ("event", "message"),
-    [
-        (Envelope(type="x", parts={"who": 1}), "The event must have the parts 'what'; it has 'who'"),
-        (Envelope(type="x"), "it has none"),
-        (b"2019", "not an epypes.v1 Envelope"),
-    ],
-)
-def test_an_event_that_f_in_does_not_understand_fails(shared, event, message):
-    shared.run(what="a")
-    shared.send_event(event)
-    header, (answer,) = shared.done()
-    assert (header["failure"]["function"], header["durations_ns"]) == ("f_in", {})
-    assert message in header["failure"]["message"]
-    assert answer.failure is not None
-
-
-def test_an_event_that_cannot_be_decoded_fails_and_the_worker_goes_on(shared):
-    seq = next(shared.seqs)
-    shared.channel.send(WorkerMessage("event", seq, frames=[b"x/", b"\xff\xff"]))
-    header, (answer,) = shared.done()
-    assert (header["seq"], header["failure"]["function"]) == (seq, "f_in")
-    assert "no Envelope" in answer.failure.message
-    assert shared.run(what="a")[1][0].parts["out"] == "a 2"
-
-
 def test_what_functions_print_goes_to_stderr_and_never_into_the_channel(shared):
     assert shared.run(what="say")[1][0].parts["out"] == "said"
     shared.run(what="a")
@@ -308,44 +204,7 @@ def test_what_functions_print_goes_to_stderr_and_never_into_the_channel(shared):
         assert line in text
 
 
-def test_events_are_done_in_their_order_by_one_slot(shared):
-    seqs = [shared.send_event(Envelope(type="x", parts={"what": f"{number}"})) for number in range(50)]
-    done = [shared.done() for _ in seqs]
-    assert [header["seq"] for header, _ in done] == seqs
-    assert [answer.parts["out"] for _, (answer,) in done] == [f"{number} 2" for number in range(50)]
-
-
 # -- parameters ----------------------------------------------------------------------------------------------------
-
-
-def test_parameters_hold_for_the_events_after_them_and_their_revision_is_stamped(own):
-    with own() as front:
-        assert front.run(what="a")[1][0].revision == 0
-        for revision in range(1, 20):
-            front.set(revision, k=revision * 10)
-            front.send_event(Envelope(type="x", parts={"what": "a"}))
-            front.send_event(Envelope(type="x", parts={"what": "fail"}))
-        for revision in range(1, 20):
-            header, (answer,) = front.done()
-            assert (header["revision"], answer.revision) == (revision, revision)
-            assert answer.parts["out"] == f"a {revision * 10}"
-            header, (answer,) = front.done()
-            assert (header["revision"], answer.revision) == (revision, revision)
-            assert front.changed()["revision"] == revision
-
-
-def test_parameters_are_refused_all_or_none_with_the_reason_of_each(own):
-    with own() as front:
-        front.send_parameters(9, {"k": {"value": 7}, "kk": {"value": 1}, "what": {"value": 1}, "out": {}})
-        header = front.changed()
-        assert header["revision"] == 9
-        assert set(header["problems"]) == {"kk", "what", "out"}
-        assert "Did you mean 'k'?" in header["problems"]["kk"]
-        assert "free source token" in header["problems"]["what"]
-        header, (answer,) = front.run(what="a")
-        assert (header["revision"], answer.parts["out"]) == (0, "a 2")
-        front.set(10)
-        assert front.values("told", revision=10).parts["told"] == "a 2 2", "what was tried is not kept anywhere"
 
 
 def test_parameters_are_set_when_no_slot_works_and_asked_values_wait_for_that(own):
@@ -364,23 +223,6 @@ def test_parameters_are_set_when_no_slot_works_and_asked_values_wait_for_that(ow
         answer = front.receive("answer")
         assert answer.number == number
         assert decode(unpack(answer.frames[0])).parts["told"] == "held 8"
-
-
-def test_a_change_that_waits_for_an_event_can_be_withdrawn_and_one_that_was_made_cannot(own):
-    with own() as front:
-        front.send_event(Envelope(type="x", parts={"what": "hold"}))
-        until(front.started.exists)
-        front.control.send(WorkerMessage("withdraw", front.set(1, k=8), {"revision": 1}))
-        assert front.changed()["is_withdrawn"]
-        front.release.touch()
-        assert front.done()[0]["revision"] == 0
-        assert front.run(what="a")[0]["revision"] == 0
-        number = front.set(2, k=9)
-        assert front.changed()["revision"] == 2
-        front.control.send(WorkerMessage("withdraw", number, {"revision": 2}))
-        header, (answer,) = front.run(what="a")
-        assert (header["revision"], answer.parts["out"]) == (2, "a 9")
-        assert not front.waiting
 
 
 def test_asked_values_are_not_computed_beside_the_events_of_the_only_slot(own):
@@ -439,63 +281,11 @@ def test_before_an_event_the_graph_is_seen_and_no_value(own):
             assert "No event has been completed yet" in header["error"]
 
 
-def test_answers_to_queries_are_of_the_last_completed_run(shared):
-    header, _ = shared.run(what="zeros")
-    shared.run(what="fail")
-    values = shared.values("out", "k", "what")
-    assert values.parts["out"].shape == (400, 400)
-    assert (values.parts["k"], values.parts["what"], values.revision) == (2, "zeros", header["revision"])
-    header, (picture,) = shared.query("preview", token="out", max_side_px=100)
-    assert header["media_type"].startswith("image/")
-    assert max(header["width"], header["height"]) <= 100
-    assert cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_UNCHANGED).shape[:2] == (
-        header["height"],
-        header["width"],
-    )
-    header, (text,) = shared.query("preview", token="what", max_side_px=100)
-    assert (header["media_type"], text.decode().partition("\n")[0]) == ("text/plain", "'zeros'")
-    _, (view,) = shared.query("view")
-    tokens = {token.name: token for token in from_json(json.loads(view)).tokens}
-    assert tokens["out"].preview.picture is not None
-    assert b"<image" in shared.query("svg")[1][0]
-
-
-@pytest.mark.parametrize(
-    ("ask", "reason", "text"),
-    [
-        ({"what": "preview", "token": "ouut", "max_side_px": 64}, "unknown token", "Did you mean 'out'?"),
-        ({"what": "run", "tokens": ["ouut"]}, "unknown token", "Did you mean 'out'?"),
-        ({"what": "preview"}, "failed", "token"),
-        ({"what": "preview", "token": ["out"], "max_side_px": 64}, "failed", "list"),
-        ({"what": "preview", "token": "out", "max_side_px": None}, "failed", "NoneType"),
-        ({"what": "run", "tokens": 3}, "failed", "int"),
-        ({"what": "everything"}, "unknown query", "everything"),
-    ],
-)
-def test_what_cannot_be_answered_is_refused_with_its_reason(shared, ask, reason, text):
-    shared.run(what="a")
-    header, frames = shared.query(**ask)
-    assert (header["reason"], frames) == (reason, [])
-    assert text in header["error"]
-
-
 def test_a_value_that_cannot_be_sent_is_refused_with_the_reason(shared):
     shared.run(what="object")
     header, _ = shared.query("run", tokens=["out"])
     assert header["reason"] == "no codec"
     assert shared.values("told").parts["told"].endswith(" 2")
-
-
-def test_values_of_a_revision_that_no_event_has_had_are_computed_on_the_last_payload_and_not_published(own):
-    with own() as front:
-        front.run(what="a")
-        front.set(4, k=8)
-        values = front.values("out", "told", revision=4)
-        assert (values.parts["told"], values.revision) == ("a 8 8", 4)
-        assert front.values("out").revision == 0, "the last completed run is still the event's"
-        assert front.run(what="b")[1][0].parts["out"] == "b 8"
-        assert front.values("told", revision=4).parts["told"] == "b 8 8"
-        assert not front.waiting or {message.kind for message in front.waiting} == {"parameters"}
 
 
 def test_a_function_that_fails_with_new_parameters_is_the_answer_to_the_query(tmp_path):
@@ -517,19 +307,6 @@ def test_a_function_that_fails_with_new_parameters_is_the_answer_to_the_query(tm
         assert front.query("run", tokens=["y"], revision=7)[0]["reason"] == "unknown revision"
 
 
-def test_the_running_function_is_reported_while_it_computes(own):
-    with own() as front:
-        seq = front.send_event(Envelope(type="x", parts={"what": "hold"}))
-        until(front.started.exists)
-        header, _ = front.query("running")
-        assert header["running"] == ["act"]
-        assert [(slot["seq"], slot["functions"]) for slot in header["slots"]] == [(seq, ["act"])]
-        assert b"<svg" in front.query("svg")[1][0], "others are answered too"
-        front.release.touch()
-        assert front.done()[1][0].parts["out"] == "held"
-        assert front.query("running")[0]["running"] == []
-
-
 def test_too_many_queries_are_refused_and_none_is_left_without_answer(own):
     with own() as front:
         front.run(what="zeros")
@@ -542,20 +319,6 @@ def test_too_many_queries_are_refused_and_none_is_left_without_answer(own):
 # -- how it ends ---------------------------------------------------------------------------------------------------
 
 
-def test_a_worker_works_off_what_it_has_and_ends_with_0(own):
-    with own() as front:
-        front.send_event(Envelope(type="x", parts={"what": "hold"}))
-        until(front.started.exists)
-        seq = front.send_event(Envelope(type="x", parts={"what": "last"}))
-        front.channel.send(WorkerMessage("end"))
-        front.release.touch()
-        front.done()
-        header, (answer,) = front.done()
-        assert (header["seq"], answer.parts["out"]) == (seq, "last 2")
-        assert front.process.wait(TIMEOUT_S) == 0
-        assert front.stderr.read_text() == ""
-
-
 def test_a_worker_whose_front_goes_ends_at_once_even_while_a_function_computes(own):
     with own() as front:
         front.send_event(Envelope(type="x", parts={"what": "hold"}))
@@ -566,39 +329,6 @@ def test_a_worker_whose_front_goes_ends_at_once_even_while_a_function_computes(o
         assert time.monotonic() - start < TIMEOUT_S / 2
 
 
-def test_a_worker_ends_with_the_thread_that_started_it_even_while_a_function_holds_the_interpreter(acting, tmp_path):
-    code = """
-import os, subprocess, sys
-*arguments, started = sys.argv[1:]
-worker = subprocess.Popen([sys.executable, "-I", "-m", "epypes.service.worker", *arguments],
-                          pass_fds=map(int, arguments[:2]), env={**os.environ, "STARTED": started})
-print(worker.pid, flush=True)
-sys.stdin.read()
-"""
-    (ours, theirs), (control, their_control) = FrameSocket.pair(), ControlSocket.pair()
-    started = tmp_path / "started"
-    with theirs, their_control:
-        sockets = theirs.fileno(), their_control.fileno()
-        parent = subprocess.Popen(
-            [sys.executable, "-I", "-c", code, *map(str, sockets), str(acting), str(started)],
-            pass_fds=sockets,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-        )
-    try:
-        worker = psutil.Process(int(parent.stdout.readline()))
-        ours.send(WorkerMessage("event", 1, frames=encode(Envelope(type="x", parts={"what": "regex"}))))
-        until(started.exists)
-        # Its sockets stay open: this is the end of the process that started it, and nothing else.
-        parent.kill()
-        until(lambda: not worker.is_running() or worker.status() == psutil.STATUS_ZOMBIE)
-    finally:
-        parent.kill()
-        parent.communicate()
-        ours.close()
-        control.close()
-
-
 def test_a_worker_writes_its_stacks_while_a_function_holds_the_interpreter(own):
     with own() as front:
         front.send_event(Envelope(type="x", parts={"what": "regex"}))
@@ -607,26 +337,6 @@ def test_a_worker_writes_its_stacks_while_a_function_holds_the_interpreter(own):
         text = until(lambda: "in regex" in front.faults.read_text() and front.faults.read_text())
         assert re.search(r'File ".*/pipeline.py", line \d+ in regex', text)
         front.process.kill()
-
-
-@pytest.mark.parametrize(("what", "number"), [("kill", signal.SIGKILL), ("segv", signal.SIGSEGV)])
-def test_an_event_that_kills_the_worker_is_the_end_of_the_channel(own, what, number):
-    with own() as front:
-        front.send_event(Envelope(type="x", parts={"what": what}))
-        with pytest.raises(EOFError):
-            front.done()
-        assert front.process.wait(TIMEOUT_S) == -number
-        if what == "segv":
-            assert re.search(
-                r"Segmentation fault.*Current thread.*in string_at.*in act", front.faults.read_text(), re.S
-            )
-
-
-def test_signals_for_the_front_do_not_end_its_worker(own):
-    with own() as front:
-        for number in (signal.SIGINT, signal.SIGTERM) * 3:
-            front.process.send_signal(number)
-        assert front.run(what="a")[1][0].parts["out"] == "a 2"
 
 
 @pytest.mark.parametrize("message", [b"garbage " * 9, MARK + b"\xff" * 40], ids=["garbage", "too many"])

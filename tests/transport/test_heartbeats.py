@@ -52,7 +52,7 @@ def test_an_idle_publisher_is_not_stale():
             sub.on_stale = changes
             assert sub.wait_joined(WAIT_S)
             with pytest.raises(queue.Empty):
-                changes.seen.get(timeout=2.0)
+                changes.seen.get(timeout=1.7)
             assert sub.last_heard_s < 1.5
         assert sub.last_heard_s is None
 

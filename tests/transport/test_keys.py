@@ -139,6 +139,8 @@ def test_a_bind_that_others_can_reach_needs_keys_or_to_be_called_insecure(tmp_pa
         with pytest.raises(KeysError, match="not whose are allowed"):
             kind("tcp://0.0.0.0:5555", queue.SimpleQueue(), bind=True, keys=keys)
         # Not started: nothing in these tests listens to other machines.
+        kind("tcp://0.0.0.0:5555", queue.SimpleQueue(), bind=True, insecure=True)
+        kind("tcp://0.0.0.0:5555", queue.SimpleQueue(), bind=False)
         kind("tcp://0.0.0.0:5555", queue.SimpleQueue(), bind=True, keys=keys, allow=[])
 
 

@@ -18,11 +18,12 @@ import pytest
 from epypes.errors import BrokerError, MessageError
 from epypes.transport.address import parse_address
 from tests.apart import apart
-from tests.brokers.nats import MAX_PAYLOAD, PASSWORD, server
+from tests.brokers.nats import PASSWORD, server
 from tests.transport.channels import WAIT_S, Receiver, Sender, body
-from tests.transport.peers import line_of, process, wait_until
-from tests.transport.test_channels import KILLED
+from tests.transport.peers import wait_until
+from tests.transport.test_channels import impatient
 
+__all__ = ["impatient"]
 pytestmark = pytest.mark.slow
 
 
@@ -95,40 +96,12 @@ def program_that_says(greeting):
         assert not thread.is_alive()
 
 
-@pytest.fixture
-def impatient(monkeypatch):
-    """Intervals that are shorter than a user's, so that the tests of them are."""
-    for interval, value_s in {"ACK_WAIT_S": 1.0, "_REQUEST_S": 1.0, "_PING_S": 0.5, "_PROGRESS_S": 0.25}.items():
-        monkeypatch.setattr(f"epypes.transport.brokers.nats.{interval}", value_s)
-
-
-def test_what_is_acknowledged_is_gone(opened, name, by_hand):
-    opened(Sender).send(b"x")
-    receiver = opened(Receiver)
-    receiver.next().ack()
-    receiver.channel.close()
-    state = by_hand(lambda jetstream: jetstream.stream_info(name.replace(".", "_"))).state
-    assert state.messages == 0
-
-
-def test_what_a_killed_consumer_held_is_delivered_again_after_the_acknowledgement_wait(impatient, opened, nats, name):
-    # The first consumer decides how long the server waits for an acknowledgement.
-    opened(Receiver).channel.close()
-    opened(Sender).send(b"x", id="1")
-    with process(KILLED, nats.address(name), "1") as consumer:
-        assert {line_of(consumer), line_of(consumer)} == {"open", "holds"}
-        consumer.kill()
-        consumer.wait()
-    delivery = opened(Receiver).next()
-    assert (delivery.id, delivery.attempt) == ("1", 2)
-
-
 def test_what_takes_long_is_not_delivered_again(impatient, opened):
     sender, worker, other = opened(Sender), opened(Receiver, prefetch=1), None
     sender.send(b"x")
     delivery = worker.next()
     other = opened(Receiver, prefetch=1)
-    assert other.is_quiet(2.5)
+    assert other.is_quiet(1.5)
     delivery.ack()
     sender.send(b"y")
     worker.channel.close()
@@ -140,7 +113,7 @@ def test_the_last_of_a_window_comes_however_late_it_is_sent(impatient, opened):
     for _ in range(3):
         sender.send(b"early")
         receiver.next()
-    assert receiver.is_quiet(2.5)
+    assert receiver.is_quiet(1.2)
     sender.send(b"late")
     assert body(receiver.next()) == b"late"
 
@@ -213,14 +186,9 @@ def test_one_stream_may_keep_events_answers_and_dead_letters_of_one_id(opened, n
         opened(Receiver, f"{name}.out", group="in", create=False, dead=f"{name}.dead")
 
 
-@pytest.mark.parametrize(
-    ("credentials", "text"),
-    [("epypes:wrong@", "refuses the user 'epypes' with this password"), ("", "refuses a connection without a user")],
-)
-def test_refused_credentials_are_an_error_without_the_password(nats, credentials, text):
-    with pytest.raises(BrokerError, match=text) as refused:
-        Sender(f"nats://{credentials}127.0.0.1:{nats.port}/a")
-    assert "wrong" not in str(refused.value)
+def test_a_connection_without_a_user_is_refused(nats):
+    with pytest.raises(BrokerError, match="refuses a connection without a user"):
+        Sender(f"nats://127.0.0.1:{nats.port}/a")
     assert PASSWORD not in str(parse_address(nats.address("a")))
 
 
@@ -245,15 +213,6 @@ def test_a_server_without_jetstream_is_an_error_for_queues_alone(opened):
 def test_a_name_that_can_not_be_a_subject_is_an_error(opened, subject):
     with pytest.raises(BrokerError, match="is no subject of NATS"):
         opened(Sender, subject.replace(" ", "%20"))
-
-
-def test_a_message_larger_than_the_server_takes_is_refused_and_the_next_one_goes_out(opened):
-    sender, receiver = opened(Sender), opened(Receiver)
-    with pytest.raises(MessageError, match=r"8,388,608 at most. Raise max_payload") as refused:
-        sender.send(bytes(MAX_PAYLOAD), id="large")
-    assert refused.value.reason == "too large"
-    sender.send(bytes(MAX_PAYLOAD - 1_000), id="fits")
-    assert receiver.next().id == "fits"
 
 
 def test_what_a_stream_refuses_is_an_error_or_waits(opened, name, by_hand, caplog):
@@ -327,18 +286,6 @@ def test_a_server_that_talks_nonsense_is_an_error(caplog):
     with program_that_says(info) as (port, _), pytest.raises(BrokerError, match="what answers there is no NATS server"):
         Sender(f"nats://127.0.0.1:{port}/a?kind=broadcast")
     assert not caplog.records
-
-
-def test_an_encrypted_server_is_checked_by_the_named_certificates(opened, certificates):
-    with server(tls=(certificates / "cert.pem", certificates / "key.pem")) as encrypted:
-        receiver = opened(Receiver, "a", at=encrypted, ca=certificates / "ca.pem")
-        opened(Sender, "a", at=encrypted, ca=certificates / "ca.pem").send(b"x" * 100_000, id="1")
-        assert receiver.next().id == "1"
-        receiver.channel.close()
-        with pytest.raises(BrokerError, match=r"can't be trusted: .*\?ca=FILE"):
-            opened(Sender, "a", at=encrypted)
-        with pytest.raises(BrokerError, match="can't be read from /nowhere"):
-            opened(Sender, "a", at=encrypted, ca="/nowhere")
 
 
 def test_a_server_that_does_not_encrypt_gets_no_password(certificates):

@@ -90,35 +90,6 @@ def test_what_is_played_is_byte_for_byte_what_was_published(peer, tmp_path):
     assert player.sent == len(TRAFFIC)
 
 
-def test_a_recording_of_a_recording_is_the_same_messages(tmp_path):
-    out = queue.SimpleQueue()
-    with ZMQPublisher(LOCAL, out, "cam1") as pub, Recorder(pub.address, tmp_path / "a.mcap", "cam1") as recorder:
-        assert recorder.wait_joined(WAIT_S)
-        for number in range(20):
-            out.put(Envelope("frame", {"n": number, "image": IMAGE}, source="s"))
-        wait_until(lambda: recorder.counts.received == 20)
-    with (
-        Recorder(LOCAL, tmp_path / "b.mcap", bind=True, messages=20) as again,
-        Player(tmp_path / "a.mcap", again.address, bind=False, speed=0),
-    ):
-        assert again.wait(WAIT_S)
-    assert frames_of(tmp_path / "a.mcap") == frames_of(tmp_path / "b.mcap")
-    sent = [decode(frames) for frames in frames_of(tmp_path / "b.mcap")]
-    assert [envelope.sequence for envelope in sent] == list(range(1, 21))
-    assert np.array_equal(sent[7].parts["image"], IMAGE)
-
-
-def test_a_subscriber_sees_no_difference_to_the_first_time(tmp_path):
-    written(tmp_path / "a.mcap", [(1, frames) for frames in TRAFFIC[:3]])
-    into = queue.SimpleQueue()
-    with Player(tmp_path / "a.mcap") as player, ZMQSubscriber(player.address, into) as sub:
-        first, second, third = (into.get(timeout=WAIT_S) for _ in range(3))
-        assert (first.type, first.epoch, first.sequence) == ("a", 7, 41)
-        assert second == TRAFFIC[1][0]
-        assert third.sequence == 43
-        assert sub.lost == {("s", 7): 1}, "what was lost when it was recorded"
-
-
 def test_the_times_and_topics_of_the_messages_are_kept(tmp_path):
     out, path = queue.SimpleQueue(), tmp_path / "a.mcap"
     with ZMQPublisher(LOCAL, out, "cam1") as pub, Recorder(pub.address, path) as recorder:
@@ -183,7 +154,7 @@ def test_topics_that_are_invented_without_end_do_not_use_up_the_channels(tmp_pat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("speed", "least_s"), [(1.0, 0.08), (2.0, 0.04), (0.5, 0.16)])
+@pytest.mark.parametrize(("speed", "least_s"), [(2.0, 0.04), (0.5, 0.16)])
 def test_the_distances_in_time_are_kept_and_can_be_changed(tmp_path, speed, least_s):
     start = time.time_ns()
     written(tmp_path / "a.mcap", [(start + number * 2 * 10**7, [b"%d" % number]) for number in range(5)])
@@ -194,20 +165,13 @@ def test_the_distances_in_time_are_kept_and_can_be_changed(tmp_path, speed, leas
     assert time.monotonic() - before >= least_s
 
 
-def test_speed_0_does_not_wait_for_the_times(tmp_path):
-    written(tmp_path / "a.mcap", [(HOUR_NS * number, [b"x"]) for number in range(10)])
+def test_it_plays_as_often_as_loop_says_and_at_speed_0_without_waiting_for_the_times(tmp_path):
+    written(tmp_path / "a.mcap", [(1, [b"a"]), (HOUR_NS, [b"b"])])
     into = queue.SimpleQueue()
-    with Player(tmp_path / "a.mcap", speed=0) as player, ZMQSubscriber(player.address, into):
-        assert [into.get(timeout=WAIT_S) for _ in range(10)] == [b"x"] * 10
-
-
-def test_it_plays_as_often_as_loop_says(tmp_path):
-    written(tmp_path / "a.mcap", [(1, [b"a"]), (2, [b"b"])])
-    into = queue.SimpleQueue()
-    with Player(tmp_path / "a.mcap", loop=3) as player, ZMQSubscriber(player.address, into):
+    with Player(tmp_path / "a.mcap", loop=3, speed=0) as player, ZMQSubscriber(player.address, into):
         assert player.wait(WAIT_S)
         assert [into.get(timeout=WAIT_S) for _ in range(6)] == [b"a", b"b"] * 3
-    with Player(tmp_path / "a.mcap", loop=0) as player, ZMQSubscriber(player.address, into):
+    with Player(tmp_path / "a.mcap", loop=0, speed=0) as player, ZMQSubscriber(player.address, into):
         assert [into.get(timeout=WAIT_S) for _ in range(100)] == [b"a", b"b"] * 50
         assert not player.wait(0.0)
 
@@ -276,20 +240,6 @@ def test_a_subscriber_that_does_not_read_does_not_keep_a_player_from_stopping(pe
     assert time.perf_counter() - before < WAIT_S
 
 
-def test_a_recorder_ends_by_itself_after_the_given_number_of_messages(tmp_path):
-    out, ended = queue.SimpleQueue(), threading.Event()
-    with ZMQPublisher(LOCAL, out) as pub:
-        recorder = Recorder(pub.address, tmp_path / "a.mcap", messages=3, on_end=ended.set).start()
-        assert recorder.wait_joined(WAIT_S)
-        for number in range(10):
-            out.put(b"%d" % number)
-        assert ended.wait(WAIT_S)
-        assert recorder.wait(0.0)
-        assert recorder.counts == RecordingCounts(3, 3)
-        recorder.stop()
-    assert frames_of(tmp_path / "a.mcap") == [[b"0"], [b"1"], [b"2"]]
-
-
 @pytest.mark.slow
 def test_what_came_can_be_played_a_second_later_while_it_still_records(tmp_path):
     out = queue.SimpleQueue()
@@ -318,8 +268,7 @@ def record(address: str, path, *options: str, code: str = "") -> subprocess.Pope
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_finishes_the_file(tmp_path, number):
+def test_ctrl_c_finishes_the_file(tmp_path):
     out, path = queue.SimpleQueue(), tmp_path / "a.mcap"
     with ZMQPublisher(LOCAL, out, "t") as pub:
         process = record(pub.address, path)
@@ -327,7 +276,7 @@ def test_a_signal_finishes_the_file(tmp_path, number):
             out.put(Envelope("x", {"image": IMAGE}))
         wait_until(lambda: still_there(path) > 0)
         pub.stop()
-        process.send_signal(number)
+        process.send_signal(signal.SIGINT)
         output, errors = process.communicate(timeout=60)
     assert (process.returncode, errors) == (0, "")
     assert output == f"RECORDED {path}: received 50, written 50, dropped 0.\n"
@@ -608,13 +557,6 @@ def test_a_damaged_file_never_gives_anything_but_a_recording_error(tmp_path, cou
 def test_a_speed_that_makes_no_sense_is_refused(tmp_path, options):
     with pytest.raises(ValueError, match="give"):
         Player(tmp_path / "a.mcap", **options)
-
-
-def test_other_machines_get_access_only_with_insecure(tmp_path):
-    with pytest.raises(AddressError, match="insecure=True"):
-        Player(tmp_path / "a.mcap", "tcp://*:5555")
-    with pytest.raises(AddressError, match="insecure=True"):
-        Recorder("tcp://*:5555", tmp_path / "a.mcap", bind=True)
 
 
 @pytest.mark.slow

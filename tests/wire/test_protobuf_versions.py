@@ -20,7 +20,7 @@ VERSIONS = ["4.25", "5.29", "6", "7"]
 NO_WHEEL = ("has no usable wheels", "has no wheels with a matching Python")
 
 
-@pytest.fixture(scope="module", params=VERSIONS)
+@pytest.fixture(scope="module")
 def environment(request, tmp_path_factory):
     """An environment with one version of protobuf, numpy, and nothing else."""
     folder = tmp_path_factory.mktemp(f"protobuf-{request.param}")
@@ -36,14 +36,22 @@ def environment(request, tmp_path_factory):
     return request.param, python
 
 
+FIRST, *BETWEEN, LAST = VERSIONS
+# Of the implementation in Python, the oldest and the newest.
+TRIED = [
+    *((version, "upb", "users first") for version in VERSIONS),
+    *((version, "python", "ours first") for version in (FIRST, LAST)),
+]
+AS_WELL = [
+    *((version, "python", "ours first") for version in BETWEEN),
+    *((version, *how) for version in VERSIONS for how in (("upb", "ours first"), ("python", "users first"))),
+]
+
+
 @pytest.mark.parametrize(
-    ("made_by", "order"),
-    [
-        ("upb", "users first"),
-        ("python", "ours first"),
-        pytest.param("upb", "ours first", marks=pytest.mark.soak),
-        pytest.param("python", "users first", marks=pytest.mark.soak),
-    ],
+    ("environment", "made_by", "order"),
+    [*TRIED, *(pytest.param(*each, marks=pytest.mark.soak) for each in AS_WELL)],
+    indirect=["environment"],
 )
 def test_a_version_makes_the_same_bytes_and_understands_those_of_this_one(environment, made_by, order):
     version, python = environment
