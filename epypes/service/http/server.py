@@ -1,7 +1,8 @@
 """uvicorn on a thread of its own beside the service's threads: binding, start and stop.
 
-Connections are uvicorn's own: beyond `MAX_CONNECTIONS` at once it answers 503, and the kernel ends the connection of a
-caller that has vanished. An address that other machines reach belongs behind a proxy that cuts off slow callers.
+Connections are uvicorn's own, but for one bound, since idle ones would use up the descriptors that a new worker needs:
+beyond `MAX_CONNECTIONS` the oldest idle connection is closed. The kernel ends the connection of a caller that has
+vanished. An address that other machines reach belongs behind a proxy that cuts off slow callers.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _START_TIMEOUT_S: Final = 30.0
 _STOP_TIMEOUT_S: Final = 3.0
 # Before that, uvicorn cancels the requests that are still worked on.
 _GRACE_S: Final = 2
-MAX_CONNECTIONS: Final = 160
+MAX_CONNECTIONS: Final = 64
 _BACKLOG: Final = 128
 
 _ADDRESS: Final = re.compile(
@@ -96,6 +97,31 @@ def _url_and_hosts(listener: socket.socket) -> tuple[str, set[str]]:
 
 
 # -- the server -------------------------------------------------------------------------------------------------------
+
+
+def _bounded_protocol() -> type[asyncio.Protocol]:
+    """Return uvicorn's HTTP protocol with a bounded number of connections."""
+    # Imported here: it takes 0.1 s, and addresses are checked without a server.
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+
+    # In the order of opening.
+    opened: dict[H11Protocol, None] = {}
+
+    class BoundedProtocol(H11Protocol):
+        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+            super().connection_made(transport)
+            opened[self] = None
+            if len(opened) > MAX_CONNECTIONS:
+                # This one is idle itself.
+                oldest = next(one for one in opened if one.cycle is None or one.cycle.response_complete)
+                del opened[oldest]
+                oldest.transport.abort()
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            opened.pop(self, None)
+            super().connection_lost(exc)
+
+    return BoundedProtocol
 
 
 class HttpServer:
@@ -185,7 +211,7 @@ class HttpServer:
         self._app = create_app(self._service, lifespan)
         config = uvicorn.Config(
             secured(self._app, token, self.token_file, hosts),
-            http="h11",
+            http=_bounded_protocol(),
             ws="none",
             loop="asyncio",
             lifespan="on",
@@ -195,7 +221,6 @@ class HttpServer:
             access_log=False,
             proxy_headers=False,
             server_header=False,
-            limit_concurrency=MAX_CONNECTIONS,
             timeout_graceful_shutdown=_GRACE_S,
             backlog=_BACKLOG,
         )

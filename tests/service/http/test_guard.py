@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import socket
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 
 import httpx
 import pytest
 
 from epypes.service.http.server import MAX_CONNECTIONS
-from tests.service.http.raw import connection, received, request, until
+from tests.service.http.raw import connection, received, request
 
 CHANGES = [
     ("PATCH", "/v1/parameters"),
@@ -235,9 +235,16 @@ def test_a_path_that_is_not_there_says_where_to_look(client):
 
 
 @pytest.mark.slow
-def test_more_connections_than_the_limit_are_refused_until_others_are_closed(http):
+def test_connections_without_a_whole_request_do_not_keep_others_out_and_the_oldest_are_closed(http):
     with ExitStack() as opened:
-        for _ in range(MAX_CONNECTIONS):
-            opened.enter_context(connection(http.url)).sendall(b"GET / HT")
-        until(lambda: httpx.get(f"{http.url}/livez", trust_env=False).status_code == 503)
-    until(lambda: is_well(http))
+        lines = [opened.enter_context(connection(http.url)) for _ in range(2 * MAX_CONNECTIONS)]
+        for line in lines[:MAX_CONNECTIONS]:
+            with suppress(ConnectionError):
+                line.sendall(b"GET / HT")
+        assert is_well(http)
+        for line in lines[:MAX_CONNECTIONS]:
+            with suppress(ConnectionError):
+                assert received(line) == b""
+        # The newest one is still open.
+        lines[-1].sendall(b"GET /livez HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+        assert received(lines[-1]).startswith(b"HTTP/1.1 200")
