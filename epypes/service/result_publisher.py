@@ -139,15 +139,15 @@ def overflow_reason(policy: str, size: int) -> str:
 
 def dead_letter_result(event: AcceptedEvent, ending: str, function: str, provenance: Provenance) -> Result:
     """Return the result of an event that killed the worker too often."""
-    again = f", and so it was {event.deaths} times" if event.deaths > 1 else ""
-    text = f"{ending} while this event was all that it worked on{again}. It is put aside."
+    times = "once" if event.deaths == 1 else f"{event.deaths} times"
+    text = f"{ending} while it computed this event alone ({times}). The event is a dead letter."
     error = ServiceError(provenance.bundle, text)
     return failed_result(event, error, provenance, "killed", function=function, is_dead=True)
 
 
 def exhausted_result(event: AcceptedEvent, provenance: Provenance) -> Result:
     """Return the result of an event that a broker has delivered too often."""
-    text = f"This event was delivered {event.attempts} times before, and never answered. It is put aside."
+    text = f"This event was delivered {event.attempts} times before, and never answered. It is a dead letter."
     return failed_result(event, ServiceError(provenance.bundle, text), provenance, "exhausted", is_dead=True)
 
 

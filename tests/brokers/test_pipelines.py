@@ -27,7 +27,7 @@ def kind_of(number):
 
 
 def outlived(broker, sub, pub, restarted_by):
-    """Send events; kill a pipeline half-way, and restart the broker. Check that each was answered once, or put aside."""
+    """Send events; kill a pipeline half-way, and restart the broker. Check that each was answered once, or a dead letter."""
     outbox = ep.Mailbox("block")
     with (
         fleet([(*REPLICA, sub, pub)] * 3) as replicas,

@@ -68,7 +68,7 @@ def test_a_frame_that_kills_the_worker_is_put_aside_and_the_others_are_answered_
             2 * n for n in range(12) if n != 7
         ]
         dead = answers[7].failure
-        assert "It is put aside" in dead.message
+        assert "The event is a dead letter" in dead.message
         until(lambda: service.state == "READY")
         counts = service.counts()
         assert (counts["answered"], counts["dead_letters"], counts["retried"]) == (11, 1, 1)
@@ -112,7 +112,7 @@ def test_frames_that_kill_the_worker_one_after_another_are_put_aside_and_the_ser
     with serving(acting, mailbox_size=100, retries=0) as (service, peer):
         for number in range(5):
             peer.send("kill", number)
-        assert all("It is put aside" in answer.failure.message for answer in peer.take(5))
+        assert all("The event is a dead letter" in answer.failure.message for answer in peer.take(5))
         assert peer.ask(number=4).parts["out"] == 8
         assert service.state == "READY"
         assert service.counts()["dead_letters"] == 5

@@ -13,6 +13,12 @@ LOCAL = "tcp://127.0.0.1:*"
 WAIT_S = 60.0
 
 
+def threads() -> list[threading.Thread]:
+    """Return the threads of this room that run; other rooms may have left some."""
+    named = ("epypes-io", "epypes-guard", "epypes-publisher", "epypes-ordering", "epypes-decoding")
+    return [one for one in threading.enumerate() if one.name.startswith((*named, "epypes from", "epypes brokers"))]
+
+
 def wait_until(condition: Callable[[], object], timeout_s: float = WAIT_S) -> None:
     """Wait on an event that nobody sets, a little at a time, until a counter of another thread is right."""
     never, end_s = threading.Event(), monotonic() + timeout_s

@@ -15,7 +15,7 @@ from epypes.transport.memory import away, queued
 from epypes.transport.publisher import Publisher
 from epypes.transport.subscriber import Subscriber
 from epypes.wire import EncodedEnvelope, Envelope, decode
-from tests.transport.peers import WAIT_S, wait_until
+from tests.transport.peers import WAIT_S, threads, wait_until
 
 _numbers = itertools.count()
 
@@ -36,14 +36,6 @@ def ids(address):
 
 def bodies(address):
     return [b"".join(message.frames) for message in queued(address)]
-
-
-def threads():
-    return [
-        thread
-        for thread in threading.enumerate()
-        if thread.name.startswith(("epypes from", "epypes brokers", "epypes-publisher"))
-    ]
 
 
 def take(q):

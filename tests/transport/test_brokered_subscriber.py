@@ -23,7 +23,7 @@ from epypes.transport.channel import Delivery
 from epypes.transport.memory import away, queued
 from epypes.transport.subscriber import Subscriber
 from epypes.wire import Envelope, encode
-from tests.transport.peers import WAIT_S, wait_until
+from tests.transport.peers import WAIT_S, threads, wait_until
 
 _numbers = itertools.count()
 
@@ -60,10 +60,6 @@ def dead_letters(address):
 
 def left(address):
     return [message.id for message in queued(address)]
-
-
-def threads():
-    return [thread for thread in threading.enumerate() if thread.name.startswith(("epypes from", "epypes brokers"))]
 
 
 def take(q):

@@ -17,7 +17,7 @@ from epypes.errors import BrokerError, MessageError, StillRunning
 from epypes.pipeline import Mailbox
 from epypes.transport import Publisher, Subscriber
 from epypes.wire import EncodedEnvelope, Envelope, JustBytes
-from tests.transport.peers import LOCAL, WAIT_S, wait_until
+from tests.transport.peers import LOCAL, WAIT_S, threads, wait_until
 
 _numbers = itertools.count()
 
@@ -45,12 +45,6 @@ def joined(address, out=None, into=None, topic="", **options):
             assert sub.wait_joined(WAIT_S)
         assert pub.wait_connected(WAIT_S)
         yield pub, sub
-
-
-def threads():
-    return [
-        thread for thread in threading.enumerate() if thread.name.startswith(("epypes-", "epypes from", "epypes b"))
-    ]
 
 
 def take(q, count=1):

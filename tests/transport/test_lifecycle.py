@@ -14,14 +14,10 @@ import zmq
 
 from epypes.errors import AddressError, StillRunning
 from epypes.transport import ZMQPublisher, ZMQSubscriber
-from tests.transport.peers import wait_until
+from tests.transport.peers import threads, wait_until
 
 LOCAL = "tcp://127.0.0.1:*"
 WAIT_S = 60.0
-
-
-def io_threads() -> list[threading.Thread]:
-    return [thread for thread in threading.enumerate() if thread.name.startswith("epypes-")]
 
 
 @pytest.mark.slow
@@ -72,7 +68,7 @@ def test_a_producer_that_goes_on_does_not_keep_it_from_stopping():
     before = time.perf_counter()
     pub.stop(timeout_s=0.2)
     assert time.perf_counter() - before < WAIT_S / 2
-    assert io_threads() == []
+    assert threads() == []
 
 
 def test_a_publisher_can_be_stopped_by_the_queue_of_a_subscriber():
@@ -92,7 +88,7 @@ def test_a_publisher_can_be_stopped_by_the_queue_of_a_subscriber():
         assert done.wait(WAIT_S)
         pub.stop(timeout_s=WAIT_S)
         assert time.perf_counter() - before < WAIT_S / 2
-    assert io_threads() == []
+    assert threads() == []
 
 
 # Opens and stops publishers while threads connect and leave. In a process of its own: libzmq waits with the GIL held.
@@ -144,7 +140,7 @@ def test_a_queue_that_never_returns_is_named_and_the_port_is_free():
         pass
     let_go.set()
     pub.stop()
-    assert io_threads() == []
+    assert threads() == []
 
 
 def test_a_broken_queue_is_counted_and_does_not_end_the_thread():
@@ -169,12 +165,12 @@ def test_one_io_thread_serves_every_socket_and_ends_with_the_last():
     made = [ZMQPublisher(LOCAL, queue.Queue()).start() for _ in range(4)]
     made += [ZMQSubscriber(pub.address, queue.Queue()).start() for pub in made]
     try:
-        assert len([thread for thread in io_threads() if thread.name == "epypes-io"]) == 1
-        assert all(thread.daemon for thread in io_threads())
+        assert len([thread for thread in threads() if thread.name == "epypes-io"]) == 1
+        assert all(thread.daemon for thread in threads())
     finally:
         for one in made:
             one.stop()
-    assert io_threads() == []
+    assert threads() == []
 
 
 def run(script: str, *options: str) -> subprocess.CompletedProcess[str]:
@@ -222,6 +218,6 @@ def test_importing_transport_does_not_import_zmq():
 def test_a_start_that_fails_leaves_nothing_running():
     with pytest.raises(AddressError):
         ZMQPublisher("tcp://127.0.0.1:99999", queue.Queue()).start()
-    for thread in io_threads():
+    for thread in threads():
         thread.join(WAIT_S)
-    assert io_threads() == []
+    assert threads() == []
