@@ -430,10 +430,16 @@ class Dispatcher:
                     self._publishing_thread = 0
 
     def _settled(self, event: AcceptedEvent, result: Result, error: Exception | None) -> None:
-        """Note that an answer is confirmed; without that, its broker will deliver the event again."""
+        """Note that an answer is confirmed; without that, the broker that keeps the event delivers it again."""
+        if error is not None and self._has_broker:
+            with self.lock:
+                if self._unconfirmed.pop(event.seq, None) is not None:
+                    event.delivery.nack()
+                    self._totals["given_back"] += 1
+                    self._assign()
+                    self._wake_waiting()
+            return
         if error is not None:
-            if self._has_broker:
-                return
             result = self._results.report_lost(event, result, error)
         if not self._is_confirmed:
             return

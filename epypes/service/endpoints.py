@@ -13,7 +13,7 @@ from contextlib import ExitStack
 from time import monotonic
 from typing import Any, Final
 
-from epypes.errors import BrokerError, EpypesError
+from epypes.errors import BrokerError
 from epypes.service.options import Options
 from epypes.transport import Publisher, Subscriber
 from epypes.transport.address import Address, is_broker, open_channel, parse_address
@@ -160,9 +160,9 @@ class EventInput:
                 try:
                     self._subscriber.start()
                     self._subscriber.resume()
-                except BrokerError as error:
+                except Exception as error:  # the system may be short of threads, memory or descriptors
                     if not is_over.is_set():
-                        self._not_open = str(error)
+                        self._not_open = str(error) or repr(error)
                         self._on_change()
                     is_over.wait(pause_s)
                     pause_s = min(2 * pause_s, _LONGEST_RETRY_S)
@@ -274,7 +274,7 @@ class AnswerOutput:
             return
         try:
             self._publisher.send(answer, id=id, confirmed=confirmed)
-        except EpypesError as error:
+        except Exception as error:  # memory may be short
             confirmed(error)
 
     @property

@@ -161,7 +161,7 @@ class FrameSocket:
                 raise EOFError("The other side of the connection is gone.") from error
             except BaseException:
                 # Half a message may be sent: what came after it could not be understood.
-                self._end()
+                self.end()
                 raise
         return left
 
@@ -205,11 +205,14 @@ class FrameSocket:
 
     def is_readable(self) -> bool:
         """Whether a message, or the end, can be read without waiting for it to begin."""
-        return bool(select.select([self._socket], [], [], 0)[0])
+        # select() takes no descriptor above 1,023, and the worker inherits its own.
+        poll = select.poll()
+        poll.register(self._socket, select.POLLIN)
+        return bool(poll.poll(0))
 
     def close(self) -> None:
         """End both directions, and wake up threads that read or send; may be called twice, from any thread."""
-        self._end()
+        self.end()
         # The descriptor may be another file's once it is closed, so no thread may be in a call on it.
         with self._sending, self._receiving:
             self._socket.close()
@@ -218,7 +221,8 @@ class FrameSocket:
         """Close it in forked child processes, or the other side would not see this process end."""
         os.register_at_fork(after_in_child=self._socket.close)
 
-    def _end(self) -> None:
+    def end(self) -> None:
+        """End both directions; what has arrived can still be read."""
         with contextlib.suppress(OSError):  # it has ended already
             self._socket.shutdown(socket.SHUT_RDWR)
 
@@ -251,11 +255,19 @@ class ControlSocket:
         return cls(ours), theirs
 
     def send(self, message: WorkerMessage) -> None:
-        """Send a message, from any thread, without waiting; it is lost if the other side is gone, or does not read."""
+        """Send a message, from any thread, without waiting; it is lost if the other side is gone, or does not read.
+
+        Raises
+        ------
+        MessageError
+            It is too large.
+        """
         packet = _encode_head(message)
-        if len(packet) <= _MAX_CONTROL_BYTES:
-            with self._sending, contextlib.suppress(OSError):
-                self._socket.send(packet, _NO_WAITING)
+        if len(packet) > _MAX_CONTROL_BYTES:
+            text = f"A query of {len(packet):,} bytes; the limit is {_MAX_CONTROL_BYTES:,}."
+            raise MessageError("too large", text)
+        with self._sending, contextlib.suppress(OSError):
+            self._socket.send(packet, _NO_WAITING)
 
     def receive(self) -> WorkerMessage:
         """Wait for a message; called by one thread.

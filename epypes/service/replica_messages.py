@@ -143,8 +143,10 @@ _DOCUMENT: Final = TypeAdapter(_Versioned)
 
 
 def encode_message(message: ReplicaMessage) -> bytes:
-    """Return a message as it is published."""
-    return json.dumps(asdict(_Versioned(message, 3)), separators=(",", ":")).encode()
+    """Return a message as it is published; raise MessageError if its readers would refuse it as too large."""
+    data = json.dumps(asdict(_Versioned(message, 3)), separators=(",", ":")).encode()
+    _check_size(data)
+    return data
 
 
 def decode_message(data: bytes | memoryview) -> ReplicaMessage:
@@ -155,10 +157,14 @@ def decode_message(data: bytes | memoryview) -> ReplicaMessage:
     MessageError
         The bytes are no message of this version, or a field has another type or exceeds its limit.
     """
-    if len(data) > _MAX_BYTES:
-        raise MessageError("too large", f"A message of {len(data):,} bytes; between replicas {_MAX_BYTES:,} is most.")
+    _check_size(data)
     try:
         return _DOCUMENT.validate_json(bytes(data), strict=True).message
     except ValidationError as error:
         text = f"This is no message between replicas of this version: {error!r:.200}."
         raise MessageError("bad replica message", text) from error
+
+
+def _check_size(data: bytes | memoryview) -> None:
+    if len(data) > _MAX_BYTES:
+        raise MessageError("too large", f"A message of {len(data):,} bytes; between replicas {_MAX_BYTES:,} is most.")

@@ -27,6 +27,7 @@ from epypes.errors import BrokerError, MessageError, ServiceError
 from epypes.service.membership import Membership, label
 from epypes.service.parameters import ParameterControl, Parameters, value_of
 from epypes.service.replica_messages import (
+    MAX_INTEGER,
     Goodbye,
     Heartbeat,
     ParameterQuery,
@@ -333,6 +334,9 @@ class Replicas:
             before = self._parameters.current
             with self._changed:
                 at_least = self._bundle(self._parameters.digest).version[0] + 1
+            if at_least > MAX_INTEGER:
+                text = f"Revision {at_least - 1} is the last one that replicas can read. Write the parameters back."
+                raise ServiceError(self._parameters.digest, text)
             changed = self._parameters.set(values, revision, at_least)
             digest, current = self._parameters.snapshot()
             # Otherwise another bundle has been deployed since.

@@ -302,7 +302,7 @@ class ResultPublisher:
     answers, failures
         Where answers go, and where failures are published.
     store
-        Returns where failures are kept.
+        Where failures are kept.
     event_log
         Where a row of each event is kept.
     provenance
@@ -354,12 +354,12 @@ class ResultPublisher:
         on_settled
             Called with the result that was published, and None; or with the reason why it was not.
         """
-        confirmed = partial(self._confirmed, event, result, on_settled)
+        confirmed: Confirmed = partial(self._confirmed, event, result, on_settled)
         if not result.answers:
             confirmed(None)
             return
         if len(result.answers) > 1:
-            confirmed = partial(_Countdown(len(result.answers), confirmed).one)
+            confirmed = _Countdown(len(result.answers), confirmed).one
         for number, answer in enumerate(result.answers, 1):
             # Numbered, so that the second answer is no duplicate of the first.
             own_id = f"{event.id}/{number}" if event.id and number > 1 else event.id

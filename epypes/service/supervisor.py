@@ -146,7 +146,8 @@ class Supervisor:
 
     @property
     def _is_loading(self) -> bool:
-        return self.worker is not None and self.worker is not self._dispatcher.connection
+        worker = self.worker
+        return worker is not None and worker is not self._dispatcher.connection and not worker.is_dismissed
 
     def _start_again(self) -> None:
         with self._changed:
@@ -175,7 +176,7 @@ class Supervisor:
 
     def _end_loading(self) -> None:
         if (worker := self.worker) is not None:
-            _log.error("the worker has not proved its bundle within %g s, so it is killed", REPLAY_TIMEOUT_S)
+            _log.error("the worker was not ready within %g s, so it is killed", REPLAY_TIMEOUT_S)
             worker.process.kill()
 
     # -- messages of a worker, on its receiving thread -----------------------------------------------------------------

@@ -9,6 +9,7 @@ import logging
 import os
 import queue
 import re
+import select
 import signal
 import subprocess
 import sys
@@ -99,7 +100,20 @@ class WorkerProcess:
                 target=_copy_output, args=(output, self._lines), name="epypes worker output", daemon=True
             )
             self._output.start()
+            threading.Thread(target=self._end_with_process, name="epypes worker end", daemon=True).start()
             kept.pop_all()
+
+    def _end_with_process(self) -> None:
+        """End the socket when the process is gone: a child that C code has forked may hold the other end open."""
+        process = os.pidfd_open(self.pid)
+        try:
+            gone = select.poll()
+            gone.register(process, select.POLLIN)
+            gone.poll()
+        finally:
+            os.close(process)
+            # What the process has sent is still read.
+            self.socket.end()
 
     def kill(self) -> None:
         """Kill it, also if it is stopped or hangs."""

@@ -14,10 +14,11 @@ import httpx
 import pytest
 from httpx_sse import EventSource
 
-from epypes.errors import ParametersRefused, RevisionConflict
+from epypes.errors import ParametersRefused, RevisionConflict, ServiceError
 from epypes.service import Service
 from epypes.service.http import HttpServer
 from epypes.service.replica_messages import (
+    MAX_INTEGER,
     Goodbye,
     Heartbeat,
     ParameterQuery,
@@ -154,7 +155,7 @@ def test_messages_of_other_programs_are_rejected_and_counted(trio):
         encode_message(ParameterSet(digest, 900, "x", {"k": 5})),
         encode_message(ParameterSet(digest, 900, "x", {f"k{number}": {} for number in range(1_001)})),
         encode_message(Goodbye("x" * 5_000)),
-        encode_message(Goodbye("x" * 1_100_000)),
+        encode_message(Goodbye("x" * 5_000)).ljust(1_100_000),
         heartbeat(pid="7"),
         heartbeat(counts={"answered": -1}),
     ]
@@ -211,6 +212,17 @@ def test_a_change_at_one_replica_reaches_all_with_one_revision(trio):
     assert {answer.revision for answer in answers} == {now.revision}
     assert sorted(int(answer.parts["out"]) for answer in answers) == [5 * number for number in range(30)]
     until(lambda: all(replica.group()["agree"] for replica in replicas))
+
+
+@pytest.mark.slow
+def test_a_revision_beyond_the_last_that_replicas_can_read_is_not_made(acting, host):
+    with line_of(host) as line, group_of(acting, line) as (first, second):
+        last = ParameterSet(first.info()["digest"], MAX_INTEGER, "peer", {"k": {"value": 9}})
+        publish_to_replicas(line.sub, last)
+        until(lambda: {first.parameters().revision, second.parameters().revision} == {MAX_INTEGER})
+        with pytest.raises(ServiceError, match="last one that replicas can read"):
+            first.set_parameters({"k": 4})
+        assert first.parameters() == second.parameters()
 
 
 def test_a_change_that_is_refused_reaches_no_replica(trio):

@@ -57,8 +57,43 @@ def tuned(steady):
 # -- what kills the worker ------------------------------------------------------------------------------------------
 
 
+FORKING = """
+    import ctypes
+    import os
+    import signal
+
+
+    def act(what, number, k):
+        if what == "die":
+            # In C, so that no hook of Python closes the child's sockets.
+            libc = ctypes.CDLL(None)
+            child = libc.fork()
+            if child == 0:
+                libc.pause()
+            with open({path!r}, "w") as file:
+                file.write(str(child))
+            os.kill(os.getpid(), signal.SIGKILL)
+        return number * k
+
+
+    func_dict = {{"act": act}}
+    func_io = {{"act": (("what", "number", "k"), "out")}}
+"""
+
+
+def test_a_worker_that_dies_is_replaced_though_a_child_of_it_lives(tmp_path, quick):
+    path = tmp_path / "child"
+    bundle = acting_bundle(tmp_path / "forking", source=FORKING.format(path=str(path)))
+    with serving(bundle) as (_, peer):
+        try:
+            assert "was killed by SIGKILL" in peer.ask("die").failure.message
+            assert peer.ask("plain", 4).parts["out"] == 8
+        finally:
+            os.kill(int(path.read_text()), signal.SIGKILL)
+
+
 @pytest.mark.parametrize("how", ["kill", "segv", "exit"])
-def test_a_frame_that_kills_the_worker_is_put_aside_and_the_others_are_answered_in_order(acting, how, quick):
+def test_a_frame_that_kills_the_worker_is_a_dead_letter_and_the_others_are_answered_in_order(acting, how, quick):
     with serving(acting, mailbox_size=100) as (service, peer):
         for number in range(12):
             peer.send(how if number == 7 else "plain", number)

@@ -23,7 +23,7 @@ from epypes.bundle.writeback import WriteBack
 from epypes.errors import BundleError
 from epypes.service import Service
 from epypes.service.failures.record import FailedEvent
-from epypes.service.http import events, graph_routes, models
+from epypes.service.http import graph_routes, models, server_sent_events
 from epypes.service.http.metrics import exposed, registry_of
 from epypes.service.http.models import CHANGE_REFUSALS, INVALID, REFUSALS, Responses, ServiceOf, refused
 from epypes.service.http.responses import add_error_handlers, json_response, parameters_body
@@ -67,10 +67,10 @@ def create_app(service: Service, lifespan: Lifespan[FastAPI] | None = None) -> F
         lifespan=lifespan,
     )
     app.state.service = service
-    app.state.events = events.EventHub(service)
+    app.state.events = server_sent_events.EventHub(service)
     app.state.registry = registry_of(service)
     add_error_handlers(app)
-    for router in (health, graph_routes.router, parameters, events.router, failures, operation):
+    for router in (health, graph_routes.router, parameters, server_sent_events.router, failures, operation):
         app.include_router(router)
 
     @app.get("/", include_in_schema=False)

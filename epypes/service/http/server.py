@@ -33,7 +33,8 @@ _STOP_TIMEOUT_S: Final = 3.0
 # Before that, uvicorn cancels the requests that are still worked on.
 _GRACE_S: Final = 2
 MAX_CONNECTIONS: Final = 64
-_BACKLOG: Final = 128
+# asyncio accepts as many at a time, before the first of them is counted.
+_BACKLOG: Final = 16
 
 _ADDRESS: Final = re.compile(
     r"(?:http://)?(?:(?P<host>\[[0-9a-fA-F:.]+\]|[\w.-]+|\*):)?(?P<port>\d{1,5}|\*)/?", re.ASCII
@@ -112,8 +113,10 @@ def _bounded_protocol() -> type[asyncio.Protocol]:
             super().connection_made(transport)
             opened[self] = None
             if len(opened) > MAX_CONNECTIONS:
-                # This one is idle itself.
-                oldest = next(one for one in opened if one.cycle is None or one.cycle.response_complete)
+                # Without a whole request, as this one, or with none that is being answered.
+                oldest = next(
+                    one for one in opened if one.cycle is None or one.cycle.more_body or one.cycle.response_complete
+                )
                 del opened[oldest]
                 oldest.transport.abort()
 
@@ -182,6 +185,8 @@ class HttpServer:
         from epypes.service.http.security import read_or_make_token
 
         token = read_or_make_token(self.token_file)
+        self._error = None
+        self._started.clear()
         listener = _listen(self.address, self.insecure)
         try:
             self.url, hosts = _url_and_hosts(listener)

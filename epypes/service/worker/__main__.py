@@ -29,8 +29,8 @@ from epypes.errors import EpypesError
 from epypes.pipeline import Pipeline
 from epypes.run import Failure
 from epypes.service.frame_socket import ControlSocket, FrameSocket, WorkerMessage
-from epypes.service.worker.answers import QueryAnswerer
 from epypes.service.worker.inputs import FRONT_GONE, Inputs, not_understood
+from epypes.service.worker.run_queries import QueryAnswerer
 from epypes.service.worker.slots import Slot, SlotParameters
 
 _ENDED: Final = 0
@@ -39,6 +39,7 @@ _REFUSED: Final = 1
 _log: Final = logging.getLogger("epypes.service")
 _PR_SET_PDEATHSIG: Final = 1
 _STOP_TIMEOUT_S: Final = 5.0
+_MAX_REASONS: Final = 100
 _MAX_REASON: Final = 2_000
 
 
@@ -159,7 +160,8 @@ def _loaded(front: FrameSocket, control: ControlSocket, path: Path, threads: int
     except BaseException as error:  # a module may call sys.exit
         worker, reasons = None, [_reason(error, doing, path.resolve())]
     if worker is None:
-        front.send(WorkerMessage("refused", content={"reasons": list(reasons)}))
+        texts = [reason[:_MAX_REASON] for reason in reasons[:_MAX_REASONS]]
+        front.send(WorkerMessage("refused", content={"reasons": texts}))
         return None
     functions = list(bundle.cg.functions)
     ready = {
@@ -181,7 +183,7 @@ def _reason(error: BaseException, doing: str, folder: Path) -> str:
     where = f" at {Path(frames[-1].filename).name}, line {frames[-1].lineno}: {frames[-1].line}" if frames else ""
     failure = Failure(doing, (), {}, error)
     notes = [note for note in getattr(error, "__notes__", ()) if isinstance(note, str)]
-    return " | ".join([f"{doing} failed{where}: {failure.kind}: {failure.message}", *notes])[:_MAX_REASON]
+    return " | ".join([f"{doing} failed{where}: {failure.kind}: {failure.message}", *notes])
 
 
 if __name__ == "__main__":

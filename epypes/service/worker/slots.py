@@ -27,8 +27,8 @@ from epypes.pipeline.reactive import SinkPipeline
 from epypes.run import Failure, Run
 from epypes.service.frame_socket import FrameSocket, WorkerMessage
 from epypes.service.packing import BytesLike
-from epypes.service.worker.answers import CompletedRun, QueryAnswerer
 from epypes.service.worker.inputs import Inputs
+from epypes.service.worker.run_queries import CompletedRun, QueryAnswerer
 from epypes.wire import Envelope, decode, encode, failure_event, serialized
 from epypes.wire.envelope import request_fields
 
@@ -158,14 +158,16 @@ class Slot:
         if run is not None and run.failure is None:
             self._answers.note(CompletedRun(run, work.event_id, work.revision))
         try:
-            self._send(work, run)
-        except MessageError as error:
-            work.answers.clear()
-            work.failure = Failure("f_out", self.pipeline.cg.sink_tokens, {}, error, work.event_id)
-            self._send(work, run)
+            try:
+                self._send(work, run)
+            except MessageError as error:
+                work.answers.clear()
+                work.failure = Failure("f_out", self.pipeline.cg.sink_tokens, {}, error, work.event_id)
+                self._send(work, run)
         except EOFError:
             _log.info("%s: the front is gone", self.pipeline.name)
-        self._inputs.finished()
+        finally:
+            self._inputs.finished()
 
     def _send(self, work: _Work, run: Run | None) -> None:
         answers = work.answers
@@ -356,4 +358,4 @@ def _values(entries: Mapping[str, Any], enums: Mapping[str, Any]) -> tuple[dict[
 
 def _text_of(error: BaseException) -> str:
     failure = Failure("", (), {}, error)
-    return failure.message or failure.kind
+    return (failure.message or failure.kind)[:_MAX_MESSAGE]

@@ -13,6 +13,7 @@ from httpx_sse import EventSource
 
 from epypes.bundle.ports import REQUEST
 from epypes.service.http import HttpServer
+from epypes.service.http.server import MAX_CONNECTIONS
 from epypes.wire import Envelope
 from tests.service.http.raw import connection, until
 from tests.service.served import TIMEOUT_S, peer_of
@@ -96,16 +97,16 @@ def test_a_change_of_parameters_is_told_to_all(http, changing):
 def test_many_listen_at_once_and_one_too_many_is_refused(http, peer, photograph):
     with ExitStack() as all_of_them:
         told = [all_of_them.enter_context(listening(http.url)) for _ in range(4)]
-        for _ in range(60):
+        for _ in range(MAX_CONNECTIONS // 2 - 4):
             more = all_of_them.enter_context(connection(http.url))
             more.sendall(b"GET /v1/events HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        until(lambda: http.listeners == 64)
+        until(lambda: http.listeners == MAX_CONNECTIONS // 2)
         work(peer, photograph, 1)
         for each in told:
             assert next(data for kind, data in each if kind == "run")["total_ns"] > 0
         refused = httpx.get(f"{http.url}/v1/events", trust_env=False)
         assert refused.status_code == 503
-        assert "64 listeners" in refused.json()["detail"]
+        assert f"{MAX_CONNECTIONS // 2} listeners" in refused.json()["detail"]
         assert httpx.get(f"{http.url}/livez", trust_env=False).status_code == 200
     until(lambda: http.listeners == 0)
 

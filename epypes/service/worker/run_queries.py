@@ -1,4 +1,4 @@
-"""Answers of a worker to queries: its graph, pictures of tokens, values; all of the last completed run of any slot.
+"""Queries of completed runs: the graph, pictures of tokens, values; all of the last completed run of any slot.
 
 A thread of its own answers, and makes each picture once per run, so that a page that asks often costs little. Only what
 runs the user's functions again is done by a slot, so that no more of them run at once than there are slots.

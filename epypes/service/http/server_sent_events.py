@@ -21,13 +21,15 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from epypes.errors import EpypesError, ServiceError
 from epypes.service.http.models import EVENT_REFUSALS
 from epypes.service.http.responses import json_text, parameters_body, with_types
+from epypes.service.http.server import MAX_CONNECTIONS
 
 if TYPE_CHECKING:
     from epypes.service import Service
 
 router = APIRouter(tags=["service"])
 
-_MAX_SUBSCRIPTIONS: Final = 64
+# Half of the connections of the server, so that others are always answered.
+_MAX_SUBSCRIPTIONS: Final = MAX_CONNECTIONS // 2
 _MAX_WAITING: Final = 100
 _RUN_INTERVAL_S: Final = 0.1
 _COUNTS_INTERVAL_S: Final = 1.0
@@ -99,9 +101,11 @@ class EventHub:
         Raises
         ------
         ServiceError
-            There are too many.
+            There are too many, or the service stops.
         """
-        if self._is_stopped or len(self._subscriptions) >= _MAX_SUBSCRIPTIONS:
+        if self._is_stopped:
+            raise ServiceError("", "The service stops.")
+        if len(self._subscriptions) >= _MAX_SUBSCRIPTIONS:
             raise ServiceError("", f"There are {len(self._subscriptions)} listeners already. Close one, or ask later.")
         if self._loop is None:
             self._loop = asyncio.get_running_loop()
