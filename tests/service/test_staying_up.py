@@ -70,8 +70,8 @@ FORKING = """
             child = libc.fork()
             if child == 0:
                 libc.pause()
-            with open({path!r}, "w") as file:
-                file.write(str(child))
+            with open({path!r}, "a") as file:
+                print(child, file=file)
             os.kill(os.getpid(), signal.SIGKILL)
         return number * k
 
@@ -89,7 +89,8 @@ def test_a_worker_that_dies_is_replaced_though_a_child_of_it_lives(tmp_path, qui
             assert "was killed by SIGKILL" in peer.ask("die").failure.message
             assert peer.ask("plain", 4).parts["out"] == 8
         finally:
-            os.kill(int(path.read_text()), signal.SIGKILL)
+            for child in path.read_text().split():
+                os.kill(int(child), signal.SIGKILL)
 
 
 @pytest.mark.parametrize("how", ["kill", "segv", "exit"])
