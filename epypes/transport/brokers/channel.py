@@ -253,6 +253,9 @@ class BrokerChannel:
             opening.cancel()
             self.close(0.0)
             raise
+        finally:
+            # It keeps the error, whose traceback keeps this frame: a cycle, with the sockets of the client in it.
+            del opening
 
     def send(
         self,
