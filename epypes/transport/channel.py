@@ -1,8 +1,8 @@
-"""The seam between EPypes and what carries its messages: ZeroMQ, a broker, or this process.
+"""The interface between EPypes and what carries its messages: ZeroMQ, a broker, or this process.
 
 `Subscriber` and `Publisher` are written on it once, for every scheme. A channel is opened either for sending or for
 receiving. It reconnects by itself until it is closed: what it has accepted for sending stays in order, under one id,
-until the broker confirms it, and what it has delivered and nobody acknowledged is delivered again.
+until the broker confirms it, and what is delivered and unacknowledged is delivered again.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Protocol
+
+from epypes.wire import Limits
 
 if TYPE_CHECKING:
     from epypes.errors import MessageError
@@ -122,7 +124,7 @@ class ChannelOptions:
 
     prefetch: int = 8
     timeout_s: float = 10.0
-    max_message_bytes: int = 256 * 1024**2
+    max_message_bytes: int = Limits().total_bytes
     on_connection: ConnectionListener | None = None
 
 

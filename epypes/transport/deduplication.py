@@ -35,13 +35,15 @@ class _Outcome:
 class _InFlight:
     """A message that is delivered and not settled. It lives as long as its Delivery: a lost one can't be answered."""
 
-    __slots__ = ("__weakref__", "_owner", "connection", "key", "settlers")
+    __slots__ = ("__weakref__", "_owner", "attempt", "connection", "key", "settlers")
 
-    def __init__(self, owner: Deduplication, key: str, settler: Settler, connection: object) -> None:
+    def __init__(self, owner: Deduplication, key: str, delivery: Delivery, connection: object) -> None:
         self._owner, self.key = owner, key
         self.connection = connection
         # Of the deliveries of the channel, the newest one last; none once the message is settled.
-        self.settlers = [settler]
+        self.settlers: list[Settler] = [delivery.settle]
+        # Of the newest delivery.
+        self.attempt = delivery.attempt
 
     def settle(self, verdict: str, reason: str) -> None:
         self._owner.settle(self, verdict, reason)
@@ -93,9 +95,10 @@ class Deduplication:
                     known.settlers.clear()
                     known.connection = connection
                 known.settlers.append(delivery.settle)
+                known.attempt = delivery.attempt
                 return False
             if outcome is None:
-                new = _InFlight(self, key, delivery.settle, connection)
+                new = _InFlight(self, key, delivery, connection)
                 if key:
                     self._in_flight[key] = new
                 delivery.id, delivery.settle = id, new.settle
@@ -103,8 +106,9 @@ class Deduplication:
             self.duplicates += 1
             # The broker may not have received the verdict if the connection has changed, or if it delivers the message
             # again. To acknowledge twice is harmless; without a second reject the message would be missing in the
-            # dead-letter queue. A first delivery over the same connection was sent twice.
-            was_heard = outcome.connection == connection and delivery.attempt <= 1
+            # dead-letter queue. A first delivery over the same connection was sent twice; where the broker does not
+            # count (attempt 0), it may as well be a redelivery.
+            was_heard = outcome.connection == connection and delivery.attempt == 1
             if outcome.reason is not None and not was_heard:
                 self._remember(key, _Outcome(outcome.reason, connection))
                 delivery.reject(outcome.reason)
@@ -113,7 +117,12 @@ class Deduplication:
             return False
 
     def settle(self, message: _InFlight, verdict: str, reason: str) -> None:
-        """Settle all deliveries of a message: the newest by the verdict, older copies by acknowledging them."""
+        """Settle all deliveries of a message: the newest by the verdict, and the older copies.
+
+        A newest copy of attempt 1 is a message of its own at the broker, which was sent twice: the older ones are
+        acknowledged. Otherwise all may be deliveries of one stored message. To acknowledge one would take it from the
+        broker before it is delivered again, or before its dead letter is confirmed: so all get the same verdict.
+        """
         if self._process != os.getpid():
             # The connection is that of the parent, and so is the message.
             return
@@ -128,7 +137,10 @@ class Deduplication:
             self.rejected += verdict == "reject"
         newest(verdict, reason)
         for settler in older:
-            settler("ack", "")
+            if message.attempt == 1:
+                settler("ack", "")
+            else:
+                settler(verdict, reason)
 
     def _remember(self, key: str, outcome: _Outcome) -> None:
         if not key:

@@ -163,9 +163,9 @@ def make_channel(address: Address, options: ChannelOptions) -> BrokerChannel:
 
 def queued(address: str | Address) -> list[Delivery]:
     """Return copies of the messages that wait in a queue and are not delivered, the oldest first; for tests."""
-    place = parse_address(address)
+    parsed = parse_address(address)
     found = []
-    for stored in [*_broker(place.host).queues.get(place.name, ())]:
+    for stored in [*_broker(parsed.host).queues.get(parsed.name, ())]:
         frames, headers = unpack(IncomingMessage(stored.body, stored.id, dict(stored.headers)))
         found.append(Delivery(frames, stored.id, stored.deliveries, headers))
     return found

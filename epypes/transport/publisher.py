@@ -19,7 +19,7 @@ from epypes.run import Failure
 from epypes.transport.address import Address
 from epypes.transport.channel import NO_HEADERS, Channel, Confirmed, Frames, confirm
 from epypes.transport.endpoint import Endpoint, has_ended, not_waiting
-from epypes.transport.sequences import check_source
+from epypes.transport.ordering import check_source
 from epypes.transport.throttle import Throttle
 from epypes.wire import EncodedEnvelope, Envelope, Limits, encode, failure_event, new_id, serialized, topic_frame
 from epypes.wire.encoder import stamped_frames
@@ -407,7 +407,7 @@ class Outbox:
                     raise MessageError("nested", text)
                 self._is_sending = True
                 try:
-                    frames = self._frames(item)
+                    frames, source = self._frames(item)
                     if self._is_broker:
                         known_as = id or (item.id if isinstance(item, Envelope | EncodedEnvelope) else "") or new_id()
                         channel.send(frames, id=known_as, headers=headers, confirmed=self._counting(confirmed))
@@ -419,6 +419,9 @@ class Outbox:
                         except BaseException:
                             self.sent -= 1
                             raise
+                    if source is not None:
+                        # Counted when it is sent: a refused item is no loss on the way.
+                        self._sequences[source] += 1
                 finally:
                     self._is_sending = False
         except BaseException as error:
@@ -450,8 +453,8 @@ class Outbox:
         kind = "" if item is None else f" of type {type(item).__name__}"
         self._log.warning(reason, f"{self._name} rejected an item{kind} ({reason}): {text}")
 
-    def _frames(self, item: Any) -> Frames:
-        """Return the frames of an item.
+    def _frames(self, item: Any) -> tuple[Frames, str | None]:
+        """Return the frames of an item, and the source that numbers it; None if it is no envelope.
 
         Raises
         ------
@@ -486,13 +489,10 @@ class Outbox:
         size = sum(map(len, frames))
         if size > self._limits.total_bytes:
             raise MessageError("too large", f"A message of {size:,} bytes; the limit is {self._limits.total_bytes:,}.")
-        return frames
+        return frames, None
 
-    def _stamped(self, source: str, frames: Frames) -> Frames:
-        """Return the frames of an envelope with the next number of its source."""
+    def _stamped(self, source: str, frames: Frames) -> tuple[Frames, str]:
+        """Return the frames of an envelope with the next number of its source, and the source."""
         check_source(source)
         number = self._sequences[source] + 1
-        stamped = stamped_frames(frames, self._epoch, number, time.time_ns(), self._limits)
-        # Counted when it can be sent: a rejected item is no loss on the way.
-        self._sequences[source] = number
-        return stamped
+        return stamped_frames(frames, self._epoch, number, time.time_ns(), self._limits), source

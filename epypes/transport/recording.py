@@ -160,6 +160,7 @@ class Recorder(Startable):
         # thread does not keep the socket of a recorder that is garbage.
         self._subscriber, self._recording = make()
         self._lock = threading.Lock()
+        self._finalizer: weakref.finalize[Any, Any] | None = None
 
     @property
     def address(self) -> str:
@@ -193,7 +194,8 @@ class Recorder(Startable):
             except BaseException:
                 self._subscriber.stop()
                 raise
-            weakref.finalize(self, self._recording.close)
+            _detach(self._finalizer)
+            self._finalizer = weakref.finalize(self, self._recording.close)
         return self
 
     def stop(self, timeout_s: float = 5.0) -> None:
@@ -214,8 +216,11 @@ class Recorder(Startable):
         """
         with self._lock:
             subscriber, recording = self._subscriber, self._recording
-        subscriber.stop(timeout_s)
-        recording.stop(timeout_s)
+            _detach(self._finalizer)
+        try:
+            subscriber.stop(timeout_s)
+        finally:
+            recording.stop(timeout_s)
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Return whether the file is closed within ``timeout_s`` seconds: see ``on_end``."""
@@ -397,9 +402,9 @@ class Player(Startable):
             raise ValueError(f"speed is {speed}; give 1.0, 0.5, 10 ..., or 0 for as fast as possible.")
         if loop < 0:
             raise ValueError(f"loop is {loop}; give how often, or 0 for without end.")
-        place = parse_address(address)
-        self._given = place.endpoint
-        binds = bind if place.binds is None else place.binds
+        parsed = parse_address(address)
+        self._given = parsed.endpoint
+        binds = bind if parsed.binds is None else parsed.binds
         self._security = CurveOptions.checked(self._given, binds, insecure, keys, allow)
         self.path = Path(path)
 
@@ -410,6 +415,7 @@ class Player(Startable):
         self._make = make
         self._lock = threading.Lock()
         self._playing: _Playback | None = None
+        self._finalizer: weakref.finalize[Any, Any] | None = None
 
     @property
     def address(self) -> str:
@@ -438,7 +444,8 @@ class Player(Startable):
                 playing = self._make()
                 playing.start()
                 self._playing = playing
-                weakref.finalize(self, _abandon, playing, self._given)
+                _detach(self._finalizer)
+                self._finalizer = weakref.finalize(self, _abandon, playing, self._given)
         return self
 
     def stop(self, timeout_s: float = 5.0) -> None:
@@ -460,6 +467,7 @@ class Player(Startable):
             playing = self._playing
         if playing is not None:
             playing.stop(timeout_s)
+            _detach(self._finalizer)
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Return whether it has ended within ``timeout_s`` seconds: see ``on_end``."""
@@ -546,6 +554,12 @@ class _Playback(_FileThread):
         except queues.Empty:
             return
         raise _Stopped
+
+
+def _detach(finalizer: weakref.finalize[Any, Any] | None) -> None:
+    """Have the garbage collector do nothing for a start that is over."""
+    if finalizer is not None:
+        finalizer.detach()
 
 
 def _abandon(playing: _Playback, address: str) -> None:

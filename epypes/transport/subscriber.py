@@ -11,7 +11,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
-from time import monotonic
+from time import monotonic, sleep
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, Protocol, Self, get_args
 
 from epypes.errors import BrokerError, MessageError, StillRunning
@@ -19,7 +19,7 @@ from epypes.transport.address import Address
 from epypes.transport.channel import ERROR, ERROR_REASON, Channel, Delivery
 from epypes.transport.deduplication import Deduplication
 from epypes.transport.endpoint import Endpoint, has_ended, weakly
-from epypes.transport.sequences import LossCounter, ReorderBuffer, Source, check_source, place_in_order
+from epypes.transport.ordering import LossCounter, ReorderBuffer, Source, check_source, place_in_order
 from epypes.transport.throttle import Throttle
 from epypes.wire import EncodedEnvelope, Envelope, Limits, decode, topic_frame
 
@@ -31,6 +31,8 @@ log = logging.getLogger("epypes.transport")
 Acknowledge = Literal["done", "received"]
 # A queue that has ended takes nothing, whatever it is: that is no fault of the message, which other consumers get.
 _ENDED: Final = (BrokerError, getattr(queues, "ShutDown", BrokerError))
+# How long a subscriber of a broker takes no message after its queue has ended: so other consumers get what it returns.
+_ENDED_S: Final = 1.0
 # How long a full queue of the user is waited for before it is checked whether the subscriber stops.
 _TICK_S: Final = 0.05
 _NO_DELIVERY: Final = Delivery(())
@@ -328,9 +330,9 @@ class ZMQSubscriber(Subscriber):
     takes_brokers: ClassVar[bool] = False
 
 
-def _hold_s(ordered: bool | float, place: Address) -> float:
+def _hold_s(ordered: bool | float, address: Address) -> float:
     if ordered is True:
-        return _HOLD_BROKER_S if place.is_broker else _HOLD_S
+        return _HOLD_BROKER_S if address.is_broker else _HOLD_S
     return float(ordered)
 
 
@@ -353,7 +355,7 @@ class Inbox:
         self,
         queue: PutQueue,
         topic: bytes,
-        place: Address,
+        address: Address,
         limits: Limits,
         *,
         acknowledge: Acknowledge,
@@ -361,10 +363,10 @@ class Inbox:
         ordered: bool | float,
         undecoded: bool,
     ) -> None:
-        self._queue, self._topic, self._place, self._limits = queue, topic, place, limits
+        self._queue, self._topic, self._address, self._limits = queue, topic, address, limits
         self._acknowledge, self._exhausted, self._undecoded = acknowledge, exhausted, undecoded
-        self._is_zeromq = not place.is_broker
-        self._ordering = ReorderBuffer(_hold_s(ordered, place)) if ordered else None
+        self._is_zeromq = not address.is_broker
+        self._ordering = ReorderBuffer(_hold_s(ordered, address)) if ordered else None
         self._timer: threading.Timer | None = None
         self.is_over = True
         self.received = self._refused = self._starts = 0
@@ -390,7 +392,7 @@ class Inbox:
         if self._process != os.getpid():
             # A thread of the parent may hold the locks, and what is in flight is the parent's.
             self._process, self._handling, self.deduplication = os.getpid(), threading.RLock(), Deduplication()
-        self._channel, self._keeps = channel, channel.keeps_messages
+        self._channel, self._keeps, self._timer = channel, channel.keeps_messages, None
         self._starts += 1
         self.losses.begin()
         self._large = _LargeMessages(self._handle, self._limits.total_bytes)
@@ -410,6 +412,7 @@ class Inbox:
 
     def wait_returned(self, timeout_s: float) -> bool:
         """After `end`: return whether the queue's ``put`` has returned within ``timeout_s`` seconds."""
+        until_s = monotonic() + timeout_s
         if not self._handling.acquire(timeout=max(timeout_s, 0.0)):
             return False
         try:
@@ -417,15 +420,18 @@ class Inbox:
                 self.dropped["stopped"] += len(rest)
         finally:
             self._handling.release()
-        return all(has_ended(thread, timeout_s) for thread in (self._timer, self._large.thread))
+        return all(has_ended(thread, until_s - monotonic()) for thread in (self._timer, self._large.thread))
 
     def accept(self, delivery: Delivery) -> None:
         """Take a delivery; called by the channel."""
         if self._is_zeromq:
             frames, large = delivery.frames, self._large
             if (len(frames) > 1 and len(frames[1]) > _LARGE_HEADER_BYTES) or large.is_busy:
-                if not large.put(delivery):
-                    self._count_rejected("too many at once", "Large messages come faster than they are decoded.")
+                try:
+                    if not large.put(delivery):
+                        self._count_rejected("too many at once", "Large messages come faster than they are decoded.")
+                except RuntimeError as error:
+                    self._count_rejected("no thread", f"A large message can't be decoded just now: {error}.")
                 return
         self._handle(delivery)
 
@@ -435,7 +441,6 @@ class Inbox:
                 return
             try:
                 if not self._is_zeromq and not self._is_wanted(delivery):
-                    delivery.ack()
                     return
                 envelope = self._read(delivery)
             except Exception as error:
@@ -455,7 +460,7 @@ class Inbox:
                     item = DeliveredEnvelope.of(envelope, delivery)
                 elif not self._undecoded:
                     item = DeliveredBytes.of(delivery)
-                if delivery.attempt > self._place.attempts:
+                if delivery.attempt > self._address.attempts:
                     self._exhaust(item, delivery)
                     return
             else:
@@ -476,7 +481,7 @@ class Inbox:
             raise MessageError("too large", f"A message of {size:,} bytes; the limit is {self._limits.total_bytes:,}.")
         if not frames or not self._topic or bytes(frames[0][: len(self._topic)]) == self._topic:
             return True
-        if self._place.kind == "queue":
+        if self._address.kind == "queue":
             raise MessageError("other topic", f"The message is not of topic {self._topic.decode()}.")
         return False
 
@@ -520,15 +525,18 @@ class Inbox:
                 "Its consumers crashed, or took it and called neither ack() nor reject(). It is in the dead-letter "
                 "queue %s; attempts=N in the address allows more."
             )
-            place = self._place
-            log.warning(f"rejected message %r of %s: %s. {way_out}", delivery.id, place, text, place.dead_letters)
+            address = self._address
+            log.warning(f"rejected message %r of %s: %s. {way_out}", delivery.id, address, text, address.dead_letters)
         except BaseException:
-            log.exception("%s: exhausted itself failed", self._place)
+            log.exception("%s: exhausted itself failed", self._address)
         delivery.reject(text)
 
     def _put_all(self, ordering: ReorderBuffer, entries: Iterator[tuple[Any, Delivery]]) -> None:
         for item, delivery in entries:
             self._put(item, delivery)
+            if self.is_over:
+                # The queue of the user has stopped the subscriber.
+                return
         due_s = ordering.due_s
         if due_s is not None and self._timer is None and not self.is_over:
             self._timer = threading.Timer(max(due_s - monotonic(), 0.0) + 0.001, self._put_overdue)
@@ -564,11 +572,18 @@ class Inbox:
             self._log.warning("refused", f"the queue refused a message: {error!r}")
             if isinstance(error, _ENDED):
                 delivery.nack()
+                self._wait_after_end()
             else:
                 delivery.reject(f"the queue refused it: {error!r}")
         else:
             if self._acknowledge == "received":
                 delivery.ack()
+
+    def _wait_after_end(self) -> None:
+        """Take no message for a moment: the queue has ended, and a returned message would come again at once."""
+        until_s = monotonic() + _ENDED_S
+        while self._keeps and not self.is_over and monotonic() < until_s:
+            sleep(_TICK_S)
 
     def _put_when_there_is_room(self, item: Any) -> None:
         """Put an item; raise queue.Full if the subscriber stops before there is room."""
@@ -580,7 +595,7 @@ class Inbox:
 
     def _count_rejected(self, reason: str, text: str, delivery: Delivery | None = None) -> None:
         self.rejected[reason] += 1
-        name = f" {delivery.id!r} of {self._place}" if delivery is not None and delivery.id else ""
+        name = f" {delivery.id!r} of {self._address}" if delivery is not None and delivery.id else ""
         self._log.warning(reason, f"rejected a message{name} ({reason}): {text}")
 
 
@@ -614,17 +629,23 @@ class _LargeMessages:
         return self._accepted_bytes != self._handled_bytes
 
     def put(self, delivery: Delivery) -> bool:
-        """Hand over a message; return False if too many wait already. On the I/O thread."""
+        """Hand over a message; return False if too many wait already. On the I/O thread.
+
+        Raises
+        ------
+        RuntimeError
+            The system has no thread to give just now; the next message asks for it again.
+        """
+        if self.thread is None:
+            # First: without a thread, what waits would never be handled, and would keep out all others.
+            thread = threading.Thread(target=self._run, name="epypes-decoding", daemon=True)
+            thread.start()
+            self.thread = thread
         size = _size(delivery)
         if self.is_busy and self._accepted_bytes - self._handled_bytes + size > self._most_bytes:
             return False
         self._accepted_bytes += size
         self._waiting.put(delivery)
-        if self.thread is None:
-            # Where the system has no thread to give just now, the next message asks for it again.
-            thread = threading.Thread(target=self._run, name="epypes-decoding", daemon=True)
-            thread.start()
-            self.thread = thread
         return True
 
     def end(self) -> None:

@@ -10,7 +10,7 @@ import time
 import pytest
 
 import epypes as ep
-from epypes.errors import BrokerError
+from epypes.errors import BrokerError, MessageError
 from epypes.transport.memory import away, queued
 from epypes.transport.publisher import Publisher
 from epypes.transport.subscriber import Subscriber
@@ -63,6 +63,14 @@ def test_send_carries_id_and_headers(address):
     message, *others = queued(address)
     assert (message.frames, message.id, message.headers) == ((b"a", b"b"), "1", {"h": "v"})
     assert [each.id for each in others] == ["2", "3"]
+
+
+def test_an_envelope_that_is_refused_takes_no_number(address):
+    with Publisher(address) as pub:
+        with pytest.raises(MessageError, match="a space at an end"):
+            pub.send(Envelope("e"), id=" a ")
+        pub.send(Envelope("e"), id="b")
+    assert [decode(message.frames).sequence for message in queued(address)] == [1]
 
 
 def test_what_is_sent_is_what_it_was_when_it_was_put(broker, address):

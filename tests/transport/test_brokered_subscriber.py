@@ -5,22 +5,27 @@ The broker lives in this process, so that it can go away at any moment; the real
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import gc
 import itertools
 import logging
 import pickle
 import queue
+import signal
+import sys
 import threading
+from time import monotonic
 
 import pytest
 
 import epypes as ep
 from epypes.errors import AddressError, BrokerError
 from epypes.transport.address import open_channel, parse_address
+from epypes.transport.brokers.channel import BrokerChannel
 from epypes.transport.brokers.message import ATTEMPTS, REASON
-from epypes.transport.channel import Delivery
-from epypes.transport.memory import away, queued
+from epypes.transport.channel import ChannelOptions, Delivery
+from epypes.transport.memory import MemorySession, away, queued
 from epypes.transport.subscriber import Subscriber
 from epypes.wire import Envelope, encode
 from tests.transport.peers import WAIT_S, threads, wait_until
@@ -306,6 +311,36 @@ def test_what_an_ordered_subscriber_holds_back_is_delivered_again_when_it_stops(
     assert len(left(address)) == 1
 
 
+def test_an_ordered_subscriber_that_was_stopped_while_it_waited_goes_on_after_its_next_start(address, send):
+    q = queue.Queue()
+    sub = Subscriber(address, q, ordered=0.5, acknowledge="received")
+    with sub:
+        for frames in numbered(1, 3):
+            send(*frames)
+        assert take(q).sequence == 1
+        wait_until(lambda: "epypes-ordering" in [thread.name for thread in threads()])
+    with sub:
+        assert take(q).sequence == 3
+
+
+def test_the_queue_of_an_ordered_subscriber_may_stop_it(address, send, caplog):
+    class Stopping(queue.Queue):
+        def put(self, item, block=True, timeout=None):
+            super().put(item)
+            if item.sequence == 1:
+                sub.stop()
+
+    q = Stopping()
+    sub = Subscriber(address, q, ordered=True, acknowledge="received").start()
+    for frames in numbered(2, 3, 1):
+        send(*frames)
+    wait_until(lambda: [thread for thread in threads() if thread.name.startswith("epypes from")] == [])
+    assert [item.sequence for item in q.queue] == [1]
+    assert "could not be taken" not in caplog.text
+    with sub:
+        assert [take(q).sequence for _ in range(3)] == [1, 2, 3]
+
+
 # A broker that goes away
 
 
@@ -388,8 +423,6 @@ def test_what_a_queue_refuses_is_counted_and_a_dead_letter(address, send):
 def test_what_a_queue_does_not_take_because_it_has_ended_goes_to_other_consumers(address, send):
     class Ended(queue.Queue):
         def put(self, item, block=True, timeout=None):
-            # Otherwise the message comes again at once.
-            sub.pause()
             # As a Mailbox whose publisher is stopped, and a queue of Python 3.13 that was shut down.
             raise getattr(queue, "ShutDown", BrokerError(address, "the publisher is stopped"))
 
@@ -399,6 +432,20 @@ def test_what_a_queue_does_not_take_because_it_has_ended_goes_to_other_consumers
         assert (sub.received, sub.dead_letters) == (0, 0)
     assert left(address) == ["a"]
     assert dead_letters(address) == []
+
+
+@pytest.mark.slow
+def test_a_subscriber_whose_queue_has_ended_takes_no_message_for_a_moment(address, send):
+    class Ended(queue.Queue):
+        def put(self, item, block=True, timeout=None):
+            times_s.append(monotonic())
+            raise BrokerError(address, "the publisher is stopped")
+
+    times_s = []
+    with Subscriber(address, Ended()):
+        send(id="a")
+        wait_until(lambda: len(times_s) == 2)
+    assert times_s[1] - times_s[0] > 0.5
 
 
 def test_a_message_that_a_newer_one_supersedes_is_a_dead_letter(address, send):
@@ -449,6 +496,49 @@ def test_a_start_fails_with_a_reason_when_the_broker_is_away_or_has_no_such_queu
     wait_until(lambda: threads() == [])
     with sub:
         assert sub.is_connected
+
+
+def test_a_start_for_which_the_system_has_no_thread_leaves_no_connection(address, monkeypatch):
+    start = threading.Thread.start
+
+    def fail(thread):
+        if thread.name.startswith("epypes from"):
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", fail)
+    with pytest.raises(RuntimeError, match="new thread"):
+        Subscriber(address, queue.Queue()).start()
+    wait_until(lambda: threads() == [])
+
+
+def test_a_start_that_is_interrupted_connects_no_more(address, send):
+    is_cancelled = threading.Event()
+    main = threading.main_thread().ident
+
+    class Silent(MemorySession):
+        async def connect(self, window):
+            while sys._current_frames()[main].f_code.co_name != "wait":
+                await asyncio.sleep(0.01)
+            signal.pthread_kill(main, signal.SIGUSR1)
+            try:
+                await asyncio.Event().wait()
+            except asyncio.CancelledError:
+                is_cancelled.set()
+                raise
+
+    def interrupt(number, frame):
+        raise KeyboardInterrupt
+
+    options = ChannelOptions(timeout_s=10 * WAIT_S)
+    before = signal.signal(signal.SIGUSR1, interrupt)
+    try:
+        # The channel of `send` keeps the event loop running.
+        with pytest.raises(KeyboardInterrupt):
+            BrokerChannel(Silent(parse_address(address), options.timeout_s), options).open(lambda delivery: None)
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+    assert is_cancelled.wait(WAIT_S)
 
 
 def test_an_address_that_can_not_be_understood_is_refused_without_its_password():

@@ -248,6 +248,25 @@ def test_large_messages_that_come_faster_than_they_are_decoded_are_dropped_beyon
         wait_until(lambda: held.items[-1] == "5")
 
 
+def test_a_large_message_for_which_the_system_has_no_thread_is_counted_and_the_next_one_is_taken(peer, monkeypatch):
+    start, failures, into = threading.Thread.start, ["can't start new thread"], queue.SimpleQueue()
+
+    def fail_once(thread):
+        if thread.name == "epypes-decoding" and failures:
+            raise RuntimeError(failures.pop())
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", fail_once)
+    with ZMQSubscriber(LOCAL, into, bind=True, max_message_bytes=2 * MB) as sub:
+        sender = peer(zmq.XPUB)
+        sender.connect(sub.address)
+        assert sender.recv() == b"\x01"
+        for known_as in "ab":
+            sender.send_multipart(encode(Envelope("e", {"b": bytes(1_500_000)}, id=known_as), inline_below=2 * MB))
+        assert into.get(timeout=WAIT_S).id == "b"
+        assert sub.rejected == {"no thread": 1}
+
+
 def test_stop_waits_for_the_message_that_is_being_decoded_and_nothing_comes_after_it(peer):
     class Held:
         def __init__(self):

@@ -136,6 +136,26 @@ def test_a_session_that_was_left_is_announced_and_ended_by_the_next_consumer(ope
     wait_until(lambda: sorted(heard.values()) == [b"", b"in use"], WAIT_S)
 
 
+def test_a_session_that_could_not_be_asked_is_emptied_when_it_is_announced(opened, queue, name, foreign, monkeypatch):
+    failures, publish = [BrokerError(queue, "refused")], mqtt.PahoConnection.publish
+
+    async def fail_once(connection, topic, body, headers, *, retain=False):
+        if body == b"?" and failures:
+            raise failures.pop()
+        return await publish(connection, topic, body, headers, retain=retain)
+
+    monkeypatch.setattr(mqtt.PahoConnection, "publish", fail_once)
+    heard, client, topic = [], foreign(), f"{name}/gone/epypes/left"
+    client.on_message = lambda _client, _data, message: heard.append(message.payload)
+    client.subscribe(topic, qos=1)
+    client.publish(topic, b"in use", qos=1, retain=True)
+    wait_until(lambda: heard == [b"in use"])
+    opened(Receiver, queue)
+    wait_until(lambda: not failures)
+    client.publish(topic, b"left", qos=1, retain=True)
+    wait_until(lambda: heard[-1] == b"")
+
+
 def test_channels_that_make_the_same_queue_at_the_same_moment_do_not_disturb_each_other(queue, opened):
     with ThreadPoolExecutor(16) as threads:
         senders = list(threads.map(lambda _: opened(Sender, queue), range(16)))

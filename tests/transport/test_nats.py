@@ -14,6 +14,7 @@ from uuid import uuid4
 
 import nats as library
 import pytest
+from nats.aio.msg import Msg
 
 from epypes.errors import BrokerError, MessageError
 from epypes.transport.address import parse_address
@@ -106,6 +107,22 @@ def test_what_takes_long_is_not_delivered_again(impatient, opened):
     sender.send(b"y")
     worker.channel.close()
     assert body(other.next()) == b"y"
+
+
+def test_a_connection_over_which_nothing_can_be_kept_in_progress_is_lost_and_made_again(impatient, opened, monkeypatch):
+    failures, in_progress = [library.errors.Error("no progress")], Msg.in_progress
+
+    async def fail_once(message):
+        if failures:
+            raise failures.pop()
+        await in_progress(message)
+
+    monkeypatch.setattr(Msg, "in_progress", fail_once)
+    sender, worker = opened(Sender), opened(Receiver)
+    sender.send(b"x")
+    worker.next()
+    wait_until(lambda: worker.channel.reconnects == 1)
+    worker.next().ack()
 
 
 def test_the_last_of_a_window_comes_however_late_it_is_sent(impatient, opened):

@@ -124,8 +124,8 @@ def test_a_caller_does_not_wait_for_ever_for_a_server_that_was_killed_and_is_ser
         server.kill()
         server.wait()
         out.put(b"2")
-        with pytest.raises(queue.Empty):
-            answers.get(timeout=0.2)
+        wait_until(lambda: sub.is_stale)
+        assert answers.empty()
     with process(ECHO, *addresses) as server, pub, sub:
         assert line_of(server).split() == addresses
         assert sub.wait_joined(WAIT_S, publishers=2)
@@ -262,13 +262,9 @@ def test_a_subscriber_that_is_stopped_or_killed_does_not_block_the_others():
             assert [line_of(dead), line_of(killed)] == ["joined"] * 2
             dead.send_signal(signal.SIGSTOP)
             killed.kill()
-            slowest_s = 0.0
             for number in range(200):
-                before = time.monotonic()
                 out.put(Envelope("x", {"n": number, "image": np.zeros(500_000, np.uint8)}))
                 assert into.get(timeout=WAIT_S).parts["n"] == number
-                slowest_s = max(slowest_s, time.monotonic() - before)
-            assert slowest_s < 1.0
         assert sub.lost == {}
 
 

@@ -241,15 +241,21 @@ class BrokerChannel:
         _warn_if_readable(self._address)
         self._handler = on_delivery
         loop = self._loop = _thread.acquire()
+        opening = asyncio.run_coroutine_threadsafe(self._open(), loop)
         try:
-            asyncio.run_coroutine_threadsafe(self._open(), loop).result()
+            opening.result()
+            if on_delivery is not None:
+                name = f"epypes from {self._address.name}"
+                self._receiver = threading.Thread(target=self._receive, name=name, daemon=True)
+                self._receiver.start()
         except BaseException:
+            # After Ctrl+C it may still be connecting.
+            opening.cancel()
             self.close(0.0)
             raise
-        if on_delivery is not None:
-            name = f"epypes from {self._address.name}"
-            self._receiver = threading.Thread(target=self._receive, name=name, daemon=True)
-            self._receiver.start()
+        finally:
+            # It keeps the error, whose traceback keeps this frame: a cycle, with the sockets of the client in it.
+            del opening
 
     def send(
         self,

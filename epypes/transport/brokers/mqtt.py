@@ -190,7 +190,7 @@ class PahoConnection:
         for waiting in unanswered:
             if not waiting.done():
                 waiting.set_exception(error)
-                # Nobody may wait for it any more.
+                # Otherwise asyncio logs an exception that no task waits for any more.
                 waiting.exception()
 
     async def open(self) -> None:
@@ -453,13 +453,21 @@ class MqttSession(BrokerSession):
 
     async def _empty(self, session: str, *, is_asked: bool) -> None:
         """Send what the broker keeps for a session to the queue again, and end the session."""
-        if is_asked:
-            await self._open.publish(_gone(self.address, session), _ASK, {})
-            await asyncio.sleep(_ANSWER_S)
-        # All consumers read of it at the same time; one will do.
-        await asyncio.sleep((secrets.randbelow(_PATIENCE_MS) + 20) / 1000)
-        if session not in self._left:
-            return
+        try:
+            if is_asked:
+                await self._open.publish(_gone(self.address, session), _ASK, {})
+                await asyncio.sleep(_ANSWER_S)
+            # All consumers read of it at the same time; one will do.
+            await asyncio.sleep((secrets.randbelow(_PATIENCE_MS) + 20) / 1000)
+            if session in self._left:
+                await self._send_what_is_kept(session)
+        except (BrokerError, MessageError, TimeoutError) as error:
+            # Mostly another consumer was quicker; if not, the broker announces it again.
+            log.debug("%s: the session %s was not emptied: %s", self.address, session, error)
+        finally:
+            self._left.discard(session)
+
+    async def _send_what_is_kept(self, session: str) -> None:
         self._emptying.add(session)
         address, kept, mark = self.address, asyncio.Queue[paho.MQTTMessage | None](), secrets.token_bytes(16)
         emptied, end = PahoConnection(address, self.timeout_s, session), f"{_gone(address, session)}/end"
@@ -484,12 +492,8 @@ class MqttSession(BrokerSession):
                 emptied.client.ack(message.mid, message.qos)
             await emptied.publish(_gone(address, session), _ENDED, {}, retain=True)
             await emptied.close(with_session=True)
-        except (BrokerError, MessageError, TimeoutError) as error:
-            # Mostly another consumer was quicker; if not, the broker announces it again.
-            log.debug("%s: the session %s was not emptied: %s", address, session, error)
         finally:
             self._emptying.discard(session)
-            self._left.discard(session)
             emptied.abort()
 
     async def close(self) -> None:

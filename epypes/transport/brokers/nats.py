@@ -99,7 +99,7 @@ class NatsSession(BrokerSession):
         async def failed(error: Exception) -> None:
             errors.append(error)
             if self._client.is_connected and not isinstance(error, SlowConsumerError):
-                self.lose(f"the server refuses: {_said(error)}" if "permissions" in str(error) else _gone(error))
+                self.lose(f"the server refuses: {_reason(error)}" if "permissions" in str(error) else _gone(error))
 
         async def closed() -> None:
             self.lose(_gone(self._client.last_error))
@@ -137,7 +137,7 @@ class NatsSession(BrokerSession):
         if "authorization" in str(error).lower():
             user = f"the user {address.user!r} with this password" if address.user else "a connection without a user"
             return BrokerError(str(address), f"{address} refuses {user}. {address.refused_way_out}")
-        otherwise = f"{address} can't be reached: what answers there is no NATS server ({_said(error)})."
+        otherwise = f"{address} can't be reached: what answers there is no NATS server ({_reason(error)})."
         return unreachable(address, error, self.timeout_s, "a NATS server", otherwise)
 
     async def _find_streams(self) -> None:
@@ -150,7 +150,7 @@ class NatsSession(BrokerSession):
             text = f"{address} can't keep messages: JetStream is off there. Start the server with it: nats-server -js."
             raise BrokerError(str(address), text) from error
         except APIError as error:
-            raise BrokerError(str(address), f"{address} refuses: {_said(error)}.") from error
+            raise BrokerError(str(address), f"{address} refuses: {_reason(error)}.") from error
 
     async def publish(self, message: OutgoingMessage) -> None:
         """Send a message; return when its stream has it, or for a broadcast when the server has read it."""
@@ -177,7 +177,7 @@ class NatsSession(BrokerSession):
         except NoStreamResponseError as error:
             raise BrokerError(str(address), f"No stream at {address} keeps what is sent there any more.") from error
         except APIError as error:
-            text = f"{address} refuses a message: {_said(error)}."
+            text = f"{address} refuses a message: {_reason(error)}."
             if error.err_code == _TOO_LARGE:
                 raise MessageError("too large", text) from error
             raise BrokerError(str(address), text) from error
@@ -212,7 +212,7 @@ class NatsSession(BrokerSession):
                 shared = _shared_consumer().evolve(durable_name=address.group, filter_subject=address.name)
                 found = (await jetstream.add_consumer(stream, shared)).config
         except APIError as error:
-            raise BrokerError(str(address), f"{address} can't be received from: {_said(error)}.") from error
+            raise BrokerError(str(address), f"{address} can't be received from: {_reason(error)}.") from error
         what = f"The consumer {address.group!r} of the stream {stream!r}"
         if found.filter_subject and found.filter_subject != address.name:
             raise BrokerError(str(address), f"{what} is for {found.filter_subject}. Add &group=NAME to {address}.")
@@ -238,15 +238,19 @@ class NatsSession(BrokerSession):
 
     async def _keep_alive(self) -> None:
         """Tell the server that the consumer of each unsettled message lives, and ask for what no request brought."""
-        while not self.lost.done():
-            await asyncio.sleep(self._progress_s)
-            if not self._client.is_connected:
-                # The client calls back only when all that it had to send was taken, which may never be.
-                self.lose(_gone(self._client.last_error))
-            elif self._requests:
-                for message in tuple(self._held.values()) if self.address.kind == "queue" else ():
-                    await message.in_progress()
-                await self._request(least=1)
+        try:
+            while not self.lost.done():
+                await asyncio.sleep(self._progress_s)
+                if not self._client.is_connected:
+                    # The client calls back only when all that it had to send was taken, which may never be.
+                    self.lose(_gone(self._client.last_error))
+                elif self._requests:
+                    for message in tuple(self._held.values()) if self.address.kind == "queue" else ():
+                        await message.in_progress()
+                    await self._request(least=1)
+        except Exception as error:
+            # Without it the server would deliver each unsettled message again and again.
+            self.lose(_reason(error))
 
     async def _take_broadcast(self, message: Msg) -> None:
         self._deliver(_incoming(message, 0))
@@ -360,14 +364,14 @@ def _check_names(address: Address) -> None:
         raise BrokerError(str(address), text)
 
 
-def _said(error: BaseException) -> str:
+def _reason(error: BaseException) -> str:
     """Return what an error of the client or the server says, without its prefix."""
     described = getattr(error, "description", None)
     return str(described or error).removeprefix("nats: ").strip("'. ") or type(error).__name__
 
 
 def _gone(error: BaseException | None) -> str:
-    why = f" ({_said(error)})" if isinstance(error, NatsError) else ""
+    why = f" ({_reason(error)})" if isinstance(error, NatsError) else ""
     return f"the server has closed the connection, or has gone away{why}"
 
 

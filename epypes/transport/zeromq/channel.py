@@ -104,7 +104,8 @@ class ZeroMQChannel:
     @property
     def is_connected(self) -> bool:
         """Whether the socket is open; whether a peer is there, `publishers` and `subscriptions` know."""
-        return self._owned is not None and self._process == os.getpid()
+        owned = self._owned
+        return owned is not None and not owned.socket.closed and self._process == os.getpid()
 
     def open(self, on_delivery: Callable[[Delivery], object] | None) -> None:
         """Open the socket; see `Channel.open`."""
@@ -174,10 +175,14 @@ class ZeroMQChannel:
         With ``must_drop`` it is dropped for such a subscriber, and sent.
         """
         owned = self._owned
-        if owned is None or owned.socket.closed or self._process != os.getpid():
-            raise BrokerError(self.address, f"A message to {self.address} was not sent: the socket is closed.")
+        # A thread of the parent may hold the lock of a forked child.
+        if owned is None or self._process != os.getpid():
+            raise self._closed_error()
         socket = owned.socket
         with self._lock:
+            # The I/O thread closes it under the lock.
+            if socket.closed:
+                raise self._closed_error()
             # Few calls from here to the socket: after an image has filled the caches each takes 3 to 5 us.
             try:
                 if must_drop:
@@ -208,6 +213,9 @@ class ZeroMQChannel:
                 self._is_read_soon = True
                 io_thread.soon(lambda thread: thread.read_again(owned))
             return True
+
+    def _closed_error(self) -> BrokerError:
+        return BrokerError(self.address, f"A message to {self.address} was not sent: the socket is closed.")
 
     def pause(self) -> None:
         """Drop what arrives from now on; a subscriber counts it as `lost`."""

@@ -172,7 +172,9 @@ class ConnectionGuard:
     def message_read(self, frame: zmq.Frame) -> None:
         """Take note that a whole message was read, of which this is a frame; on the I/O thread."""
         try:
-            self._senders.add(int(frame.get(_SRCFD)))
+            fd = int(frame.get(_SRCFD))
+            with self._lock:
+                self._senders.add(fd)
         except zmq.ZMQError:
             self._drop_old()
         self._read += 1

@@ -1,4 +1,4 @@
-"""Sequence numbers of envelopes: how many were lost, and delivery in their order.
+"""Counting of lost sequence numbers (`LossCounter`), and reordering by sequence number (`ReorderBuffer`).
 
 A publisher numbers the envelopes of each source from 1, anew in each epoch, which begins with its start.
 """
@@ -158,12 +158,15 @@ class ReorderBuffer:
     def _ready(self, source: Source) -> Iterator[Any]:
         """Yield the items of a source that nothing is missing before."""
         held = self._held[source]
-        while (entry := held.pop(self._next[source], None)) is not None:
-            self._next[source] += 1
-            self._count -= 1
-            yield entry[1]
-        if not held:
-            del self._held[source]
+        try:
+            while (entry := held.pop(self._next[source], None)) is not None:
+                self._next[source] += 1
+                self._count -= 1
+                yield entry[1]
+        finally:
+            # Also if the caller stops in between, and has perhaps called `rest`.
+            if not held:
+                self._held.pop(source, None)
 
     def _skip(self, source: Source, why: str) -> Iterator[Any]:
         """Go on with the first item that is held back of a source; what is missing before it was waited for in vain."""
