@@ -63,22 +63,23 @@ def test_a_signal_in_the_midst_of_a_put_leaves_the_publisher_usable():
     assert done.stdout.split() == ["sent"], done.stdout + done.stderr
 
 
-def test_a_message_that_is_interrupted_between_its_frames_does_not_spoil_the_next():
+@pytest.mark.parametrize("begun", [1, 4])
+def test_a_message_that_is_interrupted_before_or_between_its_frames_does_not_spoil_the_next(begun):
     out, into = Mailbox(), queue.SimpleQueue()
     payloads = {name: np.zeros((100, 100), np.uint8) for name in "abc"}
 
-    def interrupt_second_payload(frame, event, argument):
-        """As Ctrl+C would, when two frames or more have left."""
+    def interrupt(frame, event, argument):
+        """As Ctrl+C would, when so many frames are being sent."""
         if frame.f_code.co_name == "send" and "zmq" in frame.f_code.co_filename:
             sends.append(frame)
-            if len(sends) == 4:
+            if len(sends) == begun:
                 raise KeyboardInterrupt
 
     sends = []
     with ZMQPublisher(LOCAL, out) as pub, ZMQSubscriber(pub.address, into) as sub:
         assert sub.wait_joined(WAIT_S)
         before = sys.gettrace()
-        sys.settrace(interrupt_second_payload)
+        sys.settrace(interrupt)
         try:
             with pytest.raises(KeyboardInterrupt):
                 out.put(Envelope("x", payloads, id="1"))

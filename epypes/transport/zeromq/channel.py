@@ -36,6 +36,8 @@ _LENT_FROM_BYTES: Final = 64 * 1024
 _BATCH: Final = 256
 # Beside the payloads an envelope has a topic and a header.
 _MOST_FRAMES: Final = Limits().frames + LEADING_FRAMES
+# A header that is no protobuf.
+_NO_HEADER: Final = b"\xff"
 _DONTWAIT, _MORE = int(zmq.DONTWAIT), int(zmq.DONTWAIT | zmq.SNDMORE)
 
 
@@ -196,11 +198,12 @@ class ZeroMQChannel:
                 return False
             except BaseException as error:
                 # Of a signal's handler, too, as Ctrl+C: how many frames have left is unknown. These two end a message
-                # that was begun, or make one without a header, so that the receiver rejects it and not the next one.
+                # that was begun, or make one whose header is no protobuf, so that the receiver rejects it and not the
+                # next one. An empty header would be an envelope without parts.
                 if len(frames) > 1:
                     with contextlib.suppress(zmq.ZMQError):
                         socket.send(frames[0], _MORE)
-                        socket.send(b"", _DONTWAIT)
+                        socket.send(_NO_HEADER, _DONTWAIT)
                 if isinstance(error, zmq.ZMQError):
                     text = f"A message to {self.address} was not sent: {error}."
                     raise BrokerError(self.address, text) from error
