@@ -175,13 +175,20 @@ def test_a_broker_that_takes_no_messages_just_now_is_an_error_that_names_where_t
     sender = opened(Sender, rabbitmq.address(name, create=True), timeout_s=1.0)
     rabbitmq.evaluate("vm_memory_monitor:set_vm_memory_high_watermark(0).")
     try:
-        outcomes = []
-        sender.channel.send([b"x"], confirmed=outcomes.append)
-        wait_until(lambda: "low on memory" in caplog.text, WAIT_S)
+        outcomes, sent = [], []
+
+        def is_named():
+            # The broker may take some messages before it blocks.
+            if len(outcomes) == len(sent):
+                sent.append(None)
+                sender.channel.send([b"x"], confirmed=outcomes.append)
+            return "low on memory" in caplog.text
+
+        wait_until(is_named, WAIT_S)
     finally:
         rabbitmq.evaluate("vm_memory_monitor:set_vm_memory_high_watermark(0.8).")
-    wait_until(lambda: outcomes, WAIT_S)
-    assert outcomes == [None]
+    wait_until(lambda: len(outcomes) == len(sent), WAIT_S)
+    assert outcomes == sent
 
 
 def test_the_command_that_shows_the_leader_of_a_queue_is_quoted_for_a_shell():
