@@ -1,4 +1,4 @@
-"""Which arrays does a function take as images, and in which order are their colours?
+"""Contracts of images: the arrays that a function takes as images, and the order of their colours.
 
 The mark stands in the function's annotation: ``Annotated[np.ndarray, Image("uint8", (None, None, 3), order="rgb")]``,
 or alone, ``image: Image("uint8")``, which type checkers don't like.

@@ -1,4 +1,4 @@
-"""``epypes replay``: does an event that failed in a service fail again?"""
+"""``epypes replay``: run an event again that failed in a service."""
 
 from __future__ import annotations
 

@@ -431,29 +431,22 @@ class Dispatcher:
 
     def _settled(self, event: AcceptedEvent, result: Result, error: Exception | None) -> None:
         """Note that an answer is confirmed; without that, the broker that keeps the event delivers it again."""
-        if error is not None and self._has_broker:
-            with self.lock:
-                if self._unconfirmed.pop(event.seq, None) is not None:
-                    event.delivery.nack()
-                    self._totals["given_back"] += 1
-                    self._assign()
-                    self._wake_waiting()
-            return
-        if error is not None:
+        is_returned = error is not None and self._has_broker
+        if error is not None and not is_returned:
             result = self._results.report_lost(event, result, error)
-        if not self._is_confirmed:
-            return
         if event.seq not in self._unconfirmed:
-            # It was given back meanwhile, or dropped.
+            # No broker confirms it; or it was given back meanwhile, or dropped.
             return
-        if result.failure is not None and result.failure.dead_letter:
+        if is_returned:
+            event.delivery.nack()
+        elif result.failure is not None and result.failure.dead_letter:
             event.delivery.reject(result.failure.summary)
         else:
             event.delivery.ack()
         # Only now: a thread that waits until nothing is in flight may close the connection then.
         with self.lock:
             if self._unconfirmed.pop(event.seq, None) is not None:
-                self._totals[result.outcome] += 1
+                self._totals["given_back" if is_returned else result.outcome] += 1
                 self._assign()
                 self._wake_waiting()
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
-import os
 import select
 import socket
 import struct
@@ -217,10 +216,6 @@ class FrameSocket:
         with self._sending, self._receiving:
             self._socket.close()
 
-    def close_in_forks(self) -> None:
-        """Close it in forked child processes, or the other side would not see this process end."""
-        os.register_at_fork(after_in_child=self._socket.close)
-
     def end(self) -> None:
         """End both directions; what has arrived can still be read."""
         with contextlib.suppress(OSError):  # it has ended already
@@ -291,7 +286,3 @@ class ControlSocket:
         """Close it; may be called twice, from any thread that does not receive."""
         with self._sending:
             self._socket.close()
-
-    def close_in_forks(self) -> None:
-        """Close it in forked child processes, or the other side would not see this process end."""
-        os.register_at_fork(after_in_child=self._socket.close)

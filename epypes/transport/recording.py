@@ -381,7 +381,7 @@ class Player(Startable):
     Notes
     -----
     Start it, or use ``with``. Unlike a publisher it drops nothing: a file can wait for a subscriber that does not keep
-    up, which then delays what comes after. Envelopes keep their ids, epochs, sequence numbers and times.
+    up, which delays the messages behind it. Envelopes keep their ids, epochs, sequence numbers and times.
     """
 
     def __init__(

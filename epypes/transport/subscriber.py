@@ -625,7 +625,7 @@ class _LargeMessages:
 
     @property
     def is_busy(self) -> bool:
-        """Whether a message waits or is being handled: what comes after it must wait for its turn."""
+        """Whether a message waits or is being handled: later messages must wait for their turn."""
         return self._accepted_bytes != self._handled_bytes
 
     def put(self, delivery: Delivery) -> bool:

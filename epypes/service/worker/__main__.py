@@ -114,13 +114,12 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--faults", type=int)
     options = parser.parse_args(arguments)
     _stay_with_the_front(options.faults)
-    for descriptor in (options.socket, options.control):
-        os.set_inheritable(descriptor, False)
-    front = FrameSocket(socket.socket(fileno=options.socket))
-    control = ControlSocket(socket.socket(fileno=options.control))
-    front.close_in_forks()
-    control.close_in_forks()
-    worker = _loaded(front, control, options.bundle, options.threads)
+    ends = [socket.socket(fileno=descriptor) for descriptor in (options.socket, options.control)]
+    for end in ends:
+        end.set_inheritable(False)
+        # Or the front would not see this process end while a forked child lives.
+        os.register_at_fork(after_in_child=end.close)
+    worker = _loaded(FrameSocket(ends[0]), ControlSocket(ends[1]), options.bundle, options.threads)
     if worker is None:
         return _REFUSED
     worker.work()

@@ -99,7 +99,7 @@ class Inputs:
             raise MessageError("unknown kind", f"The front has sent a message of kind {message.kind!r}.")
 
     def _change(self, message: WorkerMessage) -> None:
-        """Set parameters when no slot works, unless the change is withdrawn; what comes after it is not read before."""
+        """Set parameters when no slot works, unless the change is withdrawn; later messages are read afterwards."""
         revision, number = message.content["revision"], message.number
         with self._lock:
             self._changed.wait_for(lambda: not self._working or number in self._withdrawn)
@@ -122,6 +122,6 @@ class Inputs:
 
 
 def not_understood(error: BaseException) -> NoReturn:
-    """End the process: what comes after a message that can't be understood can't be understood either."""
+    """End the process: after a message that can't be understood, the stream can't be understood either."""
     _log.error("a message of the front can't be understood: %r", error)
     os._exit(NOT_UNDERSTOOD)
