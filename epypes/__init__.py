@@ -25,6 +25,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from epypes import errors
     from epypes.acquisition import ImageAcquisition, camera
+    from epypes.batch import MapResult, map  # noqa: A004 - as in ep.map(runner, images)
+    from epypes.batch.cases import Case
+    from epypes.batch.checking import check
+    from epypes.batch.optimizing import optimize
+    from epypes.batch.sweeping import SweepResult, sweep
     from epypes.bundle import load, load_pipeline, promote, to_source, verify
     from epypes.display import Preview, register_preview, reset_display_ranges, show
     from epypes.graph import CompGraph, Placeholder, extend, group, outputs, rename, subgraph, suffix, switch, union
@@ -55,11 +60,6 @@ if TYPE_CHECKING:
         summarize,
     )
     from epypes.run.guard import unguarded
-    from epypes.scale import MapResult, map  # noqa: A004 - as in ep.map(runner, images)
-    from epypes.scale.cases import Case
-    from epypes.scale.checking import check
-    from epypes.scale.optimizing import optimize
-    from epypes.scale.sweeping import SweepResult, sweep
     from epypes.service.failures.reopen import load_failure
     from epypes.service.remote.connection import connect
     from epypes.store import Store
@@ -97,8 +97,8 @@ _HOMES = {
     "Mailbox": "epypes.pipeline",
     "Node": "epypes.pipeline",
     "NodeBasedCompGraph": "epypes.pipeline",
-    "Case": "epypes.scale.cases",
-    "check": "epypes.scale.checking",
+    "Case": "epypes.batch.cases",
+    "check": "epypes.batch.checking",
     "Param": "epypes.hints",
     "Roi": "epypes.hints",
     "Preview": "epypes.display",
@@ -118,12 +118,12 @@ _HOMES = {
     "load": "epypes.bundle",
     "load_failure": "epypes.service.failures.reopen",
     "load_pipeline": "epypes.bundle",
-    "optimize": "epypes.scale.optimizing",
-    "MapResult": "epypes.scale",
-    "map": "epypes.scale",
+    "optimize": "epypes.batch.optimizing",
+    "MapResult": "epypes.batch",
+    "map": "epypes.batch",
     "promote": "epypes.bundle",
-    "SweepResult": "epypes.scale.sweeping",
-    "sweep": "epypes.scale.sweeping",
+    "SweepResult": "epypes.batch.sweeping",
+    "sweep": "epypes.batch.sweeping",
     "to_source": "epypes.bundle",
     "verify": "epypes.bundle",
 }

@@ -12,9 +12,9 @@ from dataclasses import replace
 from typing import Any
 
 from epypes.bundle.entries import plain
+from epypes.catalog import entry_of, parameter_names, uses, usual
 from epypes.graph import CompGraph, annotated_params, as_switch
 from epypes.hints import Param, Roi
-from epypes.parameters import entry_of, parameter_names, uses, usual
 
 
 def range_of(cg: CompGraph, token: str, value: Any) -> Param | Roi | None:

@@ -13,8 +13,8 @@ from epypes.errors import ScaleError
 from epypes.wording import counted, ended
 
 if TYPE_CHECKING:
-    from epypes.scale.checking import CheckResult
-    from epypes.scale.measuring import CheckOutcome
+    from epypes.batch.checking import CheckResult
+    from epypes.batch.measuring import CheckOutcome
 
 _NAME_CHARACTERS: Final = 24
 _MOST_ROWS: Final = 100
@@ -49,10 +49,10 @@ def check(
     as_json: Annotated[bool, typer.Option("--json", help="Print every check as JSON.")] = False,
 ) -> None:
     """Run a bundle on a labelled set; exit 0 only if every case passes."""
+    from epypes.batch.cases import cases_of
+    from epypes.batch.checking import check as check_runner
+    from epypes.batch.junit import check_place
     from epypes.bundle import load
-    from epypes.scale.cases import cases_of
-    from epypes.scale.checking import check as check_runner
-    from epypes.scale.junit import check_place
 
     if junit is not None:
         check_place(junit)

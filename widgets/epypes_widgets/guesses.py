@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+from epypes.catalog import entry_of, parameter_names, uses, usual
 from epypes.graph import CompGraph, annotated_params, as_switch
 from epypes.hints import Param, Roi, Text, param_from_value
-from epypes.parameters import entry_of, parameter_names, uses, usual
 from epypes_widgets.movable import is_integer, is_movable, plain
 from epypes_widgets.places import Tunable
 

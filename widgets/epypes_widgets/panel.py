@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import ipywidgets
 
+from epypes.batch.checking import CheckResult, Checks
 from epypes.errors import NotComputed
 from epypes.hints import Roi
 from epypes.run import Run
-from epypes.scale.checking import CheckResult, Checks
 from epypes_widgets import code, settings
 from epypes_widgets.controls import column
 from epypes_widgets.cuts import cuts_of, made_from

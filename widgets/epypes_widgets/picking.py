@@ -11,12 +11,12 @@ from typing import Any, Final
 
 import anywidget
 
+from epypes.batch.order import identity
+from epypes.batch.sheet import Block, Sheet, Tile, shown_tokens
+from epypes.batch.sheetpage import page_of
+from epypes.batch.sweeping import SweepResult
 from epypes.display.markup import cut
 from epypes.errors import EpypesError
-from epypes.scale.order import identity
-from epypes.scale.sheet import Block, Sheet, Tile, shown_tokens
-from epypes.scale.sheetpage import page_of
-from epypes.scale.sweeping import SweepResult
 from epypes_widgets.route import listen_beside_cells
 from epypes_widgets.still import Still
 from epypes_widgets.values import is_same, said

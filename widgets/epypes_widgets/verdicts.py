@@ -12,13 +12,13 @@ from dataclasses import replace
 from time import monotonic
 from typing import Any, Final
 
+from epypes.batch.cases import Case, Check
+from epypes.batch.checking import CheckResult, Checks, checked, inputs_of, prepared
+from epypes.batch.files import read_value
+from epypes.batch.items import items_of, opened
+from epypes.batch.measuring import CheckOutcome
 from epypes.errors import EpypesError, PayloadError
 from epypes.run import CompGraphRunner
-from epypes.scale.cases import Case, Check
-from epypes.scale.checking import CheckResult, Checks, checked, inputs_of, prepared
-from epypes.scale.files import read_value
-from epypes.scale.items import items_of, opened
-from epypes.scale.measuring import CheckOutcome
 from epypes.wording import counted
 from epypes_widgets.history import Entry, History
 from epypes_widgets.looking.films import Payload, payloads

@@ -1,0 +1,199 @@
+"""Which inputs are run, one after another?"""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from epypes.acquisition.pictures import IMAGE_ENDINGS, image_files, natural_order
+from epypes.batch.files import is_file, read_value
+from epypes.batch.lasting import lasting_each
+from epypes.errors import ScaleError
+from epypes.graph import CompGraph
+from epypes.run import CompGraphRunner
+
+_KINDS: Final = "a folder, a glob such as 'images/*.png', a list or a generator of images, paths or dicts by token"
+_SHOWN: Final = "*?["
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One input.
+
+    Attributes
+    ----------
+    number
+        Its place, from 0.
+    name
+        Of a file its name, relative to the folder that was given; otherwise its place, as ``"#3"``.
+    payload
+        Values by free source token; a Path stands for an image file, which is read where the item is run.
+    """
+
+    number: int
+    name: str
+    payload: Mapping[str, Any]
+
+
+def items_of(images: Any, runner: CompGraphRunner, *, is_copied: bool = True) -> Iterator[Item]:
+    """Give the inputs of an image set, each when it is asked for.
+
+    Parameters
+    ----------
+    images
+        A folder, a glob, one file, or an iterable of images (arrays), paths of image files, or dicts by free source
+        token, in which a Path stands for an image file, and so does a text with the ending of an image, of ``.npy`` or
+        of ``.npz`` if there is such a file; any other text stands for itself.
+    runner
+        Its free source tokens are what an item has to give.
+    is_copied
+        Whether what a generator gives is copied, since it may be one array that is filled again each time. False if
+        each item is done with before the next one is asked for.
+
+    Raises
+    ------
+    ScaleError
+        The set is empty, which of a generator is known at its end; or an item does not give these tokens.
+    """
+    free = runner.free_source_tokens
+    if isinstance(images, str | Path):
+        return _of_files(*_files(images), _only(free, f"{str(images)!r} gives one image"))
+    _check_set(images)
+    return _of_values(lasting_each(images) if is_copied else images, type(images).__name__, free)
+
+
+def opened(item: Item, cg: CompGraph) -> dict[str, Any]:
+    """Return the payload with its files read: BGR, or RGB where the graph says that the token is.
+
+    Raises
+    ------
+    ImageFileError
+        A file is missing, or no image.
+    ScaleError
+        A ``.npy`` or ``.npz`` can't be read.
+    """
+    return {
+        token: read_value(value, cg, token) if isinstance(value, Path) else value
+        for token, value in item.payload.items()
+    }
+
+
+def count_of(images: Any) -> int | None:
+    """Return how many items there will be, as far as that is known without going through them."""
+    if isinstance(images, str | Path):
+        return len(_files(images)[0])
+    try:
+        return len(images)
+    except TypeError:
+        return None
+
+
+# -- files ------------------------------------------------------------------------------------------------------
+
+
+def _files(images: str | Path) -> tuple[list[Path], Path]:
+    """Return the files that a folder or a glob names, and the folder that their names are relative to."""
+    path = Path(images).expanduser()
+    if path.is_dir():
+        files, root = image_files(path), path
+        looked_for = f"There are no images in folder {str(images)!r}: no file ends in {_endings()}."
+    elif path.exists() or not any(mark in str(images) for mark in _SHOWN):
+        files, root = ([path] if path.is_file() else []), path.parent
+        looked_for = f"There is no folder or file {str(images)!r}. Check the path."
+    else:
+        found = (Path(name) for name in glob.glob(str(path), recursive=True))
+        files, root = sorted((file for file in found if file.is_file()), key=_place_and_name), _fixed_part(path)
+        looked_for = (
+            f"No file matches {str(images)!r}. Check the path; in a glob * stands for any text, ** for folders."
+        )
+    if not files:
+        raise ScaleError(looked_for)
+    return files, root
+
+
+def _place_and_name(file: Path) -> tuple[str, tuple[list[str | int], str]]:
+    return str(file.parent), natural_order(file)
+
+
+def _fixed_part(pattern: Path) -> Path:
+    """Return the folder before the first part that has a mark in it."""
+    fixed = pattern
+    while any(mark in str(fixed) for mark in _SHOWN):
+        fixed = fixed.parent
+    return fixed
+
+
+def _endings() -> str:
+    return ", ".join(sorted(IMAGE_ENDINGS))
+
+
+def _of_files(files: list[Path], root: Path, token: str) -> Iterator[Item]:
+    for number, file in enumerate(files):
+        yield Item(number, _name(file, root), {token: file.absolute()})
+
+
+def _name(file: Path, root: Path) -> str:
+    return str(file.relative_to(root)) if file.is_relative_to(root) else str(file)
+
+
+# -- values -----------------------------------------------------------------------------------------------------
+
+
+def _check_set(images: Any) -> None:
+    if isinstance(images, Mapping):
+        raise ScaleError("images is one dict. Give a list of dicts by token: [{...}, {...}].")
+    shape = getattr(images, "shape", None)
+    if isinstance(shape, tuple) and (len(shape) < 3 or (len(shape) == 3 and shape[2] in (3, 4))):
+        raise ScaleError(f"images is one array of shape {shape}. Give a list of images, if need be of one: [image].")
+    if not isinstance(images, Iterable):
+        raise ScaleError(f"images can't be {type(images).__name__!r}. Give {_KINDS}.")
+
+
+def _of_values(images: Iterable[Any], kind: str, free: tuple[str, ...]) -> Iterator[Item]:
+    number = -1
+    for number, value in enumerate(images):
+        item = _item(number, value, free)
+        # Whoever waits for the next one must not keep this one alive.
+        del value
+        yield item
+        del item
+    if number < 0:
+        raise ScaleError(f"The image set is empty: the {kind} gave nothing. Give {_KINDS}.")
+
+
+def _item(number: int, value: Any, free: tuple[str, ...]) -> Item:
+    if isinstance(value, Item):
+        return value
+    if isinstance(value, Mapping):
+        if set(value) != set(free):
+            named, wanted = (", ".join(map(str, names)) or "nothing" for names in (value, free))
+            raise ScaleError(f"Item #{number} gives {named}; the graph's free source tokens are: {wanted}.")
+        given = {token: value[token] for token in free}
+    else:
+        if value is None:
+            raise ScaleError(f"Item #{number} is None, which is no image. Leave it out.")
+        given = {_only(free, f"item #{number} is one value"): Path(value) if isinstance(value, str) else value}
+    given = {token: _file_or_value(value) for token, value in given.items()}
+    files = [file for file in given.values() if isinstance(file, Path)]
+    # Whoever reads it may stand in another folder.
+    payload = {token: file.absolute() if isinstance(file, Path) else file for token, file in given.items()}
+    return Item(number, ", ".join(map(str, files)) or f"#{number}", payload)
+
+
+def _file_or_value(value: Any) -> Any:
+    """Return the path that a text stands for: one with a file's ending, of a file that is there."""
+    if isinstance(value, str) and is_file(value) and Path(value).expanduser().is_file():
+        return Path(value).expanduser()
+    return value
+
+
+def _only(free: tuple[str, ...], given: str) -> str:
+    """Return the one free source token."""
+    if len(free) != 1:
+        tokens = ", ".join(free) or "none"
+        example = ", ".join(f"{token!r}: ..." for token in free)
+        raise ScaleError(f"The graph's free source tokens are: {tokens}; {given}. Give dicts: [{{{example}}}, ...].")
+    return free[0]

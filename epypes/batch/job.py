@@ -1,0 +1,157 @@
+"""What is done with an item, wherever that is?"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from time import perf_counter_ns
+from typing import Any
+
+from epypes.batch.items import Item, opened
+from epypes.batch.outcome import Outcome, Trouble, is_endless, long_number, plain_number
+from epypes.batch.start import Start
+from epypes.batch.thumbnails import Album
+from epypes.display.previews.preview import sketch
+from epypes.display.previews.shown import Look
+from epypes.errors import EpypesError
+from epypes.run import CompGraphRunner, Failure, Run
+
+Setting = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Items that one worker runs, one after another.
+
+    Attributes
+    ----------
+    items
+        The inputs.
+    settings
+        Hyperparameters by token; each item is run with all of them, in this order.
+    keep
+        Tokens whose values are kept.
+    show
+        Tokens of which thumbnails are made; None: of every token that has a picture. What has none is told as text.
+    start
+        What jobs with the same one item have in common; None for what travels to another process.
+    targets
+        Tokens; only what they need is run, branches that are not chosen too. Everything without.
+    """
+
+    items: tuple[Item, ...]
+    settings: tuple[Setting, ...] = ({},)
+    keep: tuple[str, ...] = ()
+    show: tuple[str, ...] | None = ()
+    start: Start | None = None
+    targets: tuple[str, ...] = ()
+
+
+def do(runner: CompGraphRunner, job: Job, stop: threading.Event | None = None) -> list[Outcome]:
+    """Return the outcomes of a job: item by item, setting by setting.
+
+    Parameters
+    ----------
+    runner
+        One that nobody else uses; it has its hyperparameters again afterwards.
+    job
+        The items and settings. Of the second setting on only what depends on what changed is run.
+    stop
+        Once it is set, the item that is being run is the last one.
+    """
+    before = dict(runner.hyperparameters)
+    # A setting may leave out what another one has: that is then as it was.
+    varied = {token: before[token] for setting in job.settings for token in setting if token in before}
+    outcomes: list[Outcome] = []
+    try:
+        for item in job.items:
+            for outcome in _of_item(runner, item, job, varied):
+                outcomes.append(outcome)
+                if stop is not None and stop.is_set():
+                    return outcomes
+    finally:
+        runner.set(**varied)
+    return outcomes
+
+
+def _of_item(runner: CompGraphRunner, item: Item, job: Job, varied: Setting) -> Iterator[Outcome]:
+    album = Album() if job.start is None else job.start.album
+    waiting, begun = deque(job.settings), list[Outcome]()
+
+    def outcome_of(own: CompGraphRunner, payload: Mapping[str, Any] | None) -> Outcome:
+        setting, start_ns = waiting.popleft(), perf_counter_ns()
+        run, trouble = _run(own, payload, {**varied, **setting}, job.targets)
+        if run is None:
+            return Outcome(item.number, item.name, setting, total_ns=perf_counter_ns() - start_ns, trouble=trouble)
+        return _outcome(item, setting, job, run, album)
+
+    def begin() -> CompGraphRunner | None:
+        try:
+            payload = opened(item, runner.cg)
+        except (EpypesError, OSError) as error:
+            trouble = Trouble("", type(error).__name__, str(error))
+            begun.extend(Outcome(item.number, item.name, setting, trouble=trouble) for setting in waiting)
+            waiting.clear()
+            return None
+        before = runner.last
+        while waiting and runner.last is before:
+            begun.append(outcome_of(runner, payload))
+        return None if runner.last is before else runner
+
+    own = begin() if job.start is None else job.start.go_on(begin)
+    yield from begun
+    while own is not None and waiting:
+        yield outcome_of(own, None)
+    if own is not None and job.start is not None:
+        job.start.leave(own)
+
+
+def _run(
+    runner: CompGraphRunner, payload: Mapping[str, Any] | None, values: Setting, targets: tuple[str, ...]
+) -> tuple[Run | None, Trouble | None]:
+    """Run on a payload, or on the last one; return the run, completed or failed, or why there is none."""
+    before = runner.last
+    try:
+        if payload is None:
+            return runner.rerun(*targets, **values), None
+        runner.set(**values)
+        return runner.run_on(payload, targets), None
+    except (Exception, SystemExit) as error:  # whatever a function raises
+        if runner.last is not before:
+            return runner.last, None
+        return None, Trouble("", type(error).__name__, str(error))
+
+
+def _outcome(item: Item, setting: Setting, job: Job, run: Run, album: Album) -> Outcome:
+    report, tokens = run.report, run.tokens
+    thumbnails, texts = album.shown_of(run, job.show) if job.show != () else ({}, {})
+    return Outcome(
+        item.number,
+        item.name,
+        setting,
+        {token: _value(run[token]) for token in run.cg.sink_tokens if tokens.is_readable(token)},
+        report.durations_ns,
+        report.total_ns,
+        None if run.failure is None else _trouble(run.failure),
+        thumbnails,
+        {token: run[token] for token in job.keep if tokens.is_readable(token)},
+        texts,
+    )
+
+
+def _trouble(failure: Failure) -> Trouble:
+    return Trouble(failure.function, failure.kind, failure.message)
+
+
+def _value(value: Any) -> Any:
+    """Return what a table shows of a value."""
+    if type(value) is int and is_endless(value):
+        return long_number(value)
+    if value is None or type(value) in (bool, int, float, str):
+        return value
+    number = plain_number(value)
+    if number is not None:
+        return number
+    return str(value) if isinstance(value, str) else sketch(value, Look()).shown.text

@@ -1,0 +1,266 @@
+"""Which values of the hyperparameters give the best results over many cases?"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from epypes.batch.cases import Case, cases_of, with_labels_read
+from epypes.batch.items import Item, items_of
+from epypes.batch.job import Job
+from epypes.batch.lasting import settled_runner
+from epypes.batch.optimized import OptimizeResult
+from epypes.batch.outcome import Outcome
+from epypes.batch.progress import progress_bar
+from epypes.batch.ranging import axes_of
+from epypes.batch.scoring import Metric, Score, Scoring
+from epypes.batch.searched import about_search, changed_meanwhile, name_of
+from epypes.batch.spreading import spread, worker_count
+from epypes.batch.studying import Asked, Direction, Search, Trial
+from epypes.batch.trying import Bench, Stopped
+from epypes.errors import ScaleError
+from epypes.run import CompGraphRunner
+from epypes.store import opened_store
+from epypes.wording import ended
+
+if TYPE_CHECKING:
+    from epypes.store import Store
+
+_CASE_FILE: Final = ".toml"
+_DIRECTIONS: Final = ("maximize", "minimize")
+
+
+def optimize(
+    runner: CompGraphRunner,
+    metric: Metric,
+    cases: Any,
+    n: int = 100,
+    *,
+    executor: Executor | None = None,
+    direction: Direction = "maximize",
+    ranges: Mapping[str, Any] | None = None,
+    keep: Sequence[str] | None = None,
+    seed: int = 0,
+    store: str | Path | Store | None = None,
+    name: str | None = None,
+    stop: threading.Event | None = None,
+    on_trial: Callable[[Trial], object] | None = None,
+    progress: bool | None = None,
+) -> OptimizeResult:
+    """Search the values of hyperparameters that make a metric best over a set of cases; the runner is left as it is.
+
+    Parameters
+    ----------
+    runner
+        Its graph is run; hyperparameters that do not vary have the values that it has.
+    metric
+        ``metric(tokens, case)`` returns a number: how good the values of a run, by token, are for its case. It is
+        called in this process, by the thread that calls this. Or the name of a token that is a number itself. What
+        counts is the mean over all cases.
+    cases
+        ``ep.Case``, dicts or inputs alone; the path of a file of cases; or a folder or glob of images. Without labels a
+        case is its inputs.
+    n
+        How many trials there are to be: with a store, those that are in there already count.
+    executor
+        Runs the cases, as for ``ep.map``; several trials are then under way at a time, so what is tried depends on
+        which ends first. Without, the calling thread does, and runs of each case only what depends on what has changed.
+    direction
+        ``"maximize"`` or ``"minimize"``.
+    ranges
+        By hyperparameter, which values are tried: an ``ep.Param``, a tuple (low, high[, step]) or a list of choices;
+        no others vary. Without, all vary that have a range by an annotation, or by the tables of OpenCV and
+        scikit-image.
+    keep
+        Tokens that a metric is given; the sink tokens without. Only what they need is run.
+    seed
+        The same one tries the same, if there is no executor.
+    store
+        Path, URL or ``ep.Store`` of a database that keeps the trials, in Optuna's own tables. A second call goes on.
+    name
+        Of the study in the store; without, it follows from the graph and its other hyperparameters, from what is
+        searched, from what the metric computes, and from the cases: what goes into them, their labels and their
+        hyperparameters. A study that has been searched for another one of these is refused.
+    stop
+        Ends the search once it is set: when the function that runs has returned. So does Ctrl+C, at once. What has
+        been found until then is returned.
+    on_trial
+        Is called with each ``Trial`` that has ended, by the thread that calls this.
+    progress
+        Whether to show a bar; without, where somebody sees it.
+
+    Returns
+    -------
+    OptimizeResult
+        The first of its trials has the runner's present values, or the nearest ones that may be tried.
+
+    Raises
+    ------
+    ScaleError
+        There are no cases, nothing that may vary, or no trial has completed; or in the first one an input can't be
+        read, which is known before another is run.
+    UnknownName
+        The graph has no such token, or the runner no such hyperparameter.
+    StoreError
+        The store can't be used.
+
+    Examples
+    --------
+    >>> from epypes import CompGraph, CompGraphRunner
+    >>> runner = CompGraphRunner(CompGraph({"add": lambda x, y: x + y}, {"add": (("x", "y"), "total")}), {"y": 9})
+    >>> result = optimize(runner, "total", [{"x": 1}], 20, direction="minimize", ranges={"y": (0, 10)})
+    >>> result.best
+    {'y': 0}
+    """
+    _check(n, direction)
+    # Whoever sets values on theirs meanwhile, or writes into them, does not change what is searched.
+    runner = settled_runner(runner)
+    axes = axes_of(runner, ranges)
+    labelled = _cases(cases, runner)
+    scoring = Scoring(runner.cg, metric, labelled, keep)
+    items = tuple(_items(labelled, runner))
+    work = _Work(runner, scoring, items, executor, stop)
+    with opened_store(store) as opened:
+        url = None if opened is None else opened.url
+        about = {} if url is None else about_search(runner, axes, scoring, items, is_named=bool(name))
+        known = name or ("" if url is None else name_of(scoring.name, direction, axes, about))
+        at_once = 1 if executor is None else worker_count(executor)
+        present = runner.hyperparameters
+        search = Search(axes, present, direction, seed=seed, at_once=at_once, url=url, name=known, about=about)
+        with contextlib.closing(search):
+            was_stopped = _searched(search, work, n, on_trial, progress)
+            for what in changed_meanwhile(runner, scoring, about):
+                search.forget(what)
+    result = OptimizeResult(search.trials, direction, scoring.name, axes, search.study, was_stopped)
+    _require_one(result)
+    return result
+
+
+def _check(n: int, direction: str) -> None:
+    if type(n) is not int or n < 1:
+        raise ScaleError(f"n is how many trials there are to be, 1 or more, not {n!r}.")
+    if direction not in _DIRECTIONS:
+        raise ScaleError(f"direction is 'maximize' or 'minimize', not {direction!r}.")
+
+
+def _cases(given: Any, runner: CompGraphRunner) -> tuple[Case, ...]:
+    """Return the cases with their labels read."""
+    if isinstance(given, str | Path) and Path(given).suffix != _CASE_FILE:
+        return tuple(Case(item.payload, name=item.name) for item in items_of(given, runner))
+    return tuple(with_labels_read(case, runner.cg) for case in cases_of(given))
+
+
+def _items(cases: Sequence[Case], runner: CompGraphRunner) -> Iterator[Item]:
+    for number, item in enumerate(items_of([case.inputs for case in cases], runner)):
+        yield Item(number, cases[number].name or item.name, item.payload)
+
+
+# -- running ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class _Pending:
+    """A trial of which not all cases have come back."""
+
+    asked: Asked
+    outcomes: dict[int, Outcome] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class _Work:
+    """Who runs which cases, and how they are measured."""
+
+    runner: CompGraphRunner
+    scoring: Scoring
+    items: tuple[Item, ...]
+    executor: Executor | None
+    stop: threading.Event | None
+
+    @property
+    def is_stopped(self) -> bool:
+        return self.stop is not None and self.stop.is_set()
+
+    @property
+    def own(self) -> list[Mapping[str, Any]]:
+        """The hyperparameters of each case that are its own."""
+        return [case.hyperparameters or {} for case in self.scoring.cases]
+
+    def scores(self, search: Search, count: int) -> Generator[tuple[Asked, Score]]:
+        """Give the scores of the next settings as they come; fewer if it is stopped."""
+        asked = (search.ask() for _ in range(count))
+        return self._here(asked) if self.executor is None else self._spread(asked)
+
+    def _here(self, asked: Iterator[Asked]) -> Generator[tuple[Asked, Score]]:
+        bench = Bench(self.runner, self.items, self.own, self.scoring.keep, self.stop)
+        while not self.is_stopped and (one := next(asked, None)) is not None:
+            try:
+                score = self.scoring.of_outcomes(bench.outcomes(one.setting))
+            except Stopped:
+                return
+            yield one, score
+
+    def _spread(self, asked: Iterator[Asked]) -> Generator[tuple[Asked, Score]]:
+        pending: dict[int, _Pending] = {}
+        jobs = self._jobs(asked, pending)
+        ahead = None if self.executor is None else worker_count(self.executor)
+        for outcomes in spread(self.runner, jobs, self.executor, ahead=ahead, stop=self.stop):
+            for outcome in outcomes:
+                number, index = divmod(outcome.number, len(self.items))
+                pending[number].outcomes[index] = outcome
+                if len(pending[number].outcomes) == len(self.items):
+                    done = pending.pop(number)
+                    yield done.asked, self.scoring.of_outcomes([done.outcomes[i] for i in sorted(done.outcomes)])
+
+    def _jobs(self, asked: Iterator[Asked], pending: dict[int, _Pending]) -> Iterator[Job]:
+        """Give a job for each case of each trial, when there is room for it; a trial is asked for with its first."""
+        for one in asked:
+            pending[one.number] = _Pending(one)
+            for item, own in zip(self.items, self.own, strict=True):
+                number = one.number * len(self.items) + item.number
+                marked = Item(number, item.name, item.payload)
+                keep = self.scoring.keep
+                yield Job((marked,), ({**one.setting, **own},), keep=keep, targets=keep)
+
+
+def _searched(
+    search: Search,
+    work: _Work,
+    n: int,
+    on_trial: Callable[[Trial], object] | None,
+    progress: bool | None,
+) -> bool:
+    """Run the trials that are still to be run; return whether somebody has stopped it before."""
+    done = search.trials
+    with progress_bar(progress, n, f"optimize {work.scoring.name}", unit="trial") as advance:
+        if done:
+            advance(len(done), sum(trial.value is None for trial in done))
+        try:
+            with contextlib.closing(work.scores(search, n - len(done))) as coming:
+                for number, (asked, score) in enumerate(coming):
+                    if number == 0:
+                        _require_readable(score)
+                    trial = search.tell(asked, score.value, score.failure, score.total_ns)
+                    advance(1, trial.value is None)
+                    if on_trial is not None:
+                        on_trial(trial)
+        except KeyboardInterrupt:
+            return True
+    return work.is_stopped
+
+
+def _require_readable(score: Score) -> None:
+    """Raise ScaleError if an input can't be read in the trial that comes back first: it could not in any other."""
+    if score.unreadable:
+        raise ScaleError(f"No trial can complete: {ended(score.unreadable)} Mend the file, or leave it out.")
+
+
+def _require_one(result: OptimizeResult) -> None:
+    if result.trials and not result.was_stopped and all(trial.value is None for trial in result.trials):
+        first = result.trials[0]
+        text = f"None of {len(result.trials)} trials completed. The first one failed: {ended(first.failure)}"
+        raise ScaleError(f"{text} Its values: {first.setting}.")

@@ -1,0 +1,133 @@
+"""Does a Dask cluster give the same results, also when its workers die?"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+import time
+from dataclasses import replace
+
+import dask
+import numpy as np
+import pytest
+from distributed import Client, LocalCluster
+
+import epypes as ep
+from epypes.batch.spreading import worker_count
+from epypes.errors import ExecutorBroken
+from tests.batch.test_spreading import mixed, mortal_runner, without_times
+from tests.bundle.cells import cell
+
+pytestmark = pytest.mark.slow
+
+_WAIT_S = 120.0
+
+
+@pytest.fixture(scope="module")
+def client():
+    """A cluster of two worker processes; what kills three of them is given up."""
+    with (
+        dask.config.set(
+            {
+                "distributed.scheduler.allowed-failures": 1,
+                # On a machine that is busy with other tests a worker takes its time to begin.
+                "distributed.comm.timeouts.connect": "120s",
+            }
+        ),
+        LocalCluster(
+            n_workers=2,
+            threads_per_worker=1,
+            host="127.0.0.1",
+            # Without an address it listens on port 8787 all the same, and warns if another cluster does so already.
+            dashboard_address="127.0.0.1:0",
+            scheduler_kwargs={"dashboard": False},
+            silence_logs=logging.CRITICAL,
+        ) as cluster,
+        Client(cluster) as made,
+    ):
+        yield made
+
+
+def until(condition, what):
+    deadline = time.monotonic() + _WAIT_S
+    while not condition():
+        assert time.monotonic() < deadline, what
+        threading.Event().wait(0.005)
+
+
+def test_a_client_that_was_closed_is_told_with_the_way_out(client, runner, crops):
+    with Client(client.scheduler.address) as other:
+        executor = other.get_executor()
+        assert worker_count(executor) == 2
+    with pytest.raises(ExecutorBroken, match=r"takes no jobs .* Make a new one") as told:
+        ep.map(runner, crops, executor)
+    assert told.value.done == 0
+
+
+def test_a_cluster_gives_what_this_thread_gives(client, runner, crops, folder):
+    expected = ep.map(runner, mixed(crops, folder), keep=["keypoints"])
+    executor = client.get_executor()
+    assert worker_count(executor) == 2
+    found = ep.map(runner, mixed(crops, folder), executor, keep=["keypoints"])
+    assert without_times(found) == without_times(expected)
+    again = ep.map(runner, mixed(crops, folder), executor, keep=["keypoints"])
+    assert without_times(again) == without_times(expected)
+
+
+def test_a_cluster_reads_files_itself(client, runner, folder):
+    expected, found = ep.map(runner, folder), ep.map(runner, folder, client.get_executor())
+    assert without_times(found) == without_times(expected)
+    assert [outcome.name for outcome in found] == [f"crop{number}.png" for number in range(12)]
+
+
+HELD = """
+import os
+import pathlib
+import threading
+
+
+def weigh(image, marks):
+    level = int(image[0, 0])
+    if marks:
+        is_first = not any(pathlib.Path(marks).iterdir())
+        pathlib.Path(marks, str(os.getpid())).touch()
+        if is_first:
+            # Until this worker is killed.
+            threading.Event().wait(60)
+    return level * level
+"""
+
+
+def test_a_worker_killed_half_way_loses_nothing_and_nothing_comes_twice(client, tmp_path):
+    made = cell(HELD)
+    cg = ep.CompGraph({"weigh": made["weigh"]}, {"weigh": (("image", "marks"), "weight")})
+    runner = ep.CompGraphRunner(cg)
+    images = [{"image": np.full((2, 2), n), "marks": str(tmp_path) if n == 20 else ""} for n in range(40)]
+    killed = []
+
+    def kill():
+        until(lambda: any(tmp_path.iterdir()), "nobody has come to the image at which the worker is killed")
+        killed.extend(int(mark.name) for mark in tmp_path.iterdir())
+        os.kill(killed[0], signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    result = ep.map(runner, images, client.get_executor())
+    killer.join(_WAIT_S)
+    assert killed[0] != os.getpid()
+    assert [outcome.number for outcome in result] == list(range(40))
+    assert [outcome.values["weight"] for outcome in result] == [level * level for level in range(40)]
+    assert len(list(tmp_path.iterdir())) == 2
+    expected = ep.map(runner, images)
+    assert without_times(result) == without_times(expected)
+
+
+def test_an_image_that_kills_every_worker_is_a_row_that_says_so(client):
+    runner, levels = mortal_runner(), (0, 1, 2, 7, 3)
+    result = ep.map(runner, [np.full((2, 2), level) for level in levels], client.get_executor())
+    assert [outcome.values.get("level") for outcome in result] == [0, 1, 2, None, 3]
+    (failure,) = result.failures
+    assert str(failure.trouble) == "KilledWorker: every worker that ran it died"
+    assert replace(failure, trouble=None).values == {}
