@@ -282,7 +282,7 @@ def _spelled(node: ast.FunctionDef | ast.Lambda) -> list[object]:
     given = node.args
     every = ([*given.posonlyargs, None, *given.args], [given.vararg], given.kwonlyargs, [given.kwarg])
     names = [[argument and argument.arg for argument in part] for part in every]
-    body = [ast.Return(node.body)] if isinstance(node, ast.Lambda) else node.body
+    body: list[ast.stmt] = [ast.Return(node.body)] if isinstance(node, ast.Lambda) else node.body
     return [*names, *spelled_tree(ast.Module(body, []))]
 
 
@@ -438,7 +438,8 @@ def _slots(kind: type) -> list[str]:
 def _content(value: Any) -> dict[str, Any]:
     """Return what an object of a class of the notebook has of a tuple, list, dict or number that it also is."""
     if isinstance(value, tuple | str | bytes | int | float | complex):
-        kind = next(kind for kind in (tuple, str, bytes, int, float, complex) if isinstance(value, kind))
+        kinds: tuple[Any, ...] = (tuple, str, bytes, int, float, complex)
+        kind = next(kind for kind in kinds if isinstance(value, kind))
         return {" content": kind.__getnewargs__(value)}
     if isinstance(value, list):
         return {" content": [*list.__iter__(value)]}
