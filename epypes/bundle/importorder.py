@@ -14,9 +14,11 @@ from collections.abc import Sequence
 def ordered_imports(statements: Sequence[str]) -> list[str]:
     """Return the lines of imports, with an empty one between Python's own and all others."""
     found = sorted(_joined(dict.fromkeys(statements)), key=_place)
-    own = [statement for statement in found if _is_of_python(statement)]
+    first = [statement for statement in found if statement.startswith("from __future__")]
+    own = [statement for statement in found if _is_of_python(statement) and statement not in first]
     others = [statement for statement in found if not _is_of_python(statement)]
-    return [*own, *[""][: bool(own and others)], *others]
+    parts = [part for part in (first, own, others) if part]
+    return [line for part in parts for line in ("", *part)][1:]
 
 
 def _joined(statements: Sequence[str] | dict[str, None]) -> list[str]:

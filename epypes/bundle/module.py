@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Iterable, Iterator, Mapping
+import functools
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -11,15 +12,22 @@ from epypes.bundle.emit import emit_module
 from epypes.bundle.entries import members_in
 from epypes.bundle.equivalence import Pair, refusal
 from epypes.bundle.graphs import Graphs
+from epypes.bundle.load import MAKER
 from epypes.bundle.settings import Settings
 from epypes.bundle.slicer import Slice
 from epypes.bundle.source import Refused
 from epypes.bundle.subject import Subject, own_lines
+from epypes.pipeline import FullPipeline
 
 
-def write_module(subject: Subject, settings: Settings) -> tuple[str, Settings, Mapping[str, Any], list[str]]:
-    """Return the text of ``pipeline.py``, the settings with what it has of its own, its arrays, the reasons against."""
-    gathered = Slice(keeps_arrays=True)
+def write_module(
+    subject: Subject, settings: Settings, uncalled: Collection[int] = ()
+) -> tuple[str, Settings, Mapping[str, Any], list[str]]:
+    """Return the text of ``pipeline.py``, the settings with what it has of its own, its arrays, the reasons against.
+
+    Closures whose ids are in ``uncalled`` are written with what they have captured, not as calls of their factories.
+    """
+    gathered = Slice(keeps_arrays=True, uncalled=uncalled)
     graphs = Graphs(gathered)
     ports = {f"Function {name!r}": function for name, function in subject.ports.items()}
     text = graphs.write(subject.cg, {**ports, **subject.classes})
@@ -31,10 +39,17 @@ def write_module(subject: Subject, settings: Settings) -> tuple[str, Settings, M
     if enums:
         blocks.append(enums)
     settings = replace(settings, own=tuple(own))
+    if gathered.refusals and gathered.called:
+        again = write_module(subject, settings, {*uncalled, *gathered.called})
+        if not again[3]:
+            return again
     if gathered.refusals:
         return "", settings, {}, list(dict.fromkeys(gathered.refusals))
     text_of_all = emit_module(settings, subject.cg, gathered, text, graphs.blocks, blocks)
-    why = refusal(text_of_all, gathered.arrays.by_name, lambda module: _pairs(subject, settings, module))
+    pairs = functools.partial(_pairs, subject, settings)
+    why, closure = refusal(text_of_all, gathered.arrays.by_name, pairs, gathered.called)
+    if closure:
+        return write_module(subject, settings, {*uncalled, closure})
     return text_of_all, settings, gathered.arrays.by_name, [why] if why else []
 
 
@@ -48,6 +63,11 @@ def _pairs(subject: Subject, settings: Settings, module: Any) -> Iterator[Pair]:
         yield what, kind, getattr(module, kind.__name__)
     for kind in _enums_in(settings):
         yield f"Class {kind.__name__!r}", kind, module.enums[kind.__qualname__]
+    pipeline = subject.pipeline
+    if MAKER in settings.own and isinstance(pipeline, FullPipeline):
+        given = (pipeline.q_in, pipeline.q_out, *(getattr(pipeline, name, None) for name in ("f_in", "f_out")))
+        made = module.make_pipeline(pipeline.source_cg, *given, dict(pipeline.runner.hyperparameters))
+        yield f"Pipeline {pipeline.name!r}", pipeline, made
 
 
 def _enums(gathered: Slice, settings: Settings) -> list[str]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import builtins
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 from epypes.bundle.branches import Placement, place
 from epypes.bundle.definitions import definitions, early_constants
-from epypes.bundle.equivalence import refusal
+from epypes.bundle.equivalence import Pair, refusal
 from epypes.bundle.importorder import ordered_imports
 from epypes.bundle.literal import literal_source
 from epypes.bundle.nodes import called_by, is_plain_pipeline
@@ -91,24 +92,34 @@ def to_source(
     graph, values = _subject(cg, hparams)
     wanted = _wanted(graph, returns)
     top = _Part(name, graph, values, place(graph, wanted), graph.sink_tokens if wanted is None else wanted)
-    parts = _with_pipelines(top)
+    return _written(top, wanted)
+
+
+def _written(top: _Part, wanted: tuple[str, ...] | None, uncalled: Collection[int] = ()) -> str:
+    """Return the text; closures whose ids are in ``uncalled`` are written with what they have captured."""
+    name, parts = top.name, _with_pipelines(top)
     _check_placeholders(parts)
-    gathered = Slice(reserved=(name,))
+    gathered = Slice(reserved=(name,), uncalled=uncalled)
     gathered.refusals += _unwritable(parts, name, wanted)
     _slice(gathered, parts)
     _keep_names(gathered, parts)
     straights = [_resolved(gathered, part) for part in parts]
+    if gathered.refusals and gathered.called:
+        with suppress(SourceRefused):
+            return _written(top, wanted, {*uncalled, *gathered.called})
     if gathered.refusals:
         raise SourceRefused(tuple(dict.fromkeys(gathered.refusals)))
     text = _module(gathered, straights)
-    why = _difference(text, parts, straights)
+    why, closure = _difference(text, parts, straights, gathered)
+    if closure:
+        return _written(top, wanted, {*uncalled, closure})
     if why:
         raise SourceRefused((why,))
     return text
 
 
-def _difference(text: str, parts: Sequence[_Part], straights: Sequence[Straight]) -> str:
-    """Return why what a module calls is not what the graph calls; "" if it is."""
+def _difference(text: str, parts: Sequence[_Part], straights: Sequence[Straight], gathered: Slice) -> tuple[str, int]:
+    """Return why what a module calls is not what the graph calls, as ``refusal`` returns it."""
     compared: list[tuple[str, Any, str]] = []
     for part, straight in zip(parts, straights, strict=True):
         for name, source in part.references.items():
@@ -118,9 +129,11 @@ def _difference(text: str, parts: Sequence[_Part], straights: Sequence[Straight]
             compared.append((f"Hyperparameter {token!r}{part.where}", part.values[token], source))
     listed = "".join(f"    {source},\n" for _, _, source in compared)
     whole = f"{text}\n\nreferences = [\n{listed}]\n"
-    return refusal(whole, {}, lambda module: [
-        (what, ours, theirs) for (what, ours, _), theirs in zip(compared, module.references, strict=True)
-    ])  # fmt: skip
+
+    def pairs(module: Any) -> list[Pair]:
+        return [(what, ours, made) for (what, ours, _), made in zip(compared, module.references, strict=True)]
+
+    return refusal(whole, {}, pairs, gathered.called)
 
 
 @dataclass(eq=False, slots=True)
