@@ -38,7 +38,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from epypes.batch.cases import SINK, Case
-from epypes.batch.files import is_file
+from epypes.batch.items import is_file
 from epypes.bundle.entries import read
 from epypes.errors import EpypesError, ScaleError, UnknownName
 from epypes.wording import ended

@@ -12,8 +12,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path, PurePath
 from typing import Any, Final
 
-from epypes.batch.files import is_file, read_value
-from epypes.batch.lasting import holds_its_arrays, lasting
+from epypes.batch.items import defensive_copy, holds_its_arrays, is_file, read_value
 from epypes.batch.metrics import METRICS, Metric
 from epypes.errors import ScaleError, UnknownName
 from epypes.graph import CompGraph
@@ -232,7 +231,7 @@ def with_labels_read(case: Case, cg: CompGraph) -> Case:
 
 def _lasting(case: Case) -> Case:
     """Return a case that stays as it is when whoever gave it fills its arrays for the next one."""
-    return replace(case, inputs=lasting(case.inputs), expected=lasting(case.expected))
+    return replace(case, inputs=defensive_copy(case.inputs), expected=defensive_copy(case.expected))
 
 
 def _case(item: Any) -> Case:

@@ -12,14 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.batch.cases import Case, Check, cases_of, checks_of
-from epypes.batch.files import is_file
-from epypes.batch.items import items_of
+from epypes.batch.executors import run_jobs
+from epypes.batch.items import detached_runner, is_file, items_of
 from epypes.batch.job import Job
-from epypes.batch.lasting import settled_runner
 from epypes.batch.measuring import CheckOutcome, measured
 from epypes.batch.progress import progress_bar
-from epypes.batch.spreading import spread
-from epypes.batch.table import none_as_it_is
+from epypes.batch.results import object_column
 from epypes.bundle.entries import Member
 from epypes.errors import UnknownName
 from epypes.optional import optional_import
@@ -80,7 +78,7 @@ def check(
     >>> result.failures[0].reason
     'expected 7, got 6'
     """
-    runner = settled_runner(runner)
+    runner = detached_runner(runner)
     found = prepared(runner, cases)
     outcomes: list[CheckOutcome] = []
     pictured: Counter[bool] = Counter()
@@ -148,7 +146,7 @@ def checked(
         Ends it in bounded time, once it is set.
     """
     jobs = _jobs(runner, cases, has_pictures=has_pictures)
-    for outcomes in spread(runner, jobs, executor, stop=stop):
+    for outcomes in run_jobs(runner, jobs, executor, stop=stop):
         for outcome in outcomes:
             case, checks = cases[outcome.number]
             yield measured(outcome, case, checks, runner.cg)
@@ -223,7 +221,7 @@ class CheckResult:
         with optional_import():
             import pandas as pd
         frame = pd.DataFrame(rows)
-        frame["failure"] = none_as_it_is([outcome.reason or None for outcome in self.outcomes])
+        frame["failure"] = object_column([outcome.reason or None for outcome in self.outcomes])
         return frame
 
     def to_junit(self, path: str | os.PathLike[str], name: str = "epypes check") -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from typing import Any, Final
 
-from epypes.batch.outcome import Thumbnail
+from epypes.batch.results import Thumbnail
 from epypes.batch.thumbnails import thumbnail_of_value
 from epypes.display import is_image
 from epypes.display.previews.raster import THUMBNAIL_PX

@@ -75,8 +75,8 @@ def _test_case(junit: Any, outcome: CheckOutcome, time_s: float) -> Any:
     test = junit.TestCase(_text(outcome.check), classname=_text(outcome.case), time=round(time_s, 6))
     if outcome.passed:
         return test
-    is_error = outcome.trouble is not None
-    kind = outcome.trouble.kind if outcome.trouble is not None else "threshold"
+    is_error = outcome.error_info is not None
+    kind = outcome.error_info.kind if outcome.error_info is not None else "threshold"
     problem = (junit.Error if is_error else junit.Failure)(_text(outcome.reason), _text(kind))
     problem.text = _text(_told(outcome))
     test.result = [problem]

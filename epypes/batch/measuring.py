@@ -13,9 +13,9 @@ from typing import Any, Final
 
 from epypes.batch.cases import ABSENT, Case, Check, with_labels_read
 from epypes.batch.differing import pictures_of
-from epypes.batch.files import read_value
+from epypes.batch.items import read_value
 from epypes.batch.metrics import METRICS
-from epypes.batch.outcome import Outcome, Thumbnail, Trouble
+from epypes.batch.results import ErrorInfo, Outcome, Thumbnail
 from epypes.bundle.compare import first_difference
 from epypes.errors import EpypesError, ScaleError
 from epypes.graph import CompGraph
@@ -61,7 +61,7 @@ class CheckOutcome:
     threshold: str
     passed: bool
     reason: str = ""
-    trouble: Trouble | None = None
+    error_info: ErrorInfo | None = None
     total_ns: int = 0
     pictures: Mapping[str, Thumbnail] = field(default_factory=dict, repr=False)
 
@@ -91,13 +91,13 @@ class _Verdict:
 
     value: float | None
     reason: str = ""
-    trouble: Trouble | None = None
+    error_info: ErrorInfo | None = None
     pictures: Mapping[str, Thumbnail] = field(default_factory=dict)
 
     @property
     def passed(self) -> bool:
         """Whether nothing failed, and there is no reason why it does not do."""
-        return self.trouble is None and not self.reason
+        return self.error_info is None and not self.reason
 
 
 def _outcome(outcome: Outcome, case: Case, check: Check, cg: CompGraph) -> CheckOutcome:
@@ -112,7 +112,7 @@ def _outcome(outcome: Outcome, case: Case, check: Check, cg: CompGraph) -> Check
         check.threshold,
         verdict.passed,
         " ".join(verdict.reason.split())[:_REASON_CHARACTERS],
-        verdict.trouble,
+        verdict.error_info,
         outcome.total_ns,
         # That of the run has what was found drawn over its image.
         verdict.pictures if seen is None else {**verdict.pictures, "got": seen},
@@ -121,8 +121,8 @@ def _outcome(outcome: Outcome, case: Case, check: Check, cg: CompGraph) -> Check
 
 def _judged(outcome: Outcome, case: Case, check: Check, cg: CompGraph) -> _Verdict:
     """Return the number, why it does not do, what failed, and pictures of the difference."""
-    if outcome.trouble is not None:
-        return _Verdict(None, str(outcome.trouble), outcome.trouble)
+    if outcome.error_info is not None:
+        return _Verdict(None, str(outcome.error_info), outcome.error_info)
     if check.metric == RUNS:
         return _Verdict(None)
     value = expected = None
@@ -204,7 +204,7 @@ def _failed(error: BaseException, check: Check) -> _Verdict:
     message = str(error).strip()
     if isinstance(error, KeyError) and check.token is None:
         message = f"no token {message} is kept. If the graph has it, give the metric keep=[{message}]."
-    trouble = Trouble("", type(error).__name__, message)
+    error_info = ErrorInfo("", type(error).__name__, message)
     # Our own sentences say all; of a user's metric, and where there is no text, the kind of error does.
     is_ours = bool(message) and (isinstance(error, EpypesError) or not callable(check.metric))
-    return _Verdict(None, message if is_ours else str(trouble), trouble)
+    return _Verdict(None, message if is_ours else str(error_info), error_info)

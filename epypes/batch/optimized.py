@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from epypes.batch.ranging import Axis
+from epypes.batch.results import object_column
 from epypes.batch.studying import Direction, Trial, importances
-from epypes.batch.table import none_as_it_is
 from epypes.errors import ScaleError
 from epypes.optional import optional_import
 from epypes.wording import counted
@@ -115,7 +115,7 @@ class OptimizeResult:
             columns[title] = [trial.setting[axis.token] for trial in self.trials]
         columns[self.metric] = [float("nan") if trial.value is None else trial.value for trial in self.trials]
         columns["state"] = ["failed" if trial.value is None else "complete" for trial in self.trials]
-        columns["failure"] = none_as_it_is([trial.failure or None for trial in self.trials])
+        columns["failure"] = object_column([trial.failure or None for trial in self.trials])
         columns["ms"] = [trial.total_ns / 1e6 for trial in self.trials]
         with optional_import():
             import pandas as pd

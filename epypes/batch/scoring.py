@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
+from epypes.batch.cache import combined_digest, function_digest
 from epypes.batch.cases import Case
-from epypes.batch.digests import joined
-from epypes.batch.fingerprint import function_fingerprint
-from epypes.batch.outcome import Outcome
+from epypes.batch.results import Outcome
 from epypes.errors import ScaleError
 from epypes.graph import CompGraph
 
@@ -89,8 +88,8 @@ class Scoring:
         Untold
             Nobody can say what it computes, as of an object that is called.
         """
-        measure = "token" if self._is_token else function_fingerprint(self._measure)
-        return joined("metric", measure, *self.keep).hex()
+        measure = "token" if self._is_token else function_digest(self._measure)
+        return combined_digest("metric", measure, *self.keep).hex()
 
     def of_outcomes(self, outcomes: Iterable[Outcome]) -> Score:
         """Return the score of a setting by what it gave, in the order of the cases; after a failure none is taken."""
@@ -100,16 +99,16 @@ class Scoring:
             spent_ns += outcome.total_ns
             value, failure = self.of_one(case, outcome)
             if value is None:
-                trouble = outcome.trouble
-                unreadable = trouble.message if trouble is not None and trouble.is_unreadable else ""
+                error_info = outcome.error_info
+                unreadable = error_info.message if error_info is not None and error_info.is_unreadable else ""
                 return Score(None, failure, spent_ns, unreadable)
             values.append(value)
         return Score(math.fsum(values) / len(values), "", spent_ns)
 
     def of_one(self, case: Case, outcome: Outcome) -> tuple[float | None, str]:
         """Return the metric of one case, or None and why there is none."""
-        if outcome.trouble is not None:
-            return None, self._said(case, str(outcome.trouble))
+        if outcome.error_info is not None:
+            return None, self._said(case, str(outcome.error_info))
         try:
             given = self._measure(MappingProxyType(dict(outcome.kept)), case)
         except (Exception, SystemExit) as error:

@@ -6,11 +6,9 @@ import platform
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
-from epypes.batch.digests import Untold, digest_of, joined
-from epypes.batch.fingerprint import graph_fingerprint
+from epypes.batch.cache import NoDigest, combined_digest, graph_fingerprint, payload_digest, value_digest
 from epypes.batch.items import Item
 from epypes.batch.ranging import Axis, Choices
-from epypes.batch.remembered import contents_of
 from epypes.batch.scoring import Scoring
 from epypes.bundle import to_source
 from epypes.errors import EpypesError, PlaceholderNeeded, ScaleError, SourceRefused
@@ -50,11 +48,11 @@ def about_search(
     labels = [(case.name, case.expected, case.hyperparameters) for case in scoring.cases]
     ways: dict[str, Callable[[], str]] = {
         GRAPH: lambda: _graph_digest(runner, is_named),
-        "hyperparameters": lambda: digest_of(fixed),
-        "choices": lambda: digest_of(choices),
+        "hyperparameters": lambda: value_digest(fixed),
+        "choices": lambda: value_digest(choices),
         METRIC: scoring.digest,
-        "inputs of the cases": lambda: digest_of([(item.name, contents_of(item.payload)) for item in items]),
-        "labels of the cases": lambda: digest_of(
+        "inputs of the cases": lambda: value_digest([(item.name, payload_digest(item.payload)) for item in items]),
+        "labels of the cases": lambda: value_digest(
             [[part if part is None or isinstance(part, str) else dict(part) for part in label] for label in labels]
         ),
     }
@@ -62,7 +60,7 @@ def about_search(
     for what, way in ways.items():
         try:
             found[what] = way()
-        except (EpypesError, Untold) as error:
+        except (EpypesError, NoDigest) as error:
             if not is_named:
                 text = f"What is searched has no name for the store. Nothing tells its {what} from others: {error}"
                 raise ScaleError(f"{text}.\nGive one: name='...'.") from error
@@ -79,14 +77,14 @@ def _graph_digest(runner: CompGraphRunner, is_named: bool) -> str:
         source = None
     found = graph_fingerprint(runner.cg, source)
     if found.unknown:
-        raise Untold(found.unknown)
-    return joined("graph", found.code, found.state).hex()
+        raise NoDigest(found.unknown)
+    return combined_digest("graph", found.code, found.state).hex()
 
 
 def name_of(metric: str, direction: str, axes: Sequence[Axis], about: Mapping[str, str]) -> str:
     """Return what a search is called in a store if the user does not say: a digest of what it computes."""
     said = [axis.labels if isinstance(axis, Choices) else repr(axis) for axis in axes]
-    digest = joined("search", repr((direction, [axis.token for axis in axes], said, sorted(about.items()))))
+    digest = combined_digest("search", repr((direction, [axis.token for axis in axes], said, sorted(about.items()))))
     return f"optimize {metric} {digest.hex()[:12]}"
 
 
@@ -99,7 +97,7 @@ def changed_meanwhile(runner: CompGraphRunner, scoring: Scoring, about: Mapping[
 def _or_none(way: Callable[[], str]) -> str | None:
     try:
         return way()
-    except (EpypesError, Untold):
+    except (EpypesError, NoDigest):
         return None
 
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import Any
 
-from epypes.batch.order import identity
-from epypes.batch.outcome import Outcome, Thumbnail
+from epypes.batch.grid import identity
+from epypes.batch.results import Outcome, Thumbnail
 from epypes.display.previews.preview import sketch
 from epypes.display.previews.short import reason
 from epypes.display.previews.shown import Look
@@ -235,8 +235,8 @@ def _named(outcome: Outcome, name: str, plan: _Plan) -> str:
 def _tile(place: int, outcome: Outcome, plan: _Plan) -> Tile:
     label = ", ".join(_named(outcome, name, plan) for name in plan.by_tile)
     thumbnail = None if plan.token is None else outcome.thumbnails.get(plan.token)
-    if outcome.trouble is not None:
-        return Tile(place, label, str(outcome.trouble), True, thumbnail)
+    if outcome.error_info is not None:
+        return Tile(place, label, str(outcome.error_info), True, thumbnail)
     return Tile(place, label, thumbnail.caption if thumbnail else _told(outcome, plan.token), False, thumbnail)
 
 
@@ -273,7 +273,7 @@ def _shown_tokens(outcome: Outcome) -> frozenset[str]:
 
 def _require_shown(cg: CompGraph, outcomes: Sequence[Outcome], token: str) -> str:
     cg.require_token(token)
-    complete = [outcome for outcome in outcomes if outcome.trouble is None]
+    complete = [outcome for outcome in outcomes if outcome.error_info is None]
     if token in shown_tokens(cg, outcomes) or not complete:
         return token
     pictured = dict.fromkeys(name for outcome in outcomes for name in outcome.thumbnails)

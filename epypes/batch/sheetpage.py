@@ -12,7 +12,7 @@ import io
 from dataclasses import dataclass, replace
 from typing import Final
 
-from epypes.batch.outcome import Thumbnail
+from epypes.batch.results import Thumbnail
 from epypes.batch.sheet import Block, Sheet, Tile
 from epypes.display.limits import CHARACTERS, THUMBNAIL_CHARACTERS
 from epypes.display.markup import content, escape, fitted, size

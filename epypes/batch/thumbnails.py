@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any, Final
 
-from epypes.batch.outcome import Thumbnail
+from epypes.batch.results import Thumbnail
 from epypes.display.paint.thumbnails import THUMB_HEIGHT, THUMB_WIDTH, paint_thumbnail
 from epypes.display.previews.arrays import plain_array
 from epypes.display.previews.imagekinds import image_kind, is_image, sampled

@@ -92,7 +92,7 @@ def _plain(outcome: CheckOutcome) -> dict[str, Any]:
         "threshold": outcome.threshold,
         "passed": outcome.passed,
         "reason": outcome.reason,
-        "is_error": outcome.trouble is not None,
+        "is_error": outcome.error_info is not None,
         "run_ms": outcome.total_ns / 1e6,
     }
 

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 import epypes as ep
-from epypes.batch.outcome import Thumbnail
+from epypes.batch.results import Thumbnail
 from epypes.batch.sheet import Tile, said
 from epypes.display.limits import CHARACTERS, THUMBNAIL_CHARACTERS
 from epypes.errors import ScaleError, UnknownName

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import anywidget
 
-from epypes.batch.order import identity
+from epypes.batch.grid import identity
 from epypes.batch.sheet import Block, Sheet, Tile, shown_tokens
 from epypes.batch.sheetpage import page_of
 from epypes.batch.sweeping import SweepResult
