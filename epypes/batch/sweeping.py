@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.batch.cache import StoredOutcomes, series_of
+from epypes.batch.contact_sheet import Sheet, sheet_of
 from epypes.batch.executors import run_jobs, worker_count
 from epypes.batch.grid import Grid, Setting, functions_after, grid_of, running_order, steps
 from epypes.batch.items import Item, count_of, detached_runner, items_of
 from epypes.batch.job import Job, SharedStart
 from epypes.batch.progress import Advance, progress_bar
 from epypes.batch.results import Outcome, outcomes_frame
-from epypes.batch.sheet import Sheet, sheet_of
 from epypes.errors import PayloadError, ScaleError, run_call
 from epypes.run import CompGraphRunner
 from epypes.store import Store, opened_store

@@ -16,7 +16,7 @@ from skimage import data
 
 import epypes as ep
 from epypes.acquisition import write_image
-from epypes.batch.checking import CheckResult, checked, prepared
+from epypes.batch.check import CheckResult, checked, prepared
 from epypes.errors import ScaleError, UnknownName
 
 

@@ -20,9 +20,9 @@ import pytest
 
 import epypes as ep
 from epypes.batch import incremental
-from epypes.batch.optimized import OptimizeResult
-from epypes.batch.ranging import Span
-from epypes.batch.studying import Trial
+from epypes.batch.ranges import SearchSpan as Span
+from epypes.batch.search_result import OptimizeResult
+from epypes.batch.study import Trial
 from epypes.errors import ScaleError, UnknownName
 from tests.store.postgres import PASSWORD, server
 

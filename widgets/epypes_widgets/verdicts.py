@@ -13,9 +13,8 @@ from time import monotonic
 from typing import Any, Final
 
 from epypes.batch.cases import Case, Check
-from epypes.batch.checking import CheckResult, Checks, checked, inputs_of, prepared
+from epypes.batch.check import CheckOutcome, CheckResult, Checks, checked, inputs_of, prepared
 from epypes.batch.items import items_of, payload_of, read_value
-from epypes.batch.measuring import CheckOutcome
 from epypes.errors import EpypesError, PayloadError
 from epypes.run import CompGraphRunner
 from epypes.wording import counted

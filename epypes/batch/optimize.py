@@ -15,13 +15,12 @@ from epypes.batch.executors import run_jobs, worker_count
 from epypes.batch.incremental import CaseRunners, SearchStopped
 from epypes.batch.items import Item, detached_runner, items_of
 from epypes.batch.job import Job
-from epypes.batch.optimized import OptimizeResult
+from epypes.batch.objective import Metric, Score, Scoring, about_search, changed_meanwhile, name_of
 from epypes.batch.progress import progress_bar
-from epypes.batch.ranging import axes_of
+from epypes.batch.ranges import axes_of
 from epypes.batch.results import Outcome
-from epypes.batch.scoring import Metric, Score, Scoring
-from epypes.batch.searched import about_search, changed_meanwhile, name_of
-from epypes.batch.studying import Asked, Direction, Search, Trial
+from epypes.batch.search_result import OptimizeResult
+from epypes.batch.study import Asked, Direction, Search, Trial
 from epypes.errors import ScaleError
 from epypes.run import CompGraphRunner
 from epypes.store import opened_store
@@ -29,6 +28,7 @@ from epypes.wording import ended
 
 if TYPE_CHECKING:
     from epypes.store import Store
+
 
 _CASE_FILE: Final = ".toml"
 _DIRECTIONS: Final = ("maximize", "minimize")
