@@ -7,16 +7,19 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping
+import re
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path, PurePath
 from typing import Any, Final
 
-from epypes.batch.files import is_file, read_value
-from epypes.batch.lasting import holds_its_arrays, lasting
+from epypes.batch.items import defensive_copy, holds_its_arrays, is_file, read_value
 from epypes.batch.metrics import METRICS, Metric
-from epypes.errors import ScaleError, UnknownName
+from epypes.bundle.entries import read
+from epypes.errors import EpypesError, ScaleError, UnknownName
 from epypes.graph import CompGraph
+from epypes.wording import ended
 
 # What a threshold spec may say besides the options of its metric.
 SPEC_KEYS: Final = ("token", "metric", "expected", "min", "max", "keep")
@@ -178,8 +181,6 @@ def cases_of(given: Any) -> tuple[Case, ...]:
         There is none, or one is not a case.
     """
     if isinstance(given, str | os.PathLike):
-        from epypes.batch.casefile import read_cases
-
         return _named(read_cases(Path(given)))
     if isinstance(given, Case | Mapping) or not isinstance(given, Iterable):
         raise ScaleError(
@@ -232,7 +233,7 @@ def with_labels_read(case: Case, cg: CompGraph) -> Case:
 
 def _lasting(case: Case) -> Case:
     """Return a case that stays as it is when whoever gave it fills its arrays for the next one."""
-    return replace(case, inputs=lasting(case.inputs), expected=lasting(case.expected))
+    return replace(case, inputs=defensive_copy(case.inputs), expected=defensive_copy(case.expected))
 
 
 def _case(item: Any) -> Case:
@@ -362,3 +363,137 @@ def _meant(check: Check, case: Case, cg: CompGraph) -> str:
     raise ScaleError(
         f"Metric {check.name!r} of {case} does not say which token it looks at. Give token, one of: {among}."
     )
+
+
+_CASE_KEYS: Final = ("name", "inputs", "hyperparameters", "check")
+_HEADER: Final = re.compile(r"^[ \t]*\[\[[ \t]*case[ \t]*\]\]", re.MULTILINE)
+_SHOWN: Final = 60
+
+
+def read_cases(path: Path) -> list[Case]:
+    """Return the cases in a file, in their order; no file that they name is read.
+
+    Raises
+    ------
+    ScaleError
+        The file can't be read, or says something else than cases; with every reason.
+    """
+    text, document = _document(path)
+    reasons = [str(error) for error in _unknown(document, ("case",), f"in {path.name}")]
+    tables = document.get("case")
+    if not (isinstance(tables, list) and tables and all(isinstance(table, dict) for table in tables)):
+        reasons.append(f"{path} has no cases. Write one: [[case]] with inputs and [[case.check]].")
+        raise ScaleError(" ".join(reasons))
+    cases = []
+    for table, line in zip(tables, _lines(text, len(tables)), strict=True):
+        try:
+            cases.append(_case_of_table(table, path.parent))
+        except (EpypesError, ValueError) as error:
+            reasons.append(f"{path.name}, line {line}: {error}")
+    if reasons:
+        raise ScaleError(" ".join(reasons))
+    return cases
+
+
+def _document(path: Path) -> tuple[str, dict[str, Any]]:
+    if path.is_dir():
+        text = f"{str(path)!r} is a folder. Give the path of a CASES.toml, or a list of cases that say what is expected"
+        raise ScaleError(f"{text}: [ep.Case('{path.name}/a.png', expected={{...}}), ...].")
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        return text, tomllib.loads(text)
+    except FileNotFoundError as error:
+        raise ScaleError(f"There is no file {str(path)!r}. Check the path.") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ScaleError(f"{path} is not TOML: {error}.") from error
+    except (OSError, ValueError, RecursionError) as error:  # also bytes that are no text
+        said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise ScaleError(f"{str(path)!r} can't be read: {said}.") from error
+
+
+def _lines(text: str, count: int) -> list[int]:
+    """Return the line at which each case begins; cases that are written as an inline array begin at the first line."""
+    found = [text.count("\n", 0, match.start()) + 1 for match in _HEADER.finditer(text)]
+    return found if len(found) == count else [1] * count
+
+
+def _unknown(table: Mapping[str, Any], known: tuple[str, ...], where: str) -> Iterator[UnknownName]:
+    for key in table:
+        if key not in known:
+            yield UnknownName("key", key, known, where)
+
+
+# -- a case -----------------------------------------------------------------------------------------------------
+
+
+def _case_of_table(table: Mapping[str, Any], folder: Path) -> Case:
+    name = table.get("name")
+    where = f"in case {name!r:.{_SHOWN}}" if name else "in this case"
+    for error in _unknown(table, _CASE_KEYS, where):
+        raise error
+    if name is not None and not isinstance(name, str):
+        raise ValueError(f"The name of a case is a text, not {name!r:.{_SHOWN}}.")
+    if "inputs" not in table:
+        raise ValueError(f'There are no inputs {where}. Write: inputs = {{image = "a.png"}}.')
+    metrics, expected = _checks(table.get("check", []), folder, where)
+    hyperparameters = _table(table.get("hyperparameters", {}), "hyperparameters", where)
+    values = {token: _hyperparameter(token, entry) for token, entry in hyperparameters.items()}
+    return Case(_inputs(table["inputs"], folder), expected, metrics, name, values)
+
+
+def _inputs(given: Any, folder: Path) -> Any:
+    if isinstance(given, Mapping):
+        return {token: _file_or_value(value, folder) for token, value in given.items()}
+    return _file_or_value(given, folder)
+
+
+def _hyperparameter(token: str, entry: Any) -> Any:
+    """Return a value as pipeline.toml has it: what TOML has none like is a table with its kind."""
+    if not isinstance(entry, Mapping):
+        return entry
+    try:
+        return read(entry)
+    except (LookupError, TypeError, ValueError, ArithmeticError) as error:
+        raise ValueError(
+            f"Hyperparameter {token!r} can't be read: {ended(str(error))} Write it as in pipeline.toml, such as "
+            '{value = [3, 5], kind = "tuple"}.'
+        ) from error
+
+
+def _file_or_value(value: Any, folder: Path) -> Any:
+    return folder / Path(value).expanduser() if is_file(value) else value
+
+
+def _table(given: Any, key: str, where: str) -> Mapping[str, Any]:
+    if not isinstance(given, Mapping):
+        raise ValueError(f"{key} {where} is a table, not {given!r:.{_SHOWN}}.")
+    return given
+
+
+# -- its checks -------------------------------------------------------------------------------------------------
+
+
+def _checks(given: Any, folder: Path, where: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the metrics of a case by name, and what is expected by token."""
+    if not (isinstance(given, list) and all(isinstance(table, Mapping) for table in given)):
+        raise ValueError(f"The checks {where} are tables: [[case.check]].")
+    metrics: dict[str, Any] = {}
+    expected: dict[str, Any] = {}
+    for table in given:
+        spec = {key: _file_or_value(value, folder) if key == "expected" else value for key, value in table.items()}
+        spec.setdefault("metric", "equal" if "expected" in spec else "value")
+        label = _label(spec, metrics)
+        metrics[label] = {"token": SINK, **spec}
+        if "expected" in spec and "token" in spec:
+            expected.setdefault(spec["token"], spec["expected"])
+    return metrics, expected
+
+
+def _label(spec: dict[str, Any], taken: Mapping[str, Any]) -> str:
+    """Take the name of a check out of it, or make one that no other check of the case has."""
+    token = spec.get("token")
+    name = str(spec.pop("name", spec["metric"] if token is None else f"{spec['metric']} of {token}"))
+    number = next(
+        number for number in range(1, len(taken) + 2) if (name if number == 1 else f"{name} ({number})") not in taken
+    )
+    return name if number == 1 else f"{name} ({number})"

@@ -8,16 +8,12 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
-from epypes.batch.batches import Batches
-from epypes.batch.items import Item, count_of, items_of
+from epypes.batch.cache import StoredOutcomes, series_of
+from epypes.batch.executors import JobSizes, run_jobs, worker_count
+from epypes.batch.items import Item, count_of, detached_runner, items_of
 from epypes.batch.job import Job
-from epypes.batch.lasting import settled_runner
-from epypes.batch.outcome import Outcome
 from epypes.batch.progress import Advance, progress_bar
-from epypes.batch.remembered import Remembered, series_of
-from epypes.batch.shown import rows_shown
-from epypes.batch.spreading import spread, worker_count
-from epypes.batch.table import frame_of
+from epypes.batch.results import Outcome, outcomes_frame, outcomes_html
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
 from epypes.store import Store, opened_store
@@ -53,7 +49,7 @@ class MapResult(Sequence[Outcome]):
 
         Sink tokens that are no numbers, texts or truth values stand there as a short text.
         """
-        return frame_of(self.outcomes, self.cg)
+        return outcomes_frame(self.outcomes, self.cg)
 
     @overload
     def __getitem__(self, index: int) -> Outcome: ...
@@ -73,7 +69,7 @@ class MapResult(Sequence[Outcome]):
         return f"{counted(len(self), 'image')}, {len(self.failures)} failed"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        return {"text/plain": repr(self), "text/html": rows_shown(self.outcomes, self.cg, self._caption)}
+        return {"text/plain": repr(self), "text/html": outcomes_html(self.outcomes, self.cg, self._caption)}
 
 
 def map_images(
@@ -146,14 +142,14 @@ def map_images(
     for token in (*keep, *(show or ())):
         runner.cg.require_token(token)
     # Whoever sets values on theirs meanwhile, or writes into them, does not change what is computed and stored.
-    runner = settled_runner(runner)
+    runner = detached_runner(runner)
     with ExitStack() as stack:
         opened = stack.enter_context(opened_store(store))
         memory = None
         if opened is not None:
             series, fingerprint = series_of(opened, "map", runner, name)
             how = "" if show == () else f"show={show and list(show)}"
-            memory = stack.enter_context(Remembered(series, how, not keep, fingerprint))
+            memory = stack.enter_context(StoredOutcomes(series, how, not keep, fingerprint))
         advance = stack.enter_context(progress_bar(progress, count_of(images), "map"))
         work = _Map(memory, advance, tuple(keep), None if show is None else tuple(show))
         is_copied = executor is not None or opened is not None or bool(keep)
@@ -165,7 +161,7 @@ class _Map:
     """One map: the outcomes that have come."""
 
     def __init__(
-        self, memory: Remembered | None, advance: Advance, keep: tuple[str, ...], show: tuple[str, ...] | None
+        self, memory: StoredOutcomes | None, advance: Advance, keep: tuple[str, ...], show: tuple[str, ...] | None
     ) -> None:
         self._memory, self._advance, self._keep, self._show = memory, advance, keep, show
         self.outcomes: list[Outcome] = []
@@ -180,9 +176,9 @@ class _Map:
     ) -> None:
         """Run what has to be run."""
         workers = 0 if executor is None else worker_count(executor)
-        batches = Batches(self._unknown(items), workers, count)
+        batches = JobSizes(self._unknown(items), workers, count)
         jobs = (Job(batch, keep=self._keep, show=self._show) for batch in batches)
-        for outcomes in spread(runner, jobs, executor, ahead=ahead):
+        for outcomes in run_jobs(runner, jobs, executor, ahead=ahead):
             batches.learn(outcomes)
             if self._memory is not None:
                 self._memory.add(outcomes)

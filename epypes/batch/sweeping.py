@@ -10,18 +10,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.batch.grids import Grid, Setting, grid_of
-from epypes.batch.items import Item, count_of, items_of
-from epypes.batch.job import Job
-from epypes.batch.lasting import settled_runner
-from epypes.batch.order import functions_after, running_order, steps
-from epypes.batch.outcome import Outcome
+from epypes.batch.cache import StoredOutcomes, series_of
+from epypes.batch.contact_sheet import Sheet, sheet_of
+from epypes.batch.executors import run_jobs, worker_count
+from epypes.batch.grid import Grid, Setting, functions_after, grid_of, running_order, steps
+from epypes.batch.items import Item, count_of, detached_runner, items_of
+from epypes.batch.job import Job, SharedStart
 from epypes.batch.progress import Advance, progress_bar
-from epypes.batch.remembered import Remembered, series_of
-from epypes.batch.sheet import Sheet, sheet_of
-from epypes.batch.spreading import spread, worker_count
-from epypes.batch.start import Start
-from epypes.batch.table import frame_of
+from epypes.batch.results import Outcome, outcomes_frame
 from epypes.errors import PayloadError, ScaleError, run_call
 from epypes.run import CompGraphRunner
 from epypes.store import Store, opened_store
@@ -68,7 +64,7 @@ class SweepResult:
     @property
     def failures(self) -> tuple[Outcome, ...]:
         """The outcomes in which something failed."""
-        return tuple(outcome for outcome in self.outcomes if outcome.trouble is not None)
+        return tuple(outcome for outcome in self.outcomes if outcome.error_info is not None)
 
     def to_frame(self) -> pd.DataFrame:
         """Return a table with a row per outcome.
@@ -80,7 +76,7 @@ class SweepResult:
             f"{name} (hyperparameter)" if name in _TAKEN else name: [one.setting.get(name) for one in self.outcomes]
             for name in self.names
         }
-        return frame_of(self.outcomes, self.runner.cg, varied)
+        return outcomes_frame(self.outcomes, self.runner.cg, varied)
 
     def sheet(self, token: str | None = None, rows: str | None = None, columns: str | None = None) -> Sheet:
         """Return the contact sheet of a token.
@@ -182,7 +178,7 @@ def sweep(
     >>> [outcome.values["total"] for outcome in result]
     [11, 21, 12, 22]
     """
-    given, runner = runner, settled_runner(runner)
+    given, runner = runner, detached_runner(runner)
     kept, shown = _tokens(runner, keep), None if show is None else _tokens(runner, show)
     plan = grid_of(runner, grid, how=how, n=n, seed=seed)
     count = 1 if images is None else count_of(images)
@@ -196,7 +192,7 @@ def sweep(
         memory = None
         if (opened := stack.enter_context(opened_store(store))) is not None:
             series, fingerprint = series_of(opened, "sweep", runner, name, plan.names)
-            memory = stack.enter_context(Remembered(series, f"show={shown and list(shown)}", not kept, fingerprint))
+            memory = stack.enter_context(StoredOutcomes(series, f"show={shown and list(shown)}", not kept, fingerprint))
         work = _Sweep(runner, Job((), in_order, kept, shown), memory, advance)
         is_copied = executor is not None or opened is not None or bool(kept)
         work.run(_items(given, images, plan, is_copied=is_copied), executor, count)
@@ -207,13 +203,13 @@ def sweep(
 class _Sweep:
     """One sweep: the outcomes that have come."""
 
-    def __init__(self, runner: CompGraphRunner, grid: Job, memory: Remembered | None, advance: Advance) -> None:
+    def __init__(self, runner: CompGraphRunner, grid: Job, memory: StoredOutcomes | None, advance: Advance) -> None:
         self._runner, self._grid, self._memory, self._advance = runner, grid, memory, advance
         self.outcomes: list[Outcome] = []
 
     def run(self, items: Iterator[Item], executor: Executor | None, images: int | None) -> None:
         """Run what has to be run of each item."""
-        for outcomes in spread(self._runner, self._jobs(items, executor, images), executor):
+        for outcomes in run_jobs(self._runner, self._jobs(items, executor, images), executor):
             if self._memory is not None:
                 self._memory.add(outcomes)
             self._take(outcomes)
@@ -223,7 +219,7 @@ class _Sweep:
         for item in items:
             settings = self._unknown(item)
             cuts = _cuts(self._runner, settings, executor, images) if settings else []
-            start = Start() if len(cuts) > 2 and _is_here(executor) else None
+            start = SharedStart() if len(cuts) > 2 and _is_here(executor) else None
             for first, end in pairwise(cuts):
                 yield replace(self._grid, items=(item,), settings=settings[first:end], start=start)
             # Whoever waits for the next one must not keep this one alive.

@@ -13,8 +13,7 @@ from epypes.errors import ScaleError
 from epypes.wording import counted, ended
 
 if TYPE_CHECKING:
-    from epypes.batch.checking import CheckResult
-    from epypes.batch.measuring import CheckOutcome
+    from epypes.batch.check import CheckOutcome, CheckResult
 
 _NAME_CHARACTERS: Final = 24
 _MOST_ROWS: Final = 100
@@ -50,8 +49,8 @@ def check(
 ) -> None:
     """Run a bundle on a labelled set; exit 0 only if every case passes."""
     from epypes.batch.cases import cases_of
-    from epypes.batch.checking import check as check_runner
-    from epypes.batch.junit import check_place
+    from epypes.batch.check import check as check_runner
+    from epypes.batch.check import check_place
     from epypes.bundle import load
 
     if junit is not None:
@@ -92,7 +91,7 @@ def _plain(outcome: CheckOutcome) -> dict[str, Any]:
         "threshold": outcome.threshold,
         "passed": outcome.passed,
         "reason": outcome.reason,
-        "is_error": outcome.trouble is not None,
+        "is_error": outcome.error_info is not None,
         "run_ms": outcome.total_ns / 1e6,
     }
 

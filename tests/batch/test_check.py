@@ -16,7 +16,7 @@ from skimage import data
 
 import epypes as ep
 from epypes.acquisition import write_image
-from epypes.batch.checking import CheckResult, checked, prepared
+from epypes.batch.check import CheckResult, checked, prepared
 from epypes.errors import ScaleError, UnknownName
 
 
@@ -157,7 +157,7 @@ def test_a_metric_that_raises_without_a_text_fails_and_is_an_error(text, tmp_pat
         (False, "AssertionError", None),
         (False, "MemoryError", None),
     ]
-    assert [one.trouble.kind for one in result.outcomes] == ["AssertionError", "MemoryError"]
+    assert [one.error_info.kind for one in result.outcomes] == ["AssertionError", "MemoryError"]
     [suite] = junitparser.JUnitXml.fromfile(str(result.to_junit(tmp_path / "checks.xml")))
     assert (suite.tests, suite.failures, suite.errors) == (2, 0, 2)
     assert [(test.result[0].type, test.result[0].message) for test in suite] == [
@@ -195,7 +195,7 @@ def test_a_file_names_a_member_of_the_enumeration_that_the_runner_has(tmp_path):
 def test_a_function_that_fails_is_named(runner, coins):
     [outcome] = ep.check(runner, [ep.Case(np.zeros((2, 2, 2, 2)), {"n": 3})]).outcomes
     assert outcome.reason.startswith("corners: error: ")
-    assert outcome.trouble.function == "corners"
+    assert outcome.error_info.function == "corners"
     assert outcome.value is None
 
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from epypes.batch.digests import Untold, digest_of, file_digest, told
+from epypes.batch.cache import NoDigest, file_digest, told, value_digest
 
 
 class Mode(enum.Enum):
@@ -81,7 +81,7 @@ DIFFERENT = {
 
 @pytest.mark.parametrize("values", DIFFERENT.values(), ids=DIFFERENT)
 def test_what_differs_has_another_digest_and_another_text(values):
-    assert len({digest_of(value) for value in values}) == len(values)
+    assert len({value_digest(value) for value in values}) == len(values)
     assert len({told(value) for value in values}) == len(values)
 
 
@@ -91,13 +91,13 @@ def test_an_array_in_a_file_is_told_by_what_is_in_it(tmp_path, level):
     for number, content in enumerate((image(level), image(level), image(level + 1))):
         mapped = np.memmap(tmp_path / f"{number}.dat", np.uint8, "w+", shape=(100, 100))
         mapped[:] = content
-        found.append(digest_of(mapped))
+        found.append(value_digest(mapped))
     assert found[0] == found[1] != found[2]
 
 
 def test_how_an_array_lies_in_memory_says_nothing():
     there = np.arange(24).reshape(4, 6)
-    assert digest_of(np.asfortranarray(there)) == digest_of(there) == digest_of(np.repeat(there, 2, 0)[::2])
+    assert value_digest(np.asfortranarray(there)) == value_digest(there) == value_digest(np.repeat(there, 2, 0)[::2])
 
 
 def test_what_a_person_can_read_stays_readable():
@@ -108,7 +108,7 @@ def test_what_a_person_can_read_stays_readable():
 
 @pytest.mark.slow
 def test_another_process_finds_the_same(tmp_path):
-    text = "from epypes.batch.digests import digest_of; print(digest_of({'a': {'x', 'y', 'z'}, 'b': [1.5, None]}))"
+    text = "from epypes.batch.cache import value_digest; print(value_digest({'a': {'x', 'y', 'z'}, 'b': [1.5, None]}))"
     found = {
         subprocess.run(
             [sys.executable, "-c", text], env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, check=True
@@ -126,8 +126,8 @@ def holding_itself() -> list:
 
 @pytest.mark.parametrize("value", [object(), [object()], {"a": lambda: 1}, (n for n in ()), holding_itself()])
 def test_what_nobody_can_look_into_is_refused(value):
-    with pytest.raises(Untold):
-        digest_of(value)
+    with pytest.raises(NoDigest):
+        value_digest(value)
 
 
 def test_a_file_is_told_by_what_is_in_it_and_how_it_is_read(tmp_path):
@@ -138,12 +138,12 @@ def test_a_file_is_told_by_what_is_in_it_and_how_it_is_read(tmp_path):
     assert a == b
     assert len({a, c, npy}) == 3
     for name in ("there is none.png", "pipe.png", "."):
-        with pytest.raises(Untold):
+        with pytest.raises(NoDigest):
             file_digest(tmp_path / name)
 
 
 def test_a_path_that_is_a_value_is_told_by_its_name_and_its_file(tmp_path):
-    assert digest_of(Path("a.txt")) != digest_of(Path("b.txt"))
-    before = digest_of(tmp_path / "a.txt")
+    assert value_digest(Path("a.txt")) != value_digest(Path("b.txt"))
+    before = value_digest(tmp_path / "a.txt")
     (tmp_path / "a.txt").write_text("x")
-    assert digest_of(tmp_path / "a.txt") != before
+    assert value_digest(tmp_path / "a.txt") != before

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.batch.fingerprint import graph_fingerprint
+from epypes.batch.cache import graph_fingerprint
 from epypes.errors import ScaleError
 
 LOCK = threading.Lock()

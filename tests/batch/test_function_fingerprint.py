@@ -17,8 +17,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.batch.digests import Untold
-from epypes.batch.fingerprint import function_fingerprint
+from epypes.batch.cache import NoDigest, function_digest
 
 
 def made(source: str, **names: Any) -> Any:
@@ -77,19 +76,19 @@ PAIRS = {
 @pytest.mark.parametrize("what", PAIRS)
 def test_metrics_that_compute_something_else_are_told_apart_and_one_is_itself(what: str) -> None:
     one, other = PAIRS[what]
-    assert function_fingerprint(one) == function_fingerprint(one) != function_fingerprint(other)
+    assert function_digest(one) == function_digest(one) != function_digest(other)
 
 
 def test_metrics_that_are_made_anew_are_the_same() -> None:
-    assert function_fingerprint(within(np.arange(5))) == function_fingerprint(within(np.arange(5)))
-    assert function_fingerprint(made(READS, weights={"a": [1]}, other=1)) == function_fingerprint(
+    assert function_digest(within(np.arange(5))) == function_digest(within(np.arange(5)))
+    assert function_digest(made(READS, weights={"a": [1]}, other=1)) == function_digest(
         made("\n\n" + READS, other=2, weights={"a": [1]})
     )
 
 
 def test_a_function_that_calls_itself_has_a_digest() -> None:
     calls_itself = "def metric(tokens, case): return metric(tokens, case) if case else 1"
-    assert function_fingerprint(made(calls_itself)) == function_fingerprint(made(calls_itself))
+    assert function_digest(made(calls_itself)) == function_digest(made(calls_itself))
 
 
 class Near:
@@ -115,22 +114,22 @@ class Near:
     ],
 )
 def test_what_nobody_can_see_through_is_refused(metric: Any) -> None:
-    with pytest.raises(Untold):
-        function_fingerprint(metric)
+    with pytest.raises(NoDigest):
+        function_digest(metric)
 
 
 def test_objects_are_told_by_what_is_in_them() -> None:
-    assert function_fingerprint(Near(1)) == function_fingerprint(Near(1)) != function_fingerprint(Near(2))
+    assert function_digest(Near(1)) == function_digest(Near(1)) != function_digest(Near(2))
 
 
 @pytest.mark.slow
 def test_a_metric_is_the_same_in_another_process(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(
-        "from epypes.batch.fingerprint import function_fingerprint\n"
+        "from epypes.batch.cache import function_digest\n"
         "words = {'a', 'b', 'c'}\n"
         "def metric(tokens, case): return case in {'x', 'y', 'z', 'w'} and tokens in words\n"
-        "print(function_fingerprint(metric))\n"
+        "print(function_digest(metric))\n"
     )
     found = {
         subprocess.run(

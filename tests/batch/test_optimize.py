@@ -19,10 +19,10 @@ import optuna
 import pytest
 
 import epypes as ep
-from epypes.batch import trying
-from epypes.batch.optimized import OptimizeResult
-from epypes.batch.ranging import Span
-from epypes.batch.studying import Trial
+from epypes.batch import incremental
+from epypes.batch.ranges import SearchSpan as Span
+from epypes.batch.search_result import OptimizeResult
+from epypes.batch.study import Trial
 from epypes.errors import ScaleError, UnknownName
 from tests.store.postgres import PASSWORD, server
 
@@ -225,7 +225,7 @@ def test_cases_that_do_not_fit_into_memory_are_run_anew(
     cases, ranges = [np.full((30, 30), 1), np.full((2, 2), 5)], {"k": (0, 9)}
     kept = ep.optimize(runner, "y", cases, 8, ranges=ranges)
     calls["heavy"] = 0
-    monkeypatch.setattr(trying, "_MOST_BYTES", 1_000)
+    monkeypatch.setattr(incremental, "_MOST_BYTES", 1_000)
     anew = ep.optimize(runner, "y", cases, 8, ranges=ranges)
     assert calls["heavy"] == 8 + 1, "the small one is kept"
     assert [trial.value for trial in anew] == [trial.value for trial in kept]

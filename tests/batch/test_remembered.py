@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import epypes as ep
+from epypes.batch.cache import StoredOutcomes
 from epypes.batch.items import Item
-from epypes.batch.outcome import Outcome
-from epypes.batch.remembered import Remembered
+from epypes.batch.results import Outcome
 from epypes.errors import ScaleError, StoreError
 
 
@@ -205,7 +205,7 @@ def test_a_number_too_long_to_be_read_is_a_short_text_and_the_others_are_stored(
 
 
 def test_a_row_that_can_not_be_written_takes_no_other_with_it(store):
-    memory = Remembered(store.series("map", "n"))
+    memory = StoredOutcomes(store.series("map", "n"))
     for number in range(4):
         item = Item(number, f"#{number}", {"image": number})
         memory.recall(item)
@@ -223,7 +223,7 @@ def without_rows(path):
 
 def test_what_could_not_be_written_waits_until_it_can(tmp_path):
     with ep.Store(tmp_path / "r.sqlite") as store:
-        memory = Remembered(store.series("map", "n"))
+        memory = StoredOutcomes(store.series("map", "n"))
         memory.recall(Item(0, "#0", {"image": 0}))
         memory.add([Outcome(0, "#0", values={"out": 1})])
         without_rows(tmp_path / "r.sqlite")

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.batch.fingerprint import function_fingerprint
+from epypes.batch.cache import function_digest
 from epypes.errors import ScaleError
 from tests.calls import log_to
 
@@ -276,5 +276,5 @@ def test_an_edited_module_that_is_not_loaded_again_stores_nothing_of_what_it_is_
 
 @pytest.mark.parametrize("form", FORMS)
 def test_trials_of_a_search_with_a_metric_that_was_edited_are_not_taken_for_its_own(form: str) -> None:
-    one, again, other = (function_fingerprint(notebook(form, factor)) for factor in (1, 1, 2))
+    one, again, other = (function_digest(notebook(form, factor)) for factor in (1, 1, 2))
     assert one == again != other

@@ -13,10 +13,8 @@ from time import monotonic
 from typing import Any, Final
 
 from epypes.batch.cases import Case, Check
-from epypes.batch.checking import CheckResult, Checks, checked, inputs_of, prepared
-from epypes.batch.files import read_value
-from epypes.batch.items import items_of, opened
-from epypes.batch.measuring import CheckOutcome
+from epypes.batch.check import CheckOutcome, CheckResult, Checks, checked, inputs_of, prepared
+from epypes.batch.items import items_of, payload_of, read_value
 from epypes.errors import EpypesError, PayloadError
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
@@ -200,7 +198,7 @@ def _held(runner: CompGraphRunner, cases: Checks) -> Checks:
     """Return cases whose files have been read; what was expected and can't be read is left to fail each time."""
     items = items_of((inputs_of(case) for case, _ in cases), runner)
     return [
-        (replace(case, inputs=opened(item, runner.cg), expected=_labels(case, runner)), _with_label(checks, runner))
+        (replace(case, inputs=payload_of(item, runner.cg), expected=_labels(case, runner)), _with_label(checks, runner))
         for item, (case, checks) in zip(items, cases, strict=True)
     ]
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
-from epypes.batch.ranging import Axis, Choices, Span, setting_of, suggestion_of
-from epypes.batch.searched import changed_in
+from epypes.batch.objective import changed_in
+from epypes.batch.ranges import Axis, Choices, SearchSpan, setting_of, suggestion_of
 from epypes.batch.steps import ends_on_step
 from epypes.errors import ScaleError
 from epypes.optional import optional_import
@@ -24,6 +24,7 @@ from epypes.store.place import connect_options
 if TYPE_CHECKING:
     import optuna
     from sqlalchemy import URL
+
 
 Direction = Literal["maximize", "minimize"]
 _FAILURE, _NANOSECONDS, _ABOUT = "failure", "total_ns", "about"
@@ -231,7 +232,7 @@ def _distribution(axis: Axis) -> optuna.distributions.BaseDistribution:
     return FloatDistribution(axis.low, axis.high, log=axis.log, step=step)
 
 
-def _ends_on_step(axis: Span) -> bool:
+def _ends_on_step(axis: SearchSpan) -> bool:
     return axis.step is not None and ends_on_step(axis.low, axis.high, axis.step)
 
 

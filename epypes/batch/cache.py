@@ -1,37 +1,45 @@
-"""Fingerprints of graphs and functions: whether stored results are of the code and values that are here now.
-
-A fingerprint covers all that a function reaches: its code, defaults, closure and attributes, the globals that it reads,
-and of each object in there its class and its state. Installed packages and the standard library count by name and
-version. What can't be seen through, such as a generator or an object of a C library, is listed as unknown: the caller
-must not take a fingerprint with unknowns for a proof that nothing has changed.
-"""
+"""What a stored result is keyed by, and which results of a series need not be computed again."""
 
 from __future__ import annotations
 
 import ast
 import copyreg
+import datetime
+import decimal
 import dis
 import enum
+import fractions
 import functools
 import hashlib
 import sys
 import threading
 import types
+import uuid
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib import metadata
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path, PurePath
-from typing import Any, Final
+from time import monotonic
+from types import MappingProxyType
+from typing import Any, Final, Self
+from warnings import warn
 
-from epypes.batch.digests import Untold, digest_of, joined
+from epypes.batch.items import Item
+from epypes.batch.results import Outcome
+from epypes.bundle import to_source
 from epypes.bundle.requirements import bringing
 from epypes.bundle.text import nested_codes
+from epypes.errors import MessageError, PlaceholderNeeded, ScaleError, SourceRefused, StoreError
 from epypes.graph import CompGraph
-from epypes.run.guard import is_array
+from epypes.run import CompGraphRunner
+from epypes.run.guard import is_array, is_plain_array
+from epypes.store import Series, Store
+from epypes.wire.encoder import ValueWriter
+from epypes.wire.protobuf import message_class
 
 _OURS: Final = "epypes"
 # The folders that pip, and Debian's packages, install into.
@@ -115,11 +123,11 @@ def graph_fingerprint(cg: CompGraph, source: str | None) -> Fingerprint:
     walk = _Walk()
     walk.graph(cg)
     modules = walk.modules | (set(_imports(source.encode("utf-8", "surrogatepass"), "", False)) if source else set())
-    code = joined("computation", source or "", walk.code.digest(), sys.version, *_versions(modules)).hex()
+    code = combined_digest("computation", source or "", walk.code.digest(), sys.version, *_versions(modules)).hex()
     return Fingerprint(code, walk.state.hexdigest(), walk.unknown if source is None else "")
 
 
-def function_fingerprint(function: Callable[..., Any]) -> str:
+def function_digest(function: Callable[..., Any]) -> str:
     """Return the digest of a function; what is installed counts by its name.
 
     Raises
@@ -130,7 +138,7 @@ def function_fingerprint(function: Callable[..., Any]) -> str:
     walk = _Walk()
     walk.value(function)
     if walk.unknown:
-        raise Untold(walk.unknown)
+        raise NoDigest(walk.unknown)
     return walk.digest().hex()
 
 
@@ -153,7 +161,7 @@ class _Walk:
         self.unknown = ""
 
     def digest(self) -> bytes:
-        return joined("", self.code.digest(), self.state.digest())
+        return combined_digest("", self.code.digest(), self.state.digest())
 
     def graph(self, cg: CompGraph) -> None:
         self._put("graph", str(len(cg.functions)))
@@ -169,7 +177,7 @@ class _Walk:
             self._opaque(value)
 
     def _put(self, *texts: str | bytes) -> None:
-        self._into.update(joined("", *texts))
+        self._into.update(combined_digest("", *texts))
 
     def _opaque(self, value: Any, why: str = "") -> None:
         kind = type(value).__qualname__
@@ -180,7 +188,7 @@ class _Walk:
     def _value(self, value: Any) -> None:
         kind = type(value)
         if kind in _LEAVES or (isinstance(value, PurePath) and _is_installed(kind.__module__)):
-            self._put("value", digest_of(value))
+            self._put("value", value_digest(value))
         elif kind is tuple:
             self._all("tuple", value)
         elif kind in (set, frozenset):
@@ -347,8 +355,8 @@ class _Walk:
     def _array(self, array: Any) -> None:
         try:
             with self._in_state():
-                self._put("array", digest_of(array))
-        except Untold:  # of objects that are no plain values
+                self._put("array", value_digest(array))
+        except NoDigest:  # of objects that are no plain values
             self._object(array)
 
     def _runner(self, runner: Any, cg: CompGraph) -> None:
@@ -411,8 +419,8 @@ class _Walk:
     def _unpicklable(self, value: Any) -> None:
         try:
             # Such as key points of OpenCV, which travel as messages.
-            self._put("value", digest_of(value))
-        except Untold:
+            self._put("value", value_digest(value))
+        except NoDigest:
             self._opaque(value)
 
     def _installed_name(self, value: Any) -> str:
@@ -565,3 +573,435 @@ def _from(node: ast.ImportFrom, package: str) -> set[str]:
     origin = ".".join(filter(None, (above, node.module)))
     # A name that is taken from a package may be a module of it.
     return {origin, *(f"{origin}.{alias.name}" for alias in node.names)} - {""}
+
+
+_BYTES: Final = 16
+_SHOWN: Final = 60
+_SCALARS: Final = (type(None), bool, int, float, complex, str)
+# Their repr says all that is in them.
+_SAID: Final = (
+    datetime.date,
+    datetime.time,
+    datetime.datetime,
+    datetime.timedelta,
+    datetime.timezone,
+    decimal.Decimal,
+    fractions.Fraction,
+    uuid.UUID,
+    range,
+    type(...),
+)
+
+
+class NoDigest(TypeError):
+    """A value of which nobody can say what is in it."""
+
+
+def value_digest(value: Any) -> str:
+    """Return what tells a value from others: arrays of any kind, containers, enumerations, numbers, texts, files.
+
+    A path stands for what is in its file. Beside these, all that `epypes.wire` has a codec for.
+
+    Raises
+    ------
+    Untold
+        It is, or holds, something of which that can't be said; or a file that can't be read.
+    """
+    try:
+        return _digest(value).hex()
+    except RecursionError as error:
+        raise NoDigest(f"a {type(value).__name__!r} that holds itself") from error
+
+
+def told(value: Any) -> str:
+    """Return a value as a person reads it, with its digest if that does not say all.
+
+    Raises
+    ------
+    Untold
+        As for `digest_of`.
+    """
+    digest = value_digest(value)
+    if _is_short(value) and len(text := repr(value)) <= _SHOWN:
+        return text
+    what = f"{value.dtype} {value.shape}" if is_plain_array(value) else type(value).__name__
+    return f"{value} {digest}" if isinstance(value, enum.Enum) else f"{what} {digest}"
+
+
+def combined_digest(kind: str, *parts: bytes | memoryview | str) -> bytes:
+    """Return a digest of several parts, each of which is told from its neighbours."""
+    made = hashlib.blake2b(kind.encode(), digest_size=_BYTES)
+    for part in parts:
+        raw = part.encode("utf-8", "surrogatepass") if isinstance(part, str) else part
+        made.update(b"\0%d:" % len(raw))
+        made.update(raw)
+    return made.digest()
+
+
+def _is_short(value: Any) -> bool:
+    if type(value) in (tuple, list):
+        return len(value) <= _SHOWN and all(map(_is_short, value))
+    # A long number takes long to write, and of one that is too long Python refuses to.
+    return type(value) in _SCALARS and not (type(value) is int and value.bit_length() > _SHOWN * 4)
+
+
+def _digest(value: Any) -> bytes:
+    plain = _BY_TYPE.get(type(value))
+    if plain is not None:
+        return plain(value)
+    if is_array(value):
+        return _of_array(value)
+    found = next((way for kind, way in _BY_CLASS if isinstance(value, kind)), None)
+    if found is not None:
+        return found(value)
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return _of_items(value)
+    return _of_scalar(value) if _is_numpy_scalar(value) else _of_wire(value)
+
+
+def _kind(value: Any) -> str:
+    return f"{type(value).__module__}.{type(value).__qualname__}"
+
+
+def _of_text(value: Any) -> bytes:
+    return combined_digest(_kind(value), repr(value))
+
+
+def _of_int(value: int) -> bytes:
+    # In time linear in its length; and Python refuses to write very long ones as decimals.
+    return combined_digest("int", hex(value))
+
+
+def _of_str(value: str) -> bytes:
+    return combined_digest("str", value)
+
+
+def _of_bytes(value: Any) -> bytes:
+    return combined_digest(_kind(value), bytes(value))
+
+
+def _of_view(value: memoryview) -> bytes:
+    return combined_digest("memoryview", repr(value.format), repr(value.shape), value.tobytes())
+
+
+def _of_items(value: Iterable[Any]) -> bytes:
+    return combined_digest(_kind(value), *map(_digest, value))
+
+
+def _of_set(value: Iterable[Any]) -> bytes:
+    return combined_digest(_kind(value), *sorted(map(_digest, value)))
+
+
+def _of_dict(value: Mapping[Any, Any]) -> bytes:
+    return combined_digest(_kind(value), *(_digest(part) for item in value.items() for part in item))
+
+
+def _of_member(value: enum.Enum) -> bytes:
+    return combined_digest(_kind(value), str(value.name), _digest(value.value))
+
+
+def _of_class(value: type) -> bytes:
+    return combined_digest("type", f"{value.__module__}.{value.__qualname__}")
+
+
+def file_digest(path: Path) -> str:
+    """Return a digest of what is in a file, and of the end of its name, which decides how it is read.
+
+    Raises
+    ------
+    Untold
+        There is no such file, or it can't be read.
+    """
+    try:
+        # Who opens a pipe waits for somebody who writes into it.
+        if not path.is_file():
+            raise NoDigest(f"{str(path)!r}, which is no file")
+        with path.open("rb") as file:
+            # The fastest one that there is: processors compute it themselves.
+            found = hashlib.file_digest(file, "sha256").digest()
+    except OSError as error:
+        raise NoDigest(f"{str(path)!r}, which can't be read: {error.strerror}") from error
+    return combined_digest("file", path.suffix.lower(), found).hex()
+
+
+def _of_path(value: PurePath) -> bytes:
+    """Return a digest of a path that is handed on as it is: of the name, and of the file if there is one."""
+    try:
+        return combined_digest("path", str(value), file_digest(Path(value)))
+    except NoDigest:
+        return combined_digest("path", str(value))
+
+
+def _is_numpy_scalar(value: Any) -> bool:
+    return getattr(value, "shape", None) == () and hasattr(value, "dtype") and hasattr(value, "tobytes")
+
+
+# NumPy's long doubles have bytes that mean nothing.
+_PADDED: Final = "gG"
+
+
+def _of_scalar(value: Any) -> bytes:
+    content = repr(value) if value.dtype.char in _PADDED else value.tobytes()
+    return combined_digest(_kind(value), repr(value.dtype.descr), content)
+
+
+def _of_array(array: Any) -> bytes:
+    import numpy as np
+
+    plain = np.asarray(array)
+    described = _kind(array), repr(plain.dtype.descr), repr(plain.shape)
+    if plain.dtype.hasobject or plain.dtype.char in _PADDED:
+        content: bytes | memoryview = _digest(plain.tolist())
+    else:
+        content = np.ascontiguousarray(plain).reshape(-1).view(np.uint8).data if plain.nbytes else b""
+    if isinstance(array, np.ma.MaskedArray):
+        more = _digest((np.ma.getmaskarray(array), array.fill_value, bool(array.hardmask)))
+    else:
+        # What a class of somebody's own keeps beside the numbers, such as a unit.
+        more = _digest(dict(getattr(array, "__dict__", {}))) if type(array) is not np.memmap else b""
+    return combined_digest("array", *described, content, more)
+
+
+def _of_wire(value: Any) -> bytes:
+    message, writer = message_class("epypes.v1.Value")(), ValueWriter()
+    try:
+        writer.write_named(message, value, "value")
+    except MessageError as error:
+        raise NoDigest(f"a {type(value).__name__!r}") from error
+    beside = (_digest(payload.data) for payload in writer.payloads)
+    return combined_digest(_kind(value), message.SerializeToString(deterministic=True), *beside)
+
+
+_BY_TYPE: Final[Mapping[type, Callable[[Any], bytes]]] = {
+    int: _of_int,
+    str: _of_str,
+    bytes: _of_bytes,
+    bytearray: _of_bytes,
+    memoryview: _of_view,
+    list: _of_items,
+    tuple: _of_items,
+    dict: _of_dict,
+    set: _of_set,
+    frozenset: _of_set,
+    type: _of_class,
+    **dict.fromkeys((type(None), bool, float, complex, *_SAID), _of_text),
+}
+_BY_CLASS: Final[tuple[tuple[type, Callable[[Any], bytes]], ...]] = (
+    (enum.Enum, _of_member),
+    (PurePath, _of_path),
+    (type, _of_class),
+)
+
+
+# What is lost at most if the process is killed; to write each outcome by itself would take longer than to make it.
+_WRITE_EVERY_S: Final = 0.5
+_NONE: Final[Mapping[str, Any]] = MappingProxyType({})
+
+
+def series_of(
+    store: Store, kind: str, runner: CompGraphRunner, name: str | None, varied: Collection[str] = ()
+) -> tuple[Series, Fingerprint]:
+    """Return the series in which outcomes of a runner are kept, and the fingerprint of its graph.
+
+    Parameters
+    ----------
+    store
+        Where it is.
+    kind
+        ``"map"``, or what else made the outcomes.
+    runner
+        Its graph and hyperparameters are what the series is of.
+    name
+        What it is called; a digest of graph and hyperparameters without.
+    varied
+        The hyperparameters that each outcome has its own values of.
+
+    Warns
+    -----
+    UserWarning
+        A function uses something that can't be seen through, so nothing that is stored counts.
+
+    Raises
+    ------
+    ScaleError
+        There is no name and the graph can't be written as text; or the series is of another graph or of other
+        hyperparameters.
+    """
+    fixed = {token: value for token, value in runner.hyperparameters.items() if token not in varied}
+    source, hyperparameters = _source_of(runner), _hyperparameters(fixed)
+    found = graph_fingerprint(runner.cg, source)
+    if name is None:
+        if source is None:
+            text = "What this graph computes can't be written as text, which would tell it from others. Give name=."
+            raise ScaleError(text)
+        name = combined_digest("", found.code, repr(hyperparameters)).hex()[:16]
+    about = {"graph": found.code, "hyperparameters": hyperparameters}
+    series = store.series(kind, name, about=about)
+    _check_same(series, about)
+    if found.unknown:
+        text = f"The graph uses {found.unknown}, and nothing tells whether that has changed: every item is run again."
+        warn(f"{text} Use functions, numbers, texts, arrays, or objects that can be pickled.", stacklevel=4)
+    return series, found
+
+
+def _source_of(runner: CompGraphRunner) -> str | None:
+    try:
+        return to_source(runner.cg)
+    except (SourceRefused, PlaceholderNeeded):
+        return None
+
+
+def _texts_of(values: Mapping[str, Any]) -> dict[str, str]:
+    return {token: told(value) for token, value in values.items()}
+
+
+def _hyperparameters(values: Mapping[str, Any]) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for token in values:
+        try:
+            found |= _texts_of({token: values[token]})
+        except NoDigest as error:
+            text = f"Hyperparameter {token!r} is or holds {error}: nothing tells it from others, as a store has to."
+            raise ScaleError(f"{text} Make it of numbers, texts, arrays, lists or dicts.") from error
+    return found
+
+
+def _check_same(series: Series, about: Mapping[str, Any]) -> None:
+    before = series.about
+    was, now = before.get("hyperparameters", {}), about["hyperparameters"]
+    changed = [token for token in {**was, **now} if was.get(token) != now.get(token)]
+    if not changed and before.get("graph") == about["graph"]:
+        return
+    told = ", ".join(f"{token} was {was.get(token, 'free')} and is {now.get(token, 'free')}" for token in changed)
+    raise ScaleError(
+        f"Series {series.name!r} in the store is of another computation: {told or 'the graph has changed'}. "
+        "Give another name=, or none."
+    )
+
+
+class StoredOutcomes:
+    """The outcomes of a series; new ones are written a few at a time.
+
+    Parameters
+    ----------
+    series
+        The series.
+    how
+        What else decides about an outcome, such as the tokens of which thumbnails are made.
+    are_whole
+        Whether all that is wanted of an outcome is in the store; whole values of tokens are not.
+    fingerprint
+        That of the graph. Outcomes of another state don't count, and none does if it has an unknown.
+
+    Notes
+    -----
+    An item is known again by its name and by what is in its files and values. One that holds something of which nobody
+    can say what is in it is run each time, and not written.
+    """
+
+    def __init__(
+        self, series: Series, how: str = "", are_whole: bool = True, fingerprint: Fingerprint | None = None
+    ) -> None:
+        self._series, self._how = series, how
+        if fingerprint is not None:
+            self._how = f"{how} state={fingerprint.state}"
+            are_whole = are_whole and not fingerprint.unknown
+        self._known = series.keys() if are_whole else frozenset()
+        self._keys: dict[tuple[int, int], str] = {}
+        self._of_item: tuple[int, str | None] = -1, None
+        # With the settings themselves, so that no other has the identity of one.
+        self._of_settings: dict[int, tuple[Mapping[str, Any], str | None]] = {id(_NONE): (_NONE, "")}
+        self._waiting: list[tuple[str, dict[str, Any]]] = []
+        self._written_s = monotonic()
+
+    def recall(self, item: Item, setting: Mapping[str, Any] = _NONE) -> Outcome | None:
+        """Return the outcome of an item, under a setting, that was run before; None if it has to be run."""
+        of_item, of_setting = self._item_text(item), self._setting_text(setting)
+        if of_item is None or of_setting is None:
+            return None
+        key = f"{of_item} {self._how}{of_setting}"
+        found = self._series.get(key) if key in self._known else None
+        if found is None:
+            self._keys[item.number, id(setting or _NONE)] = key
+            return None
+        return replace(Outcome.from_json(found), number=item.number, name=item.name, setting=setting)
+
+    def _item_text(self, item: Item) -> str | None:
+        if self._of_item[0] != item.number:
+            self._of_item = item.number, _told(lambda: f"{item.name} {payload_digest(item.payload)}")
+        return self._of_item[1]
+
+    def _setting_text(self, setting: Mapping[str, Any]) -> str | None:
+        setting = setting or _NONE
+        if id(setting) not in self._of_settings:
+            self._of_settings[id(setting)] = setting, _told(lambda: f" {_texts_of(setting)}")
+        return self._of_settings[id(setting)][1]
+
+    def add(self, outcomes: Iterable[Outcome]) -> None:
+        """Take outcomes of items that had to be run."""
+        for outcome in outcomes:
+            key = self._keys.pop((outcome.number, id(outcome.setting or _NONE)), None)
+            # A file that could not be read may be there the next time.
+            if key is not None and (outcome.error_info is None or outcome.error_info.function):
+                self._waiting.append((key, outcome.to_json()))
+        if monotonic() - self._written_s >= _WRITE_EVERY_S:
+            self.write()
+
+    def write(self) -> None:
+        """Write what waits.
+
+        Raises
+        ------
+        StoreError
+            The store can't be written; then it still waits.
+        """
+        try:
+            self._series.append_all(self._waiting)
+            self._waiting.clear()
+        except TypeError:
+            # All or none are written, and one of them can't be.
+            self._write_each()
+        self._written_s = monotonic()
+
+    def _write_each(self) -> None:
+        while self._waiting:
+            try:
+                self._series.append(*self._waiting[0])
+            except TypeError as error:
+                warn(f"{error} It is run again the next time.", stacklevel=2)
+            del self._waiting[0]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        """Write what waits; if something else has gone wrong before, that is what is raised."""
+        try:
+            self.write()
+        except StoreError as failed:
+            if error is None:
+                raise
+            if error is not failed:
+                error.add_note(f"What waited to be stored could not be: {failed}")
+
+
+def _told(what: Callable[[], str]) -> str | None:
+    try:
+        return what()
+    except NoDigest:
+        return None
+
+
+def payload_digest(payload: Mapping[str, Any]) -> str:
+    """Return what tells a payload from others: of every token the file's contents, or the value.
+
+    Raises
+    ------
+    Untold
+        A file can't be read, or nobody can say what is in a value.
+    """
+    parts = (
+        (token, file_digest(value) if isinstance(value, Path) else value_digest(value))
+        for token, value in sorted(payload.items())
+    )
+    return combined_digest("payload", *(text for part in parts for text in part)).hex()

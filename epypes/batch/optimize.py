@@ -11,18 +11,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.batch.cases import Case, cases_of, with_labels_read
-from epypes.batch.items import Item, items_of
+from epypes.batch.executors import run_jobs, worker_count
+from epypes.batch.incremental import CaseRunners, SearchStopped
+from epypes.batch.items import Item, detached_runner, items_of
 from epypes.batch.job import Job
-from epypes.batch.lasting import settled_runner
-from epypes.batch.optimized import OptimizeResult
-from epypes.batch.outcome import Outcome
+from epypes.batch.objective import Metric, Score, Scoring, about_search, changed_meanwhile, name_of
 from epypes.batch.progress import progress_bar
-from epypes.batch.ranging import axes_of
-from epypes.batch.scoring import Metric, Score, Scoring
-from epypes.batch.searched import about_search, changed_meanwhile, name_of
-from epypes.batch.spreading import spread, worker_count
-from epypes.batch.studying import Asked, Direction, Search, Trial
-from epypes.batch.trying import Bench, Stopped
+from epypes.batch.ranges import axes_of
+from epypes.batch.results import Outcome
+from epypes.batch.search_result import OptimizeResult
+from epypes.batch.study import Asked, Direction, Search, Trial
 from epypes.errors import ScaleError
 from epypes.run import CompGraphRunner
 from epypes.store import opened_store
@@ -30,6 +28,7 @@ from epypes.wording import ended
 
 if TYPE_CHECKING:
     from epypes.store import Store
+
 
 _CASE_FILE: Final = ".toml"
 _DIRECTIONS: Final = ("maximize", "minimize")
@@ -119,7 +118,7 @@ def optimize(
     """
     _check(n, direction)
     # Whoever sets values on theirs meanwhile, or writes into them, does not change what is searched.
-    runner = settled_runner(runner)
+    runner = detached_runner(runner)
     axes = axes_of(runner, ranges)
     labelled = _cases(cases, runner)
     scoring = Scoring(runner.cg, metric, labelled, keep)
@@ -196,11 +195,11 @@ class _Work:
         return self._here(asked) if self.executor is None else self._spread(asked)
 
     def _here(self, asked: Iterator[Asked]) -> Generator[tuple[Asked, Score]]:
-        bench = Bench(self.runner, self.items, self.own, self.scoring.keep, self.stop)
+        bench = CaseRunners(self.runner, self.items, self.own, self.scoring.keep, self.stop)
         while not self.is_stopped and (one := next(asked, None)) is not None:
             try:
                 score = self.scoring.of_outcomes(bench.outcomes(one.setting))
-            except Stopped:
+            except SearchStopped:
                 return
             yield one, score
 
@@ -208,7 +207,7 @@ class _Work:
         pending: dict[int, _Pending] = {}
         jobs = self._jobs(asked, pending)
         ahead = None if self.executor is None else worker_count(self.executor)
-        for outcomes in spread(self.runner, jobs, self.executor, ahead=ahead, stop=self.stop):
+        for outcomes in run_jobs(self.runner, jobs, self.executor, ahead=ahead, stop=self.stop):
             for outcome in outcomes:
                 number, index = divmod(outcome.number, len(self.items))
                 pending[number].outcomes[index] = outcome

@@ -1,4 +1,4 @@
-"""What does a process do with a job that came to it?"""
+"""The worker side of an executor: a process unpacks a packaged graph and runs its jobs."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from epypes.batch.job import Job, do
-from epypes.batch.outcome import Outcome
-from epypes.batch.parcel import Parcel
-from epypes.batch.travel import packed_outcomes, unpacked_job, unpacked_values
+from epypes.batch.packaged_graph import PackagedGraph, packed_outcomes, unpacked_job, unpacked_values
+from epypes.batch.results import Outcome
 from epypes.bundle.load import Bundle, read_bundle
 from epypes.errors import ScaleError
 from epypes.run import CompGraphRunner
@@ -26,7 +25,7 @@ _MOST_LOADED: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Sent:
+class PackagedJob:
     """A job that travels.
 
     Attributes
@@ -44,7 +43,7 @@ class Sent:
     """
 
     id: str
-    parcel: Parcel
+    parcel: PackagedGraph
     hyperparameters: Mapping[str, Any]
     job: Job
     workers: int = 1
@@ -70,7 +69,7 @@ class _Loaded:
         self._bundle = bundle
         self._idle: queue.SimpleQueue[CompGraphRunner] = queue.SimpleQueue()
 
-    def do(self, sent: Sent) -> list[Outcome]:
+    def do(self, sent: PackagedJob) -> list[Outcome]:
         """Do a job, on a runner that no other thread uses meanwhile."""
         enums = self._bundle.enums
         hyperparameters = unpacked_values(sent.hyperparameters, enums)
@@ -95,7 +94,7 @@ _LOADED: Final[OrderedDict[tuple[str, int, bool, bool], _Loaded]] = OrderedDict(
 _LOCK: Final = threading.Lock()
 
 
-def work(sent: Sent) -> list[Outcome] | Refusal:
+def work(sent: PackagedJob) -> list[Outcome] | Refusal:
     """Do a job in this process; called by whatever executor there is."""
     key = sent.parcel.digest, sent.workers, sent.guard, sent.check_mutation
     with _LOCK:
@@ -126,7 +125,7 @@ def _unpacked(files: Mapping[str, bytes]) -> Bundle:
         return read_bundle(Path(folder) / "graph", sealed=False)
 
 
-def _why_not(parcel: Parcel, error: BaseException) -> str:
+def _why_not(parcel: PackagedGraph, error: BaseException) -> str:
     where = f"Worker process {os.getpid()} on {socket.gethostname()}"
     needs = ", ".join(line for line in parcel.requirements.splitlines() if line and not line.startswith("#"))
     way_out = f"Install there what the graph needs: {needs}" if needs else "Look at what its modules do there"
@@ -134,6 +133,6 @@ def _why_not(parcel: Parcel, error: BaseException) -> str:
     return f"{where} can't load the graph: {said} {way_out}; or use an executor of this machine."
 
 
-def lighter(sent: Sent) -> Sent:
+def lighter(sent: PackagedJob) -> PackagedJob:
     """Return what is sent without the files of its parcel, for who may have them."""
     return replace(sent, parcel=replace(sent.parcel, files=None))

@@ -1,4 +1,4 @@
-"""What do cases give with one setting after another, if no more is computed than has changed?"""
+"""Cases run with one setting after another, each time only what depends on what has changed."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from time import perf_counter_ns
 from typing import Any, Final
 
-from epypes.batch.hands import own_runner
-from epypes.batch.items import Item, opened
-from epypes.batch.outcome import Outcome, Trouble
+from epypes.batch.executors import cloned_runner
+from epypes.batch.items import Item, payload_of
+from epypes.batch.results import ErrorInfo, Outcome
 from epypes.run import CompGraphRunner, Run
 from epypes.run.stopped import stop_at
 
@@ -17,11 +17,11 @@ from epypes.run.stopped import stop_at
 _MOST_BYTES: Final = 2**30
 
 
-class Stopped(Exception):
+class SearchStopped(Exception):
     """Somebody has asked to stop, and the function that ran then has returned."""
 
 
-class Bench:
+class CaseRunners:
     """Runs cases with one setting after another, each case on a runner of its own, as far as memory is for that.
 
     Parameters
@@ -67,26 +67,26 @@ class Bench:
         runner = self._runners.get(index)
         is_new = runner is None
         kept: dict[str, Any] = {}
-        trouble: Trouble | None = None
+        error_info: ErrorInfo | None = None
         try:
             if runner is None:
                 runner = self._loaded(item)
             begun_ns = perf_counter_ns()  # files are not what is measured
             run = self._run(runner, {**setting, **self._own[index]})
             kept = {token: run[token] for token in self._keep}
-        except Stopped:
+        except SearchStopped:
             raise
         except (Exception, SystemExit) as error:  # whatever a function raises
-            trouble = _trouble(runner, error)
+            error_info = _trouble(runner, error)
         spent_ns = perf_counter_ns() - begun_ns
         if is_new and runner is not None:
             self._remember(index, runner)
-        return Outcome(item.number, item.name, setting, total_ns=spent_ns, trouble=trouble, kept=kept)
+        return Outcome(item.number, item.name, setting, total_ns=spent_ns, error_info=error_info, kept=kept)
 
     def _loaded(self, item: Item) -> CompGraphRunner:
         """Return a runner that has an item as payload and has run nothing."""
-        runner = own_runner(self._runner)
-        stop_at(runner, opened(item, runner.cg))
+        runner = cloned_runner(self._runner)
+        stop_at(runner, payload_of(item, runner.cg))
         return runner
 
     def _run(self, runner: CompGraphRunner, values: Mapping[str, Any]) -> Run:
@@ -96,7 +96,7 @@ class Bench:
         # One function at a time, so that a stop waits for one alone.
         for function in runner.plan(*self._keep).order:
             if self._stop.is_set():
-                raise Stopped
+                raise SearchStopped
             runner.rerun(*runner.cg.func_outputs(function))
         return runner.rerun(*self._keep)
 
@@ -113,7 +113,7 @@ def _bytes_of(run: Run) -> int:
     return sum(getattr(value, "nbytes", 0) for value in found)
 
 
-def _trouble(runner: CompGraphRunner | None, error: BaseException) -> Trouble:
+def _trouble(runner: CompGraphRunner | None, error: BaseException) -> ErrorInfo:
     failure = None if runner is None or runner.last is None else runner.last.failure
     where = failure.function if failure is not None and failure.exception is error else ""
-    return Trouble(where, type(error).__name__, str(error))
+    return ErrorInfo(where, type(error).__name__, str(error))
