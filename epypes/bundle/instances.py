@@ -133,6 +133,14 @@ _PIPELINES: Final = frozenset({
 })  # fmt: skip
 
 
+def is_set_elsewhere(made: Node, name: str) -> bool:
+    """Whether an attribute of a node is one of EPypes, or one that a run sets: what it counts or remembers."""
+    if name in {*vars(Node("node", len)), *_PIPELINES, "__wrapped__"}:
+        return True
+    is_watched = as_written(vars(made)[name]) is not vars(made)[name]
+    return is_watched or name in {*_set_by_runs(type(made), _called_by(made))}
+
+
 def _called_by(made: Node) -> list[str]:
     """Return the names of the methods that a run calls: the hooks, and what the node was made to call."""
     function = getattr(made, "func", None)

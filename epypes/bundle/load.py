@@ -87,7 +87,7 @@ def read_bundle(path: str | Path, *, sealed: bool = True) -> Bundle:
         # A promotion puts another folder in this one's place: then what was read may be of both.
         if _identity(folder) == before:
             break
-    module = _execute(folder / MODULE, source)
+    module = execute(folder / MODULE, source)
     try:
         enums = getattr(module, "enums", {}) if settings.has_members else {}
         settings = settings.with_enums(enums)
@@ -128,7 +128,7 @@ def module_name(folder: Path) -> str:
     return f"epypes_bundle_{folder.name}"
 
 
-def _execute(path: Path, source: bytes) -> Any:
+def execute(path: Path, source: bytes) -> Any:
     """Execute the module's source as it was checked; a cached .pyc, which the seal does not cover, is not looked at."""
     module = types.ModuleType(module_name(path.parent))
     module.__file__ = str(path)

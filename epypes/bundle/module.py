@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
 from epypes.bundle.emit import emit_module
 from epypes.bundle.entries import members_in
+from epypes.bundle.equivalence import Pair, refusal
 from epypes.bundle.graphs import Graphs
 from epypes.bundle.settings import Settings
 from epypes.bundle.slicer import Slice
@@ -33,15 +34,32 @@ def write_module(subject: Subject, settings: Settings) -> tuple[str, Settings, M
     if gathered.refusals:
         return "", settings, {}, list(dict.fromkeys(gathered.refusals))
     text_of_all = emit_module(settings, subject.cg, gathered, text, graphs.blocks, blocks)
-    return text_of_all, settings, gathered.arrays.by_name, []
+    why = refusal(text_of_all, gathered.arrays.by_name, lambda module: _pairs(subject, settings, module))
+    return text_of_all, settings, gathered.arrays.by_name, [why] if why else []
+
+
+def _pairs(subject: Subject, settings: Settings, module: Any) -> Iterator[Pair]:
+    """Give what of the notebook is compared with the module, by how a reason calls it."""
+    for name, function in subject.cg.functions.items():
+        yield f"Function {name!r}", function, module.func_dict[name]
+    for name, function in subject.ports.items():
+        yield f"Function {name!r}", function, getattr(module, name)
+    for what, kind in subject.classes.items():
+        yield what, kind, getattr(module, kind.__name__)
+    for kind in _enums_in(settings):
+        yield f"Class {kind.__name__!r}", kind, module.enums[kind.__qualname__]
 
 
 def _enums(gathered: Slice, settings: Settings) -> list[str]:
     """Return the lines that name the enumerations whose members stand in pipeline.toml."""
+    kinds = _enums_in(settings)
+    return _listed(gathered, kinds) if kinds else []
+
+
+def _enums_in(settings: Settings) -> dict[type[enum.Enum], None]:
     values = [settings.hyperparameters, settings.defaults, settings.attributes]
     members = [member for part in values for value in part.values() for member in members_in(value)]
-    kinds = dict.fromkeys(type(member) for member in members if isinstance(member, enum.Enum))
-    return _listed(gathered, kinds) if kinds else []
+    return dict.fromkeys(type(member) for member in members if isinstance(member, enum.Enum))
 
 
 def _listed(gathered: Slice, kinds: Iterable[type[enum.Enum]]) -> list[str]:

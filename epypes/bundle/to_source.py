@@ -9,6 +9,7 @@ from typing import Any
 
 from epypes.bundle.branches import Placement, place
 from epypes.bundle.definitions import definitions, early_constants
+from epypes.bundle.equivalence import refusal
 from epypes.bundle.importorder import ordered_imports
 from epypes.bundle.literal import literal_source
 from epypes.bundle.nodes import called_by, is_plain_pipeline
@@ -99,7 +100,27 @@ def to_source(
     straights = [_resolved(gathered, part) for part in parts]
     if gathered.refusals:
         raise SourceRefused(tuple(dict.fromkeys(gathered.refusals)))
-    return _module(gathered, straights)
+    text = _module(gathered, straights)
+    why = _difference(text, parts, straights)
+    if why:
+        raise SourceRefused((why,))
+    return text
+
+
+def _difference(text: str, parts: Sequence[_Part], straights: Sequence[Straight]) -> str:
+    """Return why what a module calls is not what the graph calls; "" if it is."""
+    compared: list[tuple[str, Any, str]] = []
+    for part, straight in zip(parts, straights, strict=True):
+        for name, source in part.references.items():
+            if name not in part.pipelines:
+                compared.append((f"Function {name!r}{part.where}", part.cg.functions[name], source))
+        for token, source in straight.defaults.items():
+            compared.append((f"Hyperparameter {token!r}{part.where}", part.values[token], source))
+    listed = "".join(f"    {source},\n" for _, _, source in compared)
+    whole = f"{text}\n\nreferences = [\n{listed}]\n"
+    return refusal(whole, {}, lambda module: [
+        (what, ours, theirs) for (what, ours, _), theirs in zip(compared, module.references, strict=True)
+    ])  # fmt: skip
 
 
 @dataclass(eq=False, slots=True)

@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
+import epypes as ep
+from epypes.bundle.emit import emit_module
+from epypes.bundle.equivalence import refusal
+from epypes.bundle.settings import Settings
 from epypes.bundle.slicer import Slice, slice_functions
 
 
 def slice_graph(functions):
-    """Return what the module needs, and by function of the graph the expression that refers to it."""
+    """Return what the module needs, and by function of the graph the expression that refers to it.
+
+    The module is executed and compared with the functions, as a promotion does.
+    """
     gathered = Slice()
     references = slice_functions(gathered, [(f"Function {name!r}", function) for name, function in functions.items()])
-    return gathered, dict(zip(functions, references, strict=True))
+    written = dict(zip(functions, references, strict=True))
+    if not gathered.refusals:
+        cg = ep.CompGraph(functions, {name: ("x", f"{name}_made") for name in functions}, types=False)
+        text = emit_module(Settings("case", ("x",), ("y",), {}), cg, gathered, written)
+        why = refusal(
+            text, {}, lambda module: [(f"Function {n!r}", f, module.func_dict[n]) for n, f in functions.items()]
+        )
+        gathered.refusals += [why] if why else []
+    return gathered, written
