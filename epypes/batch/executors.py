@@ -32,7 +32,7 @@ from epypes.batch.packaged_graph import (
 )
 from epypes.batch.results import ErrorInfo, Outcome
 from epypes.batch.worker_side import PackagedJob, Refusal, lighter, work
-from epypes.bundle.apart import apart, without_unfrozen
+from epypes.bundle.clone import clone_runner
 from epypes.errors import EpypesError, ExecutorBroken, ScaleError
 from epypes.run import CompGraphRunner
 from epypes.wording import counted, ended
@@ -90,7 +90,7 @@ def run_jobs(
 
 
 def _done_here(runner: CompGraphRunner, jobs: Iterable[Job], stop: threading.Event | None) -> Iterator[list[Outcome]]:
-    own = cloned_runner(runner)
+    own = clone_runner(runner)
     for job in jobs:
         if stop is not None and stop.is_set():
             return
@@ -218,15 +218,6 @@ def said(error: BaseException) -> str:
     return f"{type(error).__name__}: {error!s:.500}" if str(error) else type(error).__name__
 
 
-def cloned_runner(runner: CompGraphRunner) -> CompGraphRunner:
-    """Return another runner of the same graph, with the same hyperparameters; the user's nodes see nothing of it."""
-    hyperparameters = runner.hyperparameters
-    cg = without_unfrozen(apart(runner.cg), hyperparameters)
-    return CompGraphRunner(
-        cg, hyperparameters, workers=runner.workers, guard=runner.guard, check_mutation=runner.check_mutation
-    )
-
-
 class Threads:
     """Threads of this process: each job on a runner that no other thread uses meanwhile.
 
@@ -245,7 +236,7 @@ class Threads:
     def __init__(
         self, runner: CompGraphRunner, executor: Executor, over: threading.Event, stop: threading.Event | None
     ) -> None:
-        self._runner, self._executor, self._over, self._stop = cloned_runner(runner), executor, over, stop
+        self._runner, self._executor, self._over, self._stop = clone_runner(runner), executor, over, stop
         self._idle: queue.SimpleQueue[CompGraphRunner] = queue.SimpleQueue()
 
     def submit(self, job: Job) -> Future[Any]:
@@ -258,7 +249,7 @@ class Threads:
         try:
             own = self._idle.get_nowait()
         except queue.Empty:
-            own = cloned_runner(self._runner)
+            own = clone_runner(self._runner)
         try:
             return do(own, job, self._over)
         finally:
@@ -285,7 +276,7 @@ class Bundles:
     """
 
     def __init__(self, runner: CompGraphRunner, executor: Executor) -> None:
-        self._runner, self._executor = cloned_runner(runner), executor
+        self._runner, self._executor = clone_runner(runner), executor
         self._hyperparameters = packed_values(runner.hyperparameters, "Hyperparameter")
         self._parcel: PackagedGraph | None = None
         self._sent: dict[Future[Any], PackagedJob] = {}
@@ -298,7 +289,7 @@ class Bundles:
             self._parcel = known_package(self._runner) or self._proven(job)
         if self._parcel is None:
             here: Future[Any] = Future()
-            here.set_result(do(cloned_runner(self._runner), job))
+            here.set_result(do(clone_runner(self._runner), job))
             return here
         runner = self._runner
         ways = runner.workers, runner.guard, runner.check_mutation
@@ -307,7 +298,7 @@ class Bundles:
 
     def _proven(self, job: Job) -> PackagedGraph | None:
         for item in job.items:
-            own = cloned_runner(self._runner)
+            own = clone_runner(self._runner)
             try:
                 own.run_on(payload_of(item, own.cg))
             except (Exception, SystemExit):  # noqa: S112 - whatever a function raises: it will be that item's failure

@@ -7,9 +7,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from time import perf_counter_ns
 from typing import Any, Final
 
-from epypes.batch.executors import cloned_runner
 from epypes.batch.items import Item, payload_of
 from epypes.batch.results import ErrorInfo, Outcome
+from epypes.bundle.clone import clone_runner
 from epypes.run import CompGraphRunner, Run
 from epypes.run.stopped import stop_at
 
@@ -85,7 +85,7 @@ class CaseRunners:
 
     def _loaded(self, item: Item) -> CompGraphRunner:
         """Return a runner that has an item as payload and has run nothing."""
-        runner = cloned_runner(self._runner)
+        runner = clone_runner(self._runner)
         stop_at(runner, payload_of(item, runner.cg))
         return runner
 

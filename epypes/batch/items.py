@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from epypes.acquisition.files import read_image
 from epypes.acquisition.pictures import IMAGE_ENDINGS, image_files, natural_order
-from epypes.bundle.apart import without_unfrozen
+from epypes.bundle.clone import clone_runner
 from epypes.errors import ScaleError
 from epypes.graph import CompGraph, colour_order
 from epypes.run import CompGraphRunner
@@ -291,5 +291,4 @@ def each_copied(values: Iterable[Any]) -> Iterator[Any]:
 def detached_runner(runner: CompGraphRunner) -> CompGraphRunner:
     """Return a runner of one's own, which no longer changes when somebody sets, or writes into, hyperparameters."""
     own = {token: defensive_copy(value) for token, value in runner.hyperparameters.items()}
-    cg = without_unfrozen(runner.cg, own)
-    return CompGraphRunner(cg, own, workers=runner.workers, guard=runner.guard, check_mutation=runner.check_mutation)
+    return clone_runner(runner, own)

@@ -16,7 +16,7 @@ from epypes.bundle.source import Importable, Refused
 from epypes.bundle.text import parsed
 
 if TYPE_CHECKING:
-    from epypes.bundle.positions import AnyDefinition
+    from epypes.bundle.order import AnyDefinition
 
 Key = tuple[int, str]
 

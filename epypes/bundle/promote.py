@@ -16,9 +16,9 @@ from typing import Any
 from epypes.bundle.answers import ANSWERS, record_answer
 from epypes.bundle.arrays import write_arrays
 from epypes.bundle.compare import Tolerance
+from epypes.bundle.emit import write_module
 from epypes.bundle.exchange import exchange as _exchange
 from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
-from epypes.bundle.module import write_module
 from epypes.bundle.proof import prove
 from epypes.bundle.seal import MANIFEST, why_no_bundle
 from epypes.bundle.settings import Settings, unwritable, writable_defaults, write_settings

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.bundle.apart import apart
+from epypes.bundle.clone import clone_graph
 from epypes.bundle.compare import Tolerance, Unlike, differences
 from epypes.bundle.kept import kept_by, what_changed
 from epypes.bundle.suspects import suspicion, way_out
@@ -76,7 +76,7 @@ def learn(
         A function fails that did not fail before, or changes an object inside its input.
     """
     # Without its defaults, so that what was unfrozen is taken from the payload.
-    runner = CompGraphRunner(with_defaults(apart(cg), {}), hyperparameters, check_mutation=True)
+    runner = CompGraphRunner(with_defaults(clone_graph(cg), {}), hyperparameters, check_mutation=True)
     tolerances: dict[str, Tolerance] = {}
     reasons: list[str] = []
     before = kept_by(cg.functions)

@@ -80,7 +80,7 @@ def test_a_factory_that_chooses_what_it_defines_is_not_called_again(monkeypatch)
 
 def test_what_a_list_was_when_a_factory_copied_it_is_kept(monkeypatch):
     cell = "def make(t):\n    w = dict(t)\n    def f(a):\n        return a + w['k'] + t['k']\n    return f\nT = {'k': 1}\nf = make(T)"
-    assert sliced(monkeypatch, cell, "T['k'] = 9", f="f").constants == {"w": "{'k': 1}", "t": "{'k': 9}"}
+    assert sliced(monkeypatch, cell, "T['k'] = 9", f="f").constants == {"w": '{"k": 1}', "t": '{"k": 9}'}
 
 
 def test_a_closure_keeps_its_own_default(monkeypatch):
