@@ -8,9 +8,9 @@ from dataclasses import replace
 from typing import Any
 
 from epypes.bundle.emit import emit_module
-from epypes.bundle.entries import members_in
 from epypes.bundle.equivalence import Pair, refusal
 from epypes.bundle.graphs import Graphs
+from epypes.bundle.hyperparameters import members_in
 from epypes.bundle.settings import Settings
 from epypes.bundle.slicer import Slice
 from epypes.bundle.source import Refused

@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from epypes.bundle.adapters import is_usual
 from epypes.bundle.graphs import Graphs
 from epypes.bundle.instances import arguments_of, parameters_of
 from epypes.bundle.lines import Piece, call, laid_out, piece_of, prefixed, quoted
 from epypes.bundle.load import MAKER
-from epypes.bundle.ports import is_usual
 from epypes.bundle.slicer import Slice
 from epypes.bundle.source import Refused
 from epypes.bundle.values import expression
