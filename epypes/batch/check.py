@@ -24,7 +24,7 @@ from epypes.batch.progress import progress_bar
 from epypes.batch.results import ErrorInfo, Outcome, Thumbnail, object_column
 from epypes.batch.thumbnails import LEGEND, pictures_of
 from epypes.bundle.compare import first_difference
-from epypes.bundle.entries import Member
+from epypes.bundle.hyperparameters import Member
 from epypes.display.markup import content, escape, fitted
 from epypes.errors import EpypesError, ScaleError, UnknownName
 from epypes.graph import CompGraph

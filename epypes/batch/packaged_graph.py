@@ -17,7 +17,7 @@ from typing import Any, Final
 from epypes.batch.job import Job
 from epypes.batch.results import Outcome
 from epypes.bundle import promote, to_source
-from epypes.bundle.entries import Unwritable, members_in, read, written
+from epypes.bundle.hyperparameters import Unwritable, members_in, read, written
 from epypes.bundle.load import SAMPLES
 from epypes.errors import BundleError, MessageError, PlaceholderNeeded, PromotionRefused, ScaleError, SourceRefused
 from epypes.run import CompGraphRunner

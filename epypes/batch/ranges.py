@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from epypes.batch.steps import at_place, kept_below, last_place, odd_from
-from epypes.bundle.entries import plain
-from epypes.bundle.ranges import range_of
+from epypes.bundle.hyperparameters import plain, range_of
 from epypes.catalog import parameter_names
 from epypes.errors import ScaleError, UnknownName
 from epypes.graph import CompGraph

@@ -12,11 +12,11 @@ from dataclasses import replace
 from typing import Any, Final
 
 from epypes.bundle.constants import constant_lines
-from epypes.bundle.entries import members_in
 from epypes.bundle.equivalence import Pair, refusal
 from epypes.bundle.expressions import noted_refusals
 from epypes.bundle.formatting import LINE, one_per_line
 from epypes.bundle.graphs import Graphs, GraphText
+from epypes.bundle.hyperparameters import members_in
 from epypes.bundle.literal import literal, quoted
 from epypes.bundle.order import ordered
 from epypes.bundle.settings import Settings

@@ -1,7 +1,9 @@
-"""The proof of a draft: replays under usual and other conditions; then requirements and manifest are written."""
+"""The proof of a draft: replays under usual and other conditions; then it is sealed and swapped into its place."""
 
 from __future__ import annotations
 
+import ctypes
+import os
 import shutil
 import tempfile
 from collections.abc import Iterable
@@ -9,14 +11,17 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
-from epypes.bundle.causes import REQUIREMENTS
+from epypes.bundle.compare import Difference
 from epypes.bundle.conditions import CALL, PROCESS, Condition, other_conditions, usual_environment
-from epypes.bundle.reach import named_here
-from epypes.bundle.replay import REPLAY_TIMEOUT_S, replay_isolated, run_isolated
-from epypes.bundle.report import Difference, ReplayReport
-from epypes.bundle.seal import seal
+from epypes.bundle.file_access import named_here
+from epypes.bundle.manifest import write_manifest
+from epypes.bundle.replay import REPLAY_TIMEOUT_S, ReplayReport, replay_isolated, run_isolated
+from epypes.bundle.requirements import REQUIREMENTS
 from epypes.errors import BundleError, PromotionRefused
 
+# From Linux's fcntl.h and fs.h.
+_AT_FDCWD: Final = -100
+_RENAME_EXCHANGE: Final = 2
 _WHY: Final = (
     "A function may depend on something that is not a token, such as a file, the current folder, a counter, "
     "the time or random numbers. Pass it in as a token."
@@ -59,7 +64,7 @@ def prove(draft: Path, target: Path, timeout_s: float = REPLAY_TIMEOUT_S) -> Rep
         ):
             raise PromotionRefused(target, _reasons(draft, target, usual, other, conditions, folders))
     (draft / REQUIREMENTS).write_text("".join(f"{line}\n" for line in usual.requirements), encoding="utf-8")
-    seal(draft, usual.environment)
+    write_manifest(draft, usual.environment)
     return usual
 
 
@@ -166,3 +171,15 @@ def _find_causes(
             if PROCESS not in causes.setdefault(token, []):
                 causes[token].append(condition)
     return failing
+
+
+def swap_folders(left: Path, right: Path) -> None:
+    """Exchange two folders in one step, which Python has no call for; rename by rename where the system has none."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    in_one = getattr(libc, "renameat2", None)
+    if in_one and in_one(_AT_FDCWD, os.fsencode(left), _AT_FDCWD, os.fsencode(right), _RENAME_EXCHANGE) == 0:
+        return
+    aside = left.with_name("old")
+    right.rename(aside)
+    left.rename(right)
+    aside.rename(left)

@@ -14,22 +14,85 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from epypes.bundle.answers import answer_differences, record_answers_again
-from epypes.bundle.compare import differences
+from epypes.bundle.adapters import ANSWERS, answer_differences, record_answer
+from epypes.bundle.compare import Difference, difference, differences
 from epypes.bundle.conditions import without_python
-from epypes.bundle.environment import environment
-from epypes.bundle.importwatch import ImportWatch
-from epypes.bundle.load import MODULE, SAMPLES, Bundle, module_name, pipeline_of, read_bundle
-from epypes.bundle.reach import ReachWatch
-from epypes.bundle.report import Difference, ReplayReport, difference, report_from
-from epypes.bundle.requirements import owner, requirement_lines
+from epypes.bundle.file_access import FileAccess
+from epypes.bundle.load import MODULE, SAMPLES, Bundle, pipeline_of, read_bundle
+from epypes.bundle.manifest import environment
+from epypes.bundle.requirements import import_all_of, requirement_lines
 from epypes.errors import BundleError, EpypesError
 from epypes.run import CompGraphRunner
 from epypes.wire.samples import load_sample, save_sample
+from epypes.wording import counted
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayReport:
+    """What a replay found.
+
+    Attributes
+    ----------
+    samples
+        How many samples were replayed.
+    tokens
+        How many tokens were compared.
+    differences
+        The first difference of each token that differs.
+    requirements
+        The lines of requirements.txt, from what the replay imported; empty where it ran in this process.
+    environment
+        What the replay ran on: Python, platform, processor, OpenCV's build and threads.
+    unsteady
+        The tokens that differ from what was recorded, and from run to run as well.
+    causes
+        What the differences likely come from, the likeliest first.
+    notes
+        What else is worth knowing, as sentences.
+    outside
+        The files outside of the bundle that its functions open or name, as sentences.
+    """
+
+    samples: int
+    tokens: int
+    differences: tuple[Difference, ...]
+    requirements: tuple[str, ...] = ()
+    environment: Mapping[str, str] = field(default_factory=dict)
+    unsteady: tuple[str, ...] = ()
+    causes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    outside: tuple[str, ...] = ()
+
+    @property
+    def identical(self) -> bool:
+        """Whether every token was what had been recorded, and there was one."""
+        return self.tokens > 0 and not self.differences
+
+    def __str__(self) -> str:
+        if self.identical:
+            return f"identical: {counted(self.tokens, 'token')} of {counted(self.samples, 'sample')}"
+        found = [*map(str, self.differences)] or ["nothing was compared: the bundle has no samples"]
+        return "\n".join([*found, *(f"Likely: {cause}" for cause in self.causes)])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain values, as JSON has them."""
+        from dataclasses import asdict
+
+        return {"identical": self.identical, **asdict(self)}
+
+
+def report_from(outcome: Mapping[str, Any]) -> ReplayReport:
+    """Return the report that a process has written as JSON."""
+    found = (Difference(**entry) for entry in outcome["differences"])
+    texts = {name: tuple(outcome[name]) for name in ("requirements", "unsteady", "causes", "notes", "outside")}
+    return ReplayReport(
+        outcome["samples"], outcome["tokens"], tuple(found), environment=outcome["environment"], **texts
+    )
+
 
 REPLAY_TIMEOUT_S = 600.0
 
@@ -156,14 +219,17 @@ def replay(bundle: Bundle, *, twice: bool = False) -> ReplayReport:
 
 
 def record_again(folder: Path) -> dict[str, Any]:
-    """Run the samples of an unsealed bundle in this process, and write down what comes out."""
+    """Run the samples of an unsealed bundle in this process, and record their outputs and answers."""
     bundle = read_bundle(folder, sealed=False)
     settings = bundle.settings
     for path in bundle.samples:
         inputs, outputs = load_sample(path)
         run = _run(bundle, inputs)
         save_sample(path, inputs, {token: run[token] for token in outputs}, rgb=settings.rgb)
-    record_answers_again(bundle)
+        answer = bundle.path / ANSWERS / path.name
+        if answer.is_file():
+            answer.unlink()
+            record_answer(answer, bundle.own["f_out"], settings.name, (run, _run(bundle, inputs)), settings.attributes)
     return {"samples": len(bundle.samples)}
 
 
@@ -193,24 +259,22 @@ def _replayed(folder: Path, options: Sequence[str]) -> dict[str, Any]:
     is_sealed, twice = "--unsealed" not in options, "--twice" in options
     if "--watched" not in options:
         return replay(read_bundle(folder, sealed=is_sealed), twice=twice).to_dict()
-    with ImportWatch() as watch:
-        for path in sorted((folder / SAMPLES).glob("*.npz")):
-            # What reading a sample needs is loaded now, so that it is not taken for what the bundle needs.
-            try:
-                sample = load_sample(path)
-                list(differences(sample, sample))
-            except EpypesError:
-                break
-        watch.mark()
-        with ReachWatch(folder) as reached:
-            bundle = read_bundle(folder, sealed=is_sealed)
-            reached.also_in(bundle.settings.hyperparameters)
-            report = replay(bundle, twice=twice)
-        name = module_name(folder)
-        watch.import_all_of((folder / MODULE).read_text(encoding="utf-8"), name)
-    modules = watch.imported_by(name, owner)
-    report = replace(report, outside=reached.files, notes=(*report.notes, *reached.notes))
-    return replace(report, requirements=requirement_lines(modules)).to_dict()
+    for path in sorted((folder / SAMPLES).glob("*.npz")):
+        # What reading a sample needs is loaded now, so that it is not taken for what the bundle needs.
+        try:
+            sample = load_sample(path)
+            list(differences(sample, sample))
+        except EpypesError:
+            break
+    before = frozenset(sys.modules)
+    with FileAccess(folder) as access:
+        bundle = read_bundle(folder, sealed=is_sealed)
+        access.also_in(bundle.settings.hyperparameters)
+        report = replay(bundle, twice=twice)
+    named = import_all_of((folder / MODULE).read_text(encoding="utf-8"))
+    requirements = requirement_lines(named | (sys.modules.keys() - before))
+    report = replace(report, outside=access.files, notes=(*report.notes, *access.notes), requirements=requirements)
+    return report.to_dict()
 
 
 def _outcome_of(folder: Path, work: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:

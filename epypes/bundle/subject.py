@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from epypes.bundle.adapters import is_usual
 from epypes.bundle.expressions import expression, noted_refusals
 from epypes.bundle.formatting import laid_out
 from epypes.bundle.graphs import Graphs
 from epypes.bundle.instances import arguments_of, parameters_of
 from epypes.bundle.literal import quoted
 from epypes.bundle.load import MAKER
-from epypes.bundle.ports import is_usual
 from epypes.bundle.slicer import Slice
 from epypes.bundle.source import Refused
 from epypes.graph import CompGraph, with_defaults

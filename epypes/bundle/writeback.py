@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from epypes.bundle.entries import alike, fits, read, written
-from epypes.bundle.exchange import exchange
+from epypes.bundle.hyperparameters import alike, fits, read, written
 from epypes.bundle.load import SETTINGS
-from epypes.bundle.proof import prove
+from epypes.bundle.manifest import check_manifest, digest
+from epypes.bundle.proof import prove, swap_folders
 from epypes.bundle.replay import REPLAY_TIMEOUT_S, run_isolated
-from epypes.bundle.seal import check_seal, digest
 from epypes.errors import BundleError, HyperparameterError, PromotionRefused, UnknownName
 from epypes.optional import optional_import
 
@@ -66,7 +65,7 @@ def write_back(
         it is.
     """
     folder = Path(path).resolve()
-    before = check_seal(folder)
+    before = check_manifest(folder)
     text = (folder / SETTINGS).read_text(encoding="utf-8")
     changed = changed_settings(text, values)
     if changed == text:
@@ -78,10 +77,10 @@ def write_back(
             (draft / SETTINGS).write_text(changed, encoding="utf-8")
             _record(draft, folder, timeout_s)
             found = WriteBack(_diff(text, changed), digest(draft))
-            if check_seal(folder) != before:
+            if check_manifest(folder) != before:
                 raise BundleError(folder, f"{folder} was replaced meanwhile. Write the values back again.")
             if not dry_run:
-                exchange(draft, folder)
+                swap_folders(draft, folder)
     except OSError as error:
         raise BundleError(folder, f"{folder} can't be written: {error}. The bundle stays as it is.") from error
     return found
@@ -132,7 +131,7 @@ def _record(draft: Path, target: Path, timeout_s: float) -> None:
     """Record the outputs of a draft's samples again, replay and seal it."""
     try:
         run_isolated(draft, ["--record"], timeout_s=timeout_s)
-        prove(draft, target)
+        prove(draft, target, timeout_s)
     except BundleError as error:
         reasons = error.reasons if isinstance(error, PromotionRefused) else (str(error),)
         why = " ".join(reasons).replace(str(draft.resolve()), str(target)).rstrip(".")

@@ -37,12 +37,12 @@ def call(
 ) -> None:
     """Send one image, or other values, to the service of a bundle; write the answer to files and print the rest."""
     from epypes.bundle.load import SETTINGS
-    from epypes.bundle.seal import check_seal
+    from epypes.bundle.manifest import check_manifest
     from epypes.bundle.settings import read_settings
     from epypes.display.previews.preview import preview
     from epypes.service import Client
 
-    check_seal(bundle)
+    check_manifest(bundle)
     settings = read_settings(bundle / SETTINGS)
     given = by_token(images, settings.inputs, "input")
     targets = by_token(out_file or [], settings.outputs, "output")

@@ -13,7 +13,7 @@ from epypes.errors import BundleError, ReplayDiffers
 from epypes.wording import counted
 
 if TYPE_CHECKING:
-    from epypes.bundle.report import ReplayReport
+    from epypes.bundle.replay import ReplayReport
 
 
 def verify(

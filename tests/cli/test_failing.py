@@ -16,7 +16,7 @@ import pytest
 import typer.main
 
 import epypes as ep
-from epypes.bundle.seal import seal
+from epypes.bundle.manifest import write_manifest
 from epypes.cli.app import app
 from epypes.wire import load_sample, save_sample
 
@@ -122,11 +122,11 @@ def places(tmp_path_factory):
     for name in ("broken", "other"):
         shutil.copytree(found["bundle"], found[name])
     (found["broken"] / "pipeline.toml").write_text("[ports\n")
-    seal(found["broken"])
+    write_manifest(found["broken"])
     sample = found["other"] / "samples" / "000.npz"
     inputs, outputs = load_sample(sample)
     save_sample(sample, inputs, {"edges": outputs["edges"] ^ 255})
-    seal(found["other"])
+    write_manifest(found["other"])
     found["folder"].mkdir()
     found["text"].write_text("some text")
     found["cases"].write_text('[[case]]\ninputs = {image = "none.png"}\n')

@@ -12,7 +12,7 @@ import sys
 import pytest
 
 import epypes as ep
-from epypes.bundle.seal import seal
+from epypes.bundle.manifest import write_manifest
 from epypes.service import Service
 from epypes.service.http import HttpServer
 from epypes.service.state_file import StateLock
@@ -110,7 +110,7 @@ def test_a_bundle_that_was_mended_since_is_told_to_have_changed_and_to_be_fine(e
     failure = keep(mended, request(RAISES))
     module = mended / "pipeline.py"
     module.write_text(module.read_text().replace("raise ValueError", "return bright; raise ValueError"))
-    seal(mended)
+    write_manifest(mended)
     done = epypes("replay", failure)
     assert done.returncode == 0
     first, second = done.stdout.splitlines()

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 import epypes as ep
-from epypes.bundle.entries import MOST_NUMBERS, Member, Unwritable, alike, fits, read, written
+from epypes.bundle.hyperparameters import MOST_NUMBERS, Member, Unwritable, alike, fits, read, written
 from epypes.bundle.settings import Settings, read_settings, unwritable, write_settings
 
 

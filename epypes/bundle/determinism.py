@@ -1,4 +1,4 @@
-"""How far may a token be from what was recorded? Learnt from runs in the notebook, one after another.
+"""Determinism of the functions, learnt from runs in the notebook, one after another, with a tolerance for noise.
 
 Where all runs agree to the last bit, nothing is tolerated. Where floating-point numbers differ in less than half of
 their digits, which is what summing in another order does, the tolerance is SAFETY times the largest difference seen.
@@ -14,9 +14,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.bundle.clone import clone_graph
+from epypes.bundle.code_snapshot import CodeSnapshot
 from epypes.bundle.compare import Tolerance, Unlike, differences
-from epypes.bundle.kept import kept_by, what_changed
-from epypes.bundle.suspects import suspicion, way_out
 from epypes.errors import BundleError, InputMutated
 from epypes.graph import CompGraph, with_defaults
 from epypes.optional import optional_import
@@ -31,6 +30,21 @@ RUNS: Final = 3
 SAFETY: Final = 10.0
 # Noise goes up and down: 1 in 362,880 series of as many runs goes further away each time by chance.
 _RUNS_OF_SUSPECTS: Final = 10
+# What likely makes a function compute something else from the same inputs, and what to do about it.
+_GROWS: Final = "Its result goes further away from run to run: it counts, keeps something, or looks at a clock."
+_NOISE: Final = "Its floating-point results differ by noise, and what is made of them differs by more."
+_SETTLED: Final = (
+    "It computes the same whenever it is run now, but not what it did then: an array that it takes was written into "
+    "since, or it keeps something."
+)
+_UNSTEADY: Final = "It draws random numbers without a seed, looks at a clock, or keeps something from run to run."
+_WAYS_OUT: Final = {
+    _GROWS: "Pass what it reads or keeps as a token.",
+    _NOISE: "Round the noise away before it decides anything, or compute it in one thread: cv2.setNumThreads(1).",
+    _SETTLED: "Run the graph again, on arrays that nothing writes into; what is kept is to be a token.",
+    _UNSTEADY: "Pass a seed as a token and make the generator of it, as in np.random.default_rng(seed), or call "
+    "cv2.setRNGSeed(seed) inside the function; a time and what is kept are to be tokens, too.",
+}
 _MEANING: Final = (
     f"{counted(RUNS, 'more run')} in the notebook gave other last digits: a replay may differ by {SAFETY:g} times as",
     "much, and each number by no more than the relative part of its own magnitude.",
@@ -79,7 +93,7 @@ def learn(
     runner = CompGraphRunner(with_defaults(clone_graph(cg), {}), hyperparameters, check_mutation=True)
     tolerances: dict[str, Tolerance] = {}
     reasons: list[str] = []
-    before = kept_by(cg.functions)
+    held = {name: CodeSnapshot({name: function}, lock=False) for name, function in cg.functions.items()}
     for number, sample in enumerate(samples, 1):
         of = f" of sample {number} of {len(samples)}" if len(samples) > 1 else ""
         seen = _Seen(runner, sample, lambda text, of=of: told(text + of))  # type: ignore[misc]
@@ -88,7 +102,14 @@ def learn(
                 tolerances[token] = _widened(tolerances.get(token), found)
         reason = seen.reason(outputs)
         reasons += [reason] if reason and reason not in reasons else []
-    return Learnt(tolerances, tuple(reasons or what_changed(before, kept_by(cg.functions))))
+    changed = {name: snapshot.changed() for name, snapshot in held.items()}
+    kept = [
+        f"Function {name!r} changes {known!r} from run to run, which outlives the call: the next event would find it "
+        "different. Copy it first, or make it a token."
+        for name, known in changed.items()
+        if known is not None
+    ]
+    return Learnt(tolerances, tuple(reasons or kept))
 
 
 class _Seen:
@@ -149,15 +170,15 @@ class _Seen:
         name = next(name for name in cg.func_io if any(token in self.unlike for token in cg.func_outputs(name)))
         token = next(token for token in cg.func_outputs(name) if token in self.unlike)
         also = f" So {', '.join(map(repr, bad))} can't be verified." if bad != [token] else ""
-        kind = suspicion(
-            cg.functions[name],
-            grows=token in growing,
-            is_noise=_is_noise(self.unlike[token]),
-            is_settled=token not in self._unsteady,
-        )
+        if token in growing:
+            cause = _GROWS
+        elif _is_noise(self.unlike[token]):
+            cause = _NOISE
+        else:
+            cause = _UNSTEADY if token in self._unsteady else _SETTLED
         return (
             f"Function {name!r} does not compute the same again from the same inputs: token {token!r}: "
-            f"{self.unlike[token][0].text}. {kind}{also} {way_out(kind)}"
+            f"{self.unlike[token][0].text}. {cause}{also} {_WAYS_OUT[cause]}"
         )
 
 

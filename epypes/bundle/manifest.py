@@ -1,6 +1,6 @@
-"""The manifest of a bundle: a digest of every file, and the lines that were changed since.
+"""The manifest of a bundle: a digest of every file, the lines that were changed since, and what it was recorded on.
 
-The manifest can be checked by ``sha256sum --check MANIFEST.sha256``, which passes over its comments. They say what the
+The manifest can be checked by ``sha256sum --check MANIFEST.sha256``, which passes over its comments. They name what the
 samples were recorded with, so that a replay that differs can be explained. It is no signature: it shows accidents and
 careless changes, and anyone who can write the files can write the manifest anew.
 
@@ -15,7 +15,9 @@ import errno
 import hashlib
 import io
 import os
+import platform
 import stat
+import sys
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -37,7 +39,7 @@ MOST_FILES: Final = 10_000
 _MOST_TEXT_BYTES: Final = 64 * 1024**2
 
 
-def seal(folder: Path, environment: Mapping[str, str] | None = None) -> str:
+def write_manifest(folder: Path, environment: Mapping[str, str] | None = None) -> str:
     """Write the manifest, in the format of ``sha256sum``; return the bundle's digest.
 
     Parameters
@@ -60,7 +62,7 @@ def digest(folder: Path) -> str:
     return _hash(folder / MANIFEST)
 
 
-def check_seal(folder: Path) -> str:
+def check_manifest(folder: Path) -> str:
     """Compare every file with the manifest; return the bundle's digest.
 
     Raises
@@ -274,3 +276,49 @@ def _check_text(path: Path, size: int) -> None:
 def _hash(path: Path) -> str:
     with _opened(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+_CPU_INFO: Final = Path("/proc/cpuinfo")
+# What is told of each difference, by the name of what differs.
+_TOLD: Final = {
+    "python": "another Python",
+    "platform": "another platform",
+    "processor": "another processor",
+    "opencv": "another build of OpenCV",
+    "opencv processor features": "a processor of which OpenCV uses other features",
+    "opencv threads": "another number of threads of OpenCV",
+}
+
+
+def environment() -> dict[str, str]:
+    """Return Python, platform and processor; and OpenCV's build, features and threads where it is imported."""
+    facts = {
+        "python": platform.python_version(),
+        "platform": f"{platform.system()} {platform.machine()}",
+        "processor": _processor(),
+    }
+    cv2 = sys.modules.get("cv2")
+    if cv2 is not None:
+        build = hashlib.sha256(cv2.getBuildInformation().encode()).hexdigest()[:12]
+        facts["opencv"] = f"{cv2.__version__} {build}"
+        facts["opencv processor features"] = cv2.getCPUFeaturesLine()
+        facts["opencv threads"] = str(cv2.getNumThreads())
+    return {name: " ".join(value.split()) for name, value in facts.items()}
+
+
+def _processor() -> str:
+    try:
+        lines = _CPU_INFO.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor()) or f"{os.cpu_count()} of unknown kind"
+
+
+def environment_differences(recorded: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """Return as sentences what is not as it was when the samples were recorded."""
+    return [
+        f"It was recorded on {what}: {recorded[name]}, here it is {now[name]}."
+        for name, what in _TOLD.items()
+        if name in recorded and name in now and recorded[name] != now[name]
+    ]

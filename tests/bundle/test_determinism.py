@@ -11,10 +11,9 @@ import pytest
 
 import epypes as ep
 from epypes.bundle import verify
-from epypes.bundle.compare import Tolerance, differences, first_difference
-from epypes.bundle.report import difference
+from epypes.bundle.compare import Tolerance, difference, differences, first_difference
+from epypes.bundle.determinism import RUNS, SAFETY, learn, read_tolerances
 from epypes.bundle.settings import read_settings
-from epypes.bundle.tolerance import RUNS, SAFETY, learn, read_tolerances
 from epypes.errors import BundleError, PromotionRefused
 from tests.bundle.test_slicer import notebook
 
@@ -103,7 +102,11 @@ def test_noise_is_tolerated_ten_times_as_large_as_it_was():
 @pytest.mark.parametrize(
     ("names", "output", "words"),
     [
-        (["draw"], "draw", "Function 'draw' .*token 'draw': 5000 of 5000 values differ.*It draws random numbers.*seed"),
+        (
+            ["draw"],
+            "draw",
+            "Function 'draw' .*token 'draw': 5000 of 5000 values differ.*It draws random numbers without a seed.*seed",
+        ),
         (["clock"], "clock", "Function 'clock' .*(looks at a clock).*as a token"),
         (["count"], "count", "Function 'count' .*goes further away from run to run.*as a token"),
         (["grow"], "grow", r"Function 'grow' .*expected float64 \(1,\), got float64 \(2,\)"),

@@ -1,7 +1,7 @@
-"""What does a bundle reach for outside of itself while it is replayed?
+"""File access of a bundle while it is replayed: files outside of it, connections and processes.
 
-Python tells of every file that it opens, by an audit hook. Libraries in C open files without telling; their names are
-looked for in the text of the module and in the values of hyperparameters.
+An audit hook hears of every file that Python opens. Libraries in C open files without it; their names are looked for in
+the text of the module and in the values of hyperparameters.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Named:
     what: str
 
 
-class ReachWatch:
+class FileAccess:
     """While its block runs, it is noted what the bundle's functions open, connect to and start.
 
     Parameters
@@ -53,7 +53,7 @@ class ReachWatch:
 
     def __enter__(self) -> Self:
         self._is_on = True
-        sys.addaudithook(self._heard)  # which can't be taken away again
+        sys.addaudithook(self._on_event)  # which can't be taken away again
         self._before = {named: _state(named.text) for named in named_in(self._folder)}
         return self
 
@@ -69,14 +69,14 @@ class ReachWatch:
         """Why the bundle is not alone: a sentence for each file that is not its own."""
         own = self._own_places()
         opened = {path: what for path, what in self._files.items() if not _is_in(path, own) and path not in self._made}
-        told = [f"{what} opens {path}. {_WAY_OUT}" for path, what in opened.items()]
+        found = [f"{what} opens {path}. {_WAY_OUT}" for path, what in opened.items()]
         for named, before in self._before.items():
             path = os.path.realpath(named.text)
             # What is another one now was written, not read.
             if before is None or path in opened or _is_in(path, own) or _state(named.text) != before:
                 continue
-            told.append(f"{named.what} names {named.text}, which is there. {_WAY_OUT}")
-        return tuple(told)
+            found.append(f"{named.what} names {named.text}, which is there. {_WAY_OUT}")
+        return tuple(found)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -94,14 +94,14 @@ class ReachWatch:
             {os.path.realpath(str(place)) for place in places if str(place)} - {os.sep, os.path.realpath(home)}
         )
 
-    def _heard(self, event: str, given: tuple[Any, ...]) -> None:
-        if not self._is_on or event not in _TOLD:
+    def _on_event(self, event: str, given: tuple[Any, ...]) -> None:
+        if not self._is_on or event not in _EVENTS:
             return
-        what = self._speaker()
+        what = self._function_at_work()
         if what:
-            _TOLD[event](self, what, given)
+            _EVENTS[event](self, what, given)
 
-    def _speaker(self) -> str:
+    def _function_at_work(self) -> str:
         """Return which function of the bundle is at work; "" if none is, or a module is being imported by it."""
         frame: FrameType | None = sys._getframe(2)
         while frame is not None:
@@ -125,8 +125,8 @@ class ReachWatch:
 
     def _connected(self, what: str, given: tuple[Any, ...]) -> None:
         address = given[1]
-        told = ":".join(map(str, address[:2])) if isinstance(address, tuple) else os.fsdecode(address)
-        self._notes[f"{what} connects to {told}."] = None
+        found = ":".join(map(str, address[:2])) if isinstance(address, tuple) else os.fsdecode(address)
+        self._notes[f"{what} connects to {found}."] = None
 
     def _started(self, what: str, given: tuple[Any, ...]) -> None:
         arguments = given[1] if len(given) > 1 else given[0]
@@ -134,15 +134,15 @@ class ReachWatch:
         self._notes[f"{what} starts {' '.join(map(os.fsdecode, words)):.80}."] = None
 
 
-_TOLD: Final = {
-    "open": ReachWatch._opened,
-    "os.listdir": ReachWatch._opened,
-    "os.scandir": ReachWatch._opened,
-    "sqlite3.connect": ReachWatch._opened,
-    "socket.connect": ReachWatch._connected,
-    "subprocess.Popen": ReachWatch._started,
-    "os.system": ReachWatch._started,
-    "os.posix_spawn": ReachWatch._started,
+_EVENTS: Final = {
+    "open": FileAccess._opened,
+    "os.listdir": FileAccess._opened,
+    "os.scandir": FileAccess._opened,
+    "sqlite3.connect": FileAccess._opened,
+    "socket.connect": FileAccess._connected,
+    "subprocess.Popen": FileAccess._started,
+    "os.system": FileAccess._started,
+    "os.posix_spawn": FileAccess._started,
 }
 
 
