@@ -1,28 +1,31 @@
-"""Does a graph still do on a labelled set what it must?"""
+"""The check of a labelled set: its cases are run and measured; the result shows itself, or becomes JUnit XML.
+
+A metric that raises, or a file of expected values that can't be read, fails the check that it belongs to, with the
+reason; the others go on.
+"""
 
 from __future__ import annotations
 
-import base64
 import enum
 import math
 import os
 import re
 import threading
-from collections import Counter
+import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.batch.cases import ABSENT, Case, Check, cases_of, checks_of, with_labels_read
+from epypes.batch.cases import ABSENT, Case, Check, cases_of, checks_of, inputs_of, with_labels_read
 from epypes.batch.executors import run_jobs
-from epypes.batch.items import detached_runner, is_file, items_of, read_value
+from epypes.batch.items import detached_runner, items_of, read_value
 from epypes.batch.job import Job
 from epypes.batch.metrics import METRICS
 from epypes.batch.progress import progress_bar
-from epypes.batch.results import ErrorInfo, Outcome, Thumbnail, object_column
-from epypes.batch.thumbnails import LEGEND, pictures_of
+from epypes.batch.results import ErrorInfo, Outcome, Thumbnail, data_uri, object_column
+from epypes.batch.thumbnails import DIFFERENCE_LEGEND, comparison_thumbnails
 from epypes.bundle.compare import first_difference
 from epypes.bundle.hyperparameters import Member
 from epypes.display.markup import content, escape, fitted
@@ -33,19 +36,18 @@ from epypes.run import CompGraphRunner
 from epypes.wording import counted
 
 if TYPE_CHECKING:
-    import os
-
     import pandas as pd
 
+Checks = Sequence[tuple[Case, tuple[Check, ...]]]
 
-# What a case without a check has to do.
-RUNS: Final = "runs"
+# The check of a case that has none: it runs.
+_RUNS: Final = Check("runs", None, "runs")
 _REASON_CHARACTERS: Final = 300
 
 
 @dataclass(frozen=True, slots=True)
 class CheckOutcome:
-    """What came of one check of one case.
+    """The result of one check of one case.
 
     Attributes
     ----------
@@ -58,13 +60,11 @@ class CheckOutcome:
     value
         The number that the metric gave; None if there is none.
     threshold
-        What must be so, as ``"at least 0.9"``; empty if the metric says true or false.
-    passed
-        Whether it is.
+        The bounds, as ``"at least 0.9"``; empty if the metric returns true or false.
     reason
         Why it has not passed; empty if it has.
-    trouble
-        What failed, so that nothing could be measured: the run, the metric, or reading what was expected.
+    error_info
+        The error because of which nothing could be measured: of the run, the metric, or reading what was expected.
     total_ns
         Nanoseconds of the case's run.
     pictures
@@ -77,82 +77,258 @@ class CheckOutcome:
     token: str | None
     value: float | None
     threshold: str
-    passed: bool
     reason: str = ""
     error_info: ErrorInfo | None = None
     total_ns: int = 0
     pictures: Mapping[str, Thumbnail] = field(default_factory=dict, repr=False)
 
+    @property
+    def passed(self) -> bool:
+        """Whether the check has passed."""
+        return not self.reason
 
-def measured(outcome: Outcome, case: Case, checks: tuple[Check, ...], cg: CompGraph) -> tuple[CheckOutcome, ...]:
-    """Return what came of a case, check by check.
+
+def check(
+    runner: CompGraphRunner,
+    cases: str | os.PathLike[str] | Iterable[Any],
+    executor: Executor | None = None,
+    *,
+    progress: bool | None = None,
+) -> CheckResult:
+    """Run a labelled set and return which cases pass.
 
     Parameters
     ----------
-    outcome
-        Of its run; it keeps the tokens that the checks look at.
-    case
-        The case.
-    checks
-        Its checks, with their tokens.
-    cg
-        The graph that was run.
+    runner
+        Its graph and hyperparameters are used; it is left as it is.
+    cases
+        ``ep.Case``s, dicts with the parts of one, or the path of a CASES.toml.
+    executor
+        None runs the cases in this thread; any ``concurrent.futures.Executor`` elsewhere. Metrics are computed here.
+    progress
+        Whether a bar is shown; None: in a terminal or a notebook.
+
+    Returns
+    -------
+    CheckResult
+        True if every check of every case has passed. A case that fails, whose metric raises or gives NaN, or whose
+        file of what was expected can't be read, has not, with its reason; the others go on.
+
+    Raises
+    ------
+    ScaleError
+        There are no cases, or one can't be understood.
+    UnknownName
+        A case names a token, a hyperparameter or a metric that is not there.
+
+    Examples
+    --------
+    >>> from epypes import Case, CompGraph, CompGraphRunner
+    >>> cg = CompGraph({"double": lambda x, k: x * k}, {"double": (("x", "k"), "y")})
+    >>> result = check(CompGraphRunner(cg, {"k": 2}), [Case(2, {"y": 4}), Case(3, {"y": 7}, name="odd")])
+    >>> print(result)
+    1 of 2 cases failed: odd
+    >>> result.failures[0].reason
+    'expected 7, got 6'
     """
-    if not checks:
-        checks = (Check(RUNS, None, RUNS),)
-    return tuple(_outcome(outcome, case, check, cg) for check in checks)
+    runner = detached_runner(runner)
+    found = prepare_cases(runner, cases)
+    outcomes: list[CheckOutcome] = []
+    with progress_bar(progress, len(found), "check", unit="case") as advance:
+        for of_case in run_checks(runner, found, executor):
+            outcomes += of_case
+            advance(1, int(not all(outcome.passed for outcome in of_case)))
+    outcomes.sort(key=lambda outcome: outcome.number)
+    return CheckResult(tuple(outcomes))
 
 
-@dataclass(frozen=True, slots=True)
-class _Verdict:
-    """What was measured, why it does not do, what failed, and how it looks."""
+def prepare_cases(runner: CompGraphRunner, cases: Any) -> Checks:
+    """Return cases with their checks.
 
-    value: float | None
-    reason: str = ""
-    error_info: ErrorInfo | None = None
-    pictures: Mapping[str, Thumbnail] = field(default_factory=dict)
+    Raises
+    ------
+    ScaleError, UnknownName
+        As ``check`` does.
+    """
+    return [(_with_members(case, runner), checks_of(case, runner.cg)) for case in cases_of(cases)]
+
+
+def _with_members(case: Case, runner: CompGraphRunner) -> Case:
+    """Return a case whose hyperparameters the runner has, with members of enumerations in place of their names."""
+    now, given = runner.hyperparameters, case.hyperparameters or {}
+    for token in given:
+        if token not in now:
+            raise UnknownName("hyperparameter", token, now, f"for {case}")
+    return replace(case, hyperparameters={token: _member(value, now[token], case) for token, value in given.items()})
+
+
+def _member(value: Any, present: Any, case: Case) -> Any:
+    """Return the member of an enumeration that a file names; any other value as it is."""
+    if not isinstance(value, Member):
+        return value
+    members = type(present).__members__ if isinstance(present, enum.Enum) else {}
+    if value.name not in members:
+        raise UnknownName(f"member of {value.enum}", value.name, members, f"for {case}")
+    return members[value.name]
+
+
+def run_checks(
+    runner: CompGraphRunner,
+    cases: Checks,
+    executor: Executor | None = None,
+    *,
+    has_pictures: bool = True,
+    stop: threading.Event | None = None,
+) -> Iterator[tuple[CheckOutcome, ...]]:
+    """Yield the outcomes of the checks, case by case as they come.
+
+    Parameters
+    ----------
+    runner, cases, executor
+        As of ``check``; the cases with their checks.
+    has_pictures
+        Whether pictures are made of what is measured.
+    stop
+        Ends it in bounded time, once it is set.
+    """
+
+    def jobs() -> Iterator[Job]:
+        items = items_of([inputs_of(case) for case, _ in cases], runner)
+        for item, (case, checks) in zip(items, cases, strict=True):
+            show = tuple(dict.fromkeys(check.token for check in checks if check.token is not None))
+            keep = tuple(dict.fromkeys(token for check in checks for token in check.keep))
+            named = replace(item, name=case.name or item.name)
+            yield Job((named,), (dict(case.hyperparameters or {}),), keep, show if has_pictures else ())
+
+    for outcomes in run_jobs(runner, jobs(), executor, stop=stop):
+        for outcome in outcomes:
+            case, checks = cases[outcome.number]
+            yield tuple(_measured(outcome, case, check, runner.cg) for check in checks or (_RUNS,))
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class CheckResult:
+    """The result of a labelled set; true if all of it has passed.
+
+    Attributes
+    ----------
+    outcomes
+        Check by check, in the order of the cases.
+    """
+
+    outcomes: tuple[CheckOutcome, ...]
 
     @property
     def passed(self) -> bool:
-        """Whether nothing failed, and there is no reason why it does not do."""
-        return self.error_info is None and not self.reason
+        """Whether every check of every case has passed."""
+        return all(outcome.passed for outcome in self.outcomes)
+
+    @property
+    def failures(self) -> tuple[CheckOutcome, ...]:
+        """The checks that have not passed."""
+        return tuple(outcome for outcome in self.outcomes if not outcome.passed)
+
+    @property
+    def cases(self) -> dict[str, bool]:
+        """Whether each case has passed, by name."""
+        found: dict[str, bool] = {}
+        for outcome in self.outcomes:
+            found[outcome.case] = found.get(outcome.case, True) and outcome.passed
+        return found
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return a pandas table with a row per check: case, check, token, value, threshold, passed, failure, run_ms."""
+        outcomes = self.outcomes
+        columns = {
+            "case": [outcome.case for outcome in outcomes],
+            "check": [outcome.check for outcome in outcomes],
+            "token": [outcome.token for outcome in outcomes],
+            "value": [float("nan") if outcome.value is None else outcome.value for outcome in outcomes],
+            "threshold": [outcome.threshold for outcome in outcomes],
+            "passed": [outcome.passed for outcome in outcomes],
+            "failure": object_column([outcome.reason or None for outcome in outcomes]),
+            "run_ms": [outcome.total_ns / 1e6 for outcome in outcomes],
+        }
+        with optional_import():
+            import pandas as pd
+        return pd.DataFrame(columns)
+
+    def to_junit(self, path: str | os.PathLike[str], name: str = "epypes check") -> Path:
+        """Write JUnit XML, as continuous integration reads it, and return its path.
+
+        A case is a class, a check a test case; what could not be measured is an error, what falls short a failure.
+
+        Raises
+        ------
+        ScaleError
+            The file can't be written.
+        """
+        path = Path(path)
+        suite = _junit(self.outcomes, name)
+        ET.indent(suite)
+        try:
+            ET.ElementTree(suite).write(path, encoding="utf-8", xml_declaration=True)
+        except OSError as error:
+            raise ScaleError(f"{str(path)!r} can't be written: {error.strerror}. Name another file.") from error
+        return path
+
+    def __bool__(self) -> bool:
+        return self.passed
+
+    def __len__(self) -> int:
+        return len(self.outcomes)
+
+    def __str__(self) -> str:
+        cases = self.cases
+        failed = [name for name, has_passed in cases.items() if not has_passed]
+        if not failed:
+            return f"{counted(len(cases), 'case')} passed"
+        named = ", ".join(failed[:5])
+        return f"{len(failed)} of {counted(len(cases), 'case')} failed: {named}{', ...' if len(failed) > 5 else ''}"
+
+    def __repr__(self) -> str:
+        cases = self.cases
+        failed = sum(not passed for passed in cases.values())
+        return f"<CheckResult: {counted(len(cases), 'case')}, {f'{failed} failed' if failed else 'all passed'}>"
+
+    def _repr_html_(self) -> str:
+        return _page(self)
 
 
-def _outcome(outcome: Outcome, case: Case, check: Check, cg: CompGraph) -> CheckOutcome:
-    verdict = _judged(outcome, case, check, cg)
+# -- measuring --------------------------------------------------------------------------------------------------
+
+
+def _measured(outcome: Outcome, case: Case, check: Check, cg: CompGraph) -> CheckOutcome:
+    """Return the outcome of a check by the outcome of its case's run, which keeps the tokens that are measured."""
+    value = expected = number = None
+    error_info, reason = outcome.error_info, ""
+    if error_info is not None:
+        reason = str(error_info)
+    elif check is not _RUNS:
+        try:
+            value, expected = _compared(outcome, check, cg)
+            number = _number(_measure(outcome, case, check, cg, value, expected), check)
+            reason = _shortfall(number, check, value, expected)
+        except (Exception, SystemExit) as error:  # whatever a user's metric raises
+            number, error_info, reason = None, *_failure(error, check)
+    pictures: dict[str, Thumbnail] = {}
+    if reason and check.token is not None and expected is not None and (outcome.thumbnails or outcome.texts):
+        pictures = comparison_thumbnails(value, expected, cg, check.token)
     seen = outcome.thumbnails.get(check.token or "")
+    if seen is not None:  # it has what was found drawn over its image
+        pictures["got"] = seen
     return CheckOutcome(
         outcome.number,
         case.name or outcome.name,
         check.name,
         check.token,
-        verdict.value,
+        number,
         check.threshold,
-        verdict.passed,
-        " ".join(verdict.reason.split())[:_REASON_CHARACTERS],
-        verdict.error_info,
+        " ".join(reason.split())[:_REASON_CHARACTERS],
+        error_info,
         outcome.total_ns,
-        # That of the run has what was found drawn over its image.
-        verdict.pictures if seen is None else {**verdict.pictures, "got": seen},
+        pictures,
     )
-
-
-def _judged(outcome: Outcome, case: Case, check: Check, cg: CompGraph) -> _Verdict:
-    """Return the number, why it does not do, what failed, and pictures of the difference."""
-    if outcome.error_info is not None:
-        return _Verdict(None, str(outcome.error_info), outcome.error_info)
-    if check.metric == RUNS:
-        return _Verdict(None)
-    value = expected = None
-    try:
-        value, expected = _compared(outcome, check, cg)
-        number = _number(_measure(outcome, case, check, cg, value, expected), check)
-        verdict = _Verdict(number, _shortfall(number, check, value, expected))
-    except (Exception, SystemExit) as error:  # whatever a user's metric raises
-        verdict = _failed(error, check)
-    if check.token is None or expected is None or verdict.passed or not (outcome.thumbnails or outcome.texts):
-        return verdict
-    return replace(verdict, pictures=pictures_of(value, expected, cg, check.token))
 
 
 def _compared(outcome: Outcome, check: Check, cg: CompGraph) -> tuple[Any, Any]:
@@ -217,378 +393,102 @@ def _differing(value: Any, expected: Any) -> str:
     return first_difference(expected, value) or "they differ"
 
 
-def _failed(error: BaseException, check: Check) -> _Verdict:
-    """Return the verdict where nothing could be measured."""
+def _failure(error: BaseException, check: Check) -> tuple[ErrorInfo, str]:
+    """Return the error because of which nothing could be measured, and the reason that is shown."""
     message = str(error).strip()
     if isinstance(error, KeyError) and check.token is None:
         message = f"no token {message} is kept. If the graph has it, give the metric keep=[{message}]."
     error_info = ErrorInfo("", type(error).__name__, message)
-    # Our own sentences say all; of a user's metric, and where there is no text, the kind of error does.
+    # The messages of EPypes say all; for a user's metric, and where there is no text, the kind of error is named.
     is_ours = bool(message) and (isinstance(error, EpypesError) or not callable(check.metric))
-    return _Verdict(None, message if is_ours else str(error_info), error_info)
+    return error_info, message if is_ours else str(error_info)
 
 
-# More than a page shows; of thousands of cases the pictures would be most of the memory.
-_MOST_PICTURED: Final = 200
+# -- JUnit XML --------------------------------------------------------------------------------------------------
 
-Checks = Sequence[tuple[Case, tuple[Check, ...]]]
-
-
-def check(
-    runner: CompGraphRunner,
-    cases: str | os.PathLike[str] | Iterable[Any],
-    executor: Executor | None = None,
-    *,
-    progress: bool | None = None,
-) -> CheckResult:
-    """Run a labelled set and say which cases pass.
-
-    Parameters
-    ----------
-    runner
-        Its graph and hyperparameters are used; it is left as it is.
-    cases
-        ``ep.Case``s, dicts with the parts of one, or the path of a CASES.toml.
-    executor
-        None runs the cases in this thread; any ``concurrent.futures.Executor`` elsewhere. Metrics are computed here.
-    progress
-        Whether a bar is shown; None: in a terminal or a notebook.
-
-    Returns
-    -------
-    CheckResult
-        True if every check of every case has passed. A case that fails, whose metric raises or gives NaN, or whose
-        file of what was expected can't be read, has not, with its reason; the others go on.
-
-    Raises
-    ------
-    ScaleError
-        There are no cases, or one can't be understood.
-    UnknownName
-        A case names a token, a hyperparameter or a metric that is not there.
-
-    Examples
-    --------
-    >>> from epypes import Case, CompGraph, CompGraphRunner
-    >>> cg = CompGraph({"double": lambda x, k: x * k}, {"double": (("x", "k"), "y")})
-    >>> result = check(CompGraphRunner(cg, {"k": 2}), [Case(2, {"y": 4}), Case(3, {"y": 7}, name="odd")])
-    >>> print(result)
-    1 of 2 cases failed: odd
-    >>> result.failures[0].reason
-    'expected 7, got 6'
-    """
-    runner = detached_runner(runner)
-    found = prepared(runner, cases)
-    outcomes: list[CheckOutcome] = []
-    pictured: Counter[bool] = Counter()
-    with progress_bar(progress, len(found), "check", unit="case") as advance:
-        for of_case in checked(runner, found, executor):
-            outcomes += (_bounded(outcome, pictured) for outcome in of_case)
-            advance(1, int(not all(outcome.passed for outcome in of_case)))
-    outcomes.sort(key=lambda outcome: outcome.number)
-    return CheckResult(tuple(outcomes))
-
-
-def _bounded(outcome: CheckOutcome, pictured: Counter[bool]) -> CheckOutcome:
-    """Return an outcome, without its pictures if there are many of those that have passed, or that have not."""
-    pictured[outcome.passed] += bool(outcome.pictures)
-    return outcome if pictured[outcome.passed] <= _MOST_PICTURED else replace(outcome, pictures={})
-
-
-def prepared(runner: CompGraphRunner, cases: Any) -> Checks:
-    """Return cases with their checks.
-
-    Raises
-    ------
-    ScaleError, UnknownName
-        As ``check`` does.
-    """
-    return [(_with_members(case, runner), checks_of(case, runner.cg)) for case in cases_of(cases)]
-
-
-def _with_members(case: Case, runner: CompGraphRunner) -> Case:
-    """Return a case whose hyperparameters the runner has, with members of enumerations in place of their names."""
-    now, given = runner.hyperparameters, case.hyperparameters or {}
-    for token in given:
-        if token not in now:
-            raise UnknownName("hyperparameter", token, now, f"for {case}")
-    return replace(case, hyperparameters={token: _member(value, now[token], case) for token, value in given.items()})
-
-
-def _member(value: Any, present: Any, case: Case) -> Any:
-    """Return the member of an enumeration that a file names; any other value as it is."""
-    if not isinstance(value, Member):
-        return value
-    members = type(present).__members__ if isinstance(present, enum.Enum) else {}
-    if value.name not in members:
-        raise UnknownName(f"member of {value.enum}", value.name, members, f"for {case}")
-    return members[value.name]
-
-
-def checked(
-    runner: CompGraphRunner,
-    cases: Checks,
-    executor: Executor | None = None,
-    *,
-    has_pictures: bool = True,
-    stop: threading.Event | None = None,
-) -> Iterator[tuple[CheckOutcome, ...]]:
-    """Give what came of the cases, case by case as they come.
-
-    Parameters
-    ----------
-    runner, cases, executor
-        As of ``check``; the cases with their checks.
-    has_pictures
-        Whether pictures are made of what is measured.
-    stop
-        Ends it in bounded time, once it is set.
-    """
-    jobs = _jobs(runner, cases, has_pictures=has_pictures)
-    for outcomes in run_jobs(runner, jobs, executor, stop=stop):
-        for outcome in outcomes:
-            case, checks = cases[outcome.number]
-            yield measured(outcome, case, checks, runner.cg)
-
-
-def _jobs(runner: CompGraphRunner, cases: Checks, *, has_pictures: bool) -> Iterator[Job]:
-    """Give a job per case, when it is asked for."""
-    items = items_of([inputs_of(case) for case, _ in cases], runner)
-    for item, (case, checks) in zip(items, cases, strict=True):
-        looked_at = tuple(dict.fromkeys(check.token for check in checks if check.token is not None))
-        keep = tuple(dict.fromkeys(token for check in checks for token in check.keep))
-        named = replace(item, name=case.name or item.name)
-        yield Job((named,), (dict(case.hyperparameters or {}),), keep, looked_at if has_pictures else ())
-
-
-def inputs_of(case: Case) -> Any:
-    """Return the inputs of a case as ``ep.map`` takes them: what names a file is its path."""
-    if not isinstance(case.inputs, Mapping):
-        return _input(case.inputs)
-    return {token: _input(value) for token, value in case.inputs.items()}
-
-
-def _input(value: Any) -> Any:
-    return Path(value) if is_file(value) else value
-
-
-@dataclass(frozen=True, slots=True, repr=False)
-class CheckResult:
-    """What came of a labelled set; true if all of it has passed.
-
-    Attributes
-    ----------
-    outcomes
-        Check by check, in the order of the cases.
-    """
-
-    outcomes: tuple[CheckOutcome, ...]
-
-    @property
-    def passed(self) -> bool:
-        """Whether every check of every case has passed."""
-        return all(outcome.passed for outcome in self.outcomes)
-
-    @property
-    def failures(self) -> tuple[CheckOutcome, ...]:
-        """The checks that have not passed."""
-        return tuple(outcome for outcome in self.outcomes if not outcome.passed)
-
-    @property
-    def cases(self) -> dict[str, bool]:
-        """Whether each case has passed, by name."""
-        found: dict[str, bool] = {}
-        for outcome in self.outcomes:
-            found[outcome.case] = found.get(outcome.case, True) and outcome.passed
-        return found
-
-    def to_frame(self) -> pd.DataFrame:
-        """Return a pandas table with a row per check: case, check, token, value, threshold, passed, failure, run_ms."""
-        rows = [
-            {
-                "case": outcome.case,
-                "check": outcome.check,
-                "token": outcome.token,
-                "value": float("nan") if outcome.value is None else outcome.value,
-                "threshold": outcome.threshold,
-                "passed": outcome.passed,
-                "failure": None,
-                "run_ms": outcome.total_ns / 1e6,
-            }
-            for outcome in self.outcomes
-        ]
-        with optional_import():
-            import pandas as pd
-        frame = pd.DataFrame(rows)
-        frame["failure"] = object_column([outcome.reason or None for outcome in self.outcomes])
-        return frame
-
-    def to_junit(self, path: str | os.PathLike[str], name: str = "epypes check") -> Path:
-        """Write JUnit XML, as continuous integration reads it, and return its path.
-
-        A case is a class, a check a test case; what could not be measured is an error, what falls short a failure.
-
-        Raises
-        ------
-        ScaleError
-            The file can't be written, or junitparser is missing.
-        """
-        return write_junit(Path(path), self.outcomes, name)
-
-    def __bool__(self) -> bool:
-        return self.passed
-
-    def __len__(self) -> int:
-        return len(self.outcomes)
-
-    def __str__(self) -> str:
-        cases = self.cases
-        failed = [name for name, has_passed in cases.items() if not has_passed]
-        if not failed:
-            return f"{counted(len(cases), 'case')} passed"
-        named = ", ".join(failed[:5])
-        return f"{len(failed)} of {counted(len(cases), 'case')} failed: {named}{', ...' if len(failed) > 5 else ''}"
-
-    def __repr__(self) -> str:
-        cases = self.cases
-        failed = sum(not passed for passed in cases.values())
-        return f"<CheckResult: {counted(len(cases), 'case')}, {f'{failed} failed' if failed else 'all passed'}>"
-
-    def _repr_html_(self) -> str:
-
-        return check_html(self)
-
-
-_MOST_ROWS: Final = 100
-_MOST_PICTURE_BYTES: Final = 60_000
-_CELL_ROOM: Final = 100
-_REASON_ROOM: Final = 300
-_PICTURES: Final = ("expected", "got", "difference")
-_HEAD: Final = ("case", "check", "value", "must be", "passed", *_PICTURES)
-_LEFT: Final = ' style="text-align:left"'
-# Colours that are read on a white and on a black ground; the sign and the word say the same.
-_PASSED: Final = '<span style="color:#2e8b57">✓</span> passed'
-_FAILED: Final = '<b style="color:#d9482b">✗</b> <b>failed</b>'
-
-
-def check_html(result: CheckResult) -> str:
-    """Return a table with a row per check, those that have not passed first, of at most about 120 kB."""
-    outcomes = sorted(result.outcomes, key=lambda outcome: outcome.passed)
-    room = _MOST_PICTURE_BYTES
-    rows = []
-    for outcome in outcomes[:_MOST_ROWS]:
-        row, room = _html_row(outcome, room)
-        rows.append(row)
-    has_pictures = [any(outcome.pictures.get(name) for outcome in outcomes[:_MOST_ROWS]) for name in _PICTURES]
-    head = "".join(f"<th{_LEFT}>{name}</th>" for name in _shown(_HEAD, has_pictures))
-    more = len(outcomes) - _MOST_ROWS
-    body = "".join(
-        f"<tr>{''.join(f'<td{_LEFT}>{cell}</td>' for cell in _shown(row, has_pictures))}</tr>" for row in rows
-    )
-    below = f"<tr><td{_LEFT}>and {counted(more, 'check')} more</td></tr>" if more > 0 else ""
-    legend = f"<p>difference of masks: {LEGEND}</p>" if has_pictures[-1] else ""
-    caption = content(fitted(str(result), _REASON_ROOM))
-    return f"<table><caption{_LEFT}>{caption}</caption><tr>{head}</tr>{body}{below}</table>{legend}"
-
-
-def _shown(cells: Sequence[str], has_pictures: Sequence[bool]) -> list[str]:
-    """Return the cells of a row without the columns of pictures in which there is none."""
-    first = len(cells) - len(_PICTURES)
-    return [*cells[:first], *(cell for cell, is_there in zip(cells[first:], has_pictures, strict=True) if is_there)]
-
-
-def _html_row(outcome: CheckOutcome, room: int) -> tuple[list[str], int]:
-    """Return the cells of a check, and how many bytes of pictures there is still room for."""
-    value = "" if outcome.value is None else f"{outcome.value:.6g}"
-    verdict = _PASSED if outcome.passed else f"{_FAILED}<br>{content(fitted(outcome.reason, _REASON_ROOM))}"
-    cells = [content(fitted(text, _CELL_ROOM)) for text in (outcome.case, outcome.check, value, outcome.threshold)]
-    cells.append(verdict)
-    for name in _PICTURES:
-        picture = outcome.pictures.get(name)
-        size = 0 if picture is None else len(picture.data) * 4 // 3
-        if picture is None or size > room:
-            cells.append("")
-            continue
-        room -= size
-        about = f"{name} of {outcome.case}: {picture.caption}"
-        data = base64.b64encode(picture.data).decode()
-        cells.append(f'<img src="data:{picture.media_type};base64,{data}" alt="{escape(fitted(about, _CELL_ROOM))}">')
-    return cells, room
-
-
-# What XML 1.0 does not allow, in a name or in what an exception says, would make the whole file unreadable.
+# What XML 1.0 does not allow, in a name or in an exception's message, would make the whole file unreadable.
 _NOT_XML: Final = re.compile("[^\\t\\n\\r\\x20-\\ud7ff\\ue000-\\ufffd\\U00010000-\\U0010ffff]")
 
 
-def write_junit(path: Path, outcomes: Sequence[CheckOutcome], name: str) -> Path:
-    """Write the checks as a file of JUnit XML, and return its path.
-
-    Parameters
-    ----------
-    path
-        The file; one that is there is replaced.
-    outcomes
-        The checks.
-    name
-        Of the suite.
-
-    Raises
-    ------
-    ScaleError
-        It can't be written.
-    MissingPackage
-        junitparser is missing.
-    """
-    with optional_import():
-        import junitparser as junit
-    suite = junit.TestSuite(_text(name))
-    timed: set[int] = set()
-    for outcome in outcomes:
-        # The run of a case counts once, so that the sum is what the set has taken.
-        is_first = outcome.number not in timed
-        timed.add(outcome.number)
-        suite.add_testcase(_test_case(junit, outcome, outcome.total_ns / 1e9 if is_first else 0.0))
-    suite.update_statistics()
-    document = junit.JUnitXml()
-    document.add_testsuite(suite)
-    document.update_statistics()
-    try:
-        document.write(str(path), pretty=True)
-    except OSError as error:
-        raise ScaleError(f"{str(path)!r} can't be written: {error.strerror}. Name another file.") from error
-    return path
-
-
-def check_place(path: Path) -> None:
-    """Raise ScaleError if no JUnit XML can be written there, before what it is to tell of is run."""
-    with optional_import():
-        import junitparser  # noqa: F401 - missing here, rather than after all cases have run
+def require_writable(path: Path) -> None:
+    """Raise ScaleError if no file can be written there, before the cases are run."""
     if path.is_dir():
         raise ScaleError(f"{str(path)!r} is a folder. Name a file in it.")
     if not path.parent.is_dir():
         folder = str(path.parent)
         raise ScaleError(f"{str(path)!r} can't be written: there is no folder {folder!r}. Make it, or name another.")
-    if not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise ScaleError(f"{str(path)!r} can't be written: that is not allowed. Name another file.")
 
 
-def _test_case(junit: Any, outcome: CheckOutcome, time_s: float) -> Any:
-    test = junit.TestCase(_text(outcome.check), classname=_text(outcome.case), time=round(time_s, 6))
-    if outcome.passed:
-        return test
-    is_error = outcome.error_info is not None
-    kind = outcome.error_info.kind if outcome.error_info is not None else "threshold"
-    problem = (junit.Error if is_error else junit.Failure)(_text(outcome.reason), _text(kind))
-    problem.text = _text(_told(outcome))
-    test.result = [problem]
-    return test
+def _junit(outcomes: Sequence[CheckOutcome], name: str) -> ET.Element:
+    """Return one suite, in which a case is a class and each of its checks a test case."""
+    failed = [outcome for outcome in outcomes if not outcome.passed]
+    errors = sum(outcome.error_info is not None for outcome in failed)
+    # The run of a case counts once, so that the sum is the time of the set.
+    times_s = {outcome.number: outcome.total_ns / 1e9 for outcome in outcomes}
+    counts = {"tests": len(outcomes), "failures": len(failed) - errors, "errors": errors}
+    totals = {key: str(count) for key, count in counts.items()} | {"time": f"{sum(times_s.values()):.6f}"}
+    root = ET.Element("testsuites", totals)
+    suite = ET.SubElement(root, "testsuite", {"name": _xml_text(name), **totals})
+    for outcome in outcomes:
+        time_s = times_s.pop(outcome.number, 0.0)
+        named = {"classname": _xml_text(outcome.case), "name": _xml_text(outcome.check)}
+        test = ET.SubElement(suite, "testcase", {**named, "time": f"{time_s:.6f}"})
+        if outcome.passed:
+            continue
+        error = outcome.error_info
+        problem = ET.SubElement(test, "failure" if error is None else "error")
+        problem.set("type", "threshold" if error is None else _xml_text(error.kind))
+        problem.set("message", _xml_text(outcome.reason))
+        value = "nothing measured" if outcome.value is None else f"measured {outcome.value!r}"
+        wanted = f", wanted {outcome.threshold}" if outcome.threshold else ""
+        problem.text = _xml_text(f"{outcome.case}: {outcome.check}: {outcome.reason}\n{value}{wanted}")
+    return root
 
 
-def _told(outcome: CheckOutcome) -> str:
-    value = "nothing measured" if outcome.value is None else f"measured {outcome.value!r}"
-    wanted = f", wanted {outcome.threshold}" if outcome.threshold else ""
-    return f"{outcome.case}: {outcome.check}: {outcome.reason}\n{value}{wanted}"
-
-
-def _text(text: str) -> str:
+def _xml_text(text: str) -> str:
     return _NOT_XML.sub("\ufffd", text)
+
+
+# -- the page of a notebook -------------------------------------------------------------------------------------
+
+_MOST_ROWS: Final = 100
+_PICTURE_CHARACTERS: Final = 80_000
+_CELL_ROOM: Final = 100
+_REASON_ROOM: Final = 300
+_LEFT: Final = ' style="text-align:left"'
+# Colours that are read on a white and on a black ground; the mark and the text have the same meaning.
+_PASSED: Final = '<span style="color:#2e8b57">✓</span> passed'
+_FAILED: Final = '<b style="color:#d9482b">✗</b> <b>failed</b>'
+
+
+def _page(result: CheckResult) -> str:
+    """Return a table with a row per check, those that have not passed first, of at most about 120 kB."""
+    shown = sorted(result.outcomes, key=lambda outcome: outcome.passed)[:_MOST_ROWS]
+    pictured = [name for name in ("expected", "got", "difference") if any(name in one.pictures for one in shown)]
+    rows = [_row("th", ["case", "check", "value", "must be", "passed", *pictured])]
+    room = _PICTURE_CHARACTERS
+    for outcome in shown:
+        value = "" if outcome.value is None else f"{outcome.value:.6g}"
+        cells = [content(fitted(text, _CELL_ROOM)) for text in (outcome.case, outcome.check, value, outcome.threshold)]
+        reason = content(fitted(outcome.reason, _REASON_ROOM))
+        cells.append(_PASSED if outcome.passed else f"{_FAILED}<br>{reason}")
+        for name in pictured:
+            picture = outcome.pictures.get(name)
+            address = "" if picture is None else data_uri(picture)
+            if picture is None or len(address) > room:
+                cells.append("")
+                continue
+            room -= len(address)
+            alt = escape(fitted(f"{name} of {outcome.case}: {picture.caption}", _CELL_ROOM))
+            cells.append(f'<img src="{address}" alt="{alt}">')
+        rows.append(_row("td", cells))
+    more = len(result.outcomes) - len(shown)
+    if more:
+        rows.append(_row("td", [f"and {counted(more, 'check')} more"]))
+    caption = content(fitted(str(result), _REASON_ROOM))
+    legend = f"<p>difference of masks: {DIFFERENCE_LEGEND}</p>" if "difference" in pictured else ""
+    return f"<table><caption{_LEFT}>{caption}</caption>{''.join(rows)}</table>{legend}"
+
+
+def _row(tag: str, cells: Iterable[str]) -> str:
+    return f"<tr>{''.join(f'<{tag}{_LEFT}>{cell}</{tag}>' for cell in cells)}</tr>"

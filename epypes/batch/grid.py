@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from itertools import islice, pairwise, product
 from typing import Any, Final, Literal, get_args
 
-from epypes.batch.ranges import drawn_by, shares, span_of, token_below, values_of
-from epypes.batch.steps import kept_below
+from epypes.batch.ranges import drawn_by, kept_below, shares, span_of, token_below, values_of
 from epypes.bundle.hyperparameters import range_of
 from epypes.errors import ScaleError, UnknownName
 from epypes.graph import CompGraph, as_switch

@@ -1,4 +1,4 @@
-"""Which values of the hyperparameters give the best results over many cases?"""
+"""The search for the values of hyperparameters that give the best results over many cases."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -15,12 +15,12 @@ from epypes.batch.executors import run_jobs, worker_count
 from epypes.batch.incremental import CaseRunners, SearchStopped
 from epypes.batch.items import Item, detached_runner, items_of
 from epypes.batch.job import Job
-from epypes.batch.objective import Metric, Score, Scoring, about_search, changed_meanwhile, name_of
+from epypes.batch.objective import Objective, ObjectiveMetric, Score, code_digests, search_digests, search_name
 from epypes.batch.progress import progress_bar
 from epypes.batch.ranges import axes_of
 from epypes.batch.results import Outcome
 from epypes.batch.search_result import OptimizeResult
-from epypes.batch.study import Asked, Direction, Search, Trial
+from epypes.batch.study import Direction, Search, Suggestion, Trial
 from epypes.errors import ScaleError
 from epypes.run import CompGraphRunner
 from epypes.store import opened_store
@@ -29,14 +29,13 @@ from epypes.wording import ended
 if TYPE_CHECKING:
     from epypes.store import Store
 
-
 _CASE_FILE: Final = ".toml"
 _DIRECTIONS: Final = ("maximize", "minimize")
 
 
 def optimize(
     runner: CompGraphRunner,
-    metric: Metric,
+    metric: ObjectiveMetric,
     cases: Any,
     n: int = 100,
     *,
@@ -67,8 +66,9 @@ def optimize(
     n
         How many trials there are to be: with a store, those that are in there already count.
     executor
-        Runs the cases, as for ``ep.map``; several trials are then under way at a time, so what is tried depends on
-        which ends first. Without, the calling thread does, and runs of each case only what depends on what has changed.
+        Runs the cases, as for ``ep.map``; several trials then run at a time, so the settings that are tried depend on
+        the order in which trials end. Without, the calling thread does, and runs of each case only what depends on what
+        has changed.
     direction
         ``"maximize"`` or ``"minimize"``.
     ranges
@@ -86,12 +86,12 @@ def optimize(
         searched, from what the metric computes, and from the cases: what goes into them, their labels and their
         hyperparameters. A study that has been searched for another one of these is refused.
     stop
-        Ends the search once it is set: when the function that runs has returned. So does Ctrl+C, at once. What has
-        been found until then is returned.
+        Ends the search once it is set: when the function that runs has returned. So does Ctrl+C, at once. The trials
+        that have ended until then are returned.
     on_trial
         Is called with each ``Trial`` that has ended, by the thread that calls this.
     progress
-        Whether to show a bar; without, where somebody sees it.
+        Whether to show a bar; None: in a terminal or a notebook.
 
     Returns
     -------
@@ -102,7 +102,7 @@ def optimize(
     ------
     ScaleError
         There are no cases, nothing that may vary, or no trial has completed; or in the first one an input can't be
-        read, which is known before another is run.
+        read, which ends the search.
     UnknownName
         The graph has no such token, or the runner no such hyperparameter.
     StoreError
@@ -116,35 +116,39 @@ def optimize(
     >>> result.best
     {'y': 0}
     """
-    _check(n, direction)
-    # Whoever sets values on theirs meanwhile, or writes into them, does not change what is searched.
-    runner = detached_runner(runner)
-    axes = axes_of(runner, ranges)
-    labelled = _cases(cases, runner)
-    scoring = Scoring(runner.cg, metric, labelled, keep)
-    items = tuple(_items(labelled, runner))
-    work = _Work(runner, scoring, items, executor, stop)
-    with opened_store(store) as opened:
-        url = None if opened is None else opened.url
-        about = {} if url is None else about_search(runner, axes, scoring, items, is_named=bool(name))
-        known = name or ("" if url is None else name_of(scoring.name, direction, axes, about))
-        at_once = 1 if executor is None else worker_count(executor)
-        present = runner.hyperparameters
-        search = Search(axes, present, direction, seed=seed, at_once=at_once, url=url, name=known, about=about)
-        with contextlib.closing(search):
-            was_stopped = _searched(search, work, n, on_trial, progress)
-            for what in changed_meanwhile(runner, scoring, about):
-                search.forget(what)
-    result = OptimizeResult(search.trials, direction, scoring.name, axes, search.study, was_stopped)
-    _require_one(result)
-    return result
-
-
-def _check(n: int, direction: str) -> None:
     if type(n) is not int or n < 1:
         raise ScaleError(f"n is how many trials there are to be, 1 or more, not {n!r}.")
     if direction not in _DIRECTIONS:
         raise ScaleError(f"direction is 'maximize' or 'minimize', not {direction!r}.")
+    # A caller that sets hyperparameters meanwhile, or writes into them, does not change what is searched.
+    runner = detached_runner(runner)
+    axes = axes_of(runner, ranges)
+    objective = Objective(runner.cg, metric, _cases(cases, runner), keep)
+    inputs = items_of([case.inputs for case in objective.cases], runner)
+    items = tuple(
+        Item(number, case.name or item.name, item.payload)
+        for number, (case, item) in enumerate(zip(objective.cases, inputs, strict=True))
+    )
+    work = _Evaluation(runner, objective, items, executor, stop)
+    at_once = 1 if executor is None else worker_count(executor)
+    with opened_store(store) as opened:
+        url, digests, study = None, {}, name or ""
+        if opened is not None:
+            url, digests = opened.url, search_digests(runner, axes, objective, items, is_named=bool(name))
+            study = name or search_name(objective.name, direction, axes, digests)
+        search = Search(
+            axes, runner.hyperparameters, direction, seed=seed, at_once=at_once, url=url, name=study, digests=digests
+        )
+        with contextlib.closing(search):
+            was_stopped = _searched(search, work, n, on_trial, progress)
+            if opened is not None:
+                search.forget_changed(code_digests(runner, objective, is_named=True))
+    result = OptimizeResult(search.trials, direction, objective.name, axes, search.study, was_stopped)
+    if result.trials and not was_stopped and all(trial.value is None for trial in result.trials):
+        first = result.trials[0]
+        text = f"None of {len(result.trials)} trials completed. The first one failed: {ended(first.failure)}"
+        raise ScaleError(f"{text} Its values: {first.setting}.")
+    return result
 
 
 def _cases(given: Any, runner: CompGraphRunner) -> tuple[Case, ...]:
@@ -154,28 +158,12 @@ def _cases(given: Any, runner: CompGraphRunner) -> tuple[Case, ...]:
     return tuple(with_labels_read(case, runner.cg) for case in cases_of(given))
 
 
-def _items(cases: Sequence[Case], runner: CompGraphRunner) -> Iterator[Item]:
-    for number, item in enumerate(items_of([case.inputs for case in cases], runner)):
-        yield Item(number, cases[number].name or item.name, item.payload)
-
-
-# -- running ----------------------------------------------------------------------------------------------------
-
-
-@dataclass(slots=True)
-class _Pending:
-    """A trial of which not all cases have come back."""
-
-    asked: Asked
-    outcomes: dict[int, Outcome] = field(default_factory=dict)
-
-
 @dataclass(frozen=True, slots=True)
-class _Work:
-    """Who runs which cases, and how they are measured."""
+class _Evaluation:
+    """Runs the cases of one setting after another, and measures them."""
 
     runner: CompGraphRunner
-    scoring: Scoring
+    objective: Objective
     items: tuple[Item, ...]
     executor: Executor | None
     stop: threading.Event | None
@@ -187,62 +175,63 @@ class _Work:
     @property
     def own(self) -> list[Mapping[str, Any]]:
         """The hyperparameters of each case that are its own."""
-        return [case.hyperparameters or {} for case in self.scoring.cases]
+        return [case.hyperparameters or {} for case in self.objective.cases]
 
-    def scores(self, search: Search, count: int) -> Generator[tuple[Asked, Score]]:
-        """Give the scores of the next settings as they come; fewer if it is stopped."""
+    def scores(self, search: Search, count: int) -> Generator[tuple[Suggestion, Score]]:
+        """Yield the scores of the next settings as they come; fewer if the search is stopped."""
         asked = (search.ask() for _ in range(count))
-        return self._here(asked) if self.executor is None else self._spread(asked)
+        return self._in_this_thread(asked) if self.executor is None else self._on_executor(asked, self.executor)
 
-    def _here(self, asked: Iterator[Asked]) -> Generator[tuple[Asked, Score]]:
-        bench = CaseRunners(self.runner, self.items, self.own, self.scoring.keep, self.stop)
+    def _in_this_thread(self, asked: Iterator[Suggestion]) -> Generator[tuple[Suggestion, Score]]:
+        runners = CaseRunners(self.runner, self.items, self.own, self.objective.keep, self.stop)
         while not self.is_stopped and (one := next(asked, None)) is not None:
             try:
-                score = self.scoring.of_outcomes(bench.outcomes(one.setting))
+                score = self.objective.score(runners.outcomes(one.setting))
             except SearchStopped:
                 return
             yield one, score
 
-    def _spread(self, asked: Iterator[Asked]) -> Generator[tuple[Asked, Score]]:
-        pending: dict[int, _Pending] = {}
-        jobs = self._jobs(asked, pending)
-        ahead = None if self.executor is None else worker_count(self.executor)
-        for outcomes in run_jobs(self.runner, jobs, self.executor, ahead=ahead, stop=self.stop):
-            for outcome in outcomes:
-                number, index = divmod(outcome.number, len(self.items))
-                pending[number].outcomes[index] = outcome
-                if len(pending[number].outcomes) == len(self.items):
-                    done = pending.pop(number)
-                    yield done.asked, self.scoring.of_outcomes([done.outcomes[i] for i in sorted(done.outcomes)])
+    def _on_executor(self, asked: Iterator[Suggestion], executor: Executor) -> Generator[tuple[Suggestion, Score]]:
+        pending: dict[int, tuple[Suggestion, dict[int, Outcome]]] = {}
+        keep, count = self.objective.keep, len(self.items)
 
-    def _jobs(self, asked: Iterator[Asked], pending: dict[int, _Pending]) -> Iterator[Job]:
-        """Give a job for each case of each trial, when there is room for it; a trial is asked for with its first."""
-        for one in asked:
-            pending[one.number] = _Pending(one)
-            for item, own in zip(self.items, self.own, strict=True):
-                number = one.number * len(self.items) + item.number
-                marked = Item(number, item.name, item.payload)
-                keep = self.scoring.keep
-                yield Job((marked,), ({**one.setting, **own},), keep=keep, targets=keep)
+        def jobs() -> Iterator[Job]:
+            """Yield a job for each case of each trial, when there is room; a trial is asked for with its first."""
+            for number, one in enumerate(asked):
+                pending[number] = one, {}
+                for item, own in zip(self.items, self.own, strict=True):
+                    marked = Item(number * count + item.number, item.name, item.payload)
+                    yield Job((marked,), ({**one.setting, **own},), keep=keep, targets=keep)
+
+        for outcomes in run_jobs(self.runner, jobs(), executor, ahead=worker_count(executor), stop=self.stop):
+            for outcome in outcomes:
+                number, index = divmod(outcome.number, count)
+                one, found = pending[number]
+                found[index] = outcome
+                if len(found) == count:
+                    del pending[number]
+                    yield one, self.objective.score([found[index] for index in range(count)])
 
 
 def _searched(
     search: Search,
-    work: _Work,
+    work: _Evaluation,
     n: int,
     on_trial: Callable[[Trial], object] | None,
     progress: bool | None,
 ) -> bool:
-    """Run the trials that are still to be run; return whether somebody has stopped it before."""
+    """Run the trials that are still to be run; return whether the search was stopped before its end."""
     done = search.trials
-    with progress_bar(progress, n, f"optimize {work.scoring.name}", unit="trial") as advance:
+    with progress_bar(progress, n, f"optimize {work.objective.name}", unit="trial") as advance:
         if done:
             advance(len(done), sum(trial.value is None for trial in done))
         try:
             with contextlib.closing(work.scores(search, n - len(done))) as coming:
                 for number, (asked, score) in enumerate(coming):
-                    if number == 0:
-                        _require_readable(score)
+                    if number == 0 and score.unreadable:
+                        raise ScaleError(
+                            f"No trial can complete: {ended(score.unreadable)} Mend the file, or leave it out."
+                        )
                     trial = search.tell(asked, score.value, score.failure, score.total_ns)
                     advance(1, trial.value is None)
                     if on_trial is not None:
@@ -250,16 +239,3 @@ def _searched(
         except KeyboardInterrupt:
             return True
     return work.is_stopped
-
-
-def _require_readable(score: Score) -> None:
-    """Raise ScaleError if an input can't be read in the trial that comes back first: it could not in any other."""
-    if score.unreadable:
-        raise ScaleError(f"No trial can complete: {ended(score.unreadable)} Mend the file, or leave it out.")
-
-
-def _require_one(result: OptimizeResult) -> None:
-    if result.trials and not result.was_stopped and all(trial.value is None for trial in result.trials):
-        first = result.trials[0]
-        text = f"None of {len(result.trials)} trials completed. The first one failed: {ended(first.failure)}"
-        raise ScaleError(f"{text} Its values: {first.setting}.")

@@ -1,6 +1,8 @@
-"""Which values of which hyperparameters are searched?
+"""The values that a range of a hyperparameter stands for: counted, drawn at random, or searched.
 
-What the hints of a hyperparameter offer, or what the caller names, becomes an axis: a span of numbers, or choices.
+``Span`` is a range of numbers. An axis is what a search varies: a span or choices, with what Optuna knows of it.
+Steps are counted and added in decimals, as they are written: 0.1 and two steps of 0.1 are 0.3, for a reader and for
+Optuna, which reads ranges that way too. Sums of floats are 0.30000000000000004.
 """
 
 from __future__ import annotations
@@ -10,9 +12,9 @@ import math
 import numbers
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from decimal import Decimal
+from typing import TYPE_CHECKING, Any, Final
 
-from epypes.batch.steps import at_place, kept_below, last_place, odd_from
 from epypes.bundle.hyperparameters import plain, range_of
 from epypes.catalog import parameter_names
 from epypes.errors import ScaleError, UnknownName
@@ -21,19 +23,25 @@ from epypes.hints import Param, Roi, as_param, odd_step, param_from_value
 from epypes.optional import optional_import
 from epypes.run import CompGraphRunner
 
+if TYPE_CHECKING:
+    from optuna.distributions import BaseDistribution
+
+# In steps: 2 / 3 is written a little smaller than it is, or larger, and three of them still end at 2.
+_SLACK: Final = Decimal("1e-9")
+
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """The values from one end to the other.
+    """Numbers from ``low`` to ``high``, both included; integers if both ends and the step are.
 
     Attributes
     ----------
     low, high
-        Both are values.
+        The ends.
     step
-        The distance between two values; None if all between the ends are.
+        The distance between two values; None for any number.
     log
-        Whether as many values are drawn below the geometric mean of the ends as above it.
+        Whether small values are tried as often as large ones.
     """
 
     low: float
@@ -43,36 +51,85 @@ class Span:
 
     @property
     def size(self) -> int:
-        """How many values there are; 0 if they can't be counted."""
-        return 0 if self.step is None else last_place(self.low, self.high, self.step) + 1
+        """The number of values; 0 if they can't be counted."""
+        if self.step is None:
+            return 0
+        return math.floor((_written(self.high) - _written(self.low)) / _written(self.step) + _SLACK) + 1
+
+    @property
+    def ends_on_step(self) -> bool:
+        """Whether the steps, as they are written, lead to ``high`` exactly."""
+        return self.step is not None and (_written(self.high) - _written(self.low)) % _written(self.step) == 0
 
     def value(self, place: int) -> float:
-        """Return the value of this place, for a span that has steps."""
-        return self.low if self.step is None else at_place(self.low, self.high, self.step, place)
+        """Return the value so many steps above the lowest one; ``high`` itself if that is as near as is written."""
+        if self.step is None:
+            return self.low
+        value = _written(self.low) + place * _written(self.step)
+        if isinstance(self.low, numbers.Integral) and isinstance(self.step, numbers.Integral):
+            return int(value)
+        return float(self.high if _written(self.high) - value < _SLACK * _written(self.step) else value)
 
     def at(self, share: float) -> float:
-        """Return the value that lies so far, from 0 to below 1, on the way from low to high."""
+        """Return the value at a share, from 0 to below 1, of the way from low to high."""
         if self.step is not None and not self.log:
             return self.value(min(int(share * self.size), self.size - 1))
-        value = self._between(share)
-        return min(max(float(f"{value:.12g}"), self.low), self.high) if self.step is None else self._near(value, round)
+        if self.log:
+            value = min(self.low * math.exp(share * math.log(self.high / self.low)), self.high)
+        else:
+            value = self.low + share * (self.high - self.low)
+        return self.nearest(float(f"{value:.12g}"))
+
+    def nearest(self, value: float) -> float:
+        """Return the value of the span that is nearest to a number."""
+        return self._on_step(value, round)
 
     def at_most(self, value: float) -> float:
-        """Return the largest value that does not exceed a number; the smallest of all if none does."""
-        return min(max(value, self.low), self.high) if self.step is None else self._near(value, math.floor)
+        """Return the largest value of the span up to a number; the smallest of all if there is none."""
+        return self._on_step(value, math.floor)
 
-    def _near(self, value: float, rounded: Callable[[float], int]) -> float:
-        steps = round((value - self.low) / (self.step or 1), 9)
-        return self.value(min(max(rounded(steps), 0), self.size - 1))
+    def _on_step(self, value: float, rounded: Callable[[float], int]) -> float:
+        if self.step is None:
+            return min(max(value, self.low), self.high)
+        place = rounded(round((value - self.low) / self.step, 9))
+        return self.value(min(max(place, 0), self.size - 1))
 
-    def _between(self, share: float) -> float:
-        if self.log:
-            return min(self.low * math.exp(share * math.log(self.high / self.low)), self.high)
-        return self.low + share * (self.high - self.low)
+
+def kept_below(
+    values: Mapping[str, Any],
+    bounds: Mapping[str, tuple[str, Callable[[float], Any]]],
+    present: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return values of which none exceeds the one that it is to stay below.
+
+    Parameters
+    ----------
+    values
+        Of what varies, by token.
+    bounds
+        By token that has one: the token that it never exceeds, and the function that gives the largest value up to a
+        number.
+    present
+        The values of what does not vary.
+    """
+    kept = dict(values)
+    for _ in bounds:  # a bound may have one itself
+        for token, (above, at_most) in bounds.items():
+            bound = kept.get(above, present.get(above))
+            if isinstance(bound, numbers.Real) and kept[token] > bound:
+                kept[token] = at_most(float(bound))
+    return kept
+
+
+def _written(number: float) -> Decimal:
+    return Decimal(int(number)) if isinstance(number, numbers.Integral) else Decimal(repr(float(number)))
+
+
+# -- the values of a sweep --------------------------------------------------------------------------------------
 
 
 def values_of(name: str, param: Param, present: Any, most: int) -> Sequence[Any]:
-    """Return all values that a hyperparameter may take; of more than ``most`` only as many as there are.
+    """Return all values that a hyperparameter may take; of more than ``most`` only a range of that length.
 
     Raises
     ------
@@ -91,7 +148,7 @@ def values_of(name: str, param: Param, present: Any, most: int) -> Sequence[Any]
 
 
 def drawn_by(name: str, param: Param, present: Any) -> Callable[[float], Any]:
-    """Return what gives the value for a share from 0 to below 1, all values being equally likely.
+    """Return the function that gives the value for a share from 0 to below 1, all values being equally likely.
 
     Raises
     ------
@@ -104,36 +161,8 @@ def drawn_by(name: str, param: Param, present: Any) -> Callable[[float], Any]:
     return span_of(name, param, present).at
 
 
-def span_of(name: str, param: Param, present: Any) -> Span:
-    """Return the range of a hyperparameter that is ``present`` now; the part that is offered first, if there is one.
-
-    Raises
-    ------
-    ScaleError
-        An end is open.
-    """
-    low, high = param.soft or (param.low, param.high)
-    if low is None or high is None or not math.isfinite(low) or not math.isfinite(high):
-        raise ScaleError(f"The range of {name!r} is open. Give both ends, as {name}=(low, high), or a list of values.")
-    whole = param.odd or _is_whole(low, high, param.step, present)
-    step = param.step or (1 if whole else None)
-    if param.odd:
-        step, low = odd_step(param.step), odd_from(low)
-    if low > high:
-        raise ScaleError(f"There is no odd value between {low} and {high} for {name!r}. Widen its range.")
-    return Span(low, high, step, param.log)
-
-
-def _is_whole(low: float, high: float, step: float | None, present: Any) -> bool:
-    """Whether a range is one of integers: all that is known of it is an integer, and so is the present value."""
-    ends = (low, high, 1 if step is None else step)
-    if not all(isinstance(end, numbers.Integral) for end in ends):
-        return False
-    return isinstance(present, numbers.Integral) or not isinstance(present, numbers.Real)
-
-
 def shares(how: str, n: int, dimensions: int, seed: int) -> Sequence[Sequence[float]]:
-    """Return n rows of shares from 0 to below 1: each by chance, or, as Latin hypercubes, each n-th part once."""
+    """Return n rows of shares from 0 to below 1: random ones, or Latin hypercubes, with each n-th part once."""
     import numpy as np
 
     generator = np.random.default_rng(seed)
@@ -146,74 +175,102 @@ def shares(how: str, n: int, dimensions: int, seed: int) -> Sequence[Sequence[fl
     return drawn
 
 
-@dataclass(frozen=True, slots=True)
-class SearchSpan:
-    """Numbers from ``low`` to ``high``, both included.
+def span_of(name: str, param: Param, present: Any) -> Span:
+    """Return the range of a hyperparameter that is ``present`` now; its soft part, if it has one.
 
-    Attributes
-    ----------
-    token
-        The hyperparameter.
-    low, high
-        Both are on the grid of ``step``.
-    step
-        The distance between two values; None for any number.
-    log
-        Whether small values are tried as often as large ones.
-    is_integer
-        Whether the values are whole numbers.
-    below
-        The hyperparameter that this one never exceeds; empty for none.
+    Raises
+    ------
+    ScaleError
+        An end is open.
     """
+    low, high = _ends(param)
+    if not (_is_number(low) and _is_number(high)):
+        raise ScaleError(f"The range of {name!r} is open. Give both ends, as {name}=(low, high), or a list of values.")
+    given = (low, high, 1 if param.step is None else param.step)
+    is_whole = all(isinstance(end, numbers.Integral) for end in given) and (
+        isinstance(present, numbers.Integral) or not isinstance(present, numbers.Real)
+    )
+    return _span(name, param, low, high, is_whole)
+
+
+def _span(name: str, param: Param, low: float, high: float, is_whole: bool) -> Span:
+    """Return a span whose ends are on its steps."""
+    step = param.step
+    if param.odd:
+        low, high, step = math.ceil(low) | 1, math.floor(high), odd_step(step)
+    elif is_whole:
+        low, high, step = math.ceil(low), math.floor(high), max(1, round(step or 1))
+    if low > high:
+        raise ScaleError(f"There is no {'odd' if param.odd else 'whole'} number in the range of {name!r}. Widen it.")
+    span = Span(low, high, step, param.log)
+    return span if step is None else replace(span, high=span.value(span.size - 1))
+
+
+def _ends(param: Param) -> tuple[Any, Any]:
+    return param.soft or (param.low, param.high)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+
+
+# -- the axes of a search ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class NumberAxis:
+    """A hyperparameter that takes the numbers of a span; ``below`` is the one that it never exceeds, or empty."""
 
     token: str
-    low: float
-    high: float
-    step: float | None
-    log: bool
-    is_integer: bool
+    span: Span
     below: str = ""
 
-    def nearest(self, value: float) -> Any:
-        """Return the value of the span that is nearest to a number."""
-        return self._on_grid(min(max(value, self.low), self.high), round)
+    def value(self, suggested: Any) -> Any:
+        """Return the value for what the sampler has suggested."""
+        return self.span.nearest(suggested)
 
-    def at_most(self, value: float) -> Any:
-        """Return the largest value of the span that does not exceed a number; the smallest of all if none does."""
-        return self._on_grid(min(max(value, self.low), self.high), math.floor)
+    def suggestion(self, value: Any) -> Any:
+        """Return what the sampler would have to suggest for a value, or for the nearest one."""
+        return self.span.nearest(plain(value))
 
-    def _on_grid(self, value: float, rounded: Any) -> Any:
-        if self.step is not None:
-            place = rounded(round((value - self.low) / self.step, 9))
-            value = at_place(self.low, self.high, self.step, place)
-        return int(value) if self.is_integer else float(value)
+    @property
+    def distribution(self) -> BaseDistribution:
+        """The span for Optuna, which has no steps on a logarithmic scale, nor any that end beside the range."""
+        from optuna.distributions import FloatDistribution, IntDistribution
+
+        low, high, log = self.span.low, self.span.high, self.span.log
+        step = self.span.step if self.span.ends_on_step and not log else None
+        if isinstance(low, int):
+            return IntDistribution(low, int(high), log=log, step=int(step or 1))
+        return FloatDistribution(low, high, log=log, step=step)
 
 
 @dataclass(frozen=True, slots=True)
-class Choices:
-    """Some values.
-
-    Attributes
-    ----------
-    token
-        The hyperparameter.
-    values
-        Any objects.
-    labels
-        A text for each, all different: what a database knows it by.
-    """
+class ChoiceAxis:
+    """A hyperparameter that takes one of some values; each has a label of its own, for the database."""
 
     token: str
     values: tuple[Any, ...]
     labels: tuple[str, ...]
 
-    def label_of(self, value: Any) -> str:
-        """Return the label of a value; that of the first one if it is none of them."""
+    def value(self, suggested: Any) -> Any:
+        """Return the value of a label."""
+        return self.values[self.labels.index(suggested)]
+
+    def suggestion(self, value: Any) -> str:
+        """Return the label of a value; the first label if the value is none of them."""
         same = (label for label, known in zip(self.labels, self.values, strict=True) if _is_one(known, value))
         return next(same, self.labels[0])
 
+    @property
+    def distribution(self) -> BaseDistribution:
+        """The labels for Optuna."""
+        from optuna.distributions import CategoricalDistribution
 
-Axis = SearchSpan | Choices
+        return CategoricalDistribution(self.labels)
+
+
+Axis = NumberAxis | ChoiceAxis
 
 
 def axes_of(runner: CompGraphRunner, ranges: Mapping[str, Any] | None = None) -> tuple[Axis, ...]:
@@ -248,7 +305,7 @@ def axes_of(runner: CompGraphRunner, ranges: Mapping[str, Any] | None = None) ->
     if not ranges:
         raise ScaleError('ranges is empty, so nothing would vary. Name hyperparameters: ranges={"name": (low, high)}.')
     order = [token for token in runner.cg.source_tokens if token in ranges]
-    return tuple(_given(runner, token, ranges[token]) for token in order)
+    return tuple(_axis(runner, token, _given(token, ranges[token], present[token])) for token in order)
 
 
 def setting_of(axes: Sequence[Axis], suggested: Mapping[str, Any], present: Mapping[str, Any]) -> dict[str, Any]:
@@ -263,25 +320,11 @@ def setting_of(axes: Sequence[Axis], suggested: Mapping[str, Any], present: Mapp
     present
         The values of the other hyperparameters.
     """
-    values = {axis.token: _value(axis, suggested[axis.token]) for axis in axes}
-    bounds = {axis.token: (axis.below, axis.at_most) for axis in axes if isinstance(axis, SearchSpan) and axis.below}
-    return kept_below(values, bounds, present)
-
-
-def suggestion_of(axes: Sequence[Axis], setting: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a sampler would have to suggest for a setting, or for the nearest one within the axes."""
-    return {
-        axis.token: axis.label_of(setting[axis.token])
-        if isinstance(axis, Choices)
-        else axis.nearest(plain(setting[axis.token]))
-        for axis in axes
+    values = {axis.token: axis.value(suggested[axis.token]) for axis in axes}
+    bounds = {
+        axis.token: (axis.below, axis.span.at_most) for axis in axes if isinstance(axis, NumberAxis) and axis.below
     }
-
-
-def _value(axis: Axis, suggested: Any) -> Any:
-    if isinstance(axis, Choices):
-        return axis.values[axis.labels.index(suggested)]
-    return axis.nearest(suggested)
+    return kept_below(values, bounds, present)
 
 
 def _hinted(runner: CompGraphRunner) -> Iterator[Axis]:
@@ -289,17 +332,17 @@ def _hinted(runner: CompGraphRunner) -> Iterator[Axis]:
         if token not in runner.hyperparameters:
             continue
         value = runner.hyperparameters[token]
-        param = range_of(runner.cg, token, value) or _of_type(value)
-        if isinstance(param, Param) and (param.choices is not None or _is_closed(param)):
-            yield _axis(runner, token, param, is_given=False)
+        param = range_of(runner.cg, token, value)
+        if param is None and isinstance(value, bool | enum.Enum):
+            param = param_from_value(value)
+        if not isinstance(param, Param):
+            continue
+        if param.choices is not None or all(map(_is_number, _ends(param))):
+            yield _axis(runner, token, param, holds_present=param.soft is not None)
 
 
-def _of_type(value: Any) -> Param | None:
-    """Return all values that a type has, if these are few."""
-    return param_from_value(value) if isinstance(value, bool | enum.Enum) else None
-
-
-def _given(runner: CompGraphRunner, token: str, hint: Any) -> Axis:
+def _given(token: str, hint: Any, value: Any) -> Param:
+    """Return the range that the caller gives for a hyperparameter."""
     try:
         param = as_param(hint)
     except (TypeError, ValueError) as error:
@@ -307,48 +350,31 @@ def _given(runner: CompGraphRunner, token: str, hint: Any) -> Axis:
     if param is None or isinstance(param, Roi):
         text = f"ranges[{token!r}] is {hint!r:.60}. Give an ep.Param, a tuple (low, high), or a list of choices."
         raise ScaleError(text)
-    if param.choices is None:
-        _require_numbers(token, param, runner.hyperparameters[token])
-    return _axis(runner, token, param, is_given=True)
-
-
-def _require_numbers(token: str, param: Param, value: Any) -> None:
-    if not _is_closed(param):
+    if param.choices is None and not all(map(_is_number, _ends(param))):
         raise ScaleError(f"The range of {token!r} has an open end. Give both: ranges={{{token!r}: (low, high)}}.")
-    if not _is_number(plain(value)):
+    if param.choices is None and not _is_number(plain(value)):
         text = f"{token!r} is {value!r:.60}, so it has no range of numbers."
         raise ScaleError(f"{text} Give a list of choices: ranges={{{token!r}: [...]}}.")
+    return param
 
 
-def _axis(runner: CompGraphRunner, token: str, param: Param, *, is_given: bool) -> Axis:
+def _axis(runner: CompGraphRunner, token: str, param: Param, *, holds_present: bool = False) -> Axis:
     if param.choices is not None:
-        return Choices(token, param.choices, _labels(param))
+        names = (one.name if isinstance(one, enum.Enum) else f"{one!r:.80}" for one in param.choices)
+        labels = tuple(param.labels or names)
+        if len(set(labels)) < len(labels):  # texts that are alike are numbered
+            labels = tuple(f"{text} #{number}" for number, text in enumerate(labels))
+        return ChoiceAxis(token, param.choices, labels)
     value = plain(runner.hyperparameters[token])
     low, high = _ends(param)
-    if param.soft is not None and not is_given:
+    if holds_present:
         low, high = min(low, value), max(high, value)
     # 1.0 is a float on purpose, and so is what it ranges over, unless that is odd.
-    is_whole = param.odd or isinstance(value, numbers.Integral)
-    span = _stepped(SearchSpan(token, low, high, param.step, param.log, is_whole), is_odd=param.odd)
-    return replace(span, below=token_below(runner, token, param.below))
-
-
-def _ends(param: Param) -> tuple[Any, Any]:
-    """Return the ends of a range: those that are usual, if they are told."""
-    return param.soft if param.soft is not None else (param.low, param.high)
-
-
-def _stepped(span: SearchSpan, *, is_odd: bool) -> SearchSpan:
-    """Return a span whose ends are on its grid."""
-    low, high, step = span.low, span.high, span.step
-    if span.is_integer:
-        low, high = odd_from(low) if is_odd else math.ceil(low), math.floor(high)
-        step = odd_step(step) if is_odd else max(1, round(step or 1))
-    if low > high:
-        raise ScaleError(f"There is no {'odd' if is_odd else 'whole'} number in the range of {span.token!r}.")
-    if step is not None:
-        high = at_place(low, high, step, last_place(low, high, step))
-    return replace(span, low=low, high=high, step=step)
+    is_whole = isinstance(value, numbers.Integral)
+    span = _span(token, param, low, high, is_whole)
+    if not (is_whole or param.odd):
+        span = Span(float(span.low), float(span.high), span.step and float(span.step), span.log)
+    return NumberAxis(token, span, token_below(runner, token, param.below))
 
 
 def token_below(runner: CompGraphRunner, token: str, name: str) -> str:
@@ -365,19 +391,6 @@ def _called(cg: CompGraph, token: str, name: str) -> Iterator[str]:
         yield from (given for given, called in zip(inputs, names, strict=False) if called == name)
 
 
-def _labels(param: Param) -> tuple[str, ...]:
-    """Return a text for each choice; those that are alike are numbered."""
-    choices = param.choices or ()
-    texts = [_text(choice) for choice in choices] if param.labels is None else list(param.labels)
-    if len(set(texts)) == len(texts):
-        return tuple(texts)
-    return tuple(f"{text} #{number}" for number, text in enumerate(texts))
-
-
-def _text(choice: Any) -> str:
-    return choice.name if isinstance(choice, enum.Enum) else f"{choice!r:.80}"
-
-
 def _is_one(known: Any, value: Any) -> bool:
     """Whether two values are one, whatever comparing them gives: 1 is not True."""
     if isinstance(known, bool) != isinstance(value, bool):
@@ -386,14 +399,6 @@ def _is_one(known: Any, value: Any) -> bool:
         return known is value or bool(known == value)
     except Exception:  # arrays, for example
         return False
-
-
-def _is_closed(param: Param) -> bool:
-    return all(_is_number(end) for end in _ends(param))
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _why_none(present: Iterable[str]) -> str:

@@ -50,11 +50,11 @@ def check(
     """Run a bundle on a labelled set; exit 0 only if every case passes."""
     from epypes.batch.cases import cases_of
     from epypes.batch.check import check as check_runner
-    from epypes.batch.check import check_place
+    from epypes.batch.check import require_writable
     from epypes.bundle import load
 
     if junit is not None:
-        check_place(junit)
+        require_writable(junit)
     labelled = cases_of(cases)
     result = check_runner(load(bundle), labelled)
     if as_json:
