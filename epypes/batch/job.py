@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from time import perf_counter_ns
-from typing import Any
+from typing import Any, Final
 
 from epypes.batch.items import Item, payload_of
 from epypes.batch.results import ErrorInfo, Outcome, is_endless, long_number, plain_number
@@ -19,6 +19,8 @@ from epypes.run import CompGraphRunner, Failure, Run
 from epypes.run.branch import branched
 
 Setting = Mapping[str, Any]
+# One object, since an outcome is known by the very setting that it has.
+NO_SETTING: Final[Setting] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +44,7 @@ class Job:
     """
 
     items: tuple[Item, ...]
-    settings: tuple[Setting, ...] = ({},)
+    settings: tuple[Setting, ...] = (NO_SETTING,)
     keep: tuple[str, ...] = ()
     show: tuple[str, ...] | None = ()
     start: SharedStart | None = None

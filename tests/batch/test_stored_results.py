@@ -1,4 +1,4 @@
-"""Which items have been run before, so that they need not be run again?"""
+"""Stored results of a map, a sweep or a search are taken for the same inputs only."""
 
 from __future__ import annotations
 
@@ -6,16 +6,15 @@ import contextlib
 import os
 import shutil
 import sqlite3
+import threading
 
 import cv2
 import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.batch.cache import StoredOutcomes
-from epypes.batch.items import Item
-from epypes.batch.results import Outcome
-from epypes.errors import ScaleError, StoreError
+from epypes.errors import ScaleError
+from tests.batch.conftest import runner_of
 
 
 def above(image, level):
@@ -32,10 +31,6 @@ def total(image):
 
 def strength(keypoints):
     return float(sum(one.response for one in keypoints))
-
-
-def runner_of(function, *tokens, **hyperparameters):
-    return ep.CompGraphRunner(ep.CompGraph({"f": function}, {"f": (tokens, "out")}), hyperparameters)
 
 
 @pytest.fixture
@@ -146,7 +141,7 @@ def test_keypoints_are_told_by_what_they_say(store):
 
 
 def test_what_nobody_can_look_into_is_run_each_time_and_not_written(store):
-    class Frame:
+    class Frame(threading.local):
         def __init__(self, level):
             self.level = level
 
@@ -167,8 +162,8 @@ def test_hyperparameters_in_tuples_are_told_by_what_is_in_them(store):
 
 
 def test_a_hyperparameter_that_nobody_can_look_into_is_refused_by_name(store):
-    runner = runner_of(lambda image, model: 1, "image", "model", model=object())
-    with pytest.raises(ScaleError, match=r"Hyperparameter 'model' is or holds a 'object'"):
+    runner = runner_of(lambda image, model: 1, "image", "model", model=cv2.ORB_create())
+    with pytest.raises(ScaleError, match=r"Hyperparameter 'model' is or holds a 'ORB'"):
         ep.map(runner, [np.zeros((2, 2))], store=store, name="n")
 
 
@@ -204,34 +199,9 @@ def test_a_number_too_long_to_be_read_is_a_short_text_and_the_others_are_stored(
     assert rows(store, "sweep") == 2
 
 
-def test_a_row_that_can_not_be_written_takes_no_other_with_it(store):
-    memory = StoredOutcomes(store.series("map", "n"))
-    for number in range(4):
-        item = Item(number, f"#{number}", {"image": number})
-        memory.recall(item)
-        memory.add([Outcome(number, item.name, values={"out": object() if number == 1 else number})])
-    with pytest.warns(UserWarning, match="can't be stored: .* It is run again the next time"):
-        memory.write()
-    assert rows(store) == 3
-    memory.write()
-
-
 def without_rows(path):
     with contextlib.closing(sqlite3.connect(path)) as database, database:
         database.execute("drop table epypes_rows")
-
-
-def test_what_could_not_be_written_waits_until_it_can(tmp_path):
-    with ep.Store(tmp_path / "r.sqlite") as store:
-        memory = StoredOutcomes(store.series("map", "n"))
-        memory.recall(Item(0, "#0", {"image": 0}))
-        memory.add([Outcome(0, "#0", values={"out": 1})])
-        without_rows(tmp_path / "r.sqlite")
-        with pytest.raises(StoreError):
-            memory.write()
-        with ep.Store(tmp_path / "r.sqlite"):  # which makes the tables that are not there
-            memory.write()
-        assert rows(store) == 1
 
 
 def test_a_generators_own_error_is_the_one_that_is_raised(tmp_path):

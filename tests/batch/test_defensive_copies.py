@@ -1,4 +1,4 @@
-"""What keeps a value as it was when it was given, whatever its owner does with it afterwards?"""
+"""A value that is given is computed as it was then, whatever its owner does with it afterwards."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from tests.batch.test_remembered import runner_of
+from tests.batch.conftest import runner_of
 
 LEVELS = [float(level) for level in range(12)]
 
