@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from epypes.acquisition import ImageAcquisition, camera
     from epypes.batch import MapResult, map  # noqa: A004 - as in ep.map(runner, images)
     from epypes.batch.cases import Case
-    from epypes.batch.checking import check
-    from epypes.batch.optimizing import optimize
+    from epypes.batch.check import check
+    from epypes.batch.optimize import optimize
     from epypes.batch.sweeping import SweepResult, sweep
     from epypes.bundle import load, load_pipeline, promote, to_source, verify
     from epypes.display import Preview, register_preview, reset_display_ranges, show
@@ -98,7 +98,7 @@ _HOMES = {
     "Node": "epypes.pipeline",
     "NodeBasedCompGraph": "epypes.pipeline",
     "Case": "epypes.batch.cases",
-    "check": "epypes.batch.checking",
+    "check": "epypes.batch.check",
     "Param": "epypes.hints",
     "Roi": "epypes.hints",
     "Preview": "epypes.display",
@@ -118,7 +118,7 @@ _HOMES = {
     "load": "epypes.bundle",
     "load_failure": "epypes.service.failures.reopen",
     "load_pipeline": "epypes.bundle",
-    "optimize": "epypes.batch.optimizing",
+    "optimize": "epypes.batch.optimize",
     "MapResult": "epypes.batch",
     "map": "epypes.batch",
     "promote": "epypes.bundle",

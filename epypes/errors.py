@@ -55,7 +55,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from epypes.bundle.report import ReplayReport
+    from epypes.bundle.replay import ReplayReport
     from epypes.images import Image
     from epypes.service.parameters import Parameters
 

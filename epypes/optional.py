@@ -26,7 +26,6 @@ EXTRAS: Final[Mapping[str, tuple[str, str]]] = {
     "httpx": ("httpx", "serve"),
     "httpx_sse": ("httpx-sse", "serve"),
     "ipywidgets": ("ipywidgets", "widgets"),
-    "junitparser": ("junitparser", "scale"),
     "jupyter_client": ("jupyter-client", "service"),
     "jupyter_server": ("jupyter-server", "notebook"),
     "jupyterlab": ("jupyterlab", "notebook"),

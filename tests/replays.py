@@ -1,6 +1,6 @@
 """Replays of bundles in processes that have NumPy and EPypes loaded already.
 
-Promotion replays a bundle in an interpreter of its own (``python -I -m epypes.bundle.replay``), half of whose time goes
+Promotion replays a bundle in an interpreter of its own (``python -s -P -m epypes.bundle.replay``), half of whose time goes
 into imports and the metadata of packages. Here a server has done that once, isolated likewise, and each replay is a
 fork of it: a process of its own in which none of the bundle's imports has been done. Tests with the fixture
 ``fresh_interpreter`` start the real one.
@@ -22,10 +22,11 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
-_MODULES = ("epypes.bundle.replay", "epypes.bundle.writeback")
+_REPLAY = [sys.executable, "-s", "-P", "-m", "epypes.bundle.replay"]
 
 
 class WarmProcesses:
@@ -42,15 +43,15 @@ class WarmProcesses:
         return getattr(subprocess, name)
 
     def run(
-        self, command: list[str], *, cwd: str, timeout: float, **options: Any
+        self, command: list[str], *, cwd: str, env: dict[str, str], timeout: float, **options: Any
     ) -> subprocess.CompletedProcess[bytes]:
         """Run an isolated interpreter's command, as ``subprocess.run`` with ``capture_output``."""
-        if not self.is_on or command[:3] != [sys.executable, "-I", "-m"] or command[3] not in _MODULES:
-            return subprocess.run(command, cwd=cwd, timeout=timeout, **options)
+        if not self.is_on or command[:5] != _REPLAY:
+            return subprocess.run(command, cwd=cwd, env=env, timeout=timeout, **options)
         self._start()
         with socket.socket(socket.AF_UNIX) as channel:
             channel.connect(self._address)
-            request = {"module": command[3], "argv": command[4:], "cwd": cwd, "env": dict(os.environ)}
+            request = {"module": command[4], "argv": command[5:], "cwd": str(cwd), "env": env}
             channel.sendall(json.dumps(request).encode() + b"\n")
             with channel.makefile("rb") as answers:
                 (pid,) = struct.unpack("i", answers.read(4))
@@ -79,7 +80,6 @@ class WarmProcesses:
 def serve(address: str) -> None:
     """Fork for each request until standard input ends."""
     import epypes.bundle.replay
-    import epypes.bundle.writeback
     import epypes.pipeline
     import epypes.wire.samples  # noqa: F401 - all of that is loaded for the forks
     from epypes.bundle.requirements import bringing
@@ -134,6 +134,7 @@ def _become(request: dict[str, Any], stderr: int) -> None:
     os.chdir(request["cwd"])
     os.environ.clear()
     os.environ.update(request["env"])
+    time.tzset()
     # The server's generators, which all forks have a copy of, may be at work in a bundle.
     random.seed()
     if "numpy.random" in sys.modules:

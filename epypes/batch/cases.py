@@ -1,56 +1,72 @@
-"""What is one case of a labelled set: what goes in, and what must come out?
+"""Cases of a labelled set: inputs, and the checks of what must come of them; in Python, or in a file, CASES.toml.
 
-A case is inputs with checks. A check is a metric, of one token or of the whole run, and how large or small it must be.
+A check is a metric, of one token or of the whole run, with its bounds. The file:
+
+::
+
+    [[case]]
+    name = "left"                        # without: the name of its first file, or its number
+    inputs = {image = "left.png"}        # by free source token; a value alone is that of the one free source token
+    hyperparameters = {canny_lo = 90}    # values that differ from the bundle's in this case
+
+    [[case.check]]
+    token = "edges"                      # whose value is measured; without: the one sink token
+    expected = "left_edges.png"          # what it is compared with: a value, or an image, .npy or .npz; not of count
+                                         # and value, which compare nothing
+    metric = "iou"                       # without: equal if there is something expected, else value
+    min = 0.9                            # the least that passes; of equal and close 1 without min and max
+    max = 1.0                            # the most that passes
+
+    [[case.check]]
+    token = "points"
+    metric = "count"
+    min = 100
+    max = 300
+
+A text that ends like the name of an image, of ``.npy`` or of ``.npz`` is a file, whose path is relative to that of the
+cases; other texts and numbers stand for themselves. The metrics are ``equal``, ``close`` (``atol``, ``rtol``), ``iou``
+(``boxes``), ``count`` (``of``), ``value``, ``mean_abs_difference`` and ``psnr`` (``data_range``): see
+``epypes.batch.metrics``, whose options stand beside ``min`` and ``max``. Of label images, integers with more than one
+value besides 0, ``iou`` is the mean over the objects, paired one with one; one that is left over on either side counts
+0. A check may have a ``name``. A case without a check passes if it runs.
 """
 
 from __future__ import annotations
 
 import math
 import os
+import re
+import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path, PurePath
 from typing import Any, Final
 
-from epypes.batch.files import is_file, read_value
-from epypes.batch.lasting import holds_its_arrays, lasting
-from epypes.batch.metrics import METRICS, Metric
-from epypes.errors import ScaleError, UnknownName
+from epypes.batch.items import defensive_copy, holds_its_arrays, is_file, read_value
+from epypes.batch.metrics import METRICS
+from epypes.bundle.hyperparameters import read
+from epypes.errors import EpypesError, ScaleError, UnknownName
 from epypes.graph import CompGraph
+from epypes.wording import ended
 
-# What a threshold spec may say besides the options of its metric.
-SPEC_KEYS: Final = ("token", "metric", "expected", "min", "max", "keep")
-_CASE_CHARACTERS: Final = 80
-
-
-class _Absent:
-    """Stands for what was not given; None is a value."""
-
-    def __repr__(self) -> str:
-        return "absent"
-
-
-ABSENT: Final = _Absent()
-
-
-class _SinkToken:
-    """Stands for the one sink token, which only the graph knows."""
-
-    def __repr__(self) -> str:
-        return "the sink token"
-
-
-SINK: Final = _SinkToken()
+# The keys of a check, besides the options of its metric.
+_CHECK_KEYS: Final = ("token", "metric", "expected", "min", "max", "keep")
+_CASE_KEYS: Final = ("name", "inputs", "hyperparameters", "check")
+_CASE_HEADER: Final = re.compile(r"^[ \t]*\[\[[ \t]*case[ \t]*\]\]", re.MULTILINE)
+_NAME_CHARACTERS: Final = 80
+_VALUE_CHARACTERS: Final = 60
+# Stands for a value that was not given, since None is a value.
+ABSENT: Final = object()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Check:
-    """One thing that must be so in a case.
+    """One requirement of a case.
 
     Attributes
     ----------
     name
-        What it is called in tables: ``"iou of edges"``.
+        The name in tables: ``"iou of edges"``.
     token
         The token whose value is measured; None: the metric is given the whole run, and the case.
     metric
@@ -60,11 +76,11 @@ class Check:
     at_least, at_most
         The smallest and the largest number that passes; None where there is no bound.
     options
-        Of the metric.
+        The options of the metric.
     keep
         The tokens that the metric needs the values of.
     is_of_case
-        Without a token: whether it may be the one that the case expects something of, not the one sink token.
+        Without a token: whether the one token of the case's ``expected`` is measured, rather than the one sink token.
     """
 
     name: str
@@ -79,9 +95,9 @@ class Check:
 
     @property
     def threshold(self) -> str:
-        """What must be so, in words: ``at least 0.9``; empty if the metric itself says true or false."""
-        bounds = ((self.at_least, "at least"), (self.at_most, "at most"))
-        return ", ".join(f"{word} {bound:g}" for bound, word in bounds if bound is not None)
+        """The bounds as text: ``at least 0.9``; empty if the metric itself returns true or false."""
+        bounds = (("at least", self.at_least), ("at most", self.at_most))
+        return ", ".join(f"{label} {bound:g}" for label, bound in bounds if bound is not None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,9 +114,9 @@ class Case:
         a text with such an ending is a path. Where no function and no metric that compares looks at a token, it must
         be equal to it.
     metrics
-        By name, what must be so; see below.
+        By name, the requirements; see below.
     name
-        What it is called; without, its file is, or its number.
+        Its name in tables; without, that of its file, or its number.
     hyperparameters
         Values that differ from the runner's in this case.
 
@@ -129,7 +145,7 @@ class Case:
     Raises
     ------
     ScaleError
-        What must be so is not said, or not in these words.
+        A metric has no threshold, or is not given in one of these ways.
     UnknownName
         There is no such metric, or no such option.
 
@@ -155,17 +171,17 @@ class Case:
             _check(self, name, spec)
 
     def __str__(self) -> str:
-        return f"case {self.name!r:.{_CASE_CHARACTERS}}" if self.name else "a case"
+        return f"case {self.name!r:.{_NAME_CHARACTERS}}" if self.name else "a case"
 
     def __repr__(self) -> str:
-        looked_at = _looked_at(_check(self, name, spec) for name, spec in (self.metrics or {}).items())
-        number = len(self.metrics or ()) + sum(token not in looked_at for token in self.expected or ())
-        name = "" if self.name is None else f" {self.name!r:.{_CASE_CHARACTERS}}"
+        compared = _compared(_check(self, name, spec) for name, spec in (self.metrics or {}).items())
+        number = len(self.metrics or ()) + sum(token not in compared for token in self.expected or ())
+        name = "" if self.name is None else f" {self.name!r:.{_NAME_CHARACTERS}}"
         return f"<Case{name}: {number} check{'s' * (number != 1)}>"
 
 
 def cases_of(given: Any) -> tuple[Case, ...]:
-    """Return cases with names, whatever they were given as.
+    """Return cases, each with a name that no other has.
 
     Parameters
     ----------
@@ -178,45 +194,54 @@ def cases_of(given: Any) -> tuple[Case, ...]:
         There is none, or one is not a case.
     """
     if isinstance(given, str | os.PathLike):
-        from epypes.batch.casefile import read_cases
-
-        return _named(read_cases(Path(given)))
-    if isinstance(given, Case | Mapping) or not isinstance(given, Iterable):
+        found = _read_file(Path(given))
+    elif isinstance(given, Case | Mapping) or not isinstance(given, Iterable):
         raise ScaleError(
             f"cases is a list of cases or the path of a file of them, not a single {type(given).__name__!r}."
         )
-    cases = map(_case, given)
-    found = _named(list(cases if holds_its_arrays(given) else map(_lasting, cases)))
+    else:
+        found = [_case(item) if holds_its_arrays(given) else _copied(_case(item)) for item in given]
     if not found:
         raise ScaleError("There are no cases. Give at least one: ep.Case(inputs, expected={...}).")
-    return found
+    taken: dict[str, int] = {}
+    return tuple(
+        replace(case, name=_unique(case.name or _file_name(case.inputs) or f"#{number}", taken))
+        for number, case in enumerate(found)
+    )
 
 
 def checks_of(case: Case, cg: CompGraph) -> tuple[Check, ...]:
-    """Return what must be so in a case, each with its token.
+    """Return the checks of a case, each with its token.
 
     Raises
     ------
     UnknownName
         The graph has no such token.
     ScaleError
-        Which token is meant is not said.
+        A metric does not name its token, and there are several.
     """
     expected = dict(case.expected or {})
     for token in expected:
         cg.require_token(token)
-    checks = [_placed(_check(case, name, spec), case, cg) for name, spec in (case.metrics or {}).items()]
-    looked_at = _looked_at(checks)
+    checks = [_resolved(_check(case, name, spec), case, cg) for name, spec in (case.metrics or {}).items()]
+    compared = _compared(checks)
     alone = [
         Check(f"equal of {token}", token, "equal", wanted, METRICS["equal"].least, keep=(token,))
         for token, wanted in expected.items()
-        if token not in looked_at
+        if token not in compared
     ]
     return (*alone, *checks)
 
 
+def inputs_of(case: Case) -> Any:
+    """Return the inputs of a case as ``ep.map`` takes them: what names a file is its path."""
+    if isinstance(case.inputs, Mapping):
+        return {token: Path(value) if is_file(value) else value for token, value in case.inputs.items()}
+    return Path(case.inputs) if is_file(case.inputs) else case.inputs
+
+
 def with_labels_read(case: Case, cg: CompGraph) -> Case:
-    """Return a case whose expected values are no paths any more but what stands in their files.
+    """Return a case with the content of files in place of their paths in ``expected``.
 
     Raises
     ------
@@ -225,14 +250,6 @@ def with_labels_read(case: Case, cg: CompGraph) -> Case:
     """
     read = {token: read_value(value, cg, token) for token, value in (case.expected or {}).items()}
     return replace(case, expected=read or case.expected)
-
-
-# -- cases ------------------------------------------------------------------------------------------------------
-
-
-def _lasting(case: Case) -> Case:
-    """Return a case that stays as it is when whoever gave it fills its arrays for the next one."""
-    return replace(case, inputs=lasting(case.inputs), expected=lasting(case.expected))
 
 
 def _case(item: Any) -> Case:
@@ -244,15 +261,9 @@ def _case(item: Any) -> Case:
     return Case(item)
 
 
-def _named(cases: Iterable[Case]) -> tuple[Case, ...]:
-    """Return the cases with a name each, which no other has."""
-    taken: dict[str, int] = {}
-    named = []
-    for number, case in enumerate(cases):
-        name = case.name or _file_name(case.inputs) or f"#{number}"
-        taken[name] = taken.get(name, 0) + 1
-        named.append(replace(case, name=name if taken[name] == 1 else f"{name} ({taken[name]})"))
-    return tuple(named)
+def _copied(case: Case) -> Case:
+    """Return a case that stays as it is when a generator fills its arrays for the next one."""
+    return replace(case, inputs=defensive_copy(case.inputs), expected=defensive_copy(case.expected))
 
 
 def _file_name(inputs: Any) -> str:
@@ -260,105 +271,217 @@ def _file_name(inputs: Any) -> str:
     return next((PurePath(value).name for value in values if is_file(value)), "")
 
 
+def _unique(name: str, taken: dict[str, int]) -> str:
+    """Return a name, numbered if it is taken, and take it."""
+    unique = name
+    while unique in taken:
+        taken[name] += 1
+        unique = f"{name} ({taken[name]})"
+    taken[unique] = 1
+    return unique
+
+
 # -- checks -----------------------------------------------------------------------------------------------------
 
 
-def _looked_at(checks: Iterable[Check]) -> frozenset[Any]:
-    """Return the tokens whose values are compared with what is expected of them, or given to a function with it."""
-    return frozenset(check.token for check in checks if _takes_expected(check.metric))
-
-
-def _takes_expected(metric: str | Callable[..., Any]) -> bool:
+def _compares(metric: str | Callable[..., Any]) -> bool:
     return callable(metric) or METRICS[metric].compares
 
 
+def _compared(checks: Iterable[Check]) -> frozenset[Any]:
+    """Return the tokens whose values are compared with expected ones, or given to a function with them."""
+    return frozenset(check.token for check in checks if _compares(check.metric))
+
+
 def _check(case: Case, name: str, spec: Any) -> Check:
-    """Return what an entry of ``metrics`` asks for; its token may still be missing."""
-    given = _spelled_out(case, name, spec)
+    """Return the check of an entry of ``metrics``; its token may still be missing."""
+    given = _as_mapping(case, name, spec)
     metric = given.get("metric", name)
-    built_in = _built_in(case, metric)
-    allowed = (*SPEC_KEYS, *(built_in.options if built_in else ()))
+    if not callable(metric) and (not isinstance(metric, str) or metric not in METRICS):
+        raise UnknownName("metric", metric, METRICS, f"for {case}")
+    built_in = None if callable(metric) else METRICS[metric]
+    allowed = (*_CHECK_KEYS, *(built_in.options if built_in else ()))
     for key in given:
         if key not in allowed:
             raise UnknownName("key", key, allowed, f"for metric {name!r} of {case}")
-    if "expected" in given and not _takes_expected(metric):
+    expected = given.get("expected", ABSENT)
+    if expected is not ABSENT and not _compares(metric):
         raise ScaleError(
             f"Metric {name!r} of {case} compares nothing: {metric!r} takes no expected. Leave it out, or take a metric "
             f"that compares: {', '.join(known for known in METRICS if METRICS[known].compares)}."
         )
-    at_least, at_most = (_bound(case, name, given, key) for key in ("min", "max"))
+    at_least, at_most = (_bound(case, name, key, given.get(key)) for key in ("min", "max"))
     if at_least is None and at_most is None and built_in is not None:
         at_least = built_in.least
         if at_least is None:
             raise ScaleError(f"Metric {name!r} of {case} has no threshold. Give min, max or both.")
     if at_least is not None and at_most is not None and at_least > at_most:
         raise ScaleError(f"Metric {name!r} of {case} has min {at_least:g}, which is more than max {at_most:g}.")
-    options = {key: value for key, value in given.items() if key not in SPEC_KEYS}
-    expected, keep = given.get("expected", ABSENT), given.get("keep", ())
-    keep = (keep,) if isinstance(keep, str) else tuple(keep)
-    token = given.get("token")
-    is_of_case = token is None and built_in is not None and built_in.compares and expected is ABSENT
-    token = None if token is SINK else token
-    return Check(name, token, metric, expected, at_least, at_most, options, keep, is_of_case)
+    keep = given.get("keep", ())
+    return Check(
+        name,
+        given.get("token"),
+        metric,
+        expected,
+        at_least,
+        at_most,
+        options={key: value for key, value in given.items() if key not in _CHECK_KEYS},
+        keep=(keep,) if isinstance(keep, str) else tuple(keep),
+        is_of_case="token" not in given and built_in is not None and built_in.compares and expected is ABSENT,
+    )
 
 
-def _spelled_out(case: Case, name: str, spec: Any) -> Mapping[str, Any]:
+def _as_mapping(case: Case, name: str, spec: Any) -> Mapping[str, Any]:
+    """Return an entry of ``metrics`` in its longest form."""
     if isinstance(spec, Mapping):
         return spec
     if callable(spec):
         return {"metric": spec}
     if isinstance(spec, tuple | list) and len(spec) == 2:
-        return {key: bound for key, bound in zip(("min", "max"), spec, strict=True) if bound is not None}
+        return {"min": spec[0], "max": spec[1]}
     if not _is_number(spec):
         raise ScaleError(
             f"Metric {name!r} of {case} is a {type(spec).__name__!r}. Give a number, a pair (least, most), a function, "
             "or a dict with 'min' or 'max'."
         )
-    better = METRICS[name].better if name in METRICS else None
-    if name in METRICS and better is None:
+    better = METRICS[name].better if name in METRICS else "greater"
+    if better is None:
         raise ScaleError(f"Metric {name!r} of {case} needs a pair (least, most), since neither end is better.")
     return {"max" if better == "less" else "min": spec}
 
 
-def _built_in(case: Case, metric: Any) -> Metric | None:
-    if callable(metric):
+def _bound(case: Case, name: str, key: str, bound: Any) -> float | None:
+    if bound is None:
         return None
-    if not isinstance(metric, str) or metric not in METRICS:
-        raise UnknownName("metric", metric, METRICS, f"for {case}")
-    return METRICS[metric]
-
-
-def _bound(case: Case, name: str, given: Mapping[str, Any], key: str) -> float | None:
-    bound = given.get(key)
-    if bound is not None and (not _is_number(bound) or math.isnan(bound)):
+    if not _is_number(bound) or math.isnan(bound):
         raise ScaleError(f"{key} of metric {name!r} of {case} is {bound!r:.40}, which is no number.")
-    return None if bound is None else float(bound)
+    return float(bound)
 
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _placed(check: Check, case: Case, cg: CompGraph) -> Check:
-    """Return a check with its token, with what is expected of it and with a name that says both."""
+def _resolved(check: Check, case: Case, cg: CompGraph) -> Check:
+    """Return a check with its token, its expected value, and a name with both metric and token."""
     if check.token is None and callable(check.metric):
         for kept in check.keep:
             cg.require_token(kept)
         return replace(check, keep=tuple(dict.fromkeys((*cg.sink_tokens, *check.keep))))
-    token = check.token if check.token is not None else _meant(check, case, cg)
+    token = check.token
+    if token is None:
+        tokens = tuple(case.expected) if check.is_of_case and case.expected else cg.sink_tokens
+        if len(tokens) != 1:
+            among = ", ".join(map(repr, tokens))
+            raise ScaleError(
+                f"Metric {check.name!r} of {case} does not say which token it looks at. Give token, one of: {among}."
+            )
+        [token] = tokens
     cg.require_token(token)
     expected = check.expected if check.expected is not ABSENT else (case.expected or {}).get(token, ABSENT)
-    if expected is ABSENT and not callable(check.metric) and _takes_expected(check.metric):
+    if expected is ABSENT and not callable(check.metric) and _compares(check.metric):
         raise ScaleError(f"Metric {check.name!r} of {case} has nothing to compare {token!r} with. Give it expected.")
     name = f"{check.name} of {token}" if check.name in METRICS else check.name
     return replace(check, token=token, expected=expected, name=name, keep=(token,))
 
 
-def _meant(check: Check, case: Case, cg: CompGraph) -> str:
-    tokens = tuple(case.expected) if check.is_of_case and case.expected else cg.sink_tokens
-    if len(tokens) == 1:
-        return tokens[0]
-    among = ", ".join(map(repr, tokens))
-    raise ScaleError(
-        f"Metric {check.name!r} of {case} does not say which token it looks at. Give token, one of: {among}."
-    )
+# -- CASES.toml -------------------------------------------------------------------------------------------------
+
+
+def _read_file(path: Path) -> list[Case]:
+    """Return the cases in a file, in their order; no file that they name is read.
+
+    Raises
+    ------
+    ScaleError
+        The file can't be read, or holds something else than cases; with every reason.
+    """
+    text, document = _document(path)
+    unknown = [key for key in document if key != "case"]
+    reasons = [str(UnknownName("key", key, ("case",), f"in {path.name}")) for key in unknown]
+    tables = document.get("case")
+    if not (isinstance(tables, list) and tables and all(isinstance(table, dict) for table in tables)):
+        reasons.append(f"{path} has no cases. Write one: [[case]] with inputs and [[case.check]].")
+        raise ScaleError(" ".join(reasons))
+    lines = [text.count("\n", 0, match.start()) + 1 for match in _CASE_HEADER.finditer(text)]
+    if len(lines) != len(tables):  # written as an inline array
+        lines = [1] * len(tables)
+    cases = []
+    for table, line in zip(tables, lines, strict=True):
+        try:
+            cases.append(_case_of_table(table, path.parent))
+        except (EpypesError, ValueError) as error:
+            reasons.append(f"{path.name}, line {line}: {error}")
+    if reasons:
+        raise ScaleError(" ".join(reasons))
+    return cases
+
+
+def _document(path: Path) -> tuple[str, dict[str, Any]]:
+    if path.is_dir():
+        text = f"{str(path)!r} is a folder. Give the path of a CASES.toml, or a list of cases that say what is expected"
+        raise ScaleError(f"{text}: [ep.Case('{path.name}/a.png', expected={{...}}), ...].")
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        return text, tomllib.loads(text)
+    except FileNotFoundError as error:
+        raise ScaleError(f"There is no file {str(path)!r}. Check the path.") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ScaleError(f"{path} is not TOML: {error}.") from error
+    except (OSError, ValueError, RecursionError) as error:  # also bytes that are no text
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise ScaleError(f"{str(path)!r} can't be read: {reason}.") from error
+
+
+def _case_of_table(table: Mapping[str, Any], folder: Path) -> Case:
+    name = table.get("name")
+    where = f"in case {name!r:.{_VALUE_CHARACTERS}}" if name else "in this case"
+    for key in table:
+        if key not in _CASE_KEYS:
+            raise UnknownName("key", key, _CASE_KEYS, where)
+    if name is not None and not isinstance(name, str):
+        raise ValueError(f"The name of a case is a text, not {name!r:.{_VALUE_CHARACTERS}}.")
+    if "inputs" not in table:
+        raise ValueError(f'There are no inputs {where}. Write: inputs = {{image = "a.png"}}.')
+    checks, hyperparameters = table.get("check", []), table.get("hyperparameters", {})
+    if not (isinstance(checks, list) and all(isinstance(check, Mapping) for check in checks)):
+        raise ValueError(f"The checks {where} are tables: [[case.check]].")
+    if not isinstance(hyperparameters, Mapping):
+        raise ValueError(f"hyperparameters {where} is a table, not {hyperparameters!r:.{_VALUE_CHARACTERS}}.")
+    inputs = table["inputs"]
+    if isinstance(inputs, Mapping):
+        inputs = {token: _in_folder(value, folder) for token, value in inputs.items()}
+    metrics: dict[str, Any] = {}
+    expected: dict[str, Any] = {}
+    taken: dict[str, int] = {}
+    for check in checks:
+        # Without a token it is the one sink token, whatever other checks of the case expect.
+        spec = {"token": None, **check}
+        spec.setdefault("metric", "equal" if "expected" in spec else "value")
+        token = spec["token"]
+        if "expected" in spec:
+            spec["expected"] = _in_folder(spec["expected"], folder)
+            if token is not None:
+                expected.setdefault(token, spec["expected"])
+        label = str(spec.pop("name", spec["metric"] if token is None else f"{spec['metric']} of {token}"))
+        metrics[_unique(label, taken)] = spec
+    values = {token: _hyperparameter(token, entry) for token, entry in hyperparameters.items()}
+    return Case(_in_folder(inputs, folder), expected, metrics, name, values)
+
+
+def _in_folder(value: Any, folder: Path) -> Any:
+    """Return the path of what names a file, relative to that of the cases; any other value as it is."""
+    return folder / Path(value).expanduser() if is_file(value) else value
+
+
+def _hyperparameter(token: str, entry: Any) -> Any:
+    """Return a value as pipeline.toml has it: what has no counterpart in TOML is a table with its kind."""
+    if not isinstance(entry, Mapping):
+        return entry
+    try:
+        return read(entry)
+    except (LookupError, TypeError, ValueError, ArithmeticError) as error:
+        raise ValueError(
+            f"Hyperparameter {token!r} can't be read: {ended(str(error))} Write it as in pipeline.toml, such as "
+            '{value = [3, 5], kind = "tuple"}.'
+        ) from error

@@ -1,9 +1,12 @@
-"""Fingerprints of graphs and functions: whether stored results are of the code and values that are here now.
+"""Fingerprints: digests of a value or a function and of everything that it refers to.
 
-A fingerprint covers all that a function reaches: its code, defaults, closure and attributes, the globals that it reads,
-and of each object in there its class and its state. Installed packages and the standard library count by name and
-version. What can't be seen through, such as a generator or an object of a C library, is listed as unknown: the caller
-must not take a fingerprint with unknowns for a proof that nothing has changed.
+A digest covers a function's code, defaults, closure and attributes and the globals that it reads, and of each object
+its class and its state. Installed packages and the standard library count by name; `versions_of` adds their versions,
+and the content of modules that are not installed. A value is described as `pickle` would describe it, by its
+`__reduce_ex__`; in contrast to pickle, functions and classes of the user count by what they do.
+
+An object that pickle can't describe, such as a generator or an object of a C library, is unknown. A caller must not
+take equal digests with an unknown for a proof that nothing has changed.
 """
 
 from __future__ import annotations
@@ -20,42 +23,31 @@ import types
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
 from functools import lru_cache
 from importlib import metadata
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path, PurePath
 from typing import Any, Final
 
-from epypes.batch.digests import Untold, digest_of, joined
-from epypes.bundle.requirements import bringing
-from epypes.bundle.text import nested_codes
+from epypes.errors import MessageError
 from epypes.graph import CompGraph
-from epypes.run.guard import is_array
+from epypes.run.guard import is_plain_array
+from epypes.wire.encoder import ValueWriter
+from epypes.wire.protobuf import message_class
 
+_DIGEST_BYTES: Final = 16
 _OURS: Final = "epypes"
 # The folders that pip, and Debian's packages, install into.
 _INSTALLED: Final = frozenset({"site-packages", "dist-packages"})
 _READS_NAME: Final = frozenset({"LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS"})
-# Builtins by which code reaches what its names don't say.
+# Builtins by which code reads what its names don't say.
 _BY_TEXT: Final = frozenset({"eval", "exec", "globals", "__import__"})
 _ATTRIBUTES_BY_TEXT: Final = frozenset({"getattr", "vars", "__dict__"})
-_LEAVES: Final = (
-    type(None),
-    bool,
-    int,
-    float,
-    complex,
-    str,
-    bytes,
-    bytearray,
-    type(...),
-    type(NotImplemented),
-    PurePath,
-)
-_LOCKS: Final = (type(threading.Lock()), type(threading.RLock()))
-_LAYOUT: Final = (types.MemberDescriptorType, types.GetSetDescriptorType)
-_BUILT_IN_METHODS: Final = (types.BuiltinFunctionType, types.MethodWrapperType)
+_LEAVES: Final = (type(None), bool, float, complex, type(...), type(NotImplemented))
+# Their objects are told by what pickle says of them.
+_DATA_MODULES: Final = frozenset({"builtins", "collections", "datetime", "decimal", "fractions", "numpy", "uuid"})
+# What these have is no data, whatever it is that has them.
+_CODE: Final = (types.FunctionType, type, types.ModuleType)
 # Entries of a class that say where it stands, or that Python makes from the others, some when an object is pickled.
 _NO_BEHAVIOUR: Final = frozenset(
     [
@@ -70,128 +62,97 @@ _NO_BEHAVIOUR: Final = frozenset(
         "_abc_impl",
     ]
 )
-# Attributes that an object fills when it is used: caches and accounts.
+# Attributes that an object fills when it is used: caches and counters.
 _DERIVED: Final = {
     "numpy.vectorize": {"_ufunc"},
     "epypes.pipeline.node.Node": {"duration_ns", "run_count", "next_count"},
 }
-_SINGLE_DISPATCH: Final = frozenset(nested_codes(functools.singledispatch.__code__))
 
 
-@dataclass(frozen=True, slots=True)
-class Fingerprint:
-    """What tells a computation from others.
-
-    Attributes
-    ----------
-    code
-        A digest of functions, classes, modules and immutable values: changes when code is edited.
-    state
-        A digest of what is in lists, dicts, arrays and objects that functions reach: a call may change it.
-    unknown
-        The first thing that can't be seen through, in words; "" if there is none. A computation with one may be
-        another one although the digests are the same.
-    """
-
-    code: str
-    state: str
-    unknown: str
+def combined_digest(*parts: bytes | memoryview | str) -> bytes:
+    """Return a digest of several parts, each with its length, so that no two lists of parts have the same."""
+    made = hashlib.blake2b(digest_size=_DIGEST_BYTES)
+    _add_parts(made, parts)
+    return made.digest()
 
 
-def graph_fingerprint(cg: CompGraph, source: str | None) -> Fingerprint:
-    """Return the fingerprint of what a graph computes.
+def file_digest(path: Path) -> str:
+    """Return a digest of a file's content, and of its suffix, which decides how it is read; "" if it can't be read."""
+    try:
+        # To open a named pipe would wait for a process that writes into it.
+        if not path.is_file():
+            return ""
+        with path.open("rb") as file:
+            # The fastest one: processors have instructions for it.
+            content = hashlib.file_digest(file, "sha256").digest()
+    except OSError:
+        return ""
+    return combined_digest("file", path.suffix.lower(), content).hex()
+
+
+def _add_parts(made: Any, parts: Iterable[bytes | memoryview | str]) -> None:
+    for part in parts:
+        raw = part.encode("utf-8", "surrogatepass") if isinstance(part, str) else part
+        made.update(b"\0%d:" % len(raw))
+        made.update(raw)
+
+
+class Digester:
+    """The digest of a value and of all that it refers to, in an order that is the same in every process.
+
+    An object that comes again counts by the number that it got the first time, so cycles end, and the time is linear
+    in what there is. Immutable values are written each time: whether equal ones are one object differs from process to
+    process.
 
     Parameters
     ----------
-    cg
-        The graph.
-    source
-        What ``to_source`` has made of it, which says how objects are made that can't be seen through. None: refused.
+    of_data
+        Whether objects of installed packages are unknown unless they are plain data or a message can carry them: what
+        pickle says of a file, a shared memory or a stored array is its name, and not what is in it.
+    path
+        Names on the way to the value, for `unknown`.
 
-    Notes
-    -----
-    Modules count by what is in their files as well, those of installed distributions by their versions.
-    """
-    walk = _Walk()
-    walk.graph(cg)
-    modules = walk.modules | (set(_imports(source.encode("utf-8", "surrogatepass"), "", False)) if source else set())
-    code = joined("computation", source or "", walk.code.digest(), sys.version, *_versions(modules)).hex()
-    return Fingerprint(code, walk.state.hexdigest(), walk.unknown if source is None else "")
-
-
-def function_fingerprint(function: Callable[..., Any]) -> str:
-    """Return the digest of a function; what is installed counts by its name.
-
-    Raises
-    ------
-    Untold
-        It reaches something that can't be seen through.
-    """
-    walk = _Walk()
-    walk.value(function)
-    if walk.unknown:
-        raise Untold(walk.unknown)
-    return walk.digest().hex()
-
-
-class _Walk:
-    """One digest of all that is reached, in an order that is the same in every process.
-
-    An object that is reached again counts by the number that it got the first time, so cycles end, and the walk takes
-    time linear in what there is. Immutable values are written each time: whether equal ones are one object differs
-    from process to process.
+    Attributes
+    ----------
+    code, state
+        Two digests: of functions, classes and immutable values; and of what is in lists, dicts, arrays and objects,
+        which a call may change.
+    modules
+        The names of the modules that were met.
+    unknown
+        The first object that pickle can't describe, in words; "" if there is none.
     """
 
-    def __init__(self) -> None:
-        self.code = hashlib.blake2b(digest_size=16)
-        self.state = hashlib.blake2b(digest_size=16)
+    def __init__(self, *, of_data: bool = False, path: list[str] | None = None) -> None:
+        self.code = hashlib.blake2b(digest_size=_DIGEST_BYTES)
+        self.state = hashlib.blake2b(digest_size=_DIGEST_BYTES)
+        self.modules: set[str] = set()
+        self.unknown = ""
         self._into = self.code
         # With the objects themselves, so that no other gets the identity of one.
         self._numbers: dict[int, tuple[int, Any]] = {}
-        self._path: list[str] = []
-        self.modules: set[str] = set()
-        self.unknown = ""
+        self._path = [] if path is None else path
+        self._of_data = of_data
 
     def digest(self) -> bytes:
-        return joined("", self.code.digest(), self.state.digest())
+        """Return one digest of code and state."""
+        return combined_digest(self.code.digest(), self.state.digest())
 
-    def graph(self, cg: CompGraph) -> None:
-        self._put("graph", str(len(cg.functions)))
-        for name, function in cg.functions.items():
-            self._put(name, repr(cg.func_io[name]))
-            self._named({name: function})
-
-    def value(self, value: Any) -> None:
-        """Add a value, and all that it reaches."""
+    def add(self, value: Any) -> None:
+        """Add a value, and all that it refers to."""
         try:
-            self._value(value)
+            self._add(value)
         except RecursionError:
-            self._opaque(value)
+            self._add_unknown(value)
 
-    def _put(self, *texts: str | bytes) -> None:
-        self._into.update(joined("", *texts))
+    def _put(self, *parts: str | bytes | memoryview) -> None:
+        _add_parts(self._into, parts)
 
-    def _opaque(self, value: Any, why: str = "") -> None:
+    def _add_unknown(self, value: Any, what: str = "") -> None:
         kind = type(value).__qualname__
         self._put("unknown", kind)
         place = f" as {self._path[-1]!r}" if self._path else ""
-        self.unknown = self.unknown or (why or f"a {kind!r}") + place
-
-    def _value(self, value: Any) -> None:
-        kind = type(value)
-        if kind in _LEAVES or (isinstance(value, PurePath) and _is_installed(kind.__module__)):
-            self._put("value", digest_of(value))
-        elif kind is tuple:
-            self._all("tuple", value)
-        elif kind in (set, frozenset):
-            self._set(value)
-        elif name := self._installed_name(value):
-            self._put("installed", name)
-        elif id(value) in self._numbers:
-            self._put("again", str(self._numbers[id(value)][0]))
-        else:
-            self._numbers[id(value)] = len(self._numbers), value
-            self._new(value)
+        self.unknown = self.unknown or (what or f"a {kind!r}") + place
 
     @contextmanager
     def _in_state(self) -> Iterator[None]:
@@ -201,90 +162,118 @@ class _Walk:
         finally:
             self._into = before
 
-    def _new(self, value: Any) -> None:
-        way = next((way for kind, way in _WAYS if isinstance(value, kind)), None)
-        if way is not None:
-            way(self, value)
-        elif is_array(value):
-            self._array(value)
-        elif isinstance(cg := getattr(value, "cg", None), CompGraph):
-            self._runner(value, cg)
+    def _add(self, value: Any) -> None:
+        kind = type(value)
+        if kind in _LEAVES:
+            self._put(kind.__name__, repr(value))
+        elif kind is int:
+            # Python refuses to write very long numbers as decimals.
+            self._put("int", hex(value))
+        elif kind in (str, bytes, bytearray):
+            self._put(kind.__name__, value)
+        elif isinstance(value, PurePath):
+            self._put(kind.__name__, str(value), file_digest(Path(value)))
+        elif is_plain_array(value) and not value.dtype.hasobject:
+            self._add_array(value)
+        elif kind is tuple:
+            self._add_all("tuple", value)
+        elif kind in (set, frozenset):
+            self._add_set(value)
+        elif name := self._installed_name(value):
+            self._put("installed", name)
+        elif id(value) in self._numbers:
+            self._put("again", str(self._numbers[id(value)][0]))
         else:
-            self._object(value)
+            self._numbers[id(value)] = len(self._numbers), value
+            of_data, self._of_data = self._of_data, self._of_data and not isinstance(value, _CODE)
+            next((way for kinds, way in _WAYS if isinstance(value, kinds)), Digester._add_object)(self, value)
+            self._of_data = of_data
 
     # -- containers -------------------------------------------------------------------------------------------------
 
-    def _all(self, kind: str, values: Iterable[Any]) -> None:
+    def _add_all(self, kind: str, values: Iterable[Any]) -> None:
         values = list(values)
         self._put(kind, str(len(values)))
         for value in values:
-            self._value(value)
+            self._add(value)
 
-    def _list(self, found: list[Any]) -> None:
-        if type(found) is list:
-            with self._in_state():
-                self._all("list", found)
-        else:
-            self._object(found)
-
-    def _dict(self, found: Mapping[Any, Any]) -> None:
-        if type(found) in (dict, types.MappingProxyType):
-            with self._in_state():
-                self._all("dict", (part for item in list(found.items()) for part in item))
-        else:
-            self._object(found)
-
-    def _set(self, found: Iterable[Any]) -> None:
-        """Add the members in the order of digests of their own: the set's order is another one in each process."""
-        walks = []
-        for member in list(found):
-            walk = _Walk()
-            walk._path = self._path
-            walk.value(member)
-            self.modules |= walk.modules
-            self.unknown = self.unknown or walk.unknown
-            walks.append(walk.digest())
-        with self._in_state() if type(found) is set else nullcontext():
-            self._put("set", *sorted(walks))
-
-    def _named(self, values: Mapping[str, Any]) -> None:
+    def _add_named(self, values: Mapping[str, Any]) -> None:
         self._put("names", str(len(values)))
         for name in sorted(values):
             self._put(name)
             self._path.append(name)
-            self._value(values[name])
+            self._add(values[name])
             self._path.pop()
+
+    def _add_list(self, found: list[Any]) -> None:
+        if type(found) is not list:
+            self._add_object(found)
+            return
+        with self._in_state():
+            self._add_all("list", found)
+
+    def _add_dict(self, found: Mapping[Any, Any]) -> None:
+        if type(found) not in (dict, types.MappingProxyType):
+            self._add_object(found)
+            return
+        with self._in_state():
+            self._add_all("dict", (part for item in list(found.items()) for part in item))
+
+    def _add_set(self, found: Iterable[Any]) -> None:
+        """Add the members in the order of digests of their own: the set's order is another one in each process."""
+        members = []
+        for member in list(found):
+            own = Digester(of_data=self._of_data, path=self._path)
+            own.add(member)
+            self.modules |= own.modules
+            self.unknown = self.unknown or own.unknown
+            members.append(own.digest())
+        with self._in_state() if type(found) is set else nullcontext():
+            self._put("set", *sorted(members))
+
+    def _add_array(self, array: Any) -> None:
+        import numpy as np
+
+        content = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data if array.nbytes else b""
+        with self._in_state():
+            self._put("array", repr(array.dtype.descr), repr(array.shape), content)
 
     # -- code -------------------------------------------------------------------------------------------------------
 
-    def _function(self, function: types.FunctionType) -> None:
+    def add_graph(self, cg: CompGraph) -> None:
+        """Add the functions of a graph, and how they are connected."""
+        self._put("graph", str(len(cg.functions)))
+        for name, function in cg.functions.items():
+            self._put(name, repr(cg.func_io[name]))
+            self._add_named({name: function})
+
+    def _add_function(self, function: types.FunctionType) -> None:
         code = function.__code__
         self.modules.add(str(function.__module__))
         self._put("function", function.__qualname__)
-        self._code(code)
-        self._value(function.__defaults__)
-        self._named(function.__kwdefaults__ or {})
-        self._named(_annotations(function))
+        self._add_code(code)
+        self._add(function.__defaults__)
+        self._add_named(function.__kwdefaults__ or {})
+        self._add_named(_annotations(function))
         cells = dict(zip(code.co_freevars, function.__closure__ or (), strict=True))
         if code in _SINGLE_DISPATCH:
-            # Beside its registry it keeps a cache, which each call may fill.
-            self._named({"registry": cells.get("registry", function.__dict__.get("registry"))})
+            # Beside its registry it has a cache, which each call may fill.
+            self._add_named({"registry": cells.get("registry", vars(function).get("registry"))})
         else:
-            self._named(vars(function))
-            self._named(cells)
+            self._add_named(vars(function))
+            self._add_named(cells)
         if not _is_installed(str(function.__globals__.get("__name__", ""))):
-            self._named(self._globals(function))
+            self._add_named(self._globals(function))
 
     def _globals(self, function: types.FunctionType) -> dict[str, Any]:
         """Return the globals that a function reads, and of modules of the user's what is read of them, by name."""
         found = function.__globals__
-        codes = list(nested_codes(function.__code__))
+        codes = list(_codes_in(function.__code__))
         attributes = {name for code in codes for name in code.co_names}
-        instructions = (one for code in codes for one in dis.get_instructions(code) if one.opname in _READS_NAME)
-        names = {one.argval for one in instructions}
+        names = {one.argval for code in codes for one in dis.get_instructions(code) if one.opname in _READS_NAME}
         by_text = sorted(_BY_TEXT.intersection(names) - found.keys())
         if by_text or "import_module" in attributes:
-            self._opaque(function, f"a call of {(by_text or ['import_module'])[0]!r}")
+            self._add_unknown(function, f"a call of {(by_text or ['import_module'])[0]!r}")
         read: dict[str, Any] = {}
         seen: set[str] = set()
         waiting = [(name, found[name]) for name in names if name in found]
@@ -298,38 +287,31 @@ class _Walk:
                 waiting += [(f"{name}.{one}", own[one]) for one in sorted(of_it) if not one.startswith("__")]
         return read
 
-    def _code(self, code: types.CodeType) -> None:
+    def _add_code(self, code: types.CodeType) -> None:
         counts = code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount, code.co_flags
         names = code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars
         self._put("code", code.co_code, code.co_exceptiontable, repr((counts, names)))
-        self._all("constants", code.co_consts)
+        self._add_all("constants", code.co_consts)
 
-    def _partial(self, found: functools.partial[Any]) -> None:
-        self._all("partial", (type(found), found.func, found.args))
-        self._named(found.keywords)
-        self._named(vars(found))
-
-    def _cell(self, cell: types.CellType) -> None:
+    def _add_cell(self, cell: types.CellType) -> None:
         try:
             content = cell.cell_contents
         except ValueError:  # nothing has been assigned yet
             self._put("empty cell")
             return
-        self._value(content)
+        self._add(content)
 
-    def _module(self, module: types.ModuleType) -> None:
+    def _add_module(self, module: types.ModuleType) -> None:
         self.modules.add(module.__name__)
         self._put("module", module.__name__)
         if module.__name__ == "__main__":
-            self._opaque(module)
+            self._add_unknown(module)
 
-    # -- objects ----------------------------------------------------------------------------------------------------
-
-    def _class(self, found: type) -> None:
+    def _add_class(self, found: type) -> None:
         self.modules.add(found.__module__)
         self._put("class", found.__qualname__)
-        self._value(type(found))
-        self._value(found.__bases__)
+        self._add(type(found))
+        self._add(found.__bases__)
         own = {name: value for name, value in vars(found).items() if name not in _NO_BEHAVIOUR}
         if isinstance(found, enum.EnumMeta):
             # Beside the members an enumeration has tables of them, which may grow when it is used.
@@ -337,35 +319,32 @@ class _Walk:
             own = {
                 name: own[name] for name in own if name not in members and not (name[0] == name[-1] == "_" != name[1])
             }
-            self._all("members", ((name, member.name, member.value) for name, member in members.items()))
-        self._named(own)
+            self._add_all("members", ((name, member.name, member.value) for name, member in members.items()))
+        self._add_named(own)
 
-    def _member(self, member: enum.Enum) -> None:
-        self._all("member", (type(member), member.name, member.value))
-        self._named({name: value for name, value in vars(member).items() if name[0] != "_"})
+    # -- objects ----------------------------------------------------------------------------------------------------
 
-    def _array(self, array: Any) -> None:
-        try:
-            with self._in_state():
-                self._put("array", digest_of(array))
-        except Untold:  # of objects that are no plain values
-            self._object(array)
+    def _add_member(self, member: enum.Enum) -> None:
+        self._add_all("member", (type(member), member.name, member.value))
+        self._add_named({name: value for name, value in vars(member).items() if name[0] != "_"})
 
-    def _runner(self, runner: Any, cg: CompGraph) -> None:
-        """Add what a runner or a pipeline computes; beside that, it keeps accounts of each run."""
-        self._value(type(runner))
-        self.graph(cg)
-        self._named(getattr(getattr(runner, "runner", runner), "hyperparameters", {}))
-        if not _is_installed(type(runner).__module__):
-            self._object(runner)
-
-    def _object(self, value: Any) -> None:
-        """Add the class and the state of an object, as it would be pickled, and of an own class all attributes."""
-        self._value(type(value))
+    def _add_object(self, value: Any) -> None:
+        """Add the class and the state of an object, as it would be pickled; of an own class all attributes as well."""
+        cg = getattr(value, "cg", None)
+        self._add(type(value))
+        if isinstance(cg, CompGraph):  # a runner or a pipeline, which also counts its runs
+            self.add_graph(cg)
+            self._add_named(getattr(getattr(value, "runner", value), "hyperparameters", {}))
+            if _is_installed(type(value).__module__):
+                return
+        module = type(value).__module__
         with self._in_state():
-            self._content(value)
+            if self._of_data and _is_installed(module) and module.partition(".")[0] not in _DATA_MODULES:
+                self._add_unpicklable(value)
+            else:
+                self._add_content(value)
 
-    def _content(self, value: Any) -> None:
+    def _add_content(self, value: Any) -> None:
         kind = type(value)
         try:
             with warnings.catch_warnings():
@@ -373,47 +352,35 @@ class _Walk:
                 reduce = copyreg.dispatch_table.get(kind)
                 reduced: Any = reduce(value) if reduce else value.__reduce_ex__(4)
         except Exception:  # whatever a class raises that can't be pickled
-            self._unpicklable(value)
+            self._add_unpicklable(value)
             return
         if isinstance(reduced, str):
-            self._by_name(value, reduced)
+            self._add_global(value, reduced)
         else:
             make, arguments, state, items, pairs = (*reduced, *(None,) * 5)[:5]
-            self._all(
-                "object", (make, arguments, self._lasting_state(value, state), *map(list, filter(None, (items, pairs))))
-            )
+            state = _lasting_state(value, state)
+            self._add_all("object", (make, arguments, state, *map(list, filter(None, (items, pairs)))))
         if not _is_installed(kind.__module__):
-            self._all("attributes", (self._lasting_state(value, object.__getstate__(value)),))
+            self._add_all("attributes", (_lasting_state(value, object.__getstate__(value)),))
 
-    def _lasting_state(self, value: Any, state: Any) -> Any:
-        """Return a state without what is computed from the rest when it is first needed, or counts calls."""
-        if isinstance(state, tuple) and len(state) == 2 and isinstance(state[0], dict):
-            return self._lasting_state(value, state[0]), state[1]
-        if not isinstance(state, dict):
-            return state
-        kinds = [f"{one.__module__}.{one.__qualname__}" for one in type(value).__mro__]
-        derived = {name for kind in kinds for name in _DERIVED.get(kind, ())}
-        derived |= {
-            name
-            for one in type(value).__mro__
-            for name, found in vars(one).items()
-            if isinstance(found, functools.cached_property)
-        }
-        return {name: state[name] for name in sorted(state, key=str) if name not in derived}
-
-    def _by_name(self, value: Any, name: str) -> None:
-        module = getattr(value, "__module__", None) or _module_of(value, name)
+    def _add_global(self, value: Any, name: str) -> None:
+        module = getattr(value, "__module__", None)
+        module = module or next((module for module in list(sys.modules) if _found(module, name) is value), "__main__")
         self.modules.add(module)
         self._put("global", module, name)
         if _found(module, name) is not value:
-            self._opaque(value)
+            self._add_unknown(value)
 
-    def _unpicklable(self, value: Any) -> None:
+    def _add_unpicklable(self, value: Any) -> None:
+        """Add an object such as a key point of OpenCV, which travels as a message."""
+        message, writer = message_class("epypes.v1.Value")(), ValueWriter()
         try:
-            # Such as key points of OpenCV, which travel as messages.
-            self._put("value", digest_of(value))
-        except Untold:
-            self._opaque(value)
+            writer.write_named(message, value, "value")
+        except MessageError:
+            self._add_unknown(value)
+            return
+        self._put("message", message.SerializeToString(deterministic=True))
+        self._add_all("payloads", (payload.data for payload in writer.payloads))
 
     def _installed_name(self, value: Any) -> str:
         """Return the name by which a function or class of an installed package is imported; "" for any other value."""
@@ -431,38 +398,58 @@ class _Walk:
         return f"{module}.{name}"
 
 
-_WAYS: Final[tuple[tuple[Any, Callable[[_Walk, Any], None]], ...]] = (
-    (types.FunctionType, _Walk._function),
-    (types.CodeType, _Walk._code),
-    (types.CellType, _Walk._cell),
-    (types.ModuleType, _Walk._module),
-    (enum.Enum, _Walk._member),
-    (type, _Walk._class),
-    (list, _Walk._list),
-    ((dict, types.MappingProxyType), _Walk._dict),
-    (types.MethodType, lambda walk, found: walk._all("method", (found.__self__, found.__func__))),
-    (_BUILT_IN_METHODS, lambda walk, found: walk._all("method", (found.__name__, found.__self__))),
-    ((staticmethod, classmethod), lambda walk, found: walk._all(type(found).__name__, (found.__func__,))),
-    (property, lambda walk, found: walk._all("property", (found.fget, found.fset, found.fdel))),
-    (functools._lru_cache_wrapper, lambda walk, found: walk._named(vars(found))),
-    (functools.partial, _Walk._partial),
-    (_LAYOUT, lambda walk, found: walk._put("slot", found.__name__)),
+_WAYS: Final[tuple[tuple[Any, Callable[[Digester, Any], None]], ...]] = (
+    (types.FunctionType, Digester._add_function),
+    (types.CodeType, Digester._add_code),
+    (types.CellType, Digester._add_cell),
+    (types.ModuleType, Digester._add_module),
+    (enum.Enum, Digester._add_member),
+    (type, Digester._add_class),
+    (list, Digester._add_list),
+    ((dict, types.MappingProxyType), Digester._add_dict),
+    (types.MethodType, lambda into, found: into._add_all("method", (found.__self__, found.__func__))),
+    ((staticmethod, classmethod), lambda into, found: into._add_all(type(found).__name__, (found.__func__,))),
+    (property, lambda into, found: into._add_all("property", (found.fget, found.fset, found.fdel))),
+    (functools._lru_cache_wrapper, lambda into, found: into._add_named(vars(found))),
+    # The class that has them is met before them.
+    ((types.MemberDescriptorType, types.GetSetDescriptorType), lambda into, found: into._put("slot", found.__name__)),
     # They have no state but that of this moment.
-    (_LOCKS, lambda walk, found: walk._put("lock")),
-    (CompGraph, _Walk.graph),
+    ((type(threading.Lock()), type(threading.RLock())), lambda into, found: into._put("lock")),
+    (CompGraph, Digester.add_graph),
 )
 
 
+def _codes_in(code: types.CodeType) -> Iterator[types.CodeType]:
+    """Yield a function's code, and that of the functions defined inside of it."""
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, types.CodeType):
+            yield from _codes_in(constant)
+
+
+_SINGLE_DISPATCH: Final = frozenset(_codes_in(functools.singledispatch.__code__))
+
+
+def _lasting_state(value: Any, state: Any) -> Any:
+    """Return a state without what is computed from the rest when it is first needed, or counts calls."""
+    if isinstance(state, tuple) and len(state) == 2 and isinstance(state[0], dict):
+        return _lasting_state(value, state[0]), state[1]
+    if not isinstance(state, dict):
+        return state
+    derived: set[str] = set()
+    for kind in type(value).__mro__:
+        derived |= _DERIVED.get(f"{kind.__module__}.{kind.__qualname__}", set())
+        derived |= {name for name, found in vars(kind).items() if isinstance(found, functools.cached_property)}
+    return {name: state[name] for name in sorted(state, key=str) if name not in derived}
+
+
 def _found(module: str, name: str) -> Any:
-    found: Any = sys.modules.get(module)
-    for part in name.split("."):
+    first, *rest = name.split(".")
+    # Not by getattr, which would run the module's own __getattr__.
+    found: Any = getattr(sys.modules.get(module), "__dict__", {}).get(first)
+    for part in rest:
         found = getattr(found, part, None)
     return found
-
-
-def _module_of(value: Any, name: str) -> str:
-    """Return the module in which a name stands for a value that doesn't say where it was made."""
-    return next((module for module in list(sys.modules) if _found(module, name) is value), "__main__")
 
 
 def _annotations(function: types.FunctionType) -> Mapping[str, Any]:
@@ -470,6 +457,9 @@ def _annotations(function: types.FunctionType) -> Mapping[str, Any]:
         return function.__annotations__
     except NameError:  # from Python 3.14 on they are evaluated when they are read
         return {}
+
+
+# -- modules --------------------------------------------------------------------------------------------------------
 
 
 def _is_installed(module: str) -> bool:
@@ -482,36 +472,50 @@ def _is_installed(module: str) -> bool:
     return file is not None and not _INSTALLED.isdisjoint(Path(file).parts)
 
 
-# -- modules ----------------------------------------------------------------------------------------------------
+def versions_of(modules: Iterable[str], source: str = "") -> list[str]:
+    """Return a line for each module of these, and for each that those which are not installed import.
 
+    Parameters
+    ----------
+    modules
+        Their names.
+    source
+        Python whose imports count as well.
 
-def _versions(modules: Iterable[str]) -> list[str]:
-    """Return a line for each module that these need, and each of its own kind that those import."""
-    waiting, found = sorted(modules), dict[str, str]()
+    Returns
+    -------
+    list of str
+        Sorted. An installed module has the versions of its distributions, any other one the digest of its file.
+    """
+    waiting = sorted({*modules, *_imports(source.encode("utf-8", "surrogatepass"), "", False)})
+    found = {"python": sys.version}
     seen: set[str] = set()
     while waiting:
         name = waiting.pop()
-        if name in seen:
+        top = name.partition(".")[0]
+        if name in seen or top in sys.stdlib_module_names:
             continue
         seen.add(name)
-        top = name.partition(".")[0]
-        if top in sys.stdlib_module_names:
-            found["python"] = sys.version
-        elif top == _OURS:
+        if top == _OURS:
             found[top] = metadata.version(_OURS)
         elif (spec := _spec(name)) is not None and spec.origin is not None:
-            installed = _installed(top, spec.origin)
-            if installed:
-                found[top] = installed
-            else:
-                content = _bytes(spec.origin)
-                found[name] = hashlib.sha256(content).hexdigest()
-                is_package = spec.submodule_search_locations is not None
-                waiting += _imports(content if spec.origin.endswith(".py") else b"", name, is_package)
+            if not _INSTALLED.isdisjoint(Path(spec.origin).parts):
+                found[top] = ", ".join(f"{one}=={metadata.version(one)}" for one in _distributions().get(top, ()))
+                continue
+            content = _content_of(spec.origin)
+            found[name] = hashlib.sha256(content).hexdigest()
+            is_package = spec.submodule_search_locations is not None
+            waiting += _imports(content if spec.origin.endswith(".py") else b"", name, is_package)
     return sorted(f"{name} {version}" for name, version in found.items())
 
 
-def _bytes(file: str) -> bytes:
+@functools.cache
+def _distributions() -> Mapping[str, list[str]]:
+    # A distribution is listed once for each of its files' folders.
+    return {name: sorted(set(found)) for name, found in metadata.packages_distributions().items()}
+
+
+def _content_of(file: str) -> bytes:
     try:
         return Path(file).read_bytes()
     except OSError:
@@ -535,13 +539,6 @@ def _spec(name: str) -> ModuleSpec | None:
     return spec
 
 
-def _installed(top: str, file: str) -> str:
-    """Return the versions of the distributions that have brought a file; "" if none has, or from an editable folder."""
-    if _INSTALLED.isdisjoint(Path(file).parts):
-        return ""
-    return ", ".join(f"{name}=={metadata.version(name)}" for name in bringing(top))
-
-
 @lru_cache(512)
 def _imports(source: bytes, module: str, is_package: bool) -> tuple[str, ...]:
     """Return the names of all that a module may import, wherever in it."""
@@ -555,13 +552,9 @@ def _imports(source: bytes, module: str, is_package: bool) -> tuple[str, ...]:
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            found |= _from(node, package)
+            parts = package.split(".")
+            above = ".".join(parts[: len(parts) - node.level + 1]) if node.level else ""
+            origin = ".".join(filter(None, (above, node.module)))
+            # A name that is taken from a package may be a module of it.
+            found |= {origin, *(f"{origin}.{alias.name}" for alias in node.names)} - {""}
     return tuple(sorted(found))
-
-
-def _from(node: ast.ImportFrom, package: str) -> set[str]:
-    parts = package.split(".")
-    above = ".".join(parts[: len(parts) - node.level + 1]) if node.level else ""
-    origin = ".".join(filter(None, (above, node.module)))
-    # A name that is taken from a package may be a module of it.
-    return {origin, *(f"{origin}.{alias.name}" for alias in node.names)} - {""}

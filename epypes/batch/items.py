@@ -1,19 +1,26 @@
-"""Which inputs are run, one after another?"""
+"""The inputs of a map, a sweep or a check: image files and values, one after another."""
 
 from __future__ import annotations
 
 import glob
+import os
+import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Final
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Any, Final
 
+from epypes.acquisition.files import read_image
 from epypes.acquisition.pictures import IMAGE_ENDINGS, image_files, natural_order
-from epypes.batch.files import is_file, read_value
-from epypes.batch.lasting import lasting_each
+from epypes.bundle.clone import clone_runner
 from epypes.errors import ScaleError
-from epypes.graph import CompGraph
+from epypes.graph import CompGraph, colour_order
 from epypes.run import CompGraphRunner
+from epypes.run.guard import is_array, is_plain_array
+
+if TYPE_CHECKING:
+    from epypes.graph import CompGraph
+
 
 _KINDS: Final = "a folder, a glob such as 'images/*.png', a list or a generator of images, paths or dicts by token"
 _SHOWN: Final = "*?["
@@ -62,10 +69,10 @@ def items_of(images: Any, runner: CompGraphRunner, *, is_copied: bool = True) ->
     if isinstance(images, str | Path):
         return _of_files(*_files(images), _only(free, f"{str(images)!r} gives one image"))
     _check_set(images)
-    return _of_values(lasting_each(images) if is_copied else images, type(images).__name__, free)
+    return _of_values(each_copied(images) if is_copied else images, type(images).__name__, free)
 
 
-def opened(item: Item, cg: CompGraph) -> dict[str, Any]:
+def payload_of(item: Item, cg: CompGraph) -> dict[str, Any]:
     """Return the payload with its files read: BGR, or RGB where the graph says that the token is.
 
     Raises
@@ -197,3 +204,91 @@ def _only(free: tuple[str, ...], given: str) -> str:
         example = ", ".join(f"{token!r}: ..." for token in free)
         raise ScaleError(f"The graph's free source tokens are: {tokens}; {given}. Give dicts: [{{{example}}}, ...].")
     return free[0]
+
+
+ARRAYS: Final = frozenset({".npy", ".npz"})
+
+
+def is_file(value: Any) -> bool:
+    """Whether something stands for what is in a file: a path, or a text that ends like the name of one."""
+    if isinstance(value, os.PathLike):
+        return True
+    return isinstance(value, str) and PurePath(value).suffix.lower() in IMAGE_ENDINGS | ARRAYS
+
+
+def read_value(value: Any, cg: CompGraph, token: str) -> Any:
+    """Return a value, of a path what is in its file.
+
+    Parameters
+    ----------
+    value
+        A value, or the path of an image, of ``.npy`` or of ``.npz``: an archive of one array is that array, of several
+        a dict.
+    cg, token
+        Whose value it is: this says the order of an image's colours.
+
+    Raises
+    ------
+    ScaleError
+        The file can't be read as an array.
+    ImageFileError
+        It can't be read as an image.
+    """
+    if not is_file(value):
+        return value
+    path = Path(value)
+    if path.suffix.lower() in ARRAYS:
+        return _arrays(path)
+    return read_image(path, colour_order(cg, token))
+
+
+def _arrays(path: Path) -> Any:
+    import numpy as np
+
+    try:
+        found = np.load(path, allow_pickle=False)
+        if not hasattr(found, "files"):
+            return found
+        with found:
+            arrays = {name: found[name] for name in found.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        said = error.strerror if isinstance(error, OSError) and error.strerror else str(error).partition("\n")[0]
+        raise ScaleError(f"{str(path)!r} can't be read as an array: {said}. Check the path.") from error
+    return next(iter(arrays.values())) if len(arrays) == 1 else arrays
+
+
+def defensive_copy(value: Any) -> Any:
+    """Return a value whose arrays are copies, also those in tuples, lists and dicts."""
+    if is_plain_array(value):
+        return value.copy(order="K")
+    if is_array(value):
+        return value.copy()
+    if type(value) in (list, tuple):
+        return type(value)(map(defensive_copy, value))
+    if isinstance(value, tuple) and hasattr(value, "_make"):
+        return value._make(map(defensive_copy, value))
+    return {key: defensive_copy(item) for key, item in value.items()} if type(value) is dict else value
+
+
+def holds_its_arrays(values: Any) -> bool:
+    """Whether an iterable is a list, a tuple or an array; any other may give one array, filled again, each time."""
+    return type(values) in (list, tuple) or is_array(values)
+
+
+def each_copied(values: Iterable[Any]) -> Iterator[Any]:
+    """Give what an iterable gives, copied when it is taken if it does not hold its arrays itself."""
+    if holds_its_arrays(values):
+        yield from values
+        return
+    for value in values:
+        copied = defensive_copy(dict(value) if isinstance(value, Mapping) else value)
+        # Whoever waits for the next one must not keep this one alive.
+        del value
+        yield copied
+        del copied
+
+
+def detached_runner(runner: CompGraphRunner) -> CompGraphRunner:
+    """Return a runner of one's own, which no longer changes when somebody sets, or writes into, hyperparameters."""
+    own = {token: defensive_copy(value) for token, value in runner.hyperparameters.items()}
+    return clone_runner(runner, own)

@@ -1,24 +1,26 @@
-"""What is done with an item, wherever that is?"""
+"""Jobs: items and settings that one worker runs, and how it runs them."""
 
 from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from time import perf_counter_ns
-from typing import Any
+from typing import Any, Final
 
-from epypes.batch.items import Item, opened
-from epypes.batch.outcome import Outcome, Trouble, is_endless, long_number, plain_number
-from epypes.batch.start import Start
+from epypes.batch.items import Item, payload_of
+from epypes.batch.results import ErrorInfo, Outcome, is_endless, long_number, plain_number
 from epypes.batch.thumbnails import Album
 from epypes.display.previews.preview import sketch
 from epypes.display.previews.shown import Look
 from epypes.errors import EpypesError
 from epypes.run import CompGraphRunner, Failure, Run
+from epypes.run.branch import branched
 
 Setting = Mapping[str, Any]
+# One object, since an outcome is known by the very setting that it has.
+NO_SETTING: Final[Setting] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,10 +44,10 @@ class Job:
     """
 
     items: tuple[Item, ...]
-    settings: tuple[Setting, ...] = ({},)
+    settings: tuple[Setting, ...] = (NO_SETTING,)
     keep: tuple[str, ...] = ()
     show: tuple[str, ...] | None = ()
-    start: Start | None = None
+    start: SharedStart | None = None
     targets: tuple[str, ...] = ()
 
 
@@ -82,17 +84,19 @@ def _of_item(runner: CompGraphRunner, item: Item, job: Job, varied: Setting) -> 
 
     def outcome_of(own: CompGraphRunner, payload: Mapping[str, Any] | None) -> Outcome:
         setting, start_ns = waiting.popleft(), perf_counter_ns()
-        run, trouble = _run(own, payload, {**varied, **setting}, job.targets)
+        run, error_info = _run(own, payload, {**varied, **setting}, job.targets)
         if run is None:
-            return Outcome(item.number, item.name, setting, total_ns=perf_counter_ns() - start_ns, trouble=trouble)
+            return Outcome(
+                item.number, item.name, setting, total_ns=perf_counter_ns() - start_ns, error_info=error_info
+            )
         return _outcome(item, setting, job, run, album)
 
     def begin() -> CompGraphRunner | None:
         try:
-            payload = opened(item, runner.cg)
+            payload = payload_of(item, runner.cg)
         except (EpypesError, OSError) as error:
-            trouble = Trouble("", type(error).__name__, str(error))
-            begun.extend(Outcome(item.number, item.name, setting, trouble=trouble) for setting in waiting)
+            error_info = ErrorInfo("", type(error).__name__, str(error))
+            begun.extend(Outcome(item.number, item.name, setting, error_info=error_info) for setting in waiting)
             waiting.clear()
             return None
         before = runner.last
@@ -110,7 +114,7 @@ def _of_item(runner: CompGraphRunner, item: Item, job: Job, varied: Setting) -> 
 
 def _run(
     runner: CompGraphRunner, payload: Mapping[str, Any] | None, values: Setting, targets: tuple[str, ...]
-) -> tuple[Run | None, Trouble | None]:
+) -> tuple[Run | None, ErrorInfo | None]:
     """Run on a payload, or on the last one; return the run, completed or failed, or why there is none."""
     before = runner.last
     try:
@@ -121,7 +125,7 @@ def _run(
     except (Exception, SystemExit) as error:  # whatever a function raises
         if runner.last is not before:
             return runner.last, None
-        return None, Trouble("", type(error).__name__, str(error))
+        return None, ErrorInfo("", type(error).__name__, str(error))
 
 
 def _outcome(item: Item, setting: Setting, job: Job, run: Run, album: Album) -> Outcome:
@@ -141,8 +145,8 @@ def _outcome(item: Item, setting: Setting, job: Job, run: Run, album: Album) -> 
     )
 
 
-def _trouble(failure: Failure) -> Trouble:
-    return Trouble(failure.function, failure.kind, failure.message)
+def _trouble(failure: Failure) -> ErrorInfo:
+    return ErrorInfo(failure.function, failure.kind, failure.message)
 
 
 def _value(value: Any) -> Any:
@@ -155,3 +159,38 @@ def _value(value: Any) -> Any:
     if number is not None:
         return number
     return str(value) if isinstance(value, str) else sketch(value, Look()).shown.text
+
+
+class SharedStart:
+    """What several jobs of one process begin with: parts of a grid on one and the same item.
+
+    The job that comes first runs the item; the others, on whatever thread, wait for that and go on from there.
+
+    Attributes
+    ----------
+    album
+        The thumbnails of the item.
+    """
+
+    def __init__(self) -> None:
+        self.album = Album()
+        self._lock = threading.Lock()
+        self._runner: CompGraphRunner | None = None
+
+    def go_on(self, begin: Callable[[], CompGraphRunner | None]) -> CompGraphRunner | None:
+        """Return a runner that has run the item.
+
+        For who comes first that is what ``begin`` returns, which is called meanwhile: a runner that has run the item,
+        or None if that can't be; who comes next is then the first one. All others get one of their own.
+        """
+        with self._lock:
+            if self._runner is not None:
+                return branched(self._runner)
+            begun = begin()
+            self._runner = None if begun is None else branched(begun)
+            return begun
+
+    def leave(self, runner: CompGraphRunner) -> None:
+        """Let the next one begin where this runner stands."""
+        with self._lock:
+            self._runner = branched(runner)

@@ -1,26 +1,21 @@
-"""What does a graph compute of each of many images?"""
+"""Map: run a graph on each of many images."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
-from epypes.batch.batches import Batches
-from epypes.batch.items import Item, count_of, items_of
-from epypes.batch.job import Job
-from epypes.batch.lasting import settled_runner
-from epypes.batch.outcome import Outcome
+from epypes.batch.cache import OutcomeCache, outcome_cache
+from epypes.batch.executors import JobSizes, run_jobs, worker_count
+from epypes.batch.items import Item, count_of, detached_runner, items_of
+from epypes.batch.job import NO_SETTING, Job, Setting
 from epypes.batch.progress import Advance, progress_bar
-from epypes.batch.remembered import Remembered, series_of
-from epypes.batch.shown import rows_shown
-from epypes.batch.spreading import spread, worker_count
-from epypes.batch.table import frame_of
+from epypes.batch.results import Outcome, outcomes_frame, outcomes_html
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
-from epypes.store import Store, opened_store
+from epypes.store import Store
 from epypes.wording import counted
 
 if TYPE_CHECKING:
@@ -28,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class MapResult(Sequence[Outcome]):
-    """What a graph computed of many images: a sequence of outcomes in the order of the images, shown as a table.
+    """The results of a map: a sequence of outcomes in the order of the images, shown as a table.
 
     Attributes
     ----------
@@ -53,7 +48,7 @@ class MapResult(Sequence[Outcome]):
 
         Sink tokens that are no numbers, texts or truth values stand there as a short text.
         """
-        return frame_of(self.outcomes, self.cg)
+        return outcomes_frame(self.outcomes, self.cg)
 
     @overload
     def __getitem__(self, index: int) -> Outcome: ...
@@ -73,7 +68,7 @@ class MapResult(Sequence[Outcome]):
         return f"{counted(len(self), 'image')}, {len(self.failures)} failed"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        return {"text/plain": repr(self), "text/html": rows_shown(self.outcomes, self.cg, self._caption)}
+        return {"text/plain": repr(self), "text/html": outcomes_html(self.outcomes, self.cg, self._caption)}
 
 
 def map_images(
@@ -111,9 +106,10 @@ def map_images(
         A path, a URL or an ep.Store, where outcomes are written as they come. What is there already is not run again,
         unless ``keep`` is given: so a map that was interrupted goes on.
     name
-        What the series in the store is called; without, a digest of graph, hyperparameters, and all that functions
-        reach: code, globals, attributes, the modules that they import. A series of other code is refused. All is run
-        again if lists, dicts, arrays or objects that functions use have changed, or one can't be seen through.
+        What the series in the store is called; without, a digest of the graph, its hyperparameters and all that its
+        functions use: code, globals, attributes, modules. A graph that can't be written as text needs a name. Under
+        a name that is taken, other code or other hyperparameters are refused. Every item is run again if lists, dicts,
+        arrays or objects that functions use have changed, or if the content of one can't be told.
     progress
         Whether there is a bar; without, in a terminal and in a notebook.
     ahead
@@ -145,59 +141,59 @@ def map_images(
     """
     for token in (*keep, *(show or ())):
         runner.cg.require_token(token)
-    # Whoever sets values on theirs meanwhile, or writes into them, does not change what is computed and stored.
-    runner = settled_runner(runner)
-    with ExitStack() as stack:
-        opened = stack.enter_context(opened_store(store))
-        memory = None
-        if opened is not None:
-            series, fingerprint = series_of(opened, "map", runner, name)
-            how = "" if show == () else f"show={show and list(show)}"
-            memory = stack.enter_context(Remembered(series, how, not keep, fingerprint))
-        advance = stack.enter_context(progress_bar(progress, count_of(images), "map"))
-        work = _Map(memory, advance, tuple(keep), None if show is None else tuple(show))
-        is_copied = executor is not None or opened is not None or bool(keep)
-        work.run(runner, items_of(images, runner, is_copied=is_copied), count_of(images), executor, ahead)
-    return MapResult(runner.cg, sorted(work.outcomes, key=lambda outcome: outcome.number))
+    # If the caller changes hyperparameters meanwhile, that does not change what is computed and stored.
+    runner = detached_runner(runner)
+    count = count_of(images)
+    with (
+        outcome_cache(store, "map", runner, name, keep=keep, show=show) as cache,
+        progress_bar(progress, count, "map") as advance,
+    ):
+        collector = OutcomeCollector(cache, advance)
+        items = items_of(images, runner, is_copied=executor is not None or cache is not None or bool(keep))
+        batches = JobSizes(collector.missing_items(items), 0 if executor is None else worker_count(executor), count)
+        jobs = (Job(batch, keep=tuple(keep), show=None if show is None else tuple(show)) for batch in batches)
+        for outcomes in run_jobs(runner, jobs, executor, ahead=ahead):
+            batches.learn(outcomes)
+            collector.add(outcomes)
+    return MapResult(runner.cg, sorted(collector.outcomes, key=lambda outcome: outcome.number))
 
 
-class _Map:
-    """One map: the outcomes that have come."""
+class OutcomeCollector:
+    """The outcomes of a map or a sweep: those in the cache, and those that come from workers.
 
-    def __init__(
-        self, memory: Remembered | None, advance: Advance, keep: tuple[str, ...], show: tuple[str, ...] | None
-    ) -> None:
-        self._memory, self._advance, self._keep, self._show = memory, advance, keep, show
+    Parameters
+    ----------
+    cache
+        What was stored before, and where new outcomes go; None for none.
+    advance
+        Moves the progress bar on.
+    """
+
+    def __init__(self, cache: OutcomeCache | None, advance: Advance) -> None:
+        self._cache, self._advance = cache, advance
         self.outcomes: list[Outcome] = []
 
-    def run(
-        self,
-        runner: CompGraphRunner,
-        items: Iterable[Item],
-        count: int | None,
-        executor: Executor | None,
-        ahead: int | None,
-    ) -> None:
-        """Run what has to be run."""
-        workers = 0 if executor is None else worker_count(executor)
-        batches = Batches(self._unknown(items), workers, count)
-        jobs = (Job(batch, keep=self._keep, show=self._show) for batch in batches)
-        for outcomes in spread(runner, jobs, executor, ahead=ahead):
-            batches.learn(outcomes)
-            if self._memory is not None:
-                self._memory.add(outcomes)
-            self._take(outcomes)
-
-    def _unknown(self, items: Iterable[Item]) -> Iterator[Item]:
-        """Give the items that have to be run; take the outcomes of the others."""
+    def missing_items(self, items: Iterable[Item]) -> Iterator[Item]:
+        """Yield the items that have to be run without a setting; take the stored outcomes of the others."""
         for item in items:
-            found = None if self._memory is None else self._memory.recall(item)
-            if found is None:
+            if self.missing_settings(item, (NO_SETTING,)):
                 yield item
-            else:
-                self._take([found])
-            # Whoever waits for the next one must not keep this one alive.
+            # This generator waits for its caller, and must not keep the item alive meanwhile.
             del item
+
+    def missing_settings(self, item: Item, settings: tuple[Setting, ...]) -> tuple[Setting, ...]:
+        """Return the settings with which an item has to be run; take the stored outcomes of the others."""
+        if self._cache is None:
+            return settings
+        found = [self._cache.find(item, setting) for setting in settings]
+        self._take([outcome for outcome in found if outcome is not None])
+        return tuple(setting for setting, outcome in zip(settings, found, strict=True) if outcome is None)
+
+    def add(self, outcomes: list[Outcome]) -> None:
+        """Take outcomes that were computed, and store them."""
+        if self._cache is not None:
+            self._cache.add(outcomes)
+        self._take(outcomes)
 
     def _take(self, outcomes: list[Outcome]) -> None:
         self.outcomes += outcomes

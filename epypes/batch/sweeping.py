@@ -1,30 +1,26 @@
-"""What do many settings make of one image, or of many?"""
+"""Sweep: run a graph with many settings, on one image or many."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.batch.grids import Grid, Setting, grid_of
-from epypes.batch.items import Item, count_of, items_of
-from epypes.batch.job import Job
-from epypes.batch.lasting import settled_runner
-from epypes.batch.order import functions_after, running_order, steps
-from epypes.batch.outcome import Outcome
-from epypes.batch.progress import Advance, progress_bar
-from epypes.batch.remembered import Remembered, series_of
-from epypes.batch.sheet import Sheet, sheet_of
-from epypes.batch.spreading import spread, worker_count
-from epypes.batch.start import Start
-from epypes.batch.table import frame_of
+from epypes.batch.cache import outcome_cache
+from epypes.batch.contact_sheet import Sheet, sheet_of
+from epypes.batch.executors import run_jobs, worker_count
+from epypes.batch.grid import Grid, Setting, functions_after, grid_of, running_order, steps
+from epypes.batch.items import Item, count_of, detached_runner, items_of
+from epypes.batch.job import Job, SharedStart
+from epypes.batch.mapping import OutcomeCollector
+from epypes.batch.progress import progress_bar
+from epypes.batch.results import Outcome, outcomes_frame
 from epypes.errors import PayloadError, ScaleError, run_call
 from epypes.run import CompGraphRunner
-from epypes.store import Store, opened_store
+from epypes.store import Store
 from epypes.wording import counted
 
 if TYPE_CHECKING:
@@ -35,12 +31,12 @@ _MOST_PICTURES: Final = 200_000
 # Progress is seen, and a stop is heard, between two parts; and workers are done at about the same time.
 _PARTS: Final = 16
 _MOST_SETTINGS: Final = 256
-_TAKEN: Final = ("name", "failure", "total_ms")
+_FIXED_COLUMNS: Final = ("name", "failure", "total_ms")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SweepResult:
-    """What a sweep has made; shows itself as a contact sheet.
+    """The results of a sweep; shows itself as a contact sheet.
 
     Attributes
     ----------
@@ -49,7 +45,7 @@ class SweepResult:
     names
         The hyperparameters that were varied.
     runner
-        The one that was given, for whoever picks a setting.
+        The one that was given.
     """
 
     outcomes: tuple[Outcome, ...]
@@ -68,7 +64,7 @@ class SweepResult:
     @property
     def failures(self) -> tuple[Outcome, ...]:
         """The outcomes in which something failed."""
-        return tuple(outcome for outcome in self.outcomes if outcome.trouble is not None)
+        return tuple(outcome for outcome in self.outcomes if outcome.error_info is not None)
 
     def to_frame(self) -> pd.DataFrame:
         """Return a table with a row per outcome.
@@ -77,10 +73,12 @@ class SweepResult:
         total_ms and the milliseconds of each function that ran: what did not depend on what changed has none.
         """
         varied = {
-            f"{name} (hyperparameter)" if name in _TAKEN else name: [one.setting.get(name) for one in self.outcomes]
+            f"{name} (hyperparameter)" if name in _FIXED_COLUMNS else name: [
+                one.setting.get(name) for one in self.outcomes
+            ]
             for name in self.names
         }
-        return frame_of(self.outcomes, self.runner.cg, varied)
+        return outcomes_frame(self.outcomes, self.runner.cg, varied)
 
     def sheet(self, token: str | None = None, rows: str | None = None, columns: str | None = None) -> Sheet:
         """Return the contact sheet of a token.
@@ -182,7 +180,7 @@ def sweep(
     >>> [outcome.values["total"] for outcome in result]
     [11, 21, 12, 22]
     """
-    given, runner = runner, settled_runner(runner)
+    given, runner = runner, detached_runner(runner)
     kept, shown = _tokens(runner, keep), None if show is None else _tokens(runner, show)
     plan = grid_of(runner, grid, how=how, n=n, seed=seed)
     count = 1 if images is None else count_of(images)
@@ -191,56 +189,37 @@ def sweep(
     # By object: a setting comes back as the very mapping that was sent.
     places = {id(setting): place for place, setting in enumerate(settings)}
     in_order = tuple(settings[place] for place in running_order(runner.cg, settings))
-    with ExitStack() as stack:
-        advance = stack.enter_context(progress_bar(progress, count and count * plan.size, "sweep", unit="setting"))
-        memory = None
-        if (opened := stack.enter_context(opened_store(store))) is not None:
-            series, fingerprint = series_of(opened, "sweep", runner, name, plan.names)
-            memory = stack.enter_context(Remembered(series, f"show={shown and list(shown)}", not kept, fingerprint))
-        work = _Sweep(runner, Job((), in_order, kept, shown), memory, advance)
-        is_copied = executor is not None or opened is not None or bool(kept)
-        work.run(_items(given, images, plan, is_copied=is_copied), executor, count)
-    found = sorted(work.outcomes, key=lambda outcome: (outcome.number, places[id(outcome.setting)]))
+    with (
+        progress_bar(progress, count and count * plan.size, "sweep", unit="setting") as advance,
+        outcome_cache(store, "sweep", runner, name, keep=kept, show=shown, varied=plan.names) as cache,
+    ):
+        collector = OutcomeCollector(cache, advance)
+        is_copied = executor is not None or cache is not None or bool(kept)
+        items = _items(given, images, plan, is_copied=is_copied)
+        grid_job = Job((), in_order, kept, shown)
+        for outcomes in run_jobs(runner, _jobs(runner, grid_job, items, collector, executor, count), executor):
+            collector.add(outcomes)
+    found = sorted(collector.outcomes, key=lambda outcome: (outcome.number, places[id(outcome.setting)]))
     return SweepResult(tuple(found), plan.names, given)
 
 
-class _Sweep:
-    """One sweep: the outcomes that have come."""
-
-    def __init__(self, runner: CompGraphRunner, grid: Job, memory: Remembered | None, advance: Advance) -> None:
-        self._runner, self._grid, self._memory, self._advance = runner, grid, memory, advance
-        self.outcomes: list[Outcome] = []
-
-    def run(self, items: Iterator[Item], executor: Executor | None, images: int | None) -> None:
-        """Run what has to be run of each item."""
-        for outcomes in spread(self._runner, self._jobs(items, executor, images), executor):
-            if self._memory is not None:
-                self._memory.add(outcomes)
-            self._take(outcomes)
-
-    def _jobs(self, items: Iterator[Item], executor: Executor | None, images: int | None) -> Iterator[Job]:
-        """Give the jobs of each item: its settings in parts, which in this process have their beginning in common."""
-        for item in items:
-            settings = self._unknown(item)
-            cuts = _cuts(self._runner, settings, executor, images) if settings else []
-            start = Start() if len(cuts) > 2 and _is_here(executor) else None
-            for first, end in pairwise(cuts):
-                yield replace(self._grid, items=(item,), settings=settings[first:end], start=start)
-            # Whoever waits for the next one must not keep this one alive.
-            del item, start
-
-    def _unknown(self, item: Item) -> tuple[Setting, ...]:
-        """Return the settings with which an item has to be run; take the outcomes of the others."""
-        if self._memory is None:
-            return self._grid.settings
-        found = [self._memory.recall(item, setting) for setting in self._grid.settings]
-        self._take([outcome for outcome in found if outcome is not None])
-        pairs = zip(self._grid.settings, found, strict=True)
-        return tuple(setting for setting, outcome in pairs if outcome is None)
-
-    def _take(self, outcomes: list[Outcome]) -> None:
-        self.outcomes += outcomes
-        self._advance(len(outcomes), sum(outcome.has_failed for outcome in outcomes))
+def _jobs(
+    runner: CompGraphRunner,
+    grid_job: Job,
+    items: Iterator[Item],
+    collector: OutcomeCollector,
+    executor: Executor | None,
+    images: int | None,
+) -> Iterator[Job]:
+    """Yield the jobs of each item: its settings in parts, which in this process share the item's first run."""
+    for item in items:
+        settings = collector.missing_settings(item, grid_job.settings)
+        cuts = _cuts(runner, settings, executor, images) if settings else []
+        start = SharedStart() if len(cuts) > 2 and _is_here(executor) else None
+        for first, end in pairwise(cuts):
+            yield replace(grid_job, items=(item,), settings=settings[first:end], start=start)
+        # This generator waits for its caller, and must not keep the item alive meanwhile.
+        del item, start
 
 
 def _tokens(runner: CompGraphRunner, given: str | Sequence[str]) -> tuple[str, ...]:

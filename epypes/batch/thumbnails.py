@@ -1,25 +1,28 @@
-"""What is kept of a run's tokens to look at: a small picture, or a text of what has none?
+"""Thumbnails: small pictures of a run's tokens, of what was expected of them, and of the difference.
 
-The same value is seen the same whatever was run before, and in whichever process: of images whose dtype does not tell
-what is black and white, each has a range of its own, which its caption tells.
+The same value looks the same whatever was run before, in any process: an image whose dtype does not define black and
+white has a display range of its own, which its caption states.
 """
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable
 from typing import Any, Final
 
-from epypes.batch.outcome import Thumbnail
+from epypes.batch.results import Thumbnail
 from epypes.display.paint.thumbnails import THUMB_HEIGHT, THUMB_WIDTH, paint_thumbnail
 from epypes.display.previews.arrays import plain_array
 from epypes.display.previews.imagekinds import image_kind, is_image, sampled
 from epypes.display.previews.preview import finished, looked_closer, sketch
-from epypes.display.previews.ranges import Range, display_range, sole_value
+from epypes.display.previews.ranges import display_range, sole_value
+from epypes.display.previews.raster import THUMBNAIL_PX
 from epypes.display.previews.short import float_text
 from epypes.display.previews.shown import Look, Sketch
 from epypes.display.views.backdrops import RunSurroundings
-from epypes.graph import colour_order
+from epypes.graph import CompGraph, colour_order
 from epypes.images import Order
+from epypes.optional import optional_import
 from epypes.run import Run
 
 # A chart stands alone in its file, so it brings its colours: a grey that is seen on white and on black.
@@ -32,11 +35,12 @@ _CHART_STYLE: Final = (
 def thumbnail_of(run: Run, token: str) -> Thumbnail | str:
     """Return a picture of a token of at most 5 KB, with what was found in an image drawn over it; a text without one.
 
-    An image of one value is told by it, where a picture would not.
+    An image of one value is a text that states it, which a picture would not.
     """
     value = run.tokens.values[run.tokens.program.slots[token]]
-    sketched = sketch(value, Look(colour_order(run.cg, token), around=RunSurroundings(run, token, _range_of)))
-    return _all_the_same(value, sketched) or _as_file(sketched)
+    around = RunSurroundings(run, token, lambda _token, image: display_range(image))
+    sketched = sketch(value, Look(colour_order(run.cg, token), around=around))
+    return _sole_value_text(value, sketched) or _as_file(sketched)
 
 
 def thumbnail_of_value(value: Any, order: Order = "bgr") -> Thumbnail | None:
@@ -45,12 +49,8 @@ def thumbnail_of_value(value: Any, order: Order = "bgr") -> Thumbnail | None:
     return shown if isinstance(shown, Thumbnail) else None
 
 
-def _range_of(token: str, image: Any) -> Range:
-    return display_range(image)
-
-
-def _all_the_same(value: Any, sketched: Sketch) -> str:
-    """Return what is said of an image of one value; "" of anything else."""
+def _sole_value_text(value: Any, sketched: Sketch) -> str:
+    """Return the text of an image of one value; "" for anything else."""
     if not (sketched.is_image and is_image(value)):
         return ""
     image = plain_array(value)
@@ -74,7 +74,7 @@ def _as_file(sketched: Sketch) -> Thumbnail | str:
 
 
 class Album:
-    """What is shown of the tokens of one item; of values that stay from run to run it is made once."""
+    """Thumbnails and texts of the tokens of one item; those of values that stay from run to run are made once."""
 
     def __init__(self) -> None:
         self._made: dict[str, tuple[Any, Thumbnail | str]] = {}
@@ -82,18 +82,76 @@ class Album:
     def shown_of(self, run: Run, tokens: Iterable[str] | None) -> tuple[dict[str, Thumbnail], dict[str, str]]:
         """Return pictures of tokens, and texts of those that have none. Never raises.
 
-        None: pictures of all, texts of what functions have made. What was not computed has neither. Threads may ask
-        for several runs at once.
+        None: pictures of all, texts of what functions have made. What was not computed has neither. Several threads
+        may ask at once.
         """
-        wanted = run.cg.tokens if tokens is None else tokens
-        found = {token: self._shown_of(run, token) for token in wanted if run.tokens.is_readable(token)}
-        pictures = {token: shown for token, shown in found.items() if isinstance(shown, Thumbnail)}
-        given = run.cg.source_tokens if tokens is None else ()
-        return pictures, {token: text for token, text in found.items() if isinstance(text, str) and token not in given}
+        values, slots = run.tokens.values, run.tokens.program.slots
+        pictures: dict[str, Thumbnail] = {}
+        texts: dict[str, str] = {}
+        for token in run.cg.tokens if tokens is None else tokens:
+            if not run.tokens.is_readable(token):
+                continue
+            value, made = values[slots[token]], self._made.get(token)
+            if made is None or made[0] is not value:
+                self._made[token] = made = value, thumbnail_of(run, token)
+            if isinstance(made[1], Thumbnail):
+                pictures[token] = made[1]
+            elif tokens is not None or token not in run.cg.source_tokens:
+                texts[token] = made[1]
+        return pictures, texts
 
-    def _shown_of(self, run: Run, token: str) -> Thumbnail | str:
-        value = run.tokens.values[run.tokens.program.slots[token]]
-        made = self._made.get(token)
-        if made is None or made[0] is not value:
-            self._made[token] = made = value, thumbnail_of(run, token)
-        return made[1]
+
+# Neither, both, missing, extra. Blue and orange are told apart with any colour vision; the legend names them.
+_DIFFERENCE_PALETTE: Final = bytes((0, 0, 0, 150, 150, 150, 40, 110, 220, 240, 140, 20))
+DIFFERENCE_LEGEND: Final = "blue: expected and missing, orange: there and not expected, grey: both"
+
+
+def comparison_thumbnails(value: Any, expected: Any, cg: CompGraph, token: str) -> dict[str, Thumbnail]:
+    """Return small pictures of what has one: ``"expected"``, ``"got"``, and ``"difference"`` of two images.
+
+    The difference of two masks has three colours, see DIFFERENCE_LEGEND; of other images it is the absolute difference,
+    from black where there is none to white where it is largest.
+    """
+    order = colour_order(cg, token)
+    found = {
+        "expected": thumbnail_of_value(expected, order),
+        "got": thumbnail_of_value(value, order),
+        "difference": _difference(value, expected),
+    }
+    return {name: picture for name, picture in found.items() if picture is not None}
+
+
+def _difference(value: Any, expected: Any) -> Thumbnail | None:
+    if not (is_image(value) and is_image(expected)):
+        return None
+    with optional_import("scale"):
+        import numpy as np
+
+    got, wanted = np.asarray(value), np.asarray(expected)
+    if got.shape != wanted.shape:
+        return None
+    if all(image.ndim == 2 and image.dtype.kind in "biu" and len(np.unique(image)) <= 2 for image in (got, wanted)):
+        return _mask_difference(got != 0, wanted != 0)
+    distance = np.abs(got.astype(np.float32) - wanted.astype(np.float32))
+    distance = distance.max(axis=2) if distance.ndim == 3 else distance
+    largest = float(np.nanmax(distance, initial=0.0))
+    if not largest or not np.isfinite(largest):
+        return None
+    return thumbnail_of_value((distance * (255 / largest)).astype(np.uint8))
+
+
+def _mask_difference(got: Any, wanted: Any) -> Thumbnail:
+    """Return a PNG in which one pixel that differs is seen: as JPEG, or averaged, it would be grey."""
+    with optional_import("scale"):
+        import numpy as np
+        from PIL import Image
+        from skimage.measure import block_reduce
+
+    places = np.where(got & wanted, 1, np.where(wanted, 2, np.where(got, 3, 0))).astype(np.uint8)
+    side = -(-max(places.shape) // THUMBNAIL_PX)
+    picture = Image.fromarray(block_reduce(places, side, np.max)).convert("P")
+    picture.putpalette(_DIFFERENCE_PALETTE)
+    data = io.BytesIO()
+    picture.save(data, "PNG", bits=2)
+    pixels = np.count_nonzero(got != wanted)
+    return Thumbnail("image/png", data.getvalue(), f"{pixels} of {got.size} pixels differ")

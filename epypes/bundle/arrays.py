@@ -1,4 +1,4 @@
-"""Which arrays are too large for text, and how does the module have them from files?
+"""Arrays that are too large for text are files of a bundle.
 
 They stand in ``arrays/NAME.npy`` beside the module, named as the notebook names them; one small function reads them.
 """
@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from epypes.bundle.identifiers import identifier_of
 from epypes.bundle.source import Refused
-from epypes.bundle.words import word_of
 
 if TYPE_CHECKING:
     from epypes.bundle.slicer import Slice
@@ -83,7 +83,7 @@ class Arrays:
             )
         if not self.by_name:
             gathered.keep_name(READER)
-        name = word_of(_name_in(gathered.names.read, array), self.by_name.__contains__)
+        name = identifier_of(_name_in(gathered.names.read, array), self.by_name.__contains__)
         self.by_name[name] = array
         # What the function that reads them needs is known before the imports are written.
         for module in ("numpy", "pathlib"):

@@ -9,7 +9,6 @@ from typing import Any
 
 from epypes.bundle.cells import place_of, place_of_object
 from epypes.bundle.decorators import decorated, has_decorators, layers
-from epypes.bundle.lines import flat, piece_of
 from epypes.bundle.literal import literal_source
 from epypes.bundle.side_effects import CHANGING
 from epypes.bundle.source import Definition, Importable, Refused, definition, importable
@@ -59,7 +58,6 @@ def method_of(function: Any) -> tuple[str | Importable, str] | None:
         return None
     source = literal_source(owner) if name not in CHANGING else ""
     if source:
-        source = flat(piece_of(source))
         return f"({source})" if source[0] not in "\"'[({" else source, name
     home = importable(owner) if isinstance(owner, type) else None
     return (home, name) if home else None

@@ -1,15 +1,16 @@
-"""Do two values agree, to the last bit or within a tolerance, and if not, where do they first differ?"""
+"""Comparison of two values, to the last bit or within a tolerance, and the first place where they differ."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
 from epypes.wire.encoder import set_sort_key
 from epypes.wire.opencv_pandas import FIELDS, is_table, record_fields, record_type, table_parts
+from epypes.wording import counted
 
 # As Python and OpenCV write them; other text may hold numbers that look alike.
 _ADDRESS: Final = re.compile(r"( at |< ?[\w.]+ )0x[0-9a-fA-F]+")
@@ -73,6 +74,42 @@ class Unlike:
     epsilon: float = 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Where a token first is not what was recorded.
+
+    Attributes
+    ----------
+    sample
+        The sample's name.
+    token
+        The token's.
+    text
+        What differs, with the first index and both values.
+    index
+        The first index, ``""`` for a value that has none.
+    expected, got
+        The values there, as text.
+    count, size
+        How many values of the token differ, of how many.
+    largest
+        The largest difference of numbers, None for what is none.
+    """
+
+    sample: str
+    token: str
+    text: str
+    index: str = ""
+    expected: str = ""
+    got: str = ""
+    count: int = 0
+    size: int = 0
+    largest: float | None = None
+
+    def __str__(self) -> str:
+        return f"sample {self.sample}, token {self.token!r}: {self.text}"
+
+
 def first_difference(expected: Any, got: Any, tolerance: Tolerance | None = None) -> str | None:
     """Return where two values first differ, as text, or None if they agree in type and to the last bit."""
     return next((unlike.text for unlike in differences(expected, got, tolerance)), None)
@@ -98,6 +135,20 @@ def differences(expected: Any, got: Any, tolerance: Tolerance | None = None, whe
     else:
         inside = next((inside for is_kind, inside in _INSIDE if is_kind(expected)), _in_others)
         yield from inside(expected, got, tolerance, where)
+
+
+def difference(sample: str, token: str, found: Iterable[Unlike]) -> Difference | None:
+    """Return the difference of a token of all places where it differs; None if there are none."""
+    places = [*found]
+    if not places:
+        return None
+    first = places[0]
+    more = len(places) - 1
+    text = first.text + (f"; {counted(more, 'other place')} of it differ{'s' * (more == 1)}" if more else "")
+    count, size = (sum(getattr(place, name) for place in places) for name in ("count", "size"))
+    numbers = [place.largest for place in places if place.largest is not None]
+    largest = max(numbers, default=None)
+    return Difference(sample, token, text, first.where, first.expected, first.got, count, size, largest)
 
 
 def _named(where: str, expected: str, got: str) -> Unlike:
@@ -206,10 +257,10 @@ def _in_arrays(expected: Any, got: Any, tolerance: Tolerance | None, where: str)
     if tolerance and epsilon:
         unlike &= ~(distance <= np.minimum(tolerance.absolute, tolerance.relative * magnitude))
     if unlike.any():
-        yield _told(left, right, unlike, expected.shape, where, (distance, magnitude, epsilon))
+        yield _in_elements(left, right, unlike, expected.shape, where, (distance, magnitude, epsilon))
 
 
-def _told(left: Any, right: Any, unlike: Any, shape: tuple[int, ...], where: str, measured: Any) -> Unlike:
+def _in_elements(left: Any, right: Any, unlike: Any, shape: tuple[int, ...], where: str, measured: Any) -> Unlike:
     import numpy as np
 
     distance, magnitude, epsilon = measured

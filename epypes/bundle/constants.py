@@ -1,19 +1,16 @@
-"""How does a constant stand in the module, so that people know it from the notebook?
-
-With the comment above or beside it, its numbers spelled as they were; one that was computed says how.
-"""
+"""Constants of the notebook in the module: spelled as they were, with the comment above or beside them."""
 
 from __future__ import annotations
 
 import ast
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from epypes.bundle.cells import Statement, statements_of
 from epypes.bundle.evaluate import UNKNOWN, value_of
-from epypes.bundle.lines import assignment, fits, piece_of
+from epypes.bundle.formatting import LINE, laid_out
 from epypes.bundle.literal import is_data, is_same_data
 from epypes.bundle.order import Position
 from epypes.bundle.text import is_comment
@@ -22,22 +19,22 @@ from epypes.run.guard import is_plain_array
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """What the notebook says about a constant.
+    """What the notebook has written about a constant.
 
     Attributes
     ----------
     position
-        Cell and line.
+        Where it stands.
     above, beside
         Lines of comment.
-    source
-        The expression as people wrote it, if it is as good as the value; else "".
+    statement
+        The assignment as it stands there, if it makes the same value wherever it stands; else "".
     """
 
     position: Position
     above: tuple[str, ...] = ()
     beside: str = ""
-    source: str = ""
+    statement: str = ""
 
 
 def imported_as(name: str, value: Any, names: Mapping[str, Any], file: str) -> tuple[str, str]:
@@ -90,7 +87,7 @@ def _is_assignment_to(name: str, node: ast.stmt) -> bool:
 
 def _remark(name: str, value: Any, source: str, given: ast.expr, statement: Statement, is_known: bool) -> Remark:
     node, lines = statement.node, statement.lines
-    position = (statement.cell, node.lineno)
+    position = (statement.cell, 0, node.lineno)
     if not _is_assignment_to(name, node):
         return Remark(position)
     first = number = node.lineno - 1
@@ -100,43 +97,20 @@ def _remark(name: str, value: Any, source: str, given: ast.expr, statement: Stat
     above = tuple(line.strip() for line in lines[first:number])
     beside = rest if rest.startswith("#") else ""
     if is_known:
-        return Remark(position, above, beside, _spelled(given, "\n".join(lines)))
+        text = ast.get_source_segment("\n".join(lines), node) if isinstance(node, ast.Assign) else ""
+        return Remark(position, above, beside, text or f"{name} = {ast.unparse(given)}")
     is_computed = is_data(value) or is_plain_array(value)
     if not beside and is_computed and ast.unparse(ast.parse(source)) != ast.unparse(given):
         beside = f"# {ast.unparse(given)} in the notebook"
-        beside = beside if fits(0, beside) else ""
+        beside = beside if len(beside) <= LINE else ""
     return Remark(position, above, beside)
-
-
-def _spelled(given: ast.expr, text: str) -> str:
-    """Return an expression as it was written, if it is a number or stands on one line without strings."""
-    source = ast.get_source_segment(text, given) or ""
-    has_text = any(isinstance(part, ast.Constant) and isinstance(part.value, str | bytes) for part in ast.walk(given))
-    return "" if has_text or "\n" in source else source
 
 
 def constant_lines(name: str, source: str, remark: Remark | None) -> list[str]:
     """Return the lines of a constant, with the comments of the notebook."""
     known = remark or Remark(())
-    spelled = f"{name} = {known.source}"
-    lines = [spelled] if known.source and fits(0, spelled) else assignment([name], True, piece_of(source), 0)
-    above = list(known.above)
-    if known.beside and len(lines) == 1 and fits(0, f"{lines[0]}  {known.beside}"):
-        lines = [f"{lines[0]}  {known.beside}"]
-    elif known.beside:
-        above.append(known.beside)
-    return [*above, *lines]
-
-
-def constants_text(constants: Mapping[str, str], remarks: Mapping[str, Remark]) -> list[str]:
-    """Return the lines of constants in the order of the notebook, each that has a comment above it set off."""
-    return list(_lines(constants, remarks))
-
-
-def _lines(constants: Mapping[str, str], remarks: Mapping[str, Remark]) -> Iterator[str]:
-    names = sorted(constants, key=lambda name: (name not in remarks, remarks[name].position if name in remarks else ()))
-    for number, name in enumerate(names):
-        lines = constant_lines(name, constants[name], remarks.get(name))
-        if number and lines[0].startswith("#"):
-            yield ""
-        yield from lines
+    lines = known.statement.split("\n") if known.statement else laid_out(source, before=f"{name} = ")
+    whole = f"{lines[-1]}  {known.beside}"
+    if known.beside and (known.statement or len(lines) == 1) and len(whole) <= LINE:
+        return [*known.above, *lines[:-1], whole]
+    return [*known.above, *[known.beside][: bool(known.beside)], *lines]

@@ -1,20 +1,33 @@
-"""How does the module of a bundle read?"""
+"""The text of a bundle's ``pipeline.py``: imports, constants, definitions in the notebook's order, then the graph."""
 
 from __future__ import annotations
 
+import ast
+import enum
+import functools
 import itertools
 import json
-from collections.abc import Mapping, Sequence
-from typing import Final
+import sys
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final
 
-from epypes.bundle.definitions import definitions, early_constants
-from epypes.bundle.graphs import GraphText, grouped
-from epypes.bundle.importorder import ordered_imports
-from epypes.bundle.lines import LINE, laid_out
+from epypes.bundle.constants import constant_lines
+from epypes.bundle.equivalence import Pair, refusal
+from epypes.bundle.expressions import noted_refusals
+from epypes.bundle.formatting import LINE, one_per_line
+from epypes.bundle.graphs import Graphs, GraphText
+from epypes.bundle.hyperparameters import members_in
+from epypes.bundle.literal import literal, quoted
+from epypes.bundle.load import MAKER
+from epypes.bundle.order import ordered
 from epypes.bundle.settings import Settings
 from epypes.bundle.slicer import Slice
+from epypes.bundle.source import Refused
+from epypes.bundle.subject import Subject, own_lines
 from epypes.errors import run_call
 from epypes.graph import CompGraph
+from epypes.pipeline import FullPipeline
 
 # The folder is wherever the bundle is: it may be moved.
 _TEXT: Final = '''"""{title}
@@ -29,6 +42,76 @@ lets it answer events. The values of its hyperparameters stand in pipeline.toml.
 """'''
 
 
+def write_module(
+    subject: Subject, settings: Settings, uncalled: Collection[int] = ()
+) -> tuple[str, Settings, Mapping[str, Any], list[str]]:
+    """Return the text of ``pipeline.py``, the settings with what it has of its own, its arrays, the reasons against.
+
+    Closures whose ids are in ``uncalled`` are written with what they have captured, not as calls of their factories.
+    """
+    gathered = Slice(keeps_arrays=True, uncalled=uncalled)
+    graphs = Graphs(gathered)
+    ports = {f"Function {name!r}": function for name, function in subject.ports.items()}
+    text = graphs.write(subject.cg, {**ports, **subject.classes})
+    own = dict(own_lines(gathered, graphs, subject))
+    if settings.has_groups:
+        with noted_refusals(gathered):
+            gathered.keep_name("func_groups")
+    blocks = [*filter(None, own.values()), *_enums(gathered, settings)]
+    settings = replace(settings, own=tuple(own))
+    if gathered.refusals and gathered.called:
+        again = write_module(subject, settings, {*uncalled, *gathered.called})
+        if not again[3]:
+            return again
+    if gathered.refusals:
+        return "", settings, {}, list(dict.fromkeys(gathered.refusals))
+    text_of_all = emit_module(settings, subject.cg, gathered, text, graphs.blocks, blocks)
+    pairs = functools.partial(_pairs, subject, settings)
+    why, closure = refusal(text_of_all, gathered.arrays.by_name, pairs, gathered.called)
+    if closure:
+        return write_module(subject, settings, {*uncalled, closure})
+    return text_of_all, settings, gathered.arrays.by_name, [why] if why else []
+
+
+def _pairs(subject: Subject, settings: Settings, module: Any) -> Iterator[Pair]:
+    """Give what of the notebook is compared with the module, by how a reason calls it."""
+    for name, function in subject.cg.functions.items():
+        yield f"Function {name!r}", function, module.func_dict[name]
+    for name, function in subject.ports.items():
+        yield f"Function {name!r}", function, getattr(module, name)
+    for what, kind in subject.classes.items():
+        yield what, kind, getattr(module, kind.__name__)
+    for enumeration in _enums_in(settings):
+        yield f"Class {enumeration.__name__!r}", enumeration, module.enums[enumeration.__qualname__]
+    pipeline = subject.pipeline
+    if MAKER in settings.own and isinstance(pipeline, FullPipeline):
+        given = (pipeline.q_in, pipeline.q_out, *(getattr(pipeline, name, None) for name in ("f_in", "f_out")))
+        made = module.make_pipeline(pipeline.source_cg, *given, dict(pipeline.runner.hyperparameters))
+        yield f"Pipeline {pipeline.name!r}", pipeline, made
+
+
+def _enums(gathered: Slice, settings: Settings) -> list[list[str]]:
+    """Return the lines that name the enumerations whose members stand in pipeline.toml."""
+    found: dict[str, str] = {}
+    for kind in _enums_in(settings):
+        with noted_refusals(gathered):
+            reference = gathered.add_class(kind, None, f"Class {kind.__name__!r} of a hyperparameter")
+            if found.setdefault(kind.__qualname__, reference) != reference:
+                raise Refused(f"Two hyperparameters are of two classes called {kind.__name__!r}. Rename one.")
+    if not found:
+        return []
+    with noted_refusals(gathered):
+        gathered.keep_name("enums")
+    items = [(f"{quoted(name)}: ", reference) for name, reference in found.items()]
+    return [["# Whose members stand in pipeline.toml.", *one_per_line("enums = {", items, "}")]]
+
+
+def _enums_in(settings: Settings) -> dict[type[enum.Enum], None]:
+    values = [settings.hyperparameters, settings.defaults, settings.attributes]
+    members = [member for part in values for value in part.values() for member in members_in(value)]
+    return dict.fromkeys(type(member) for member in members if isinstance(member, enum.Enum))
+
+
 def emit_module(
     settings: Settings,
     cg: CompGraph,
@@ -37,7 +120,7 @@ def emit_module(
     blocks: Sequence[Sequence[str]] = (),
     own: Sequence[Sequence[str]] = (),
 ) -> str:
-    """Write ``pipeline.py``: imports, constants, the functions' own source, then the graph.
+    """Return the text of ``pipeline.py``.
 
     Parameters
     ----------
@@ -55,23 +138,42 @@ def emit_module(
         Lines that stand behind it: what the bundle has of its own in place of the usual ports and pipeline.
     """
     text = written if isinstance(written, GraphText) else GraphText(written)
-    head = [_docstring(settings)]
-    if needed.imports:
-        head.append("\n".join(ordered_imports(list(needed.imports.values()))))
-    sections = ["\n\n".join(head)]
-    constants, reader = early_constants(needed), needed.arrays.reader(needed)
-    if reader:
-        sections += [reader, *([constants] if constants else [])]
-    elif constants:
-        sections = ["\n\n".join([*head, constants])]
-    sections += definitions(needed)
-    tail = ["\n".join(block) for block in blocks]
-    tail += ["\n".join(text.functions("func_dict")), "\n".join(text.io("func_io", cg))]
+    tail = [*blocks, text.functions("func_dict"), text.io("func_io", cg)]
     if cg.groups:
-        lines = [line for item in grouped(cg) for line in laid_out(item, 1, ",")]
-        tail.append("\n".join(["# Drawn as one box each.", "func_groups = {", *lines, "}"]))
-    tail += ["\n".join(block) for block in own]
-    return "\n\n\n".join([*sections, _spaced(tail)]) + "\n"
+        items = [(f"{quoted(name)}: ", literal(list(functions))) for name, functions in cg.groups.items()]
+        tail.append(["# Drawn as one box each.", *one_per_line("func_groups = {", items, "}")])
+    return module_text([_docstring(settings)], needed, [_spaced(["\n".join(block) for block in [*tail, *own]])])
+
+
+def module_text(head: Sequence[str], needed: Slice, tail: Sequence[str]) -> str:
+    """Return the text of a module: what stands at its head, what its functions need, and what stands behind that."""
+    texts = {name: found.text.rstrip() for name, found in needed.definitions.items()}
+    positions = {**needed.positions, **{name: remark.position for name, remark in needed.remarks.items()}}
+    early: list[str] = []
+    for name in sorted(needed.constants, key=lambda name: (name not in needed.remarks, positions.get(name, ()))):
+        lines = constant_lines(name, needed.constants[name], needed.remarks.get(name))
+        read = {node.id for node in ast.walk(ast.parse(needed.constants[name])) if isinstance(node, ast.Name)}
+        if read & needed.definitions.keys():
+            texts[name] = "\n".join(lines)
+        else:
+            early += [*[""][: bool(early) and lines[0].startswith("#")], *lines]
+    reader = needed.arrays.reader(needed)
+    imports = [_import_lines(needed.imports.values())] if needed.imports else []
+    constants = ["\n".join(early)] if early else []
+    sections = ["\n\n".join([*head, *imports, *([] if reader else constants)])]
+    if reader:
+        sections += [reader, *constants]
+    sections += [texts[name] for name in ordered(texts, positions, needed.reads)]
+    return "\n\n\n".join([*filter(None, sections), *tail]) + "\n"
+
+
+def _import_lines(statements: Iterable[str]) -> str:
+    """Return imports in order: Python's own first, whole modules before names from modules."""
+    in_order = sorted(dict.fromkeys(statements), key=lambda text: (text.startswith("from"), text.lower(), text))
+    first = [text for text in in_order if text.startswith("from __future__")]
+    others = [text for text in in_order if text.split()[1].partition(".")[0] not in sys.stdlib_module_names]
+    own = [text for text in in_order if text not in first and text not in others]
+    return "\n\n".join("\n".join(part) for part in (first, own, others) if part)
 
 
 def _spaced(blocks: Sequence[str]) -> str:
@@ -84,7 +186,7 @@ def _spaced(blocks: Sequence[str]) -> str:
 
 
 def _docstring(settings: Settings) -> str:
-    """Say what the module is and how it is used; names are data, whatever they hold."""
+    """Return the module's docstring, which names the graph and how to run it."""
     ends = f"{', '.join(settings.inputs) or 'nothing'} -> {', '.join(settings.outputs)}"
     title = _escaped(f"The computational graph {settings.name}: {ends}.")
     if len(title) > LINE - 3:

@@ -7,7 +7,7 @@ import types
 from collections.abc import Iterator
 from typing import Final
 
-from epypes.bundle.lines import fits, flat, laid_out, piece_of, prefixed
+from epypes.bundle.formatting import LINE, laid_out
 from epypes.bundle.text import (
     LATE_ANNOTATIONS,
     codes_in,
@@ -95,9 +95,9 @@ def _returned(source: str, body: ast.expr) -> str:
     tree = parsed(f"def f():\n{text}\n")
     returned = getattr(tree.body[0], "body", [])[0] if tree else None
     value = returned.value if isinstance(returned, ast.Return) else None
-    if value is not None and "\n" not in text and fits(0, text) and spelled_tree(value) == spelled_tree(body):
+    if value is not None and "\n" not in text and len(text) <= LINE and spelled_tree(value) == spelled_tree(body):
         return text
-    return "\n".join(laid_out(prefixed("return ", piece_of(ast.unparse(body))), 1))
+    return "\n".join(laid_out(ast.unparse(body), 1, "return "))
 
 
 def _parameters(arguments: ast.arguments) -> Iterator[str]:
@@ -119,7 +119,7 @@ def _parameters(arguments: ast.arguments) -> Iterator[str]:
 
 
 def _parameter(argument: ast.arg, default: ast.expr | None) -> str:
-    return f"{argument.arg}={flat(piece_of(ast.unparse(default)))}" if default else argument.arg
+    return f"{argument.arg}={ast.unparse(default)}" if default else argument.arg
 
 
 def _comment(lines: list[str], node: ast.Lambda) -> str:

@@ -1,4 +1,4 @@
-"""Which literal makes a value again, to the last bit?"""
+"""Literals: the source text that makes plain data again, to the last bit."""
 
 from __future__ import annotations
 
@@ -12,6 +12,12 @@ def is_data(value: object) -> bool:
     return type(value) in kinds
 
 
+def quoted(text: str | bytes) -> str:
+    """Return the literal of a text, in double quotes unless it holds some; of a member of a StrEnum, of its text."""
+    source = repr(text if isinstance(text, bytes) else str.__str__(text))
+    return source if '"' in source else source.replace("'", '"')
+
+
 def literal(value: Any) -> str:
     """Return the source of a constant: as repr, but with sets sorted, whose order changes from process to process.
 
@@ -20,6 +26,8 @@ def literal(value: Any) -> str:
     ValueError
         Something in it is of a type that literals are not made of, or is an int that is too long for Python.
     """
+    if type(value) in (str, bytes):
+        return quoted(value)
     if type(value) is set and value:
         return "{" + ", ".join(sorted(map(literal, value))) + "}"
     if type(value) is dict:

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from epypes.bundle.adapters import answer_with, payload_of
+from epypes.bundle.manifest import check_files, check_manifest
 from epypes.bundle.mutable_state import MutableState, lock_cached_values
-from epypes.bundle.ports import answer_with, payload_of
-from epypes.bundle.seal import check_files, check_seal
 from epypes.bundle.settings import Settings, read_settings
 from epypes.errors import BundleError
 from epypes.graph import CompGraph, group, with_defaults
@@ -78,7 +78,7 @@ def read_bundle(path: str | Path, *, sealed: bool = True) -> Bundle:
         try:
             if not sealed:
                 check_files(folder)
-            digest = check_seal(folder) if sealed else ""
+            digest = check_manifest(folder) if sealed else ""
             settings, source = read_settings(folder / SETTINGS), (folder / MODULE).read_bytes()
         except (BundleError, OSError):
             if _identity(folder) == before:

@@ -7,8 +7,8 @@ import sys
 from collections.abc import Collection, Mapping
 
 from epypes.bundle.cells import names_of
+from epypes.bundle.identifiers import identifier_of, is_identifier
 from epypes.bundle.source import Definition, Refused
-from epypes.bundle.words import is_word, word_of
 
 Meaning = tuple[str, object]
 
@@ -75,8 +75,8 @@ class Names:
         is_known_otherwise = bool(found.captured) or found.names.get(own, function) is not function
         others = [wanted, own] if is_known_otherwise else [own, wanted]
         candidates = [*(name for name in bound if name == own), *bound, *others]
-        free = (name for name in candidates if is_word(name) and self.is_free(name, function))
-        return next(free, "") or word_of(own or wanted or found.name, self.is_taken)
+        free = (name for name in candidates if is_identifier(name) and self.is_free(name, function))
+        return next(free, "") or identifier_of(own or wanted or found.name, self.is_taken)
 
     def alias_for(self, value: object, notebook: Mapping[str, object], own: str) -> str:
         """Return the name that a notebook has for an object besides its own; "" if it has none that is free."""

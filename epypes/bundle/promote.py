@@ -13,18 +13,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from epypes.bundle.answers import ANSWERS, record_answer
+from epypes.bundle.adapters import ANSWERS, record_answer
 from epypes.bundle.arrays import write_arrays
 from epypes.bundle.compare import Tolerance
-from epypes.bundle.exchange import exchange as _exchange
+from epypes.bundle.determinism import learn
+from epypes.bundle.emit import write_module
 from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
-from epypes.bundle.module import write_module
-from epypes.bundle.proof import prove
-from epypes.bundle.seal import MANIFEST, why_no_bundle
+from epypes.bundle.manifest import MANIFEST, why_no_bundle
+from epypes.bundle.proof import prove, swap_folders
 from epypes.bundle.settings import Settings, unwritable, writable_defaults, write_settings
 from epypes.bundle.source import Refused
 from epypes.bundle.subject import Subject, subject_of
-from epypes.bundle.tolerance import learn
 from epypes.errors import BundleError, EpypesError, MessageError, PromotionRefused, run_call
 from epypes.graph import colour_order
 from epypes.pipeline import Pipeline
@@ -222,8 +221,8 @@ def _replace(draft: Path, target: Path) -> None:
         draft.rename(target)
         return
     # The old one is then in the scratch folder, and goes with it; unless it is no bundle any more.
-    _exchange(draft, target)
+    swap_folders(draft, target)
     why = _why_kept(draft)
     if why:
-        _exchange(draft, target)
+        swap_folders(draft, target)
         raise PromotionRefused(target, [why.replace(str(draft), str(target))])

@@ -1,39 +1,114 @@
-"""Does a bundle, alone in a fresh process, compute what was recorded?
+"""The replay of a bundle's samples, alone in a fresh process, compared with what was recorded.
 
-Run as a program (``python -I -m epypes.bundle.replay FOLDER REPORT``) it is that process.
+Run as a program (``python -s -P -m epypes.bundle.replay FOLDER REPORT``) it is that process. With ``--record`` it
+records the samples anew instead.
 """
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import subprocess
 import sys
 import tempfile
 import traceback
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from epypes.bundle.answers import answer_differences
-from epypes.bundle.compare import differences
-from epypes.bundle.environment import environment
-from epypes.bundle.importwatch import ImportWatch
-from epypes.bundle.load import MODULE, SAMPLES, Bundle, module_name, pipeline_of, read_bundle
-from epypes.bundle.reach import ReachWatch
-from epypes.bundle.report import Difference, ReplayReport, difference, report_from
-from epypes.bundle.requirements import owner, requirement_lines
+from epypes.bundle.adapters import ANSWERS, answer_differences, record_answer
+from epypes.bundle.compare import Difference, difference, differences
+from epypes.bundle.conditions import without_python
+from epypes.bundle.file_access import FileAccess
+from epypes.bundle.load import MODULE, SAMPLES, Bundle, pipeline_of, read_bundle
+from epypes.bundle.manifest import environment
+from epypes.bundle.requirements import import_all_of, requirement_lines
 from epypes.errors import BundleError, EpypesError
 from epypes.run import CompGraphRunner
+from epypes.wire.samples import load_sample, save_sample
+from epypes.wording import counted
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayReport:
+    """What a replay found.
+
+    Attributes
+    ----------
+    samples
+        How many samples were replayed.
+    tokens
+        How many tokens were compared.
+    differences
+        The first difference of each token that differs.
+    requirements
+        The lines of requirements.txt, from what the replay imported; empty where it ran in this process.
+    environment
+        What the replay ran on: Python, platform, processor, OpenCV's build and threads.
+    unsteady
+        The tokens that differ from what was recorded, and from run to run as well.
+    causes
+        What the differences likely come from, the likeliest first.
+    notes
+        What else is worth knowing, as sentences.
+    outside
+        The files outside of the bundle that its functions open or name, as sentences.
+    """
+
+    samples: int
+    tokens: int
+    differences: tuple[Difference, ...]
+    requirements: tuple[str, ...] = ()
+    environment: Mapping[str, str] = field(default_factory=dict)
+    unsteady: tuple[str, ...] = ()
+    causes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    outside: tuple[str, ...] = ()
+
+    @property
+    def identical(self) -> bool:
+        """Whether every token was what had been recorded, and there was one."""
+        return self.tokens > 0 and not self.differences
+
+    def __str__(self) -> str:
+        if self.identical:
+            return f"identical: {counted(self.tokens, 'token')} of {counted(self.samples, 'sample')}"
+        found = [*map(str, self.differences)] or ["nothing was compared: the bundle has no samples"]
+        return "\n".join([*found, *(f"Likely: {cause}" for cause in self.causes)])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain values, as JSON has them."""
+        from dataclasses import asdict
+
+        return {"identical": self.identical, **asdict(self)}
+
+
+def report_from(outcome: Mapping[str, Any]) -> ReplayReport:
+    """Return the report that a process has written as JSON."""
+    found = (Difference(**entry) for entry in outcome["differences"])
+    texts = {name: tuple(outcome[name]) for name in ("requirements", "unsteady", "causes", "notes", "outside")}
+    return ReplayReport(
+        outcome["samples"], outcome["tokens"], tuple(found), environment=outcome["environment"], **texts
+    )
+
 
 REPLAY_TIMEOUT_S = 600.0
 
 
 def replay_isolated(
-    folder: Path, *, sealed: bool, timeout_s: float = REPLAY_TIMEOUT_S, python: str = sys.executable
+    folder: Path,
+    *,
+    sealed: bool,
+    timeout_s: float = REPLAY_TIMEOUT_S,
+    python: str = sys.executable,
+    twice: bool = False,
+    environment: Mapping[str, str] | None = None,
+    cwd: Path | None = None,
+    watched: bool = True,
 ) -> ReplayReport:
-    """Replay in a new interpreter that sees neither the environment nor the current folder.
+    """Replay in a new interpreter that sees neither the current folder nor the variables that Python reads.
 
     Parameters
     ----------
@@ -45,22 +120,34 @@ def replay_isolated(
         When the process is ended.
     python
         The interpreter, this one without.
+    twice
+        Whether every sample is replayed a second time, in the opposite order.
+    environment, cwd
+        The variables and the working folder of the process; this environment and a new folder without.
+    watched
+        Whether the report has the requirements and the files outside of the bundle.
 
     Raises
     ------
     BundleError
         The process failed or took longer than ``timeout_s``.
     """
-    outcome = run_isolated(
-        "epypes.bundle.replay", folder, [] if sealed else ["--unsealed"], timeout_s=timeout_s, python=python
-    )
+    options = {"--unsealed": not sealed, "--twice": twice, "--watched": watched}
+    arguments = [option for option, is_given in options.items() if is_given]
+    outcome = run_isolated(folder, arguments, timeout_s=timeout_s, python=python, environment=environment, cwd=cwd)
     return report_from(outcome)
 
 
 def run_isolated(
-    module: str, folder: Path, arguments: Sequence[str], *, timeout_s: float, python: str = sys.executable
+    folder: Path,
+    arguments: Sequence[str],
+    *,
+    timeout_s: float = REPLAY_TIMEOUT_S,
+    python: str = sys.executable,
+    environment: Mapping[str, str] | None = None,
+    cwd: Path | None = None,
 ) -> Any:
-    """Run a module of EPypes as a program on a bundle, in a new interpreter; return what it has written as JSON.
+    """Run this module as a program on a bundle, in a new interpreter; return what it has written as JSON.
 
     Raises
     ------
@@ -70,9 +157,11 @@ def run_isolated(
     with tempfile.TemporaryDirectory(prefix="epypes-replay-") as scratch:
         out = Path(scratch) / "report.json"
         try:
+            # Isolated as by -I, which would also have it overlook PYTHONHASHSEED.
             done = subprocess.run(  # noqa: S603 - an interpreter, a module of ours
-                [python, "-I", "-m", module, str(folder.resolve()), str(out), *arguments],
-                cwd=scratch,
+                [python, "-s", "-P", "-m", "epypes.bundle.replay", str(folder.resolve()), str(out), *arguments],
+                cwd=cwd or scratch,
+                env=without_python() if environment is None else environment,
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
                 timeout=timeout_s,
@@ -90,12 +179,19 @@ def run_isolated(
     return outcome
 
 
-def replay(bundle: Bundle) -> ReplayReport:
-    """Replay a bundle's samples in this process."""
-    from epypes.wire.samples import load_sample
+def replay(bundle: Bundle, *, twice: bool = False) -> ReplayReport:
+    """Replay a bundle's samples in this process.
 
+    Parameters
+    ----------
+    bundle
+        The bundle.
+    twice
+        Whether every sample is replayed a second time, in the opposite order: a function that keeps something from
+        call to call computes something else then.
+    """
     found: list[Difference] = []
-    unsteady: list[str] = []
+    unsteady: dict[str, None] = {}
     tokens = 0
     pipeline_of(bundle, None, None)  # what serves it can be made
     for path in bundle.samples:
@@ -109,12 +205,32 @@ def replay(bundle: Bundle) -> ReplayReport:
         if differing:
             again = _run(bundle, inputs)
             differs = (entry.token for entry in differing)
-            unsteady += [token for token in differs if next(differences(run[token], again[token]), None)]
+            unsteady |= {token: None for token in differs if next(differences(run[token], again[token]), None)}
         found += [*differing, *answer_differences(bundle, path.stem, run)]
         tokens += len(outputs)
-    return ReplayReport(
-        len(bundle.samples), tokens, tuple(found), environment=environment(), unsteady=tuple(dict.fromkeys(unsteady))
-    )
+    known = {(entry.sample, entry.token) for entry in found}
+    for path in reversed(bundle.samples) if twice else ():
+        inputs, outputs = load_sample(path)
+        again = _differing(bundle, path.stem, outputs, _run(bundle, inputs))
+        new = [entry for entry in again if (entry.sample, entry.token) not in known]
+        found += new
+        unsteady |= {entry.token: None for entry in new}
+    return ReplayReport(len(bundle.samples), tokens, tuple(found), environment=environment(), unsteady=tuple(unsteady))
+
+
+def record_again(folder: Path) -> dict[str, Any]:
+    """Run the samples of an unsealed bundle in this process, and record their outputs and answers."""
+    bundle = read_bundle(folder, sealed=False)
+    settings = bundle.settings
+    for path in bundle.samples:
+        inputs, outputs = load_sample(path)
+        run = _run(bundle, inputs)
+        save_sample(path, inputs, {token: run[token] for token in outputs}, rgb=settings.rgb)
+        answer = bundle.path / ANSWERS / path.name
+        if answer.is_file():
+            answer.unlink()
+            record_answer(answer, bundle.own["f_out"], settings.name, (run, _run(bundle, inputs)), settings.attributes)
+    return {"samples": len(bundle.samples)}
 
 
 def _run(bundle: Bundle, inputs: dict[str, Any]) -> Any:
@@ -133,43 +249,42 @@ def _differing(bundle: Bundle, sample: str, outputs: dict[str, Any], run: Any) -
 def main(arguments: list[str]) -> int:
     """Replay the bundle in the folder that is named first; write the outcome as JSON to the file named second."""
     folder, out = Path(arguments[0]), Path(arguments[1])
-    out.write_text(json.dumps(outcome_of(folder, lambda: _watched(folder, arguments))), encoding="utf-8")
+    work = record_again if "--record" in arguments else functools.partial(_replayed, options=arguments[2:])
+    out.write_text(json.dumps(_outcome_of(folder, work)), encoding="utf-8")
     return 0
 
 
-def _watched(folder: Path, arguments: list[str]) -> dict[str, Any]:
-    """Replay, and say what that has imported."""
-    from epypes.wire.samples import load_sample
+def _replayed(folder: Path, options: Sequence[str]) -> dict[str, Any]:
+    """Replay; with ``--watched`` the report has what that has imported and opened."""
+    is_sealed, twice = "--unsealed" not in options, "--twice" in options
+    if "--watched" not in options:
+        return replay(read_bundle(folder, sealed=is_sealed), twice=twice).to_dict()
+    for path in sorted((folder / SAMPLES).glob("*.npz")):
+        # What reading a sample needs is loaded now, so that it is not taken for what the bundle needs.
+        try:
+            sample = load_sample(path)
+            list(differences(sample, sample))
+        except EpypesError:
+            break
+    before = frozenset(sys.modules)
+    with FileAccess(folder) as access:
+        bundle = read_bundle(folder, sealed=is_sealed)
+        access.also_in(bundle.settings.hyperparameters)
+        report = replay(bundle, twice=twice)
+    named = import_all_of((folder / MODULE).read_text(encoding="utf-8"))
+    requirements = requirement_lines(named | (sys.modules.keys() - before))
+    report = replace(report, outside=access.files, notes=(*report.notes, *access.notes), requirements=requirements)
+    return report.to_dict()
 
-    with ImportWatch() as watch:
-        for path in sorted((folder / SAMPLES).glob("*.npz")):
-            # What reading a sample needs is loaded now, so that it is not taken for what the bundle needs.
-            try:
-                sample = load_sample(path)
-                list(differences(sample, sample))
-            except EpypesError:
-                break
-        watch.mark()
-        with ReachWatch(folder) as reached:
-            bundle = read_bundle(folder, sealed="--unsealed" not in arguments)
-            reached.also_in(bundle.settings.hyperparameters)
-            report = replay(bundle)
-        name = module_name(folder)
-        watch.import_all_of((folder / MODULE).read_text(encoding="utf-8"), name)
-    modules = watch.imported_by(name, owner)
-    report = replace(report, outside=reached.files, notes=(*report.notes, *reached.notes))
-    return replace(report, requirements=requirement_lines(modules)).to_dict()
 
-
-def outcome_of(folder: Path, work: Any) -> dict[str, Any]:
+def _outcome_of(folder: Path, work: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
     """Return what some work with a bundle returns, or as an error what stopped it."""
     try:
-        outcome: dict[str, Any] = work()
+        return work(folder)
     except EpypesError as error:
         return {"error": str(error)}
     except BaseException as error:
         return {"error": _told(error, folder)}
-    return outcome
 
 
 def _told(error: BaseException, folder: Path) -> str:

@@ -10,9 +10,18 @@ from pathlib import Path
 from typing import Any, Final
 
 from epypes.bundle.compare import Tolerance
-from epypes.bundle.entries import MOST_NUMBERS, LargeArray, Unwritable, fits, members_in, plain, read, written
-from epypes.bundle.ranges import range_of
-from epypes.bundle.tolerance import add_tolerances, read_tolerances
+from epypes.bundle.determinism import add_tolerances, read_tolerances
+from epypes.bundle.hyperparameters import (
+    MOST_NUMBERS,
+    LargeArray,
+    Unwritable,
+    fits,
+    members_in,
+    plain,
+    range_of,
+    read,
+    written,
+)
 from epypes.errors import BundleError
 from epypes.graph import CompGraph
 from epypes.hints import Param

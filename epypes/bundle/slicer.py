@@ -20,11 +20,11 @@ from epypes.bundle.callables import found_definition, holds_functions, is_functi
 from epypes.bundle.classes import class_definition, class_names
 from epypes.bundle.closures import FactoryCall, factory_call
 from epypes.bundle.constants import Remark, imported_as, remark_on
-from epypes.bundle.lines import assignment, flat, piece_of
+from epypes.bundle.expressions import expression
+from epypes.bundle.formatting import laid_out
 from epypes.bundle.literal import is_data, is_same_data, literal_source
 from epypes.bundle.names import Names, of_object
-from epypes.bundle.order import Position, arranged
-from epypes.bundle.positions import AnyDefinition, Positions
+from epypes.bundle.order import AnyDefinition, Position, Positions
 from epypes.bundle.side_effects import check_asked, check_home, check_patches, check_state
 from epypes.bundle.source import Definition, Importable, Refused, evaluated, importable
 from epypes.bundle.text import renamed, with_defaults
@@ -36,7 +36,6 @@ from epypes.bundle.uses import (
     replaced,
     submodules,
 )
-from epypes.bundle.values import expression
 from epypes.run.guard import WATCH
 
 _CONSTANT_CHARACTERS: Final = 400
@@ -74,7 +73,11 @@ class Slice:
     remarks
         What the notebook says about constants, by name.
     definitions
-        Functions, and objects made of them, by name: in the order of the notebook, each after what it needs.
+        Functions, classes, and objects made of them, by name.
+    positions
+        Where the notebook has them, as far as that is known.
+    reads
+        The names that they read from outside, as far as that is known.
     refusals
         Why something can't be promoted.
     called
@@ -94,8 +97,8 @@ class Slice:
         self.uncalled = frozenset(uncalled)
         self.called: dict[int, str] = {}
         self._known: dict[int, str] = {}
-        self._positions: dict[str, Position] = {}
-        self._reads: dict[str, frozenset[str]] = {}
+        self.positions: dict[str, Position] = {}
+        self.reads: dict[str, frozenset[str]] = {}
         self._places = Positions()
 
     def add_graph_function(self, what: str, function: Callable[..., Any], wanted: str = "") -> str:
@@ -133,11 +136,6 @@ class Slice:
     def keep_name(self, name: str) -> None:
         """Keep a name that is not taken for what is written below the functions."""
         self.names.claim(name, ("kept", name), f"Function {name!r}")
-
-    def arrange(self) -> None:
-        """Put the definitions into the order of the notebook."""
-        texts = {name: found.text for name, found in self.definitions.items()}
-        self.definitions = {name: self.definitions[name] for name in arranged(texts, self._positions, self._reads)}
 
     def module_name(self, module: str, what: str) -> str:
         """Import a module, unless a function has brought it already under a name of its own (``np``)."""
@@ -194,7 +192,7 @@ class Slice:
         if not source or (len(source) > _CONSTANT_CHARACTERS and not callable(value)):
             text = f"{what} has a value of type {type(value).__name__} inside, which no short expression makes again"
             raise Refused(f"{text}. Make it a token, or make it inside the function.")
-        return flat(piece_of(source))
+        return source
 
     def _add_definition(self, function: Any, what: str, wanted: str = "") -> Written:
         """Add a function of the notebook."""
@@ -237,12 +235,12 @@ class Slice:
             raise Refused(
                 f"{text}, which no short expression makes again. Make it a token, or make it in the function."
             )
-        return flat(piece_of(source))
+        return source
 
     def _add_names(self, name: str, names: Sequence[str], found: AnyDefinition, what: str) -> None:
         """Add what a definition has from outside."""
         check_patches(found, what)
-        self._reads[name] = frozenset(names)
+        self.reads[name] = frozenset(names)
         for needed in names:
             try:
                 self._add_name(needed, found, what)
@@ -275,7 +273,7 @@ class Slice:
     def _write(self, name: str, text: str, position: Position) -> None:
         self.definitions[name] = Written(name, text)
         if position:
-            self._positions[name] = position
+            self.positions[name] = position
 
     def _add_name(self, name: str, found: AnyDefinition, what: str) -> None:
         """Add what one global name of a function means at the time of promotion."""
@@ -357,7 +355,7 @@ class Slice:
         self.names.claim(name, of_object(value), what)
         if name not in self.definitions:
             source = self._argument(value, f"{name!r}, which {what[0].lower()}{what[1:]} uses,")
-            text = "\n".join(assignment([name], True, piece_of(source), 0))
+            text = "\n".join(laid_out(source, before=f"{name} = "))
             self._write(name, f"{text}\n", self._places.of_name(name))
         return True
 
@@ -432,9 +430,7 @@ def slice_functions(gathered: Slice, functions: Sequence[tuple[str, Callable[...
     survey = Slice(gathered.names.reserved, keeps_arrays=gathered.keeps_arrays, uncalled=gathered.uncalled)
     _add_all(survey, functions)
     gathered.names.read.update(survey.names.read)
-    references = _add_all(gathered, functions)
-    gathered.arrange()
-    return references
+    return _add_all(gathered, functions)
 
 
 def _add_all(gathered: Slice, functions: Sequence[tuple[str, Callable[..., Any]]]) -> list[str]:

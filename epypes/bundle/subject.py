@@ -6,14 +6,15 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from epypes.bundle.adapters import is_usual
+from epypes.bundle.expressions import expression, noted_refusals
+from epypes.bundle.formatting import laid_out
 from epypes.bundle.graphs import Graphs
 from epypes.bundle.instances import arguments_of, parameters_of
-from epypes.bundle.lines import Piece, call, laid_out, piece_of, prefixed, quoted
+from epypes.bundle.literal import quoted
 from epypes.bundle.load import MAKER
-from epypes.bundle.ports import is_usual
 from epypes.bundle.slicer import Slice
 from epypes.bundle.source import Refused
-from epypes.bundle.values import expression
 from epypes.graph import CompGraph, with_defaults
 from epypes.pipeline import FullPipeline, Pipeline, SinkPipeline, SourcePipeline
 from epypes.run import CompGraphRunner
@@ -100,17 +101,13 @@ def own_lines(gathered: Slice, graphs: Graphs, subject: Subject) -> Iterator[tup
         if reference == name:
             yield name, []
             continue
-        try:
+        with noted_refusals(gathered):
             gathered.keep_name(name)
-        except Refused as refusal:
-            gathered.refusals.append(str(refusal))
         yield name, [comments[name], f"{name} = {reference}"]
     if subject.pipeline is not None and type(subject.pipeline) not in _OURS:
-        try:
+        with noted_refusals(gathered):
             gathered.keep_name(MAKER)
             yield MAKER, _maker(gathered, subject.pipeline)
-        except Refused as refusal:
-            gathered.refusals.append(str(refusal))
 
 
 def _maker(gathered: Slice, pipeline: Pipeline) -> list[str]:
@@ -120,22 +117,21 @@ def _maker(gathered: Slice, pipeline: Pipeline) -> list[str]:
     lines: list[str] = []
     if not isinstance(pipeline, FullPipeline):
         known, lines = _answering(gathered, kind, known, what)
-        arguments: list[Piece] = ["name", *_GIVEN]
-        arguments[0] = quoted(pipeline.name)
+        arguments = [quoted(pipeline.name), *_GIVEN]
     else:
         arguments = _arguments(gathered, pipeline, what)
-    made = prefixed("return ", call(known, arguments))
+    made = f"{known}({', '.join(arguments)})"
     head = f"def {MAKER}({', '.join(_GIVEN)}):"
-    return [*lines, head, '    """Return the pipeline that answers events."""', *laid_out(made, 1)]
+    return [*lines, head, '    """Return the pipeline that answers events."""', *laid_out(made, 1, "return ")]
 
 
-def _arguments(gathered: Slice, pipeline: Pipeline, what: str) -> list[Piece]:
+def _arguments(gathered: Slice, pipeline: Pipeline, what: str) -> list[str]:
     taken = [parameter.name for parameter in parameters_of(type(pipeline))]
     for name in ("cg", "q_in", "q_out", "hparams"):
         if name not in taken:
             text = f"{what} is of class {type(pipeline).__name__!r}, whose __init__ does not take {name!r}"
             raise Refused(f"{text}. Take it, and hand it on: super().__init__(..., {name}={name}).")
-    arguments: list[Piece] = []
+    arguments: list[str] = []
     given = arguments_of(pipeline, what)
     for name in taken:
         if name in _GIVEN:
@@ -145,7 +141,7 @@ def _arguments(gathered: Slice, pipeline: Pipeline, what: str) -> list[Piece]:
             if not source:
                 text = f"{what} is made with {name!r}, a {type(given[name]).__name__} that no expression makes again"
                 raise Refused(f"{text}. Make it in __init__, from numbers, strings or tuples of them.")
-            arguments.append(prefixed(f"{name}=", piece_of(source)))
+            arguments.append(f"{name}={source}")
     return arguments
 
 

@@ -1,28 +1,34 @@
-"""How is a graph written down as Python that needs no graph?"""
+"""A graph as Python that needs no graph: one straight-line function."""
 
 from __future__ import annotations
 
 import builtins
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any
+from itertools import chain
+from typing import Any, Final
 
-from epypes.bundle.branches import Placement, place
-from epypes.bundle.definitions import definitions, early_constants
+from epypes.bundle.clone import called_by, is_plain_pipeline
+from epypes.bundle.emit import module_text
 from epypes.bundle.equivalence import Pair, refusal
-from epypes.bundle.importorder import ordered_imports
-from epypes.bundle.literal import literal_source
-from epypes.bundle.nodes import called_by, is_plain_pipeline
+from epypes.bundle.expressions import expression_or_none
+from epypes.bundle.formatting import LINE, Item, laid_out, one_per_line
+from epypes.bundle.identifiers import identifier_of, identifiers_of, is_identifier
+from epypes.bundle.literal import literal_source, quoted
 from epypes.bundle.slicer import Slice, slice_functions
-from epypes.bundle.source import Refused
-from epypes.bundle.straight import Straight, emit_function
-from epypes.bundle.values import expression
-from epypes.bundle.words import is_word, word_of
 from epypes.errors import PlaceholderNeeded, SourceRefused
 from epypes.graph import CompGraph, as_switch
 from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner
+
+# Python itself can't indent deeper than 100; half of that can't be read.
+_DEEPEST: Final = 20
+_SHOWN: Final = 40
+_NO_VALUE: Final = (
+    "is of type {kind}, and no expression makes this value again. Leave it free, so that the function takes it; or use "
+    "numbers, strings, a small array or tuples of them."
+)
 
 
 def to_source(
@@ -91,44 +97,50 @@ def to_source(
         raise TypeError(f'name is what the function is called, a string as "run_graph", not {type(name).__name__!r}.')
     graph, values = _subject(cg, hparams)
     wanted = _wanted(graph, returns)
-    top = _Part(name, graph, values, place(graph, wanted), graph.sink_tokens if wanted is None else wanted)
-    return _written(top, wanted)
+    return _written(name, graph, values, wanted)
 
 
-def _written(top: _Part, wanted: tuple[str, ...] | None, uncalled: Collection[int] = ()) -> str:
+def _written(
+    name: str,
+    cg: CompGraph,
+    values: Mapping[str, Any],
+    wanted: tuple[str, ...] | None,
+    uncalled: Collection[int] = (),
+) -> str:
     """Return the text; closures whose ids are in ``uncalled`` are written with what they have captured."""
-    name, parts = top.name, _with_pipelines(top)
-    _check_placeholders(parts)
+    parts = _with_pipelines(_Part(name, cg, values, wanted))
+    missing = [function for part in parts for function in part.cg.placeholders if function in set(part.functions)]
+    if missing:
+        raise PlaceholderNeeded(missing)
     gathered = Slice(reserved=(name,), uncalled=uncalled)
     gathered.refusals += _unwritable(parts, name, wanted)
     _slice(gathered, parts)
-    _keep_names(gathered, parts)
-    straights = [_resolved(gathered, part) for part in parts]
+    for part in parts:
+        _write_values(gathered, part)
     if gathered.refusals and gathered.called:
         with suppress(SourceRefused):
-            return _written(top, wanted, {*uncalled, *gathered.called})
+            return _written(name, cg, values, wanted, {*uncalled, *gathered.called})
     if gathered.refusals:
         raise SourceRefused(tuple(dict.fromkeys(gathered.refusals)))
-    text = _module(gathered, straights)
-    why, closure = _difference(text, parts, straights, gathered)
+    text = module_text([], gathered, [part.text() for part in parts])
+    why, closure = _difference(text, parts, gathered)
     if closure:
-        return _written(top, wanted, {*uncalled, closure})
+        return _written(name, cg, values, wanted, {*uncalled, closure})
     if why:
         raise SourceRefused((why,))
     return text
 
 
-def _difference(text: str, parts: Sequence[_Part], straights: Sequence[Straight], gathered: Slice) -> tuple[str, int]:
+def _difference(text: str, parts: Sequence[_Part], gathered: Slice) -> tuple[str, int]:
     """Return why what a module calls is not what the graph calls, as ``refusal`` returns it."""
     compared: list[tuple[str, Any, str]] = []
-    for part, straight in zip(parts, straights, strict=True):
+    for part in parts:
         for name, source in part.references.items():
             if name not in part.pipelines:
                 compared.append((f"Function {name!r}{part.where}", part.cg.functions[name], source))
-        for token, source in straight.defaults.items():
+        for token, source in part.defaults.items():
             compared.append((f"Hyperparameter {token!r}{part.where}", part.values[token], source))
-    listed = "".join(f"    {source},\n" for _, _, source in compared)
-    whole = f"{text}\n\nreferences = [\n{listed}]\n"
+    whole = "\n".join([text, *one_per_line("references = [", [("", source) for _, _, source in compared], "]"), ""])
 
     def pairs(module: Any) -> list[Pair]:
         return [(what, ours, made) for (what, ours, _), made in zip(compared, module.references, strict=True)]
@@ -137,17 +149,211 @@ def _difference(text: str, parts: Sequence[_Part], straights: Sequence[Straight]
 
 
 @dataclass(eq=False, slots=True)
-class _Part:
-    """A graph that becomes a function: the one that was given, or that of a pipeline in it."""
+class _Region:
+    """A place of functions: the graph itself, or a branch of a switch.
 
-    name: str
-    cg: CompGraph
-    values: Mapping[str, Any]
-    placement: Placement
-    returns: tuple[str, ...]
-    where: str = ""
-    references: dict[str, str] = field(default_factory=dict)
-    pipelines: dict[str, _Part] = field(default_factory=dict)
+    Attributes
+    ----------
+    around
+        The region in which the switch is; None for the graph.
+    token
+        The token that the branch passes on.
+    keys
+        The values of the selector that choose it.
+    functions
+        The functions that stand in it, in run order.
+    """
+
+    around: _Region | None = None
+    depth: int = 0
+    token: str = ""
+    keys: list[Hashable] = field(default_factory=list)
+    functions: list[str] = field(default_factory=list)
+
+
+class _Part:
+    """A graph that becomes a function: the one that was given, or that of a pipeline in it.
+
+    A function that only one branch of a switch needs stands inside it, so that it runs only when that branch is chosen.
+    What several branches need stands before the switch.
+
+    Parameters
+    ----------
+    name
+        What the function is called.
+    cg, values
+        The graph, and the values of its hyperparameters.
+    wanted
+        The tokens that it returns; None for the sink tokens, and all functions.
+    where
+        How reasons call a pipeline; "" for the graph that was given.
+
+    Attributes
+    ----------
+    root
+        The region of the graph itself.
+    branches
+        The regions of each switch that is written.
+    functions
+        All functions that are written, in run order.
+    tokens
+        The tokens that are made, read or wanted, in graph order.
+    references
+        By function, the expression that refers to it.
+    pipelines
+        The functions that are pipelines, which are parts of their own.
+    defaults
+        By hyperparameter, the expression of its value.
+    keys
+        By function of a switch, the expressions of its selector's values, by value.
+    variables
+        By token, its variable.
+    """
+
+    def __init__(
+        self, name: str, cg: CompGraph, values: Mapping[str, Any], wanted: tuple[str, ...] | None, where: str = ""
+    ) -> None:
+        self.name, self.cg, self.values, self.where = name, cg, values, where
+        self.returns = cg.sink_tokens if wanted is None else wanted
+        self.root = _Region()
+        self.branches: dict[str, list[_Region]] = {}
+        self.functions, self.tokens = self._place(wanted is None)
+        self.references: dict[str, str] = {}
+        self.pipelines: dict[str, _Part] = {}
+        self.defaults: dict[str, str] = {}
+        self.keys: dict[str, dict[Hashable, str]] = {}
+        self.variables: dict[str, str] = {}
+
+    def _place(self, is_whole: bool) -> tuple[list[str], list[str]]:
+        """Put each function that is needed into the innermost region around what needs it."""
+        cg, inside = self.cg, dict[str, _Region]()
+        used = dict.fromkeys(self.returns, self.root)
+        switches = set(cg.switches)
+        for name in reversed(tuple(cg.functions)):
+            made = cg.func_outputs(name)
+            regions = [used[token] for token in made if token in used]
+            if not regions and (made or not is_whole):
+                continue
+            inside[name] = region = _common(regions or [self.root])
+            read = [(token, region) for token in cg.func_inputs(name)]
+            if name in switches:
+                self.branches[name] = _branches(cg, name, region)
+                read = [read[0], *((branch.token, branch) for branch in self.branches[name])]
+            for token, reader in read:
+                used[token] = _common([used.get(token, reader), reader])
+        functions = [name for name in cg.functions if name in inside]
+        for name in functions:
+            inside[name].functions.append(name)
+        seen = {*used, *(token for name in functions for token in cg.func_outputs(name))}
+        return functions, [token for token in cg.tokens if token in seen]
+
+    @property
+    def is_too_deep(self) -> bool:
+        """Whether switches stand in switches too often to be read."""
+        return any(region.depth > _DEEPEST for regions in self.branches.values() for region in regions)
+
+    def text(self) -> str:
+        """Return the function."""
+        self.variables = variables = identifiers_of(self.tokens, self._hidden().__contains__)
+        sources = [token for token in self.cg.source_tokens if token in variables]
+        given: list[Item] = [("", variables[token]) for token in sources if token not in self.defaults]
+        named = [(f"{variables[token]}=", self.defaults[token]) for token in sources if token in self.defaults]
+        given += [*[("", "*")][: len(named)], *named]
+        whole = f"def {self.name}({', '.join(before + source for before, source in given)}):"
+        head = [whole] if len(whole) <= LINE else one_per_line(f"def {self.name}(", given, "):")
+        body = [*self._docstring([*sources, *self.returns]), *self._region(self.root, 1)]
+        if self.returns:
+            returned = [variables[token] for token in self.returns]
+            source = f"({', '.join(returned)})"
+            is_short = len(returned) == 1 or len(source) + 9 <= LINE
+            body += laid_out(source[1:-1] if is_short else source, 1, "return ")
+        elif self.where:  # a function of another graph returns a value even if there is no token to return
+            body.append("    return ()")
+        return "\n".join([*head, *body])
+
+    def _hidden(self) -> set[str]:
+        """Return the names of the module that the function uses: a variable of that name would hide them."""
+        keys = chain.from_iterable(values.values() for values in self.keys.values())
+        sources = [*self.references.values(), *(key for key in keys if not key.startswith(("'", '"')))]
+        tops = {source.partition(".")[0].partition("(")[0] for source in sources}
+        return {*tops, "ValueError"} if self.branches else tops
+
+    def _region(self, region: _Region, depth: int) -> Iterator[str]:
+        """Give the lines of the functions of a region, and of the branches in it."""
+        for name in region.functions:
+            if name in self.branches:
+                yield from self._switch(name, depth)
+                continue
+            arguments = ", ".join(self.variables[token] for token in self.cg.func_inputs(name))
+            yield from laid_out(f"{self.references[name]}({arguments})", depth, self._targets(name))
+
+    def _targets(self, name: str) -> str:
+        """Return what stands before the value of a function."""
+        targets = [self.variables[token] for token in self.cg.func_outputs(name)]
+        if not targets:
+            return ""
+        is_tuple_of_one = len(targets) == 1 and not self.cg.has_single_output(name)
+        return f"({targets[0]},) = " if is_tuple_of_one else f"{', '.join(targets)} = "
+
+    def _switch(self, name: str, depth: int) -> Iterator[str]:
+        selector, keyword, pad = self.variables[self.cg.func_inputs(name)[0]], "if", "    " * depth
+        for branch in self.branches[name]:
+            keys = [self.keys[name][key] for key in branch.keys]
+            if len(keys) == 1 and keys[0] not in ("True", "False"):
+                operator, right = ("is" if keys[0] == "None" else "=="), keys[0]
+            else:
+                operator, right = "in", f"({', '.join(keys)}{',' if len(keys) == 1 else ''})"
+            yield from laid_out(right, depth, f"{keyword} {selector} {operator} ", ":")
+            body, targets = [*self._region(branch, depth + 1)], self._targets(name)
+            if targets:
+                body += laid_out(self.variables[branch.token], depth + 1, targets)
+            yield from body or [f"{pad}    pass"]
+            keyword = "elif"
+        yield f"{pad}else:"
+        yield f'{pad}    raise ValueError(f"Unknown {selector}: {{{selector}!r}}")'
+
+    def _docstring(self, shown: Iterable[str]) -> list[str]:
+        """Return the docstring: what is returned, and which parameters and results have other names than tokens."""
+        summary = f"Return {', '.join(self.variables[token] for token in self.returns)}." if self.returns else "Run."
+        if len(summary) > LINE - 10:
+            summary = f"Return {len(self.returns)} values." if len(self.returns) > 1 else "Return the result."
+        other = [token for token in dict.fromkeys(shown) if self.variables[token] != token]
+        if not other:
+            return [f'    """{summary}"""']
+        lines = [f"        {self.variables[token]}: {_printable(token)}" for token in other]
+        return [f'    """{summary}', "", "    Tokens of the graph that have other names here:", "", *lines, '    """']
+
+
+def _printable(token: str) -> str:
+    """Return a token as it may stand in a docstring, whatever it holds."""
+    plain = "".join(character if character.isprintable() and character not in '\\"' else "?" for character in token)
+    return quoted(plain if len(plain) <= _SHOWN else f"{plain[: _SHOWN - 3]}...").replace('"', "'")
+
+
+def _branches(cg: CompGraph, name: str, around: _Region) -> list[_Region]:
+    """Return the branches of a switch; values of the selector that choose the same token choose the same branch."""
+    found: dict[str, _Region] = {}
+    for key, token in _keys(cg, name):
+        found.setdefault(token, _Region(around, around.depth + 1, token)).keys.append(key)
+    return list(found.values())
+
+
+def _keys(cg: CompGraph, name: str) -> Iterator[tuple[Hashable, str]]:
+    """Give the values of a switch's selector, each with the token that it chooses."""
+    function = as_switch(cg.functions[name])
+    yield from zip(function.branches if function is not None else (), cg.func_inputs(name)[1:], strict=True)
+
+
+def _common(regions: list[_Region]) -> _Region:
+    """Return the innermost region around all of these."""
+    found = regions[0]
+    for other in regions[1:]:
+        while found is not other:
+            if found.depth >= other.depth:
+                found = found.around or found
+            else:
+                other = other.around or other
+    return found
 
 
 def _wanted(cg: CompGraph, returns: Any) -> tuple[str, ...] | None:
@@ -184,14 +390,13 @@ def _with_pipelines(top: _Part) -> list[_Part]:
     found, pending = [top], [top]
     while pending:
         part = pending.pop()
-        for name in part.placement.functions:
+        for name in part.functions:
             pipeline = called_by(part.cg.functions[name])
             if not is_plain_pipeline(pipeline):
                 continue
             if id(pipeline) not in by_pipeline:
-                cg, values = pipeline.cg, pipeline.runner.hyperparameters
                 where = f" of pipeline {pipeline.name!r}"
-                inner = _Part(pipeline.name, cg, values, place(cg, None), cg.sink_tokens, where)
+                inner = _Part(pipeline.name, pipeline.cg, pipeline.runner.hyperparameters, None, where)
                 by_pipeline[id(pipeline)] = inner
                 found.append(inner)
                 pending.append(inner)
@@ -199,114 +404,58 @@ def _with_pipelines(top: _Part) -> list[_Part]:
     return found[::-1]
 
 
-def _check_placeholders(parts: Sequence[_Part]) -> None:
-    missing = [name for part in parts for name in part.cg.placeholders if name in set(part.placement.functions)]
-    if missing:
-        raise PlaceholderNeeded(missing)
-
-
-def _unwritable(parts: Sequence[_Part], name: str, wanted: Sequence[str] | None) -> list[str]:
-    """Return what stands against writing these parts, whatever their functions are."""
-    reasons = []
-    if not is_word(name) or hasattr(builtins, name):
-        reasons.append(f"name={name!r} can't be a function's name. Give a word that means nothing to Python.")
+def _unwritable(parts: Sequence[_Part], name: str, wanted: Sequence[str] | None) -> Iterator[str]:
+    """Give what stands against writing these parts, whatever their functions are."""
+    if not is_identifier(name) or hasattr(builtins, name):
+        yield f"name={name!r} can't be a function's name. Give a word that means nothing to Python."
     if wanted == ():
-        reasons.append("returns is empty: name at least one token, or leave it out for the sink tokens.")
+        yield "returns is empty: name at least one token, or leave it out for the sink tokens."
     for part in parts:
-        if part.placement.is_too_deep:
+        if part.is_too_deep:
             text = f"The switches{part.where} stand in one another too deep to be indented."
-            reasons.append(f"{text} Make the inner ones a Pipeline, which becomes a function of its own.")
-    return reasons
+            yield f"{text} Make the inner ones a Pipeline, which becomes a function of its own."
 
 
 def _slice(gathered: Slice, parts: Sequence[_Part]) -> None:
     """Gather what the functions need, and note by which expressions they are called."""
     called: list[tuple[_Part, str, Callable[..., Any]]] = []
     for part in parts:
-        written = [name for name in part.placement.functions if name not in part.placement.branches]
-        called += [(part, name, called_by(part.cg.functions[name])) for name in written if name not in part.pipelines]
+        written = [name for name in part.functions if name not in part.branches and name not in part.pipelines]
+        called += [(part, name, called_by(part.cg.functions[name])) for name in written]
     functions = [(f"Function {name!r}{part.where}", function) for part, name, function in called]
     for (part, name, _), reference in zip(called, slice_functions(gathered, functions), strict=True):
         part.references[name] = reference
-
-
-def _keep_names(gathered: Slice, parts: Sequence[_Part]) -> None:
-    """Name the functions of pipelines, so that they hide nothing."""
     for part in parts:
-        if part.where:
-            part.name = word_of(part.name, gathered.is_taken)
+        if part.where:  # its name must hide nothing
+            part.name = identifier_of(part.name, gathered.is_taken)
             gathered.keep_name(part.name)
     for part in parts:
         part.references.update({name: inner.name for name, inner in part.pipelines.items()})
 
 
-def _resolved(gathered: Slice, part: _Part) -> Straight:
-    """Return a part with expressions for its values."""
-    read = set(part.placement.tokens)
-    values = {token: value for token, value in part.values.items() if token in read}
-    return Straight(
-        part.name,
-        part.cg,
-        part.placement,
-        part.returns,
-        part.references,
-        {token: _default(gathered, part, token, value) for token, value in values.items()},
-        {name: _keys(gathered, part, name) for name in part.placement.branches},
-        bool(part.where),
-    )
+def _write_values(gathered: Slice, part: _Part) -> None:
+    """Write the expressions of hyperparameters and of the values that switches compare."""
+    for token, value in part.values.items():
+        if token in part.tokens:
+            part.defaults[token] = _default(gathered, f"Hyperparameter {token!r}{part.where}", token, value)
+    for name in part.branches:
+        what = f"Switch {name!r}{part.where}"
+        part.keys[name] = {
+            key: expression_or_none(
+                gathered, key, what, f"chooses {token!r} by a key of type {{kind}}, which no expression makes again. "
+                "Choose by strings or numbers."
+            )
+            for key, token in _keys(part.cg, name)
+        }  # fmt: skip
 
 
-def _default(gathered: Slice, part: _Part, token: str, value: Any) -> str:
+def _default(gathered: Slice, what: str, token: str, value: Any) -> str:
     """Return the expression of a hyperparameter's value: as it is, or the constant above that holds it."""
-    what = f"Hyperparameter {token!r}{part.where}"
-    source = _expression(gathered, value, what)
-    if not source:
-        gathered.refusals.append(
-            f"{what} is of type {type(value).__name__}, and no expression makes this value again. Leave it free, so "
-            "that the function takes it; or use numbers, strings, a small array or tuples of them."
-        )
-        return "None"
+    source = expression_or_none(gathered, value, what, _NO_VALUE)
     if literal_source(value) or source.replace(".", "").isidentifier():
         return source
     name = next((name for name, known in gathered.constants.items() if known == source), "")
     if not name:
-        name = word_of(token.upper(), gathered.is_taken)
+        name = identifier_of(token.upper(), gathered.is_taken)
         gathered.add_made_constant(name, source)
     return name
-
-
-def _expression(gathered: Slice, value: Any, what: str) -> str:
-    """Return the expression of a value; "None", with the reason noted, if a name that it needs is taken."""
-    try:
-        return expression(gathered, value, what)
-    except Refused as refusal:
-        gathered.refusals.append(str(refusal))
-        return "None"
-    except RecursionError:  # it holds itself, or is nested deeper than Python reads
-        return ""
-
-
-def _keys(gathered: Slice, part: _Part, name: str) -> dict[object, str]:
-    """Return the expressions of the values that a switch compares its selector with."""
-    function = as_switch(part.cg.functions[name])
-    tokens = part.cg.func_inputs(name)[1:]
-    sources: dict[object, str] = {}
-    for key, token in zip(function.branches if function is not None else (), tokens, strict=True):
-        sources[key] = _expression(gathered, key, f"Switch {name!r}{part.where}")
-        if not sources[key]:
-            gathered.refusals.append(
-                f"Switch {name!r}{part.where} chooses {token!r} by a key of type {type(key).__name__}, which no "
-                "expression makes again. Choose by strings or numbers."
-            )
-    return sources
-
-
-def _module(gathered: Slice, straights: Sequence[Straight]) -> str:
-    blocks = []
-    if gathered.imports:
-        blocks.append("\n".join(ordered_imports(list(gathered.imports.values()))))
-    constants = early_constants(gathered)
-    if constants:
-        blocks.append(constants)
-    head = ["\n\n".join(blocks)] if blocks else []
-    return "\n\n\n".join([*head, *definitions(gathered), *map(emit_function, straights)]) + "\n"

@@ -1,16 +1,23 @@
-"""The replay of a bundle's samples, compared with what was recorded, and the likely cause of a difference."""
+"""Verification of a bundle: its samples are replayed, and a difference is explained by what is not as it was."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
-from epypes.bundle.causes import environment_notes, likely_causes
-from epypes.bundle.freshenv import replay_in_fresh_environment
-from epypes.bundle.replay import REPLAY_TIMEOUT_S, replay_isolated
-from epypes.bundle.report import ReplayReport
-from epypes.bundle.seal import check_seal
+from epypes.bundle.manifest import changed_since_recorded, check_manifest, environment_differences, recorded_environment
+from epypes.bundle.replay import REPLAY_TIMEOUT_S, ReplayReport, replay_isolated
+from epypes.bundle.requirements import REQUIREMENTS, fresh_environment, pins
 from epypes.errors import BundleChanged, BundleError, ReplayDiffers
+
+_UNSTEADY: Final = (
+    "The values of {} differ from run to run in one process, too: random numbers without a seed, a counter, or a clock."
+)
+_UNKNOWN: Final = (
+    "Neither the bundle nor what it runs on has changed as far as is known: a function may depend on something that is "
+    "not a token, such as a file, the current folder, or what was installed beside its package."
+)
 
 
 def verify(
@@ -36,7 +43,7 @@ def verify(
     Returns
     -------
     ReplayReport
-        Its notes tell what is not as it was when the samples were recorded, though it computes the same.
+        Its notes name what is not as it was when the samples were recorded, though it computes the same.
 
     Raises
     ------
@@ -50,15 +57,18 @@ def verify(
     folder = Path(path)
     change: BundleChanged | None = None
     try:
-        check_seal(folder)
+        check_manifest(folder)
     except BundleChanged as error:
         if not run_anyway:
             text = f"{error} Nothing of it was run; to run the changed code: epypes verify --run-anyway."
             raise BundleChanged(folder, text) from None
         change = error
-    replayed = replay_in_fresh_environment if fresh_env else replay_isolated
     try:
-        report = replayed(folder, sealed=change is None, timeout_s=timeout_s)
+        if fresh_env:
+            with fresh_environment(folder) as python:
+                report = replay_isolated(folder, sealed=change is None, timeout_s=timeout_s, python=python)
+        else:
+            report = replay_isolated(folder, sealed=change is None, timeout_s=timeout_s)
     except BundleError as error:
         if change is None:
             raise
@@ -67,6 +77,28 @@ def verify(
         if report.identical:
             raise BundleChanged(folder, f"{change} It still computes what was recorded.")
         raise ReplayDiffers(folder, replace(report, causes=(str(change),)))
+    notes = (
+        *_pinned_otherwise(folder, report),
+        *environment_differences(recorded_environment(folder), report.environment),
+    )
     if report.identical:
-        return replace(report, notes=(*report.notes, *report.outside, *environment_notes(folder, report)))
-    raise ReplayDiffers(path, replace(report, causes=likely_causes(folder, report)))
+        return replace(report, notes=(*report.notes, *report.outside, *notes))
+    tokens = ", ".join(map(repr, report.unsteady))
+    causes = (*changed_since_recorded(folder), *([_UNSTEADY.format(tokens)] if tokens else []), *notes)
+    raise ReplayDiffers(path, replace(report, causes=causes or (_UNKNOWN,)))
+
+
+def _pinned_otherwise(folder: Path, report: ReplayReport) -> list[str]:
+    """Return as sentences which packages are not as pinned."""
+    try:
+        lines = (folder / REQUIREMENTS).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        return []
+    pinned, imported = pins(lines), pins(report.requirements)
+    found = [
+        f"{REQUIREMENTS} pins {name} {version}, and {imported[name]} is imported here."
+        for name, version in pinned.items()
+        if name in imported and imported[name] != version
+    ]
+    missing = sorted(imported.keys() - pinned.keys())
+    return found + ([f"{REQUIREMENTS} does not name what is imported: {', '.join(missing)}."] if missing else [])

@@ -1,30 +1,22 @@
-"""How do values that were tuned on a running service get into its bundle, so that it still proves what it computes?
-
-Run as a program (``python -I -m epypes.bundle.writeback FOLDER REPORT``) it records a draft's samples again.
-"""
+"""Values that were tuned on a running service, written into its bundle, which still proves what it computes."""
 
 from __future__ import annotations
 
 import difflib
-import json
 import shutil
-import sys
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from epypes.bundle.answers import record_answers_again
-from epypes.bundle.entries import alike, fits, read, written
-from epypes.bundle.exchange import exchange
-from epypes.bundle.load import SETTINGS, read_bundle
-from epypes.bundle.proof import prove
-from epypes.bundle.replay import REPLAY_TIMEOUT_S, outcome_of, run_isolated
-from epypes.bundle.seal import check_seal, digest
+from epypes.bundle.hyperparameters import alike, fits, read, written
+from epypes.bundle.load import SETTINGS
+from epypes.bundle.manifest import check_manifest, digest
+from epypes.bundle.proof import prove, swap_folders
+from epypes.bundle.replay import REPLAY_TIMEOUT_S, run_isolated
 from epypes.errors import BundleError, HyperparameterError, PromotionRefused, UnknownName
 from epypes.optional import optional_import
-from epypes.run import CompGraphRunner
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +65,7 @@ def write_back(
         it is.
     """
     folder = Path(path).resolve()
-    before = check_seal(folder)
+    before = check_manifest(folder)
     text = (folder / SETTINGS).read_text(encoding="utf-8")
     changed = changed_settings(text, values)
     if changed == text:
@@ -85,10 +77,10 @@ def write_back(
             (draft / SETTINGS).write_text(changed, encoding="utf-8")
             _record(draft, folder, timeout_s)
             found = WriteBack(_diff(text, changed), digest(draft))
-            if check_seal(folder) != before:
+            if check_manifest(folder) != before:
                 raise BundleError(folder, f"{folder} was replaced meanwhile. Write the values back again.")
             if not dry_run:
-                exchange(draft, folder)
+                swap_folders(draft, folder)
     except OSError as error:
         raise BundleError(folder, f"{folder} can't be written: {error}. The bundle stays as it is.") from error
     return found
@@ -138,35 +130,10 @@ def _diff(before: str, after: str) -> str:
 def _record(draft: Path, target: Path, timeout_s: float) -> None:
     """Record the outputs of a draft's samples again, replay and seal it."""
     try:
-        run_isolated("epypes.bundle.writeback", draft, [], timeout_s=timeout_s)
-        prove(draft, target)
+        run_isolated(draft, ["--record"], timeout_s=timeout_s)
+        prove(draft, target, timeout_s)
     except BundleError as error:
         reasons = error.reasons if isinstance(error, PromotionRefused) else (str(error),)
         why = " ".join(reasons).replace(str(draft.resolve()), str(target)).rstrip(".")
         text = f"The values were not written back: {why}. The bundle stays as it is: try other values."
         raise BundleError(target, text) from error
-
-
-def record_again(folder: Path) -> dict[str, Any]:
-    """Run the samples of an unsealed bundle in this process, and write down what comes out."""
-    from epypes.wire.samples import load_sample, save_sample
-
-    bundle = read_bundle(folder, sealed=False)
-    settings = bundle.settings
-    for path in bundle.samples:
-        inputs, outputs = load_sample(path)
-        run = CompGraphRunner(bundle.cg, settings.hyperparameters).run(**inputs)
-        save_sample(path, inputs, {token: run[token] for token in outputs}, rgb=settings.rgb)
-    record_answers_again(bundle)
-    return {"samples": len(bundle.samples)}
-
-
-def main(arguments: list[str]) -> int:
-    """Record the samples of the draft that is named first; write how many, or an error, to the file named second."""
-    folder, out = Path(arguments[0]), Path(arguments[1])
-    out.write_text(json.dumps(outcome_of(folder, lambda: record_again(folder))), encoding="utf-8")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -1,17 +1,14 @@
-"""Which values do the functions of OpenCV and scikit-image take?
+"""The values that parameters of OpenCV's and scikit-image's functions take.
 
-- ``opencv_filters``, ``opencv_features``, ``skimage``: the table, by function and parameter; data only
-- ``lookup``: what it says of a function
-- ``calls``: what a user's function hands to such a function
-- ``names``: what a name alone says
+- ``table``: the entries by function and parameter, read from ``opencv.toml`` and ``skimage.toml`` on first use
+- ``lookup``: the entry of a function's parameter, found by object; the usual values of a parameter's name
+- ``calls``: the entries of the library functions that a user's function passes its parameter to
 
-Nothing here imports these libraries: who uses their functions has imported them.
+Nothing here imports these libraries: a caller that uses their functions has imported them.
 """
 
-from epypes.catalog.calls import Use, uses
-from epypes.catalog.entry import Entry
-from epypes.catalog.lookup import TABLE, entry_of
-from epypes.catalog.names import usual
-from epypes.catalog.signatures import parameter_names
+from epypes.catalog.calls import Use, parameter_names, uses
+from epypes.catalog.lookup import entry_of, usual
+from epypes.catalog.table import Entry, table
 
-__all__ = ["TABLE", "Entry", "Use", "entry_of", "parameter_names", "uses", "usual"]
+__all__ = ["Entry", "Use", "entry_of", "parameter_names", "table", "uses", "usual"]

@@ -1,42 +1,45 @@
-"""Which library's functions does a user's function hand its parameter to?
+"""The library functions that a user's function passes its parameter to, read from its source.
 
-Read from the source: the call counts in which an argument is the parameter itself, or ``int(k)``, or a tuple of it.
-What is called is looked up by object, so it does not matter how it was imported.
+A call counts in which an argument is the parameter itself, ``int(k)``, or a tuple of it. The called function is looked
+up by object, so it does not matter how it was imported.
 """
 
 from __future__ import annotations
 
 import ast
 import builtins
+import inspect
 import linecache
+import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
-from types import CellType, CodeType, FunctionType, ModuleType
+from types import FunctionType, ModuleType
 from typing import Any, Final
 
-from epypes.catalog.entry import Entry
 from epypes.catalog.lookup import entry_of
-from epypes.catalog.signatures import parameter_names
+from epypes.catalog.table import Entry
 from epypes.graph.redefined import unwrapped
 
 _CONVERSIONS: Final = ("int", "float", "round", "bool")
 # A user's function may call another, and that another.
 _DEEPEST: Final = 3
+# The first line of a docstring of OpenCV: "blur(src, ksize[, dst[, anchor]]) -> dst".
+_SIGNATURE = re.compile(r"[\w.]+\(([^()]*)\)")
 
 _Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
 
 
 @dataclass(frozen=True, slots=True)
 class Use:
-    """What a function does with one of its parameters.
+    """A use that a function makes of one of its parameters.
 
     Attributes
     ----------
     entry
-        What the table says of it; None if it is only compared.
+        The table's entry of the library function that gets it; None if it is only compared.
     cuts
         The function's parameter with whose values it is compared; empty if there is none.
     """
@@ -45,25 +48,55 @@ class Use:
     cuts: str = ""
 
 
+def parameter_names(function: Callable[..., Any]) -> tuple[str, ...]:
+    """Return the names of the parameters that can be given by position, a C function's too; empty if not known.
+
+    Never raises.
+
+    Examples
+    --------
+    >>> parameter_names(lambda image, k, *rest: image)
+    ('image', 'k')
+    """
+    try:
+        signature = inspect.signature(function)
+    except Exception:  # C functions have no signature, and odd objects raise anything
+        return _documented_names(function)
+    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    names = tuple(name for name, parameter in signature.parameters.items() if parameter.kind in positional)
+    return names or _documented_names(function)
+
+
+def _documented_names(function: Callable[..., Any]) -> tuple[str, ...]:
+    if isinstance(function, type):
+        function = getattr(function, "create", function)  # an object of OpenCV is made as its create() makes it
+    text = getattr(function, "__doc__", None)
+    found = _SIGNATURE.match(text.lstrip()) if isinstance(text, str) else None
+    parts = re.split(r"[\[\],\s]+", found[1]) if found else ()
+    return tuple(filter(None, parts))
+
+
 def uses(function: Any, parameter: str) -> tuple[Use, ...]:
-    """Return what a function does with a parameter, as far as the table knows and its source is there; never raises."""
+    """Return the uses of a parameter, as far as the table knows them and the source is available; never raises."""
     try:
         return tuple(_uses(unwrapped(function), parameter, _DEEPEST))
-    except Exception:  # whatever odd objects are among the names of a function, this is a guess
+    except Exception:  # the names of a function may mean any odd objects, and this is a guess
         return ()
 
 
 def _uses(function: Any, parameter: str, depth: int) -> Iterator[Use]:
-    node = definition(function)
+    node = _definition(function)
     if node is None or not depth or _is_changed(node, parameter):
         return
-    names = _names_of(function, node)
-    own = {argument.arg for argument in _arguments(node)}
+    names, own = _names_of(function, node), set(_argument_names(node))
     for part in ast.walk(node):
         if isinstance(part, ast.Call):
             yield from _uses_in_call(part, names, own, parameter, depth, function)
         elif isinstance(part, ast.Compare):
-            yield from _uses_in_comparison(part, own, parameter)
+            sides = [part.left, *part.comparators]
+            if any(_is_parameter(side, parameter) for side in sides):
+                others = (side.id for side in sides if isinstance(side, ast.Name) and side.id in own - {parameter})
+                yield from (Use(None, other) for other in others)
 
 
 def _uses_in_call(
@@ -72,69 +105,64 @@ def _uses_in_call(
     target = _object(call.func, names)
     if not callable(target):
         return
-    given = dict(_given(call, parameter_names(target)))
-    for name, value in given.items():
-        if not _is_it(value, parameter):
+    arguments = _arguments(call, parameter_names(target))
+    for name, value in arguments.items():
+        if not _is_parameter(value, parameter):
             continue
         entry = entry_of(target, name)
         if entry is not None:
-            image = given.get(entry.cuts)
+            image = arguments.get(entry.cuts)
             yield Use(entry, image.id if isinstance(image, ast.Name) and image.id in own else "")
         elif isinstance(target, FunctionType) and _package(target) == _package(caller):
-            # What the other function calls its parameters is not known here: it cuts nothing of ours.
+            # The other function's parameters have names of their own, so it compares none of this function's.
             yield from (Use(use.entry) for use in _uses(target, name, depth - 1) if use.entry is not None)
 
 
-def _uses_in_comparison(comparison: ast.Compare, own: set[str], parameter: str) -> Iterator[Use]:
-    sides = [comparison.left, *comparison.comparators]
-    if any(_is_it(side, parameter) for side in sides):
-        others = (side.id for side in sides if isinstance(side, ast.Name) and side.id in own - {parameter})
-        yield from (Use(None, other) for other in others)
+def _arguments(call: ast.Call, names: tuple[str, ...]) -> dict[str, ast.expr]:
+    """Return the arguments of a call by the parameter's name, up to a starred one."""
+    starred = (place for place, value in enumerate(call.args) if isinstance(value, ast.Starred))
+    arguments = dict(zip(names, call.args[: next(starred, None)], strict=False))
+    return arguments | {keyword.arg: keyword.value for keyword in call.keywords if keyword.arg}
 
 
-def _given(call: ast.Call, names: tuple[str, ...]) -> Iterator[tuple[str, ast.expr]]:
-    """Give the arguments of a call by the parameter's name; what stands behind a star is not known."""
-    for name, value in zip(names, call.args, strict=False):
-        if isinstance(value, ast.Starred):
-            break
-        yield name, value
-    yield from ((keyword.arg, keyword.value) for keyword in call.keywords if keyword.arg)
-
-
-def _is_it(expression: ast.expr, parameter: str) -> bool:
+def _is_parameter(expression: ast.expr, parameter: str) -> bool:
     """Whether an expression is the parameter: ``k``, ``int(k)``, ``(k, k)``."""
     if isinstance(expression, ast.Name):
         return expression.id == parameter
     if isinstance(expression, ast.Tuple | ast.List):
-        return any(_is_it(part, parameter) for part in expression.elts)
+        return any(_is_parameter(part, parameter) for part in expression.elts)
     if isinstance(expression, ast.Call) and isinstance(expression.func, ast.Name):
-        return expression.func.id in _CONVERSIONS and any(_is_it(part, parameter) for part in expression.args[:1])
+        return expression.func.id in _CONVERSIONS and any(
+            _is_parameter(part, parameter) for part in expression.args[:1]
+        )
     return False
 
 
 def _is_changed(node: _Definition, parameter: str) -> bool:
-    """Whether a function computes another value under the parameter's name."""
+    """Whether a function assigns another value to the parameter's name; ``k = int(k)`` is the same value."""
     assigned = (part for part in ast.walk(node) if isinstance(part, ast.Name) and part.id == parameter)
-    stored = sum(isinstance(part.ctx, ast.Store) for part in assigned)
-    kept = sum(
+    stores = sum(isinstance(part.ctx, ast.Store) for part in assigned)
+    conversions = sum(
         isinstance(part, ast.Assign)
-        and _is_it(part.value, parameter)
+        and _is_parameter(part.value, parameter)
         and isinstance(part.targets[0], ast.Name)
         and not isinstance(part.value, ast.Tuple | ast.List)
         for part in ast.walk(node)
     )
-    return stored > kept
+    return stores > conversions
 
 
-def definition(function: Any) -> _Definition | None:
-    """Return the definition of a function in the text that is there now; None if there is none of it."""
+def _definition(function: Any) -> _Definition | None:
+    """Return the definition of a function in its source as it is now; None if it is not there."""
     if not isinstance(function, FunctionType):
         return None
     code = function.__code__
+    names = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
     text = "".join(linecache.getlines(code.co_filename, function.__globals__))
-    wanted = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
-    found = (node for node in _definitions(text).get(code.co_firstlineno, ()) if _name(node) == code.co_name)
-    return next((node for node in found if _plain_names(node) == wanted), None)
+    for node in _definitions(text).get(code.co_firstlineno, ()):
+        if getattr(node, "name", "<lambda>") == code.co_name and _argument_names(node) == names:
+            return node
+    return None
 
 
 @lru_cache(maxsize=16)  # one cell often defines many functions
@@ -146,55 +174,40 @@ def _definitions(text: str) -> Mapping[int, tuple[_Definition, ...]]:
         return {}
     found: dict[int, tuple[_Definition, ...]] = {}
     for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
-            line = min([node.lineno, *(mark.lineno for mark in getattr(node, "decorator_list", ()))])
+        if isinstance(node, _Definition):
+            line = min([node.lineno, *(decorator.lineno for decorator in getattr(node, "decorator_list", ()))])
             found[line] = (*found.get(line, ()), node)
     return found
 
 
-def _name(node: _Definition) -> str:
-    return "<lambda>" if isinstance(node, ast.Lambda) else node.name
-
-
-def _arguments(node: _Definition) -> list[ast.arg]:
-    return [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
-
-
-def _plain_names(node: _Definition) -> tuple[str, ...]:
-    return tuple(argument.arg for argument in _arguments(node))
+def _argument_names(node: _Definition) -> tuple[str, ...]:
+    return tuple(argument.arg for argument in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs))
 
 
 def _names_of(function: FunctionType, node: _Definition) -> dict[str, Any]:
-    """Return what the names in a function mean: those imported in it, around it, in its module, and Python's own."""
-    code: CodeType = function.__code__
-    cells = zip(code.co_freevars, function.__closure__ or (), strict=False)
-    around = {name: found for name, cell in cells for found in _content(cell)}
-    return {**vars(builtins), **function.__globals__, **around, **dict(_imported(node))}
-
-
-def _content(cell: CellType) -> Iterator[Any]:
-    with suppress(ValueError):  # empty: the name has no value yet
-        yield cell.cell_contents
-
-
-def _imported(node: _Definition) -> Iterator[tuple[str, Any]]:
+    """Return the objects of the names in a function: Python's own, its module's, enclosing ones, imported in it."""
+    names = {**vars(builtins), **function.__globals__}
+    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=False):
+        with suppress(ValueError):  # empty: the name has no value yet
+            names[name] = cell.cell_contents
     for part in ast.walk(node):
         if isinstance(part, ast.Import):
             for alias in part.names:
                 top = alias.name if alias.asname else alias.name.partition(".")[0]
-                yield alias.asname or top, sys.modules.get(top)
+                names[alias.asname or top] = sys.modules.get(top)
         elif isinstance(part, ast.ImportFrom) and part.module and not part.level:
             for alias in part.names:
-                yield alias.asname or alias.name, getattr(sys.modules.get(part.module), alias.name, None)
+                names[alias.asname or alias.name] = getattr(sys.modules.get(part.module), alias.name, None)
+    return names
 
 
 def _object(expression: ast.expr, names: Mapping[str, Any]) -> Any:
-    """Look up a dotted name in modules and classes; None for any other expression."""
+    """Return the object of a dotted name in modules and classes; None for any other expression."""
     if isinstance(expression, ast.Name):
         return names.get(expression.id)
     if isinstance(expression, ast.Attribute):
-        home = _object(expression.value, names)
-        return getattr(home, expression.attr, None) if isinstance(home, ModuleType | type) else None
+        owner = _object(expression.value, names)
+        return getattr(owner, expression.attr, None) if isinstance(owner, ModuleType | type) else None
     return None
 
 

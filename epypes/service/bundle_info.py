@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from epypes.bundle.load import SETTINGS
-from epypes.bundle.seal import check_seal
+from epypes.bundle.manifest import check_manifest
 from epypes.bundle.settings import Settings, read_settings
 from epypes.errors import BundleError
 from epypes.service.parameters import read_entries
@@ -45,10 +45,10 @@ def read_bundle_info(path: str | Path) -> BundleInfo:
         The folder is not the bundle that was promoted.
     """
     folder = Path(path).resolve()
-    digest = check_seal(folder)
+    digest = check_manifest(folder)
     found = BundleInfo(folder, digest, read_settings(folder / SETTINGS), read_entries(folder / SETTINGS))
     # A promotion may have put another folder in its place meanwhile.
-    if check_seal(folder) != digest:
+    if check_manifest(folder) != digest:
         raise BundleError(folder, f"{folder} was promoted anew while it was read. Try again.")
     return found
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from epypes.bundle.seal import check_seal
+from epypes.bundle.manifest import check_manifest
 from epypes.errors import BundleError, DeployRefused, ServiceError
 from epypes.service.bundle_info import BundleInfo, differing_ports, read_bundle_info
 from epypes.service.dispatcher import Dispatcher
@@ -95,11 +95,11 @@ class Deployer:
         return self._exclusive(self._supervisor.bundle.path, lambda: self._write_back(dry_run))
 
     def _write_back(self, dry_run: bool) -> WriteBack:
-        from epypes.bundle.entries import read
+        from epypes.bundle.hyperparameters import read
         from epypes.bundle.writeback import write_back
 
         before = self._supervisor.bundle
-        if check_seal(before.path) != before.digest:
+        if check_manifest(before.path) != before.digest:
             text = f"{before.path} is not the bundle any more that is served. Deploy it first, or restore it."
             raise BundleError(before.path, text)
         values = {token: read(entry) for token, entry in self._parameters.current.entries.items()}

@@ -31,6 +31,9 @@ def test_the_wheel_holds_both_packages_and_their_data(wheel):
     for name in (
         "epypes/py.typed",
         "epypes/wire/schema.binpb",
+        "epypes/catalog/names.toml",
+        "epypes/catalog/opencv.toml",
+        "epypes/catalog/skimage.toml",
         "epypes/display/paint/explore.js",
         "epypes/display/paint/explore.css",
         "epypes_widgets/picking.css",

@@ -1,9 +1,10 @@
-"""Which graph do tests of many images share, and who does their jobs?"""
+"""Graphs, images and executors that tests of many images share."""
 
 from __future__ import annotations
 
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
+from typing import Any
 
 import cv2
 import numpy as np
@@ -44,6 +45,11 @@ def counting_runner() -> ep.CompGraphRunner:
         },
     )
     return ep.CompGraphRunner(cg, {"canny_lo": 70, "canny_hi": 200})
+
+
+def runner_of(function: Any, *tokens: str, **hyperparameters: Any) -> ep.CompGraphRunner:
+    """A runner of a graph with one function, whose token is ``out``."""
+    return ep.CompGraphRunner(ep.CompGraph({"f": function}, {"f": (tokens, "out")}), hyperparameters)
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 import epypes as ep
 from epypes.acquisition import write_image
 from epypes.batch.cases import cases_of, checks_of, with_labels_read
-from epypes.batch.files import read_value
+from epypes.batch.items import read_value
 from epypes.errors import ScaleError, UnknownName
 
 CG = ep.CompGraph(

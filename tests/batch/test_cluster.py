@@ -15,7 +15,7 @@ import pytest
 from distributed import Client, LocalCluster
 
 import epypes as ep
-from epypes.batch.spreading import worker_count
+from epypes.batch.executors import worker_count
 from epypes.errors import ExecutorBroken
 from tests.batch.test_spreading import mixed, mortal_runner, without_times
 from tests.bundle.cells import cell
@@ -129,5 +129,5 @@ def test_an_image_that_kills_every_worker_is_a_row_that_says_so(client):
     result = ep.map(runner, [np.full((2, 2), level) for level in levels], client.get_executor())
     assert [outcome.values.get("level") for outcome in result] == [0, 1, 2, None, 3]
     (failure,) = result.failures
-    assert str(failure.trouble) == "KilledWorker: every worker that ran it died"
-    assert replace(failure, trouble=None).values == {}
+    assert str(failure.error_info) == "KilledWorker: every worker that ran it died"
+    assert replace(failure, error_info=None).values == {}

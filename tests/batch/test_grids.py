@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.batch.grids import MOST_OUTCOMES, grid_of
-from epypes.batch.order import running_order
+from epypes.batch.grid import MOST_OUTCOMES, grid_of, running_order
 from epypes.errors import ScaleError, UnknownName
 
 

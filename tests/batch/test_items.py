@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.batch.items import Item, count_of, items_of, opened
+from epypes.batch.items import Item, count_of, items_of, payload_of
 from epypes.errors import ImageFileError, ScaleError
 
 
@@ -111,7 +111,7 @@ def test_files_are_read_in_the_order_of_the_tokens_colours(folder, crops):
 
     cg = ep.CompGraph({"first": first}, {"first": ("image", "out")})
     (item,) = items_of(folder / "crop0.png", ep.CompGraphRunner(cg))
-    assert np.array_equal(opened(item, cg)["image"], crops[0][..., ::-1])
+    assert np.array_equal(payload_of(item, cg)["image"], crops[0][..., ::-1])
 
 
 def test_files_are_found_from_another_folder_too(folder, runner, monkeypatch):
@@ -119,15 +119,15 @@ def test_files_are_found_from_another_folder_too(folder, runner, monkeypatch):
     items = [*items_of(["crop0.png"], runner), *items_of(".", runner)]
     monkeypatch.chdir("/")
     assert [item.name for item in items[:2]] == ["crop0.png", "crop0.png"]
-    assert all(opened(item, runner.cg)["image"].shape == (100, 150, 3) for item in items)
+    assert all(payload_of(item, runner.cg)["image"].shape == (100, 150, 3) for item in items)
 
 
 def test_a_text_by_token_stays_a_text_and_a_missing_file_is_told_when_it_is_opened(runner):
     text = Item(0, "#0", {"image": "no path"})
-    assert opened(text, runner.cg) == {"image": "no path"}
+    assert payload_of(text, runner.cg) == {"image": "no path"}
     (missing,) = items_of(["nowhere.png"], runner)
     with pytest.raises(ImageFileError, match=r"nowhere\.png"):
-        opened(missing, runner.cg)
+        payload_of(missing, runner.cg)
 
 
 def test_a_text_by_token_is_a_file_if_it_has_the_ending_of_one_and_is_there(folder, stereo, tmp_path, monkeypatch):
@@ -136,12 +136,12 @@ def test_a_text_by_token_is_a_file_if_it_has_the_ending_of_one_and_is_there(fold
     monkeypatch.chdir(folder)
     (item,) = items_of([{"left": "crop0.png", "right": str(tmp_path / "right.npy")}], stereo)
     assert item.name == f"crop0.png, {tmp_path / 'right.npy'}"
-    assert {token: value.shape for token, value in opened(item, stereo.cg).items()} == dict.fromkeys(
+    assert {token: value.shape for token, value in payload_of(item, stereo.cg).items()} == dict.fromkeys(
         ("left", "right"), (100, 150, 3)
     )
     texts = {"left": "nowhere.png", "right": str(tmp_path / "note")}
     (item,) = items_of([texts], stereo)
-    assert opened(item, stereo.cg) == texts
+    assert payload_of(item, stereo.cg) == texts
 
 
 def test_how_many_there_are_is_known_without_going_through_them(folder, crops):

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.batch.hands import own_runner
+from epypes.batch.executors import cloned_runner
 from epypes.batch.items import Item, items_of
 from epypes.batch.job import Job, do
-from epypes.batch.outcome import Outcome, Thumbnail, Trouble
-from epypes.batch.table import frame_of
-from epypes.batch.travel import packed_job, unpacked_job
+from epypes.batch.packaged_graph import packed_job, unpacked_job
+from epypes.batch.results import ErrorInfo, Outcome, Thumbnail, outcomes_frame
 
 
 @pytest.fixture
@@ -48,7 +47,7 @@ def test_only_what_the_targets_need_is_run(counted, calls):
     job = Job((item(),), ({"offset": -1}, {"offset": -2}), keep=("doubled", "total"), targets=("doubled",))
     outcomes = do(counted, job)
     assert calls == {"double": 1}
-    assert [(list(outcome.kept), outcome.values, outcome.trouble) for outcome in outcomes] == [
+    assert [(list(outcome.kept), outcome.values, outcome.error_info) for outcome in outcomes] == [
         (["doubled"], {}, None)
     ] * 2
     assert unpacked_job(packed_job(job), {}).targets == ("doubled",)
@@ -78,7 +77,7 @@ def test_what_a_setting_leaves_out_is_as_the_runner_has_it(counted):
 
 def test_a_setting_that_fails_leaves_the_others_alone(counted, calls):
     good, bad, again = do(counted, Job((item(),), ({}, {"offset": -1}, {"offset": 2})))
-    assert bad.trouble == Trouble("add", "ValueError", "offset is negative")
+    assert bad.error_info == ErrorInfo("add", "ValueError", "offset is negative")
     assert bad.values == {}
     assert totals([good, again]) == [8, 10]
     assert calls["double"] == 1
@@ -93,8 +92,8 @@ def test_a_first_setting_that_fails_leaves_the_others_alone(counted):
 def test_an_input_that_can_not_be_read_is_trouble_without_a_function(runner):
     (found,) = items_of(["nowhere.png"], runner)
     first, second = do(runner, Job((found,), ({"canny_lo": 1}, {"canny_lo": 2})))
-    assert first.trouble.function == ""
-    assert first.trouble.kind == "ImageFileError"
+    assert first.error_info.function == ""
+    assert first.error_info.kind == "ImageFileError"
     assert second.setting == {"canny_lo": 2}
 
 
@@ -104,7 +103,7 @@ def test_a_function_that_leaves_the_interpreter_is_a_failure_of_its_item():
 
     runner = ep.CompGraphRunner(ep.CompGraph({"leave": leave}, {"leave": ("image", "out")}))
     (outcome,) = do(runner, Job((item(),)))
-    assert outcome.trouble.kind == "SystemExit"
+    assert outcome.error_info.kind == "SystemExit"
 
 
 def test_numbers_texts_and_truth_values_stay_and_others_are_told_in_short(crops):
@@ -149,14 +148,14 @@ def test_a_chart_is_kept_as_a_picture_that_stands_alone():
 def test_an_outcome_comes_back_from_json_as_it_was():
     outcome = Outcome(
         3, "a.png", {"ksize": (3, 3), "points": [1, 2], "method": "canny"}, {"n": 1, "share": 0.5, "text": "x", "none": None},
-        {"f": 12}, 15, Trouble("f", "ValueError", "no"), {"edges": Thumbnail("image/png", b"\x89PNG", "uint8 2 x 2")},
+        {"f": 12}, 15, ErrorInfo("f", "ValueError", "no"), {"edges": Thumbnail("image/png", b"\x89PNG", "uint8 2 x 2")},
         {"edges": np.zeros((2, 2))},
     )  # fmt: skip
     assert Outcome.from_json(json.loads(json.dumps(outcome.to_json()))) == replace(outcome, kept={})
 
 
 def test_the_table_has_failures_as_rows_and_whole_numbers_stay_whole(counted):
-    frame = frame_of(do(counted, Job((item(),), ({}, {"offset": -1}))), counted.cg, {"offset": [0, -1]})
+    frame = outcomes_frame(do(counted, Job((item(),), ({}, {"offset": -1}))), counted.cg, {"offset": [0, -1]})
     assert list(frame.columns) == ["name", "offset", "failure", "total", "total_ms", "double ms", "add ms"]
     assert frame["total"].tolist()[0] == 8
     assert frame["total"].isna().tolist() == [False, True]
@@ -166,7 +165,7 @@ def test_the_table_has_failures_as_rows_and_whole_numbers_stay_whole(counted):
 
 def test_a_token_that_is_called_like_a_column_has_another_name():
     cg = ep.CompGraph({"f": lambda image: 1}, {"f": ("image", "name")})
-    frame = frame_of(do(ep.CompGraphRunner(cg), Job((item(),))), cg)
+    frame = outcomes_frame(do(ep.CompGraphRunner(cg), Job((item(),))), cg)
     assert frame["name (token)"].tolist() == [1]
     assert frame["name"].tolist() == ["#0"]
 
@@ -177,7 +176,7 @@ def test_a_default_that_was_unfrozen_is_an_input_of_each_item() -> None:
 
     runner = ep.CompGraphRunner(ep.CompGraph.from_functions(times))
     runner.unfreeze("gain")
-    own = own_runner(runner)
+    own = cloned_runner(runner)
     assert own.free_source_tokens == ("x", "gain")
-    assert own_runner(own).free_source_tokens == ("x", "gain")
+    assert cloned_runner(own).free_source_tokens == ("x", "gain")
     assert [one.values["times"] for one in ep.map(runner, [{"x": 3, "gain": 5}])] == [15]

@@ -67,8 +67,8 @@ def test_the_runner_is_left_as_it_was(runner, crops):
 def test_images_of_other_shapes_are_rows_that_say_so(bright):
     result = ep.map(bright, [np.ones((2, 2)), np.ones((2, 2, 3)), np.ones((7, 3))])
     assert values(result) == [1.0, None, 1.0]
-    assert result[1].trouble.function == "mean"
-    assert result[1].trouble.message == "grey only"
+    assert result[1].error_info.function == "mean"
+    assert result[1].error_info.message == "grey only"
 
 
 @pytest.mark.slow

@@ -14,15 +14,17 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
+import matplotlib
 import numpy as np
 import optuna
 import pytest
+from matplotlib import pyplot
 
 import epypes as ep
-from epypes.batch import trying
-from epypes.batch.optimized import OptimizeResult
-from epypes.batch.ranging import Span
-from epypes.batch.studying import Trial
+from epypes.batch import incremental
+from epypes.batch.ranges import ChoiceAxis
+from epypes.batch.search_result import OptimizeResult
+from epypes.batch.study import Trial
 from epypes.errors import ScaleError, UnknownName
 from tests.store.postgres import PASSWORD, server
 
@@ -225,7 +227,7 @@ def test_cases_that_do_not_fit_into_memory_are_run_anew(
     cases, ranges = [np.full((30, 30), 1), np.full((2, 2), 5)], {"k": (0, 9)}
     kept = ep.optimize(runner, "y", cases, 8, ranges=ranges)
     calls["heavy"] = 0
-    monkeypatch.setattr(trying, "_MOST_BYTES", 1_000)
+    monkeypatch.setattr(incremental, "_MOST_BYTES", 1_000)
     anew = ep.optimize(runner, "y", cases, 8, ranges=ranges)
     assert calls["heavy"] == 8 + 1, "the small one is kept"
     assert [trial.value for trial in anew] == [trial.value for trial in kept]
@@ -435,9 +437,9 @@ def test_stopped_before_it_began_there_is_no_best(runner: ep.CompGraphRunner) ->
     result = ep.optimize(runner, "score", [0], stop=stop)
     assert repr(result) == "<OptimizeResult: 0 trials, stopped; none completed>"
     assert "None has completed" in result._repr_mimebundle_()["text/html"]
-    with pytest.raises(ScaleError, match="no best one"):
-        _ = result.best
-    result.history_plot()
+    for asked in (lambda: result.best, result.history_plot, result.importance_plot):
+        with pytest.raises(ScaleError, match="no best one"):
+            asked()
 
 
 # -- stores -----------------------------------------------------------------------------------------------------
@@ -620,31 +622,31 @@ def test_it_shows_itself_as_a_curve_and_the_values_found() -> None:
     page = result._repr_mimebundle_()["text/html"]
     picture = ET.fromstring(page[page.index("<svg") : page.index("</svg>") + 6])
     name = "{http://www.w3.org/2000/svg}"
-    assert len(picture.findall(f"{name}circle[@class='trial']")) == 30 - len(result.failures)
-    assert len(picture.findall(f"{name}path[@class='fault']")) == len(result.failures) > 0
+    marks = {path.get("class"): path.get("d", "").count("M") for path in picture.findall(f"{name}path")}
+    assert (marks["trials"], marks["failed"]) == (30 - len(result.failures), len(result.failures))
+    assert result.failures
     assert ("best (trial" in page, "&lt;b&gt;2" in page, "<b>2" in page) == (True, True, False)
     assert len(page) < 20_000
 
 
 def test_the_page_of_a_long_search_stays_small() -> None:
     trials = tuple(Trial(number, {"k": number}, None if number % 7 == 0 else number % 50) for number in range(5_000))
-    axes = (Span("k", 0, 5_000, 1, False, True),)
+    axes = (ChoiceAxis("k", (0, 1), ("0", "1")),)
     result = OptimizeResult(trials, "maximize", "metric", axes, optuna.create_study(direction="maximize"))
     page = result._repr_mimebundle_()["text/html"]
     assert len(page) < 40_000
     ET.fromstring(page[page.index("<svg") : page.index("</svg>") + 6])
 
 
-def test_figures_are_matplotlibs_without_pyplot(runner: ep.CompGraphRunner) -> None:
+def test_figures_are_optunas_and_leave_pyplot_as_it_was(runner: ep.CompGraphRunner) -> None:
     result = ep.optimize(runner, "score", [0], 30)
+    before = dict(matplotlib.rcParams)
     history, importance = result.history_plot(), result.importance_plot()
-    (axes,) = history.axes
-    dots, best = axes.lines
-    assert list(dots.get_ydata()) == [trial.value for trial in result]
-    assert max(best.get_ydata()) == result.best_value
+    assert [value for _, value in history.axes[0].collections[0].get_offsets()] == [trial.value for trial in result]
+    assert max(history.axes[0].lines[0].get_ydata()) == result.best_value
     assert [bar.get_width() for bar in importance.axes[0].patches] == list(result.importances.values())[::-1]
     assert sum(result.importances.values()) == pytest.approx(1)
-    assert all(figure.number is None if hasattr(figure, "number") else True for figure in (history, importance))
+    assert (pyplot.get_fignums(), dict(matplotlib.rcParams)) == ([], before)
 
 
 @pytest.mark.slow

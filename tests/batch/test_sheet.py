@@ -11,8 +11,8 @@ import pandas as pd
 import pytest
 
 import epypes as ep
-from epypes.batch.outcome import Thumbnail
-from epypes.batch.sheet import Tile, said
+from epypes.batch.contact_sheet import Tile, said
+from epypes.batch.results import Thumbnail
 from epypes.display.limits import CHARACTERS, THUMBNAIL_CHARACTERS
 from epypes.errors import ScaleError, UnknownName
 

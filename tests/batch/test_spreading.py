@@ -21,11 +21,10 @@ import numpy as np
 import pytest
 
 import epypes as ep
+from epypes.batch.executors import run_jobs, worker_count
 from epypes.batch.items import items_of
-from epypes.batch.job import Job
-from epypes.batch.spreading import spread, worker_count
-from epypes.batch.start import Start
-from epypes.batch.travel import packed_job
+from epypes.batch.job import Job, SharedStart
+from epypes.batch.packaged_graph import packed_job
 from epypes.errors import ExecutorBroken, PromotionRefused, ScaleError
 from tests.bundle.cells import cell
 
@@ -72,8 +71,8 @@ def test_results_are_the_same_whoever_does_the_jobs(who, runner, crops, folder, 
 def test_settings_are_the_same_whoever_does_the_jobs(runner, crops, processes):
     settings = tuple({"canny_lo": low} for low in (10, 60, 120))
     jobs = [Job((item,), settings) for item in items_of(crops[:3], runner)]
-    expected = [outcome for outcomes in spread(runner, jobs) for outcome in outcomes]
-    found = [outcome for outcomes in spread(runner, jobs, processes) for outcome in outcomes]
+    expected = [outcome for outcomes in run_jobs(runner, jobs) for outcome in outcomes]
+    found = [outcome for outcomes in run_jobs(runner, jobs, processes) for outcome in outcomes]
     found.sort(key=lambda outcome: (outcome.number, outcome.setting["canny_lo"]))
     assert without_times(found) == without_times(expected)
     assert len({outcome.values["edge_pixels"] for outcome in found}) == 9
@@ -81,10 +80,10 @@ def test_settings_are_the_same_whoever_does_the_jobs(runner, crops, processes):
 
 def test_where_a_job_starts_stays_in_this_process(runner, crops, processes):
     (item,) = items_of(crops[:1], runner)
-    jobs = [Job((item,), ({"canny_lo": low},), start=start) for start in [Start()] for low in (10, 60)]
+    jobs = [Job((item,), ({"canny_lo": low},), start=start) for start in [SharedStart()] for low in (10, 60)]
 
     def pixels(executor):
-        outcomes = [outcome for outcomes in spread(runner, jobs, executor) for outcome in outcomes]
+        outcomes = [outcome for outcomes in run_jobs(runner, jobs, executor) for outcome in outcomes]
         return {outcome.setting["canny_lo"]: outcome.values["edge_pixels"] for outcome in outcomes}
 
     assert pixels(processes) == pixels(None)
@@ -114,7 +113,7 @@ def test_members_of_the_notebooks_enumerations_travel(processes, crops):
     assert issubclass(made["Side"], enum.Enum)
     (item,) = items_of(crops[:1], runner)
     job = Job((item,), ({}, {"side": made["Side"].RIGHT}))
-    ((left, right),) = spread(runner, [job], processes)
+    ((left, right),) = run_jobs(runner, [job], processes)
     assert left.values["brightness"] == float(crops[0][:, :75].mean())
     assert right.values["brightness"] == float(crops[0][:, 75:].mean())
     assert right.setting == {"side": made["Side"].RIGHT}
@@ -122,7 +121,7 @@ def test_members_of_the_notebooks_enumerations_travel(processes, crops):
 
 def test_other_hyperparameters_need_no_other_bundle(runner, crops, processes, monkeypatch):
     ep.map(runner, crops[:2], processes)
-    monkeypatch.setattr("epypes.batch.parcel.promote", None)
+    monkeypatch.setattr("epypes.batch.packaged_graph.promote", None)
     runner["canny_lo"] = 10
     assert without_times(ep.map(runner, crops[:2], processes)) == without_times(ep.map(runner, crops[:2]))
 
@@ -172,7 +171,7 @@ def test_a_large_bundle_is_sent_to_whom_asks_for_it(processes):
 
 def test_a_set_of_which_nothing_can_be_run_gives_failures_as_well(runner, processes):
     result = ep.map(runner, ["nowhere.png", "neither.png"], processes)
-    assert [outcome.trouble.kind for outcome in result] == ["ImageFileError", "ImageFileError"]
+    assert [outcome.error_info.kind for outcome in result] == ["ImageFileError", "ImageFileError"]
 
 
 def test_a_graph_that_can_not_be_promoted_is_refused_with_the_reasons(crops, processes):
@@ -347,7 +346,7 @@ def test_a_stop_ends_it_and_leaves_nothing_queued():
     gate, stop = Gate(), threading.Event()
     runner = gate.runner()
     with ThreadPoolExecutor(2) as pool:
-        outcomes = spread(runner, many_jobs(runner), pool, stop=stop, ahead=100)
+        outcomes = run_jobs(runner, many_jobs(runner), pool, stop=stop, ahead=100)
         found: Future[list] = Future()
         reader = threading.Thread(target=lambda: found.set_result([one for some in outcomes for one in some]))
         reader.start()
@@ -369,7 +368,7 @@ def test_a_stop_in_this_thread_ends_after_the_item():
         return int(image)
 
     runner = ep.CompGraphRunner(ep.CompGraph({"note": note}, {"note": ("image", "out")}))
-    (outcomes,) = spread(runner, [Job(tuple(items_of(range(10), runner)))], stop=stop)
+    (outcomes,) = run_jobs(runner, [Job(tuple(items_of(range(10), runner)))], stop=stop)
     assert [outcome.values["out"] for outcome in outcomes] == [0, 1, 2]
 
 
@@ -377,7 +376,7 @@ def test_whoever_does_not_want_more_leaves_nothing_queued():
     gate = Gate()
     runner = gate.runner()
     with ThreadPoolExecutor(2) as pool:
-        outcomes = spread(runner, many_jobs(runner), pool, ahead=100)
+        outcomes = run_jobs(runner, many_jobs(runner), pool, ahead=100)
         next(outcomes)
         outcomes.close()
         gate.opened.set()
@@ -423,7 +422,7 @@ def test_no_more_jobs_are_at_work_than_may_be():
     gate.opened.set()
     runner = gate.runner()
     with ThreadPoolExecutor(2) as pool:
-        outcomes = spread(runner, jobs(runner), pool, ahead=3)
+        outcomes = run_jobs(runner, jobs(runner), pool, ahead=3)
         assert taken == []
         next(outcomes)
         assert len(taken) == 3
@@ -432,12 +431,12 @@ def test_no_more_jobs_are_at_work_than_may_be():
 
 def test_what_is_no_executor_is_refused_at_once(runner):
     with pytest.raises(TypeError, match="executor must be a concurrent.futures.Executor, not 'int'"):
-        spread(runner, [], 2)
+        run_jobs(runner, [], 2)
 
 
 def test_so_many_jobs_ahead_as_there_can_not_be_are_refused_at_once(runner):
     with pytest.raises(ValueError, match="1 or more, not 0"):
-        spread(runner, [], ahead=0)
+        run_jobs(runner, [], ahead=0)
 
 
 def test_workers_are_counted(processes):

@@ -183,7 +183,7 @@ def test_images_of_a_folder_are_swept_and_one_that_can_not_be_read_is_a_row_for_
     assert [(one.name, one.setting["threshold"], one.has_failed) for one in result] == [
         ("a.png", 50, False), ("a.png", 100, False), ("b.png", 50, True), ("b.png", 100, True),
     ]  # fmt: skip
-    assert {one.trouble.function for one in result.failures if one.trouble} == {""}
+    assert {one.error_info.function for one in result.failures if one.error_info} == {""}
 
 
 def test_only_thumbnails_and_short_values_are_kept_unless_tokens_are_named(runner: ep.CompGraphRunner) -> None:
@@ -258,7 +258,7 @@ def test_what_is_in_a_store_is_not_run_again(runner: ep.CompGraphRunner, calls: 
     more = ep.sweep(runner, {"threshold": [10, 13, 20, 30], "kernel": [1, 2]}, store=place, name="tried")
     assert calls.counts == {"load": 1, "blur": 2, "above": 2, "area": 2}
     assert [one.values for one in more[:6]] == [one.values for one in first]
-    assert [str(one.trouble) for one in more[:6]] == [str(one.trouble) for one in first]
+    assert [str(one.error_info) for one in more[:6]] == [str(one.error_info) for one in first]
     assert [one.thumbnails["mask"] for one in more[:2]] == [one.thumbnails["mask"] for one in first[:2]]
     assert [one.setting["threshold"] for one in more] == [10, 10, 13, 13, 20, 20, 30, 30]
     # What varies is set otherwise when one of the settings has been taken over.

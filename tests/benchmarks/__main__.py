@@ -8,6 +8,8 @@ from pathlib import Path
 from rich.console import Console
 
 from tests.benchmarks import (
+    batch_map,
+    batch_sweep,
     brokers,
     case,
     engine,
@@ -16,8 +18,6 @@ from tests.benchmarks import (
     peers,
     picture,
     pipeline,
-    scale_map,
-    scale_sweep,
     service,
     sockets,
     tuning,
@@ -27,7 +27,7 @@ from tests.benchmarks.timing import Effort
 
 _WIDTH = 170
 _MODULES = (
-    *(imports, engine, pipeline, mutable_state, picture, sockets, brokers, service, scale_map, scale_sweep, case),
+    *(imports, engine, pipeline, mutable_state, picture, sockets, brokers, service, batch_map, batch_sweep, case),
     tuning,
 )
 

@@ -14,7 +14,7 @@ from typing import Any
 from skimage import data
 
 import epypes as ep
-from epypes.bundle.seal import seal
+from epypes.bundle.manifest import write_manifest
 from epypes.experiment.graph import orb_hyperparameters, stereo_pair
 from epypes.run.guard import WATCH
 from tests.benchmarks.row import OURS, Goal, Row, row
@@ -125,7 +125,7 @@ def _row(
     inputs = ", ".join(f'"{token}"' for token in payload)
     settings = f'[bundle]\nformat = 1\nname = "b"\n[ports]\ninputs = [{inputs}]\noutputs = ["{output}"]\n'
     (bundle / "pipeline.toml").write_text(settings)
-    seal(bundle)
+    write_manifest(bundle)
     guarded = ep.load(bundle)
     guarded.freeze(**hyperparameters)
     plain = ep.load(bundle).cg.functions

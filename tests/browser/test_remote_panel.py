@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.bundle.ports import REQUEST
+from epypes.bundle.adapters import REQUEST
 from epypes.wire import Envelope
 from tests.browser.jupyter import JupyterLab, Notebook, write_notebook
 from tests.browser.panel import PanelOnScreen

@@ -10,8 +10,8 @@ from contextlib import contextmanager
 import httpx
 import pytest
 
-from epypes.bundle.ports import REQUEST
-from epypes.bundle.seal import seal
+from epypes.bundle.adapters import REQUEST
+from epypes.bundle.manifest import write_manifest
 from epypes.service import Service
 from epypes.service.http import HttpServer
 from epypes.wire import Envelope
@@ -89,7 +89,7 @@ def bundle(tmp_path_factory, photograph, straight_edges):
     for token, lines in RANGES.items():
         text = re.sub(rf"(\[hyperparameters\.{token}\]\nvalue = .*)", rf"\1\n{lines}", text)
     (folder / "pipeline.toml").write_text(text)
-    seal(folder)
+    write_manifest(folder)
     return folder
 
 
@@ -231,7 +231,7 @@ def test_a_number_that_is_whole_and_may_have_a_fraction_is_given_one(browser, bu
     text = (folder / "pipeline.toml").read_text()
     text = re.sub(r"value = 200\nlow.*\nhigh.*", "value = 200.0\nsoft = [0.0, 400.0]", text)
     (folder / "pipeline.toml").write_text(text)
-    seal(folder)
+    write_manifest(folder)
     with Service(folder) as service, HttpServer(service, "127.0.0.1:*") as http:
         http.token = http.token_file.read_text().strip()
         with page_of(browser, http) as page:
@@ -334,7 +334,7 @@ def test_a_service_that_is_faulted_says_why_and_one_that_is_gone_is_asked_again(
     folder = shutil.copytree(bundle, tmp_path / "wrong")
     text = (folder / "pipeline.toml").read_text()
     (folder / "pipeline.toml").write_text(text.replace("value = 200", "value = 20"))
-    seal(folder)
+    write_manifest(folder)
     page = open_page(browser, viewport={"width": 1400, "height": 700})
     with Service(folder) as service, HttpServer(service, "127.0.0.1:*") as http:
         page.goto(http.url)

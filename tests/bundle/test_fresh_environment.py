@@ -8,7 +8,7 @@ import pytest
 
 import epypes as ep
 from epypes.bundle import verify
-from epypes.bundle.seal import seal
+from epypes.bundle.manifest import write_manifest
 from epypes.errors import BundleError
 from tests.bundle.test_slicer import notebook
 
@@ -40,11 +40,11 @@ def test_a_requirement_that_is_missing_or_does_not_exist_is_named(folder):
     pinned = folder / "requirements.txt"
     lines = pinned.read_text()
     pinned.write_text("\n".join(line for line in lines.splitlines() if "opencv" not in line) + "\n")
-    seal(folder)
+    write_manifest(folder)
     with pytest.raises(BundleError, match="No module named 'cv2'"):
         verify(folder, fresh_env=True)
     pinned.write_text(lines.replace(f"numpy=={np.__version__}", "numpy==0.0.1"))
-    seal(folder)
+    write_manifest(folder)
     with pytest.raises(BundleError, match="What requirements.txt names can't be installed: .*numpy==0.0.1"):
         verify(folder, fresh_env=True)
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.bundle.seal import seal
+from epypes.bundle.manifest import write_manifest
 from epypes.errors import StateChanged
 
 SETTINGS = '[bundle]\nformat = 1\nname = "b"\n[ports]\ninputs = ["x"]\noutputs = ["y"]\n'
@@ -27,7 +27,7 @@ def bundle(folder, source, settings=SETTINGS):
     folder.mkdir(parents=True)
     (folder / "pipeline.toml").write_text(settings)
     (folder / "pipeline.py").write_text(HEAD + textwrap.dedent(source) + FOOT * ("func_dict" not in source))
-    seal(folder)
+    write_manifest(folder)
     return folder
 
 

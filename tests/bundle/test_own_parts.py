@@ -13,7 +13,7 @@ import pytest
 import epypes as ep
 from epypes.bundle import verify
 from epypes.bundle.load import pipeline_of, read_bundle
-from epypes.bundle.seal import seal
+from epypes.bundle.manifest import write_manifest
 from epypes.bundle.settings import read_settings
 from epypes.errors import PromotionRefused, ReplayDiffers
 from epypes.wire import Envelope
@@ -216,7 +216,7 @@ def test_an_f_out_that_makes_another_answer_is_found(promoted, tmp_path):
     copy = shutil.copytree(promoted.bundle.path, tmp_path / "edges")
     module = copy / "pipeline.py"
     module.write_text(module.read_text().replace('["most"]]', '["most"]][::-1]'))
-    seal(copy)
+    write_manifest(copy)
     with pytest.raises(ReplayDiffers, match="the answer of f_out"):
         verify(copy)
 

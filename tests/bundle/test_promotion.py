@@ -19,11 +19,11 @@ import pytest
 
 import epypes as ep
 from epypes.bundle import verify
+from epypes.bundle.adapters import payload_of
 from epypes.bundle.compare import first_difference
 from epypes.bundle.load import read_bundle
+from epypes.bundle.manifest import write_manifest
 from epypes.bundle.notebook import promote_notebook
-from epypes.bundle.ports import payload_of
-from epypes.bundle.seal import seal
 from epypes.errors import BundleError, PromotionRefused, ReplayDiffers, UnknownName
 from epypes.graph import colour_order
 from epypes.wire import Envelope
@@ -134,7 +134,7 @@ def test_a_folder_that_is_no_bundle_is_named(tmp_path):
 def test_a_changed_constant_is_found_by_the_replay_with_its_first_difference(bundle):
     settings = bundle.path / "pipeline.toml"
     settings.write_text(settings.read_text().replace("value = 70", "value = 30"))
-    seal(bundle.path)
+    write_manifest(bundle.path)
     with pytest.raises(ReplayDiffers, match=r"token 'edges': \d+ of 240000 values differ, first at \[\d+, \d+\]"):
         verify(bundle.path)
 
@@ -142,7 +142,7 @@ def test_a_changed_constant_is_found_by_the_replay_with_its_first_difference(bun
 def test_a_replay_that_raises_names_the_line_in_the_bundle(bundle):
     module = bundle.path / "pipeline.py"
     module.write_text(module.read_text().replace("cv2.Canny", "(lambda *a: 1 / 0)"))
-    seal(bundle.path)
+    write_manifest(bundle.path)
     with pytest.raises(BundleError, match=r"at pipeline\.py, line \d+: .*ZeroDivisionError.*In function 'canny'"):
         verify(bundle.path)
 
@@ -154,7 +154,7 @@ def test_a_replay_that_raises_names_the_line_in_the_bundle(bundle):
 def test_a_replay_that_dies_is_reported(bundle, end):
     module = bundle.path / "pipeline.py"
     module.write_text(f"{module.read_text()}\n{end}\n")
-    seal(bundle.path)
+    write_manifest(bundle.path)
     with pytest.raises(BundleError, match="replay of"):
         verify(bundle.path)
 
@@ -163,7 +163,7 @@ def test_a_replay_that_dies_is_reported(bundle, end):
 def test_a_replay_that_takes_too_long_is_ended(bundle):
     module = bundle.path / "pipeline.py"
     module.write_text(f"{module.read_text()}\nimport threading\nthreading.Event().wait(120)\n")
-    seal(bundle.path)
+    write_manifest(bundle.path)
     with pytest.raises(BundleError, match="did not end within 2 s"):
         verify(bundle.path, timeout_s=2)
 
@@ -332,7 +332,7 @@ def test_what_is_put_there_while_the_promotion_runs_is_kept(when, was_there, bun
     mine = bundle.path / "mine.csv"
     if not was_there:
         shutil.rmtree(bundle.path)
-    exchange, told = promote_module._exchange, []
+    exchange, told = promote_module.swap_folders, []
 
     def put():
         if not told:
@@ -343,7 +343,7 @@ def test_what_is_put_there_while_the_promotion_runs_is_kept(when, was_there, bun
         put()
         exchange(left, right)
 
-    monkeypatch.setattr(promote_module, "_exchange", putting)
+    monkeypatch.setattr(promote_module, "swap_folders", putting)
     if when == "exchanging" and not was_there:
         bundle.path.mkdir()
     with pytest.raises(PromotionRefused, match=re.escape(str(bundle.path))):
@@ -531,7 +531,7 @@ def test_the_seal_covers_a_manifest_within(bundle):
 def test_ports_that_are_not_those_of_the_sample_are_found(bundle, port, value):
     settings = bundle.path / "pipeline.toml"
     settings.write_text(re.sub(rf"{port} = .*", f"{port} = {value}", settings.read_text()))
-    seal(bundle.path)
+    write_manifest(bundle.path)
     with pytest.raises(BundleError, match="its ports are image -> edges"):
         verify(bundle.path)
 
@@ -540,14 +540,14 @@ def test_the_old_bundle_is_there_until_the_new_one_is(runner, tmp_path, monkeypa
     target = tmp_path / "edges"
     ep.promote(runner, target)
     seen = []
-    exchange = promote_module._exchange
+    exchange = promote_module.swap_folders
 
     def looking(left, right):
         seen.append((left / "MANIFEST.sha256").is_file() and (right / "MANIFEST.sha256").is_file())
         exchange(left, right)
         seen.append((left / "MANIFEST.sha256").is_file() and (right / "MANIFEST.sha256").is_file())
 
-    monkeypatch.setattr(promote_module, "_exchange", looking)
+    monkeypatch.setattr(promote_module, "swap_folders", looking)
     runner.rerun(lo=10)
     ep.promote(runner, target)
     assert seen == [True, True]
@@ -565,7 +565,7 @@ def test_a_bundle_that_is_replaced_while_it_is_read_is_never_mixed_with_the_next
 
     def exchanging():
         while not done.is_set():
-            promote_module._exchange(here, there)
+            promote_module.swap_folders(here, there)
             done.wait(0.001)
 
     thread = threading.Thread(target=exchanging)

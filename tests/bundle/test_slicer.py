@@ -194,7 +194,7 @@ def test_library_functions_have_a_public_name(value, expected):
 def test_a_set_has_the_same_source_under_any_hash_seed():
     code = "from epypes.bundle.literal import literal; print(literal({'a': ({'x', 'y', 'z', 'w'}, [1], (2,), ())}))"
     texts = printed(code, "0123")
-    assert texts == {"{'a': ({'w', 'x', 'y', 'z'}, [1], (2,), ())}\n"}
+    assert texts == {'{"a": ({"w", "x", "y", "z"}, [1], (2,), ())}\n'}
 
 
 def test_a_module_is_imported_once_under_the_notebooks_name():
@@ -258,7 +258,7 @@ def f(im):
     body = text.split('"""')[2].partition("func_dict")[0]
     assert body.split("\n\n\n") == [
         "\n\nimport functools\n\nLOW = 0.5\nSIZE = 0x10  # of the window\nLIMIT = 3  # sum([1, 2]) in the notebook\n"
-        "STEP = 3  # the second\nWEIGHTS = (1, 2, 3)",
+        "STEP = 3  # the second\nWEIGHTS = (1, 2,\n           3)",
         "def blurred(im):\n    return smooth(im) + offset(im)",
         "# Makes filters.\ndef make_smooth(k, sigma=0):\n    def smooth(im):\n        return im * k + sigma\n    return smooth",
         "smooth = make_smooth(5)",

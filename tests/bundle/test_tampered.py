@@ -10,7 +10,7 @@ import pytest
 import epypes as ep
 from epypes.bundle import verify, write_back
 from epypes.bundle.load import read_bundle
-from epypes.bundle.seal import MANIFEST, MOST_BYTES, seal
+from epypes.bundle.manifest import MANIFEST, MOST_BYTES, write_manifest
 from epypes.errors import BundleChanged, BundleError, DeployRefused
 from epypes.service import Service
 from tests.service.served import acting_bundle
@@ -50,7 +50,7 @@ def test_verify_runs_a_changed_bundle_anyway_if_it_is_asked_to_and_refuses_it_al
 
 
 def test_a_manifest_with_two_digests_for_a_file_is_refused(folder, tampered, tmp_path):
-    seal(tampered)
+    write_manifest(tampered)
     module = [line for line in (tampered / MANIFEST).read_text().splitlines() if line.endswith("  pipeline.py")]
     with (folder / MANIFEST).open("a") as manifest:
         manifest.write(f"{module[0]}\n")

@@ -222,7 +222,7 @@ def test_names_that_hide_nothing_and_mean_nothing_to_python_are_kept():
     )
     text = ep.to_source(cg)
     assert "def run_graph(math_, class_):" in text
-    assert "In the graph math_ is 'math', class_ is 'class', y_z is 'y z'." in text
+    assert "        math_: 'math'\n        class_: 'class'\n        y_z: 'y z'\n" in text
     assert "    l_ = max(max_, class_)\n" in text
     assert executed(text)(16.0, 3) == 4.0
 
@@ -422,7 +422,7 @@ def test_a_chain_of_ten_thousand_functions_is_written():
     assert executed(text)(0) == 5000
 
 
-def test_long_constants_of_the_notebook_are_wrapped():
+def test_long_constants_of_the_notebook_stand_as_they_were():
     names = notebook(
         "RGB = Annotated[np.ndarray, ep.Image('uint8', ('height', 'width', 3), (0, 255), 'rgb')]\n"
         "NAMES = ('alpha', 'beta', 'gamma', 'delta', 'epsilon', 'zeta', 'eta', 'theta', 'iota', 'kappa')\n"

@@ -10,7 +10,7 @@ import pytest
 
 import epypes as ep
 from epypes.bundle import verify, write_back
-from epypes.bundle.seal import digest
+from epypes.bundle.manifest import digest
 from epypes.bundle.writeback import changed_settings
 from epypes.errors import BundleError, HyperparameterError, UnknownName
 

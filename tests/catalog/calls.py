@@ -1,4 +1,4 @@
-"""How is each function of the table called, on a small image?"""
+"""A call of each function of the table, on a small image."""
 
 from __future__ import annotations
 

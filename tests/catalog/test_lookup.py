@@ -1,4 +1,4 @@
-"""Are a parameter's usual values found by the function, by what a function does with it, and by its name?"""
+"""A parameter's usual values are found by the function, by what a function does with it, and by its name."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from cv2 import GaussianBlur as soften
 from skimage import filters
 from skimage.feature import canny as find_edges
 
-from epypes.catalog import TABLE, Entry, entry_of, parameter_names, uses, usual
+from epypes.catalog import Entry, entry_of, parameter_names, table, uses, usual
 
 BLUR = "GaussianBlur"
 
 
 def entry(function: str, parameter: str) -> Entry:
-    return next(entry for entry in TABLE if (entry.function, entry.parameter) == (function, parameter))
+    return next(entry for entry in table() if (entry.function, entry.parameter) == (function, parameter))
 
 
 @pytest.mark.parametrize(

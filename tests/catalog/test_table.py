@@ -1,4 +1,4 @@
-"""Is each entry of the table what the library itself takes?"""
+"""Each entry of the table is what the library itself takes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, Final
 import cv2
 import pytest
 
-from epypes.catalog import TABLE, Entry, entry_of, parameter_names
+from epypes.catalog import Entry, entry_of, parameter_names, table
 from tests.catalog.calls import called, function_of, names_of
 
 # Just outside of what is allowed, the library refuses these too.
@@ -103,7 +103,7 @@ def is_there(entry: Entry) -> bool:
     return function_of(entry) is not None or entry.function not in _GONE
 
 
-PRESENT: Final = tuple(filter(is_there, TABLE))
+PRESENT: Final = tuple(filter(is_there, table()))
 
 
 def ends(entry: Entry) -> list[Any]:
@@ -155,7 +155,7 @@ def test_all_constants_are_there(entry: Entry) -> None:
 
 
 @pytest.mark.parametrize(
-    "entry", [entry for entry in TABLE if entry.parameter in _REFUSED.get(entry.function, ())], ids=named
+    "entry", [entry for entry in table() if entry.parameter in _REFUSED.get(entry.function, ())], ids=named
 )
 def test_what_the_library_refuses_is_outside_of_the_table(entry: Entry) -> None:
     param = entry.resolved()
@@ -169,26 +169,26 @@ def test_what_the_library_refuses_is_outside_of_the_table(entry: Entry) -> None:
 
 
 def test_every_refusal_is_of_an_entry() -> None:
-    known = {(entry.function, entry.parameter) for entry in TABLE}
+    known = {(entry.function, entry.parameter) for entry in table()}
     assert {(function, name) for function, names in _REFUSED.items() for name in names} <= known
 
 
 @pytest.mark.parametrize(("function", "parameter", "value"), _DEADLY)
 def test_what_ends_the_process_is_outside_of_the_table(function: str, parameter: str, value: int) -> None:
-    entry = next(entry for entry in TABLE if (entry.function, entry.parameter) == (function, parameter))
+    entry = next(entry for entry in table() if (entry.function, entry.parameter) == (function, parameter))
     assert not entry.param.allows(value)
 
 
 def test_the_table_is_as_large_as_promised_and_has_no_entry_twice() -> None:
-    keys = [(entry.library, entry.function, entry.parameter) for entry in TABLE]
+    keys = [(entry.library, entry.function, entry.parameter) for entry in table()]
     assert len(keys) == len(set(keys)) >= 110
 
 
 @pytest.mark.slow
 def test_the_table_loads_no_library_and_says_nothing_of_constants_then() -> None:
     code = (
-        "import sys; from epypes.catalog import TABLE, entry_of; "
-        "assert all(entry.resolved() is None for entry in TABLE if entry.constants); "
+        "import sys; from epypes.catalog import entry_of, table; "
+        "assert all(entry.resolved() is None for entry in table() if entry.constants); "
         "assert entry_of(len, 'obj') is None; print(*{'cv2', 'skimage', 'numpy'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import xml.etree.ElementTree as ET
 
 import cv2
-import junitparser
 import numpy as np
 import pytest
 from skimage import data
@@ -72,8 +72,8 @@ def test_a_set_that_passes_exits_with_0(labelled, cases, epypes, tmp_path):
     done = epypes("check", labelled / "edges", cases(30), "--junit", junit)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.strip() == f"{labelled / 'edges'}: 2 cases passed, 3 checks in all."
-    [suite] = junitparser.JUnitXml.fromfile(str(junit))
-    assert (suite.name, suite.tests, suite.failures + suite.errors) == ("epypes check edges", 3, 0)
+    [suite] = ET.parse(junit).getroot()
+    assert [suite.get(key) for key in ("name", "tests", "failures", "errors")] == ["epypes check edges", "3", "0", "0"]
 
 
 def test_a_set_that_fails_exits_with_1_and_says_which_case_and_why(labelled, cases, epypes, tmp_path):
@@ -86,8 +86,8 @@ def test_a_set_that_fails_exits_with_1_and_says_which_case_and_why(labelled, cas
     [line] = done.stderr.strip().splitlines()
     assert line.startswith(f"epypes: {labelled / 'edges'} does not pass {path}: 1 of 2 cases failed: camera. First: ")
     assert line.endswith("is not at least 0.99.")
-    [suite] = junitparser.JUnitXml.fromfile(str(junit))
-    assert [test.is_passed for test in suite] == [True, True, False]
+    [suite] = ET.parse(junit).getroot()
+    assert [len(test) for test in suite] == [0, 0, 1]
 
 
 def things(n):
@@ -108,8 +108,8 @@ def test_a_metric_that_raises_without_a_text_exits_with_1_and_is_an_error(epypes
     done = epypes("check", tmp_path / "things", path, "--junit", junit)
     assert done.returncode == 1
     assert done.stderr.strip().endswith("First: #0, count of found: AssertionError.")
-    [suite] = junitparser.JUnitXml.fromfile(str(junit))
-    assert (suite.tests, suite.failures, suite.errors) == (1, 0, 1)
+    [suite] = ET.parse(junit).getroot()
+    assert [suite.get(key) for key in ("tests", "failures", "errors")] == ["1", "0", "1"]
 
 
 @pytest.mark.parametrize(
@@ -142,17 +142,3 @@ def test_json_has_every_check(labelled, cases, epypes):
     assert [check["check"] for check in found["checks"]] == ["equal of edges", "count of edges", "iou of edges"]
     assert found["checks"][2]["value"] < 0.99
     assert found["checks"][2]["reason"].endswith("is not at least 0.99")
-
-
-def test_the_help_documents_the_keys_of_a_case(epypes):
-    said = epypes("check", "--help").stdout
-    for word in (
-        "[[case]]",
-        "[[case.check]]",
-        "inputs = ",
-        "hyperparameters = ",
-        "token = ",
-        "expected = ",
-        "metric = ",
-    ):
-        assert word in said

@@ -13,10 +13,9 @@ import sys
 import cv2
 import numpy as np
 import pytest
-import typer.main
 
 import epypes as ep
-from epypes.bundle.seal import seal
+from epypes.bundle.manifest import write_manifest
 from epypes.cli.app import app
 from epypes.wire import load_sample, save_sample
 
@@ -64,7 +63,7 @@ ROWS = {
     ],
     "deploy": [
         (["{bundle}", "--http", "http://127.0.0.1:9"], "No service answers at http://127.0.0.1:9. Start one: "),
-        (["{bundle}"], "Which service? Say --http URL, or --service and the bundle"),
+        (["{bundle}"], "Name one service: --http URL, or --service and the bundle"),
         (["{bundle}", "--service", "{bundle}"], "No service of yours runs for {bundle}."),
     ],
     "rollback": [(["--http", "nonsense"], "'nonsense' is no address of a service. Write it as http://127.0.0.1:8642")],
@@ -122,11 +121,11 @@ def places(tmp_path_factory):
     for name in ("broken", "other"):
         shutil.copytree(found["bundle"], found[name])
     (found["broken"] / "pipeline.toml").write_text("[ports\n")
-    seal(found["broken"])
+    write_manifest(found["broken"])
     sample = found["other"] / "samples" / "000.npz"
     inputs, outputs = load_sample(sample)
     save_sample(sample, inputs, {"edges": outputs["edges"] ^ 255})
-    seal(found["other"])
+    write_manifest(found["other"])
     found["folder"].mkdir()
     found["text"].write_text("some text")
     found["cases"].write_text('[[case]]\ninputs = {image = "none.png"}\n')
@@ -145,7 +144,7 @@ def one_line(done):
 
 
 def test_every_command_has_a_row():
-    commands = set(typer.main.get_command(app).commands)
+    commands = set(app.commands)
     assert commands - ROWS.keys() == set(), "give each new command a row of what makes it fail, and what it says then"
 
 
@@ -157,7 +156,7 @@ def test_a_command_that_fails_says_so_in_one_line(command, row, places, epypes):
     assert says.format(**places) in one_line(done)
 
 
-@pytest.mark.parametrize("command", sorted(typer.main.get_command(app).commands))
+@pytest.mark.parametrize("command", sorted(app.commands))
 def test_an_option_that_there_is_not_exits_with_2(command, epypes):
     done = epypes(command, "--no-such-option")
     assert done.returncode == 2

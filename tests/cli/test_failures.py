@@ -12,7 +12,7 @@ import sys
 import pytest
 
 import epypes as ep
-from epypes.bundle.seal import seal
+from epypes.bundle.manifest import write_manifest
 from epypes.service import Service
 from epypes.service.http import HttpServer
 from epypes.service.state_file import StateLock
@@ -110,7 +110,7 @@ def test_a_bundle_that_was_mended_since_is_told_to_have_changed_and_to_be_fine(e
     failure = keep(mended, request(RAISES))
     module = mended / "pipeline.py"
     module.write_text(module.read_text().replace("raise ValueError", "return bright; raise ValueError"))
-    seal(mended)
+    write_manifest(mended)
     done = epypes("replay", failure)
     assert done.returncode == 0
     first, second = done.stdout.splitlines()
@@ -172,4 +172,4 @@ def test_failures_are_told_as_they_happen_with_the_id_to_replay_them(epypes, bun
 
 def test_who_follows_a_service_that_is_not_there_is_told_so(epypes, bundle):
     assert "No service runs for" in epypes("failures", bundle, "--follow").stderr
-    assert "Whose failures?" in epypes("failures", "--follow").stderr
+    assert "Name the service" in epypes("failures", "--follow").stderr

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 
-from epypes.bundle.seal import seal
+from epypes.bundle.manifest import write_manifest
 from epypes.wire import save_sample
 
 
@@ -33,5 +33,5 @@ def written_bundle(folder, source, inputs, outputs, *, hyperparameters=(), sampl
     (folder / "pipeline.toml").write_text("\n".join(settings) + "\n")
     (folder / "requirements.txt").write_text("")
     save_sample(folder / "samples" / "run_1.npz", *sample)
-    seal(folder)
+    write_manifest(folder)
     return folder

@@ -7,7 +7,7 @@ import linecache
 import numpy as np
 
 import epypes as ep
-from epypes.bundle.seal import check_seal
+from epypes.bundle.manifest import check_manifest
 from epypes.service.failures.record import FailedEvent
 from epypes.service.failures.store import FailureStore, failures_folder
 from epypes.wire import Envelope
@@ -93,7 +93,7 @@ def keep(bundle, event, **told):
         "exception": "ValueError",
         "message": "too bright: 95",
         "bundle": str(bundle),
-        "digest": check_seal(bundle),
+        "digest": check_manifest(bundle),
         "hyperparameters": {"by": {"value": 1}, "most": {"value": 90}},
     }
     kept = store.keep(FailedEvent(**{**record, **told}), event)

@@ -8,7 +8,7 @@ import threading
 import uuid
 from contextlib import contextmanager
 
-from epypes.bundle.entries import plain, written
+from epypes.bundle.hyperparameters import plain, written
 from epypes.display.views.jsonview import to_json
 from epypes.display.views.view import view
 from epypes.errors import NotComputed, ParametersRefused, RevisionConflict, ServiceError

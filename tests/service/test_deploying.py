@@ -9,7 +9,7 @@ import signal
 
 import pytest
 
-from epypes.bundle.seal import check_seal, seal
+from epypes.bundle.manifest import check_manifest, write_manifest
 from epypes.errors import DeployRefused, ServiceError, UnknownName
 from epypes.service import Service
 from epypes.service.failures.source import failures_of, find_failure
@@ -71,7 +71,7 @@ def test_values_that_were_written_back_are_those_of_the_bundle_that_is_served(ow
         service.deploy(better)
         with pytest.raises(DeployRefused, match=r"pipeline\.toml was changed"):
             service.rollback()
-        seal(own)
+        write_manifest(own)
         with pytest.raises(DeployRefused, match=rf"can't be rolled back to .*: epypes deploy {own}"):
             service.rollback()
     lines = [record.getMessage() for record in caplog.records if record.levelname == "INFO"]
@@ -90,7 +90,7 @@ def test_a_service_is_found_by_the_bundle_it_was_started_with_and_by_the_one_tha
         state = read_state(acting)
         assert "No service of yours runs" in epypes("status", better).stderr
         assert "k 2 -> 3" in epypes("deploy", better, "--http", state.http).stdout
-        until(lambda: read_state(acting).digest == check_seal(better))
+        until(lambda: read_state(acting).digest == check_manifest(better))
         for bundle in (acting, better):
             assert epypes("status", bundle).stdout.startswith(f"READY {better}")
             answered = epypes("call", bundle, 'what="plain"', "number=5")

@@ -9,7 +9,7 @@ import cv2
 import pytest
 
 import epypes as ep
-from epypes.bundle.seal import check_seal
+from epypes.bundle.manifest import check_manifest
 from epypes.cli import main
 from epypes.errors import BundleError, ServiceError
 from epypes.service.ops.export import systemd_unit, unit_name, write_container
@@ -87,7 +87,7 @@ def test_a_container_is_built_from_the_bundle_and_what_it_requires(bundle, tmp_p
     text = path.read_text(encoding="utf-8")
     assert 'ENTRYPOINT ["epypes", "serve", "/service/bundle", "--threads", "2"]' in text
     assert "USER epypes" in text
-    assert check_seal(path.parent / "bundle") == check_seal(bundle)
+    assert check_manifest(path.parent / "bundle") == check_manifest(bundle)
     lines = (path.parent / "requirements.txt").read_text(encoding="utf-8").splitlines()
     assert [line for line in lines if line.startswith("epypes")] == [f"epypes[serve]=={ep.__version__}"]
     assert any(line.startswith("opencv-python-headless==") for line in lines)

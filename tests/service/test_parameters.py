@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from epypes.bundle.entries import Member, read
+from epypes.bundle.hyperparameters import Member, read
 from epypes.errors import BundleError
 from epypes.service.parameters import changed_entries, misfits, read_entries, type_of, value_of
 

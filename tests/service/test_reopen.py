@@ -9,7 +9,7 @@ import warnings
 import pytest
 
 import epypes as ep
-from epypes.bundle.seal import seal
+from epypes.bundle.manifest import write_manifest
 from epypes.display.views.view import view
 from epypes.errors import BundleError, FailureNotKept, NotComputed, RemoteFailure, UnknownName
 from epypes.service import Service
@@ -130,7 +130,7 @@ def copy(bright_bundle, tmp_path):
 def test_a_bundle_that_has_changed_since_is_said_to_have(copy):
     failure = keep(copy, request(RAISES))
     (copy / "pipeline.toml").write_text((copy / "pipeline.toml").read_text() + "# more\n")
-    seal(copy)
+    write_manifest(copy)
     with pytest.warns(UserWarning, match="has changed since"):
         runner = ep.load_failure(failure, copy)
     assert runner.last.failure.function == "check"
@@ -211,7 +211,7 @@ def test_an_event_that_is_run_again_fails_is_fine_kills_or_hangs_and_the_caller_
 def test_a_bundle_whose_module_fails_is_no_reproduction(copy):
     with (copy / "pipeline.py").open("a") as file:
         file.write("\nraise RuntimeError('no')\n")
-    seal(copy)
+    write_manifest(copy)
     with pytest.raises(BundleError, match="fails: RuntimeError: no"):
         reproduce(FailedEvent(), request(1), copy)
 

@@ -15,7 +15,7 @@ import pytest
 import zmq
 
 import epypes as ep
-from epypes.bundle.seal import seal
+from epypes.bundle.manifest import write_manifest
 from epypes.errors import AddressError, BundleError, RemoteFailure, ServiceError
 from epypes.service import Client, Service, call
 from epypes.service.serving import serve
@@ -226,7 +226,7 @@ def test_a_changed_bundle_is_not_served(edge_bundle, tmp_path):
     settings.write_text(settings.read_text().replace("value = 70", "value = 20"))
     with pytest.raises(BundleError, match=r"pipeline\.toml was changed"):
         Service(copy, ANY, ANY)
-    seal(copy)
+    write_manifest(copy)
     done = run_cli("serve", copy)
     assert done.returncode == 1
     assert "token 'edges'" in done.stderr

@@ -9,7 +9,7 @@ import threading
 import psutil
 import pytest
 
-from epypes.bundle.seal import seal
+from epypes.bundle.manifest import write_manifest
 from epypes.errors import (
     DeployRefused,
     NotComputed,
@@ -403,7 +403,7 @@ def test_a_bundle_that_was_exchanged_behind_its_back_is_not_served_unasked_and_i
     with serving(copy) as (service, peer):
         settings = copy / "pipeline.toml"
         settings.write_text(settings.read_text() + "\n")
-        seal(copy)
+        write_manifest(copy)
         assert peer.ask(number=2).parts["out"] == 4
         view = service.view()
         os.kill(service.info()["worker_pid"], signal.SIGKILL)

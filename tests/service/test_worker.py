@@ -12,7 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from epypes.bundle.seal import seal
+from epypes.bundle.manifest import write_manifest
 from epypes.display.views.jsonview import from_json
 from epypes.service.frame_socket import WorkerMessage
 from epypes.service.packing import MARK, unpack
@@ -175,7 +175,7 @@ def test_a_bundle_that_does_not_compute_what_was_recorded_is_refused(acting, tmp
     shutil.copytree(acting, folder)
     module = folder / "pipeline.py"
     module.write_text(change(module.read_text()))
-    seal(folder)
+    write_manifest(folder)
     with worker_of(folder, tmp_path) as front:
         reasons = front.receive("refused").content["reasons"]
         assert any(re.search(reason, found) for found in reasons), reasons

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.bundle.tolerance import RUNS
+from epypes.bundle.determinism import RUNS
 from epypes_widgets.promotion import Outcome, Promotion, proposal
 from tests.bundle.test_slicer import notebook
 

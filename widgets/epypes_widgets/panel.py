@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import ipywidgets
 
-from epypes.batch.checking import CheckResult, Checks
+from epypes.batch.check import CheckResult, Checks
 from epypes.errors import NotComputed
 from epypes.hints import Roi
 from epypes.run import Run

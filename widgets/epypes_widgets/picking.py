@@ -11,9 +11,8 @@ from typing import Any, Final
 
 import anywidget
 
-from epypes.batch.order import identity
-from epypes.batch.sheet import Block, Sheet, Tile, shown_tokens
-from epypes.batch.sheetpage import page_of
+from epypes.batch.contact_sheet import Block, Sheet, Tile, page_of, shown_tokens
+from epypes.batch.grid import identity
 from epypes.batch.sweeping import SweepResult
 from epypes.display.markup import cut
 from epypes.errors import EpypesError

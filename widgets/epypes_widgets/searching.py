@@ -17,8 +17,8 @@ from epypes_widgets.places import Tunable
 from epypes_widgets.values import said
 
 if TYPE_CHECKING:
-    from epypes.batch.optimized import OptimizeResult
-    from epypes.batch.studying import Direction, Trial
+    from epypes.batch.search_result import OptimizeResult
+    from epypes.batch.study import Direction, Trial
 
 _LOG: Final = logging.getLogger(__name__)
 # The eye follows no more, and each time the whole curve goes to the page.
@@ -149,7 +149,7 @@ class Searching:
             raise StillRunning("epypes-search", (), timeout_s)
 
     def _work(self, n: int) -> None:
-        from epypes.batch.optimizing import optimize
+        from epypes.batch.optimize import optimize
 
         try:
             self.result = result = optimize(
@@ -237,7 +237,7 @@ def search_of(
 
 
 def _so_far(trials: Sequence[Trial], direction: Direction, n: int, state: State) -> Found:
-    from epypes.batch.optimized import best_of
+    from epypes.batch.search_result import best_of
 
     best = best_of(trials, direction)
     text = (
@@ -251,7 +251,7 @@ def _so_far(trials: Sequence[Trial], direction: Direction, n: int, state: State)
 
 
 def _at_end(result: OptimizeResult, n: int) -> Found:
-    from epypes.batch.optimized import best_of
+    from epypes.batch.search_result import best_of
 
     best = best_of(result.trials, result.direction)
     failed = f", {len(result.failures)} failed" if result.failures else ""

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from epypes.bundle.entries import fits, plain, read, written
+from epypes.bundle.hyperparameters import fits, plain, read, written
 from epypes.errors import SettingsError, UnknownName
 from epypes.graph import CompGraph, annotated_params
 from epypes.hints import Param

@@ -12,11 +12,9 @@ from dataclasses import replace
 from time import monotonic
 from typing import Any, Final
 
-from epypes.batch.cases import Case, Check
-from epypes.batch.checking import CheckResult, Checks, checked, inputs_of, prepared
-from epypes.batch.files import read_value
-from epypes.batch.items import items_of, opened
-from epypes.batch.measuring import CheckOutcome
+from epypes.batch.cases import Case, Check, inputs_of
+from epypes.batch.check import CheckOutcome, CheckResult, Checks, prepare_cases, run_checks
+from epypes.batch.items import items_of, payload_of, read_value
 from epypes.errors import EpypesError, PayloadError
 from epypes.run import CompGraphRunner
 from epypes.wording import counted
@@ -146,7 +144,7 @@ class Verdicts:
         came: dict[int, tuple[CheckOutcome, ...]] = {}
         told_s = 0.0
         self._tuning.screen.tell_verdicts(self._content(came))
-        for outcomes in checked(own, self._cases, has_pictures=False, stop=over):
+        for outcomes in run_checks(own, self._cases, has_pictures=False, stop=over):
             came[outcomes[0].number] = outcomes
             if monotonic() - told_s >= _TELL_S:
                 self._tuning.screen.tell_verdicts(self._content(came))
@@ -193,14 +191,14 @@ def cases_to_show(runner: Tunable, images: object, cases: Any) -> Checks:
     if not isinstance(runner, CompGraphRunner):
         free = runner.free_source_tokens
         raise PayloadError(free, "A service makes its own events, so it takes no cases. Check its bundle: ep.check().")
-    return _held(runner, prepared(runner, cases))
+    return _held(runner, prepare_cases(runner, cases))
 
 
 def _held(runner: CompGraphRunner, cases: Checks) -> Checks:
     """Return cases whose files have been read; what was expected and can't be read is left to fail each time."""
     items = items_of((inputs_of(case) for case, _ in cases), runner)
     return [
-        (replace(case, inputs=opened(item, runner.cg), expected=_labels(case, runner)), _with_label(checks, runner))
+        (replace(case, inputs=payload_of(item, runner.cg), expected=_labels(case, runner)), _with_label(checks, runner))
         for item, (case, checks) in zip(items, cases, strict=True)
     ]
 

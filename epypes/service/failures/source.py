@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from epypes.bundle.seal import check_seal
+from epypes.bundle.manifest import check_manifest
 from epypes.errors import BundleError, FailureNotKept, ServiceError, UnknownName
 from epypes.service.failures.record import FAILURE_TOPIC, FailedEvent, read_record
 from epypes.service.failures.store import FailureStore, failures_folder
@@ -101,7 +101,7 @@ def failures_of(source: Any = None) -> FailureSource:
     failures = _LocalFailures(path)
     if not failures_folder(path).is_dir() and not failures.records(1):
         # A bundle without failures is fine; a folder that is no bundle is not.
-        check_seal(path)
+        check_manifest(path)
     return failures
 
 
@@ -161,7 +161,7 @@ def bundle_of(record: FailedEvent, given: str | Path | None = None) -> tuple[Pat
     refused: BundleError | None = None
     for folder in (Path(each).resolve() for each in (given, record.bundle) if each):
         try:
-            digests[folder] = check_seal(folder)
+            digests[folder] = check_manifest(folder)
         except BundleError as error:
             refused = refused or error
             continue

@@ -21,7 +21,7 @@ from statistics import median
 from time import perf_counter_ns
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from epypes.bundle.seal import check_seal
+from epypes.bundle.manifest import check_manifest
 from epypes.errors import EpypesError
 from epypes.service.state_file import read_states, state_file
 
@@ -280,7 +280,7 @@ def _trip_ns(sent: Any, there: Any, back: Any, answers: Any) -> int:
 
 
 def _bundle(path: Path) -> Check:
-    digest = check_seal(path)
+    digest = check_manifest(path)
     return Check("bundle", "ok", f"{path} is whole: {digest[:16]}. epypes verify {path} replays it.")
 
 

@@ -17,10 +17,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
-from epypes.bundle.freshenv import epypes_source, uv_command
 from epypes.bundle.load import SETTINGS
-from epypes.bundle.requirements import pins
-from epypes.bundle.seal import check_seal
+from epypes.bundle.manifest import check_manifest
+from epypes.bundle.requirements import epypes_source, pins, uv_command
 from epypes.bundle.settings import read_settings
 from epypes.errors import ServiceError
 from epypes.transport.address import is_broker, parse_address
@@ -272,7 +271,7 @@ def _add_wheel(target: Path, source: str) -> bool:
 def _read_bundle(bundle: str | Path) -> tuple[Path, str]:
     """Return the folder of a whole bundle, and its name in the characters that systemd and containers take."""
     folder = Path(bundle).resolve()
-    check_seal(folder)
+    check_manifest(folder)
     name = read_settings(folder / SETTINGS).name
     return folder, re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-") or "service"
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 from urllib.parse import quote
 
-from epypes.bundle.entries import plain, written
-from epypes.bundle.ports import in_order
+from epypes.bundle.adapters import in_order
+from epypes.bundle.hyperparameters import plain, written
 from epypes.bundle.writeback import WriteBack
 from epypes.errors import EpypesError, ServiceError
 from epypes.service.failures.record import FailedEvent, read_record

@@ -10,8 +10,8 @@ from dataclasses import fields
 from types import GenericAlias
 from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 
-from epypes.bundle.entries import plain, read
-from epypes.bundle.ports import in_order
+from epypes.bundle.adapters import in_order
+from epypes.bundle.hyperparameters import plain, read
 from epypes.errors import EpypesError, RemoteFailure, ServiceError
 from epypes.graph import CompGraph, colour_order, subgraph
 from epypes.hints import Param

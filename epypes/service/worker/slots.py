@@ -18,7 +18,7 @@ from time import perf_counter_ns
 from typing import Any, Final
 
 import epypes
-from epypes.bundle.entries import Member, read
+from epypes.bundle.hyperparameters import Member, read
 from epypes.bundle.load import Bundle, pipeline_of
 from epypes.errors import MessageError
 from epypes.pipeline import FullPipeline, Pipeline

@@ -5,7 +5,7 @@ from __future__ import annotations
 import httpx
 import pytest
 
-from epypes.bundle.ports import REQUEST
+from epypes.bundle.adapters import REQUEST
 from epypes.service import Service
 from epypes.service.http import HttpServer
 from epypes.wire import Envelope

@@ -11,9 +11,9 @@ import numpy as np
 import psutil
 import pytest
 
+from epypes.bundle.adapters import REQUEST
 from epypes.bundle.load import read_bundle
-from epypes.bundle.ports import REQUEST
-from epypes.bundle.seal import seal
+from epypes.bundle.manifest import write_manifest
 from epypes.service import Service
 from epypes.service.http import HttpServer
 from epypes.service.packing import unpack, unpack_event
@@ -138,7 +138,7 @@ def changed(edge_bundle, tmp_path):
         text = (folder / file).read_text()
         assert before in text
         (folder / file).write_text(text.replace(before, after))
-        seal(folder)
+        write_manifest(folder)
         return folder
 
     return change
@@ -210,7 +210,7 @@ def test_while_a_bundle_is_deployed_another_one_is_refused_and_all_else_is_answe
         f"import os, time\nopen({str(tmp_path / 'begun')!r}, 'w').close()\nwhile not os.path.exists({str(tmp_path / 'go')!r}): time.sleep(0.01)\n"
         + (waiting / "pipeline.py").read_text()
     )
-    seal(waiting)
+    write_manifest(waiting)
     with Service(slow) as service, HttpServer(service, "127.0.0.1:*") as http:
         headers = {"Authorization": f"Bearer {http.token_file.read_text().strip()}"}
         with httpx.Client(base_url=http.url, trust_env=False, timeout=60, headers=headers) as client:

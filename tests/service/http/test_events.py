@@ -11,7 +11,7 @@ import httpx
 import pytest
 from httpx_sse import EventSource
 
-from epypes.bundle.ports import REQUEST
+from epypes.bundle.adapters import REQUEST
 from epypes.service.http import HttpServer
 from epypes.service.http.server import MAX_CONNECTIONS
 from epypes.wire import Envelope

@@ -1,0 +1,362 @@
+"""The cache of results: what a stored outcome is keyed by, and which outcomes need not be computed again.
+
+A series in a store is of one graph and of the hyperparameters that don't vary. Its name is the one that the user gives,
+or the digest of both. An outcome's key is the item's name and content, the values that vary, the tokens that are shown,
+and the state of the lists, arrays and objects that functions use. What can't be digested is never taken from the store.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import monotonic
+from typing import Any, Final, Self
+from warnings import warn
+
+from epypes.batch.fingerprint import Digester, combined_digest, file_digest, versions_of
+from epypes.batch.items import Item
+from epypes.batch.job import NO_SETTING
+from epypes.batch.results import Outcome
+from epypes.bundle import to_source
+from epypes.errors import PlaceholderNeeded, ScaleError, SourceRefused, StoreError
+from epypes.graph import CompGraph
+from epypes.run import CompGraphRunner
+from epypes.run.guard import is_plain_array
+from epypes.store import Series, Store, opened_store
+
+__all__ = [
+    "Fingerprint",
+    "NoDigest",
+    "OutcomeCache",
+    "combined_digest",
+    "function_digest",
+    "graph_fingerprint",
+    "outcome_cache",
+    "payload_digest",
+    "source_of",
+    "value_digest",
+    "value_label",
+]
+
+# What is lost at most if the process is killed; to write each outcome by itself would take longer than to make it.
+_WRITE_EVERY_S: Final = 0.5
+_SHOWN_CHARACTERS: Final = 60
+_SHORT: Final = (type(None), bool, int, float, complex, str)
+
+
+# -- digests --------------------------------------------------------------------------------------------------------
+
+
+class NoDigest(TypeError):
+    """A value holds, or a function uses, an object whose content can't be told."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fingerprint:
+    """The digests of a graph.
+
+    Attributes
+    ----------
+    code
+        Of functions, classes, modules and immutable values: changes when code is edited.
+    state
+        Of what is in lists, dicts, arrays and objects that functions use: a call may change it.
+    unknown
+        The first object whose content can't be told, in words; "" if there is none. A computation with one may be
+        another one although the digests are the same.
+    """
+
+    code: str
+    state: str
+    unknown: str
+
+
+def source_of(cg: CompGraph) -> str | None:
+    """Return a graph as the text that promotion writes; None if that is refused."""
+    try:
+        return to_source(cg)
+    except (SourceRefused, PlaceholderNeeded):
+        return None
+
+
+def graph_fingerprint(cg: CompGraph, source: str | None) -> Fingerprint:
+    """Return the fingerprint of what a graph computes.
+
+    Parameters
+    ----------
+    cg
+        The graph.
+    source
+        What `source_of` returned: if the graph has a text, that says how objects are made whose content can't be told.
+
+    Notes
+    -----
+    The text alone would not do: a module that was edited and not loaded again computes what its file had before.
+    """
+    digester = Digester()
+    digester.add(cg)
+    versions = versions_of(digester.modules, source or "")
+    code = combined_digest("graph", source or "", digester.code.digest(), *versions).hex()
+    return Fingerprint(code, digester.state.hexdigest(), digester.unknown if source is None else "")
+
+
+def function_digest(function: Any) -> str:
+    """Return the digest of a function and of all that it uses; what is installed counts by its name.
+
+    Raises
+    ------
+    NoDigest
+        It uses an object whose content can't be told.
+    """
+    return _digest(Digester(), function)
+
+
+def value_digest(value: Any) -> str:
+    """Return the digest of a value: numbers, texts, arrays, files, what a message can carry, objects of own classes.
+
+    Raises
+    ------
+    NoDigest
+        It is, or holds, an object whose content can't be told.
+    """
+    return _digest(Digester(of_data=True), value)
+
+
+def _digest(digester: Digester, value: Any) -> str:
+    digester.add(value)
+    if digester.unknown:
+        raise NoDigest(digester.unknown)
+    return digester.digest().hex()
+
+
+def payload_digest(payload: Mapping[str, Any]) -> str:
+    """Return the digest of a payload: of every token the file's content, wherever it is, or the value.
+
+    Raises
+    ------
+    NoDigest
+        A file can't be read, or the content of a value can't be told.
+    """
+    parts: list[str] = []
+    for token, value in sorted(payload.items()):
+        digest = file_digest(value) if isinstance(value, Path) else value_digest(value)
+        if not digest:
+            raise NoDigest(f"{str(value)!r}, which can't be read")
+        parts += token, digest
+    return combined_digest("payload", *parts).hex()
+
+
+def value_label(value: Any) -> str:
+    """Return a value as a person reads it, with its digest if that does not say all.
+
+    Raises
+    ------
+    NoDigest
+        As for `value_digest`.
+    """
+    digest = value_digest(value)
+    if _is_short(value) and len(text := repr(value)) <= _SHOWN_CHARACTERS:
+        return text
+    what = f"{value.dtype} {value.shape}" if is_plain_array(value) else type(value).__name__
+    return f"{value if isinstance(value, enum.Enum) else what} {digest}"
+
+
+def _is_short(value: Any) -> bool:
+    if type(value) in (tuple, list):
+        return len(value) <= _SHOWN_CHARACTERS and all(map(_is_short, value))
+    # A long number takes long to write, and Python refuses to write one that is too long.
+    return type(value) in _SHORT and not (type(value) is int and value.bit_length() > _SHOWN_CHARACTERS * 4)
+
+
+# -- series ---------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def outcome_cache(
+    store: str | Path | Store | None,
+    kind: str,
+    runner: CompGraphRunner,
+    name: str | None,
+    *,
+    keep: Sequence[str] = (),
+    show: Sequence[str] | None = (),
+    varied: Collection[str] = (),
+) -> Iterator[OutcomeCache | None]:
+    """Open the series of a runner's outcomes; what waits to be written is written at the end.
+
+    Parameters
+    ----------
+    store
+        Path, URL or ``ep.Store``; None: there is no cache.
+    kind
+        ``"map"`` or ``"sweep"``.
+    runner
+        Its graph and hyperparameters are what the series is of.
+    name
+        What the series is called; a digest of graph and hyperparameters without.
+    keep
+        Tokens whose whole values are wanted. They are not in the store, so with one everything is run.
+    show
+        Tokens of which thumbnails are made.
+    varied
+        The hyperparameters of which each outcome has its own values.
+
+    Warns
+    -----
+    UserWarning
+        A function uses an object whose content can't be told, so nothing that is stored counts.
+
+    Raises
+    ------
+    ScaleError
+        There is no name and the graph can't be written as text; or the series is of another graph or of other
+        hyperparameters.
+    """
+    with opened_store(store) as opened:
+        if opened is None:
+            yield None
+            return
+        series, found = _series_of(opened, kind, runner, name, varied)
+        shown = "" if show == () else f"show={show and list(show)}"
+        with OutcomeCache(series, f"{shown} state={found.state}", reads=not keep and not found.unknown) as cache:
+            yield cache
+
+
+def _series_of(
+    store: Store, kind: str, runner: CompGraphRunner, name: str | None, varied: Collection[str]
+) -> tuple[Series, Fingerprint]:
+    source = source_of(runner.cg)
+    found = graph_fingerprint(runner.cg, source)
+    fixed = {token: value for token, value in runner.hyperparameters.items() if token not in varied}
+    about = {"graph": found.code, "hyperparameters": _hyperparameter_labels(fixed)}
+    if name is None:
+        if source is None:
+            text = "What this graph computes can't be written as text, which would tell it from others. Give name=."
+            raise ScaleError(text)
+        name = combined_digest(found.code, repr(about["hyperparameters"])).hex()[:16]
+    series = store.series(kind, name, about=about)
+    _check_same(series, about)
+    if found.unknown:
+        text = f"The graph uses {found.unknown}, and nothing tells whether that has changed: every item is run again."
+        warn(f"{text} Use functions, numbers, texts, arrays, or objects that can be pickled.", stacklevel=5)
+    return series, found
+
+
+def _hyperparameter_labels(values: Mapping[str, Any]) -> dict[str, str]:
+    labels: dict[str, str] = {}
+    for token, value in values.items():
+        try:
+            labels[token] = value_label(value)
+        except NoDigest as error:
+            text = f"Hyperparameter {token!r} is or holds {error}: nothing tells it from others, as a store has to."
+            raise ScaleError(f"{text} Make it of numbers, texts, arrays, lists or dicts.") from error
+    return labels
+
+
+def _check_same(series: Series, about: Mapping[str, Any]) -> None:
+    before = series.about
+    was, now = before.get("hyperparameters", {}), about["hyperparameters"]
+    changed = [token for token in {**was, **now} if was.get(token) != now.get(token)]
+    if not changed and before.get("graph") == about["graph"]:
+        return
+    changes = ", ".join(f"{token} was {was.get(token, 'free')} and is {now.get(token, 'free')}" for token in changed)
+    raise ScaleError(
+        f"Series {series.name!r} in the store is of another computation: {changes or 'the graph has changed'}. "
+        "Give another name=, or none."
+    )
+
+
+class OutcomeCache:
+    """The outcomes of a series; new ones are written a few at a time.
+
+    Parameters
+    ----------
+    series
+        The series.
+    suffix
+        What else than the item and its setting decides about an outcome.
+    reads
+        Whether outcomes are taken from the series.
+
+    Notes
+    -----
+    An item whose content can't be told is run each time, and not written.
+    """
+
+    def __init__(self, series: Series, suffix: str = "", *, reads: bool = True) -> None:
+        self._series, self._suffix = series, suffix
+        self._known = series.keys() if reads else frozenset()
+        self._keys: dict[tuple[int, int], str] = {}
+        self._item_label: tuple[int, str | None] = -1, None
+        # With the settings themselves, so that no other has the identity of one.
+        self._setting_labels: dict[int, tuple[Mapping[str, Any], str | None]] = {}
+        self._waiting: list[tuple[str, dict[str, Any]]] = []
+        self._written_s = monotonic()
+
+    def find(self, item: Item, setting: Mapping[str, Any] = NO_SETTING) -> Outcome | None:
+        """Return the stored outcome of an item under a setting; None if it has to be run."""
+        of_item, of_setting = self._label_of_item(item), self._label_of_setting(setting)
+        if of_item is None or of_setting is None:
+            return None
+        key = f"{of_item} {self._suffix} {of_setting}"
+        found = self._series.get(key) if key in self._known else None
+        if found is None:
+            self._keys[item.number, id(setting)] = key
+            return None
+        return replace(Outcome.from_json(found), number=item.number, name=item.name, setting=setting)
+
+    def _label_of_item(self, item: Item) -> str | None:
+        if self._item_label[0] != item.number:
+            try:
+                label = f"{item.name} {payload_digest(item.payload)}"
+            except NoDigest:
+                label = None
+            self._item_label = item.number, label
+        return self._item_label[1]
+
+    def _label_of_setting(self, setting: Mapping[str, Any]) -> str | None:
+        if id(setting) not in self._setting_labels:
+            try:
+                label = repr({token: value_label(value) for token, value in setting.items()})
+            except NoDigest:
+                label = None
+            self._setting_labels[id(setting)] = setting, label
+        return self._setting_labels[id(setting)][1]
+
+    def add(self, outcomes: Iterable[Outcome]) -> None:
+        """Take outcomes of items that had to be run."""
+        for outcome in outcomes:
+            key = self._keys.pop((outcome.number, id(outcome.setting)), None)
+            # A file that could not be read may be there the next time.
+            if key is not None and (outcome.error_info is None or outcome.error_info.function):
+                self._waiting.append((key, outcome.to_json()))
+        if monotonic() - self._written_s >= _WRITE_EVERY_S:
+            self.write()
+
+    def write(self) -> None:
+        """Write what waits.
+
+        Raises
+        ------
+        StoreError
+            The store can't be written; then it still waits.
+        """
+        self._series.append_all(self._waiting)
+        self._waiting.clear()
+        self._written_s = monotonic()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        """Write what waits; if something else has gone wrong before, that is what is raised."""
+        try:
+            self.write()
+        except StoreError as failed:
+            if error is None:
+                raise
+            if error is not failed:
+                error.add_note(f"What waited to be stored could not be: {failed}")

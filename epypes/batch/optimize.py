@@ -1,0 +1,241 @@
+"""The search for the values of hyperparameters that give the best results over many cases."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from epypes.batch.cases import Case, cases_of, with_labels_read
+from epypes.batch.executors import run_jobs, worker_count
+from epypes.batch.incremental import CaseRunners, SearchStopped
+from epypes.batch.items import Item, detached_runner, items_of
+from epypes.batch.job import Job
+from epypes.batch.objective import Objective, ObjectiveMetric, Score, code_digests, search_digests, search_name
+from epypes.batch.progress import progress_bar
+from epypes.batch.ranges import axes_of
+from epypes.batch.results import Outcome
+from epypes.batch.search_result import OptimizeResult
+from epypes.batch.study import Direction, Search, Suggestion, Trial
+from epypes.errors import ScaleError
+from epypes.run import CompGraphRunner
+from epypes.store import opened_store
+from epypes.wording import ended
+
+if TYPE_CHECKING:
+    from epypes.store import Store
+
+_CASE_FILE: Final = ".toml"
+_DIRECTIONS: Final = ("maximize", "minimize")
+
+
+def optimize(
+    runner: CompGraphRunner,
+    metric: ObjectiveMetric,
+    cases: Any,
+    n: int = 100,
+    *,
+    executor: Executor | None = None,
+    direction: Direction = "maximize",
+    ranges: Mapping[str, Any] | None = None,
+    keep: Sequence[str] | None = None,
+    seed: int = 0,
+    store: str | Path | Store | None = None,
+    name: str | None = None,
+    stop: threading.Event | None = None,
+    on_trial: Callable[[Trial], object] | None = None,
+    progress: bool | None = None,
+) -> OptimizeResult:
+    """Search the values of hyperparameters that make a metric best over a set of cases; the runner is left as it is.
+
+    Parameters
+    ----------
+    runner
+        Its graph is run; hyperparameters that do not vary have the values that it has.
+    metric
+        ``metric(tokens, case)`` returns a number: how good the values of a run, by token, are for its case. It is
+        called in this process, by the thread that calls this. Or the name of a token that is a number itself. What
+        counts is the mean over all cases.
+    cases
+        ``ep.Case``, dicts or inputs alone; the path of a file of cases; or a folder or glob of images. Without labels a
+        case is its inputs.
+    n
+        How many trials there are to be: with a store, those that are in there already count.
+    executor
+        Runs the cases, as for ``ep.map``; several trials then run at a time, so the settings that are tried depend on
+        the order in which trials end. Without, the calling thread does, and runs of each case only what depends on what
+        has changed.
+    direction
+        ``"maximize"`` or ``"minimize"``.
+    ranges
+        By hyperparameter, which values are tried: an ``ep.Param``, a tuple (low, high[, step]) or a list of choices;
+        no others vary. Without, all vary that have a range by an annotation, or by the tables of OpenCV and
+        scikit-image.
+    keep
+        Tokens that a metric is given; the sink tokens without. Only what they need is run.
+    seed
+        The same one tries the same, if there is no executor.
+    store
+        Path, URL or ``ep.Store`` of a database that keeps the trials, in Optuna's own tables. A second call goes on.
+    name
+        Of the study in the store; without, it follows from the graph and its other hyperparameters, from what is
+        searched, from what the metric computes, and from the cases: what goes into them, their labels and their
+        hyperparameters. A study that has been searched for another one of these is refused.
+    stop
+        Ends the search once it is set: when the function that runs has returned. So does Ctrl+C, at once. The trials
+        that have ended until then are returned.
+    on_trial
+        Is called with each ``Trial`` that has ended, by the thread that calls this.
+    progress
+        Whether to show a bar; None: in a terminal or a notebook.
+
+    Returns
+    -------
+    OptimizeResult
+        The first of its trials has the runner's present values, or the nearest ones that may be tried.
+
+    Raises
+    ------
+    ScaleError
+        There are no cases, nothing that may vary, or no trial has completed; or in the first one an input can't be
+        read, which ends the search.
+    UnknownName
+        The graph has no such token, or the runner no such hyperparameter.
+    StoreError
+        The store can't be used.
+
+    Examples
+    --------
+    >>> from epypes import CompGraph, CompGraphRunner
+    >>> runner = CompGraphRunner(CompGraph({"add": lambda x, y: x + y}, {"add": (("x", "y"), "total")}), {"y": 9})
+    >>> result = optimize(runner, "total", [{"x": 1}], 20, direction="minimize", ranges={"y": (0, 10)})
+    >>> result.best
+    {'y': 0}
+    """
+    if type(n) is not int or n < 1:
+        raise ScaleError(f"n is how many trials there are to be, 1 or more, not {n!r}.")
+    if direction not in _DIRECTIONS:
+        raise ScaleError(f"direction is 'maximize' or 'minimize', not {direction!r}.")
+    # A caller that sets hyperparameters meanwhile, or writes into them, does not change what is searched.
+    runner = detached_runner(runner)
+    axes = axes_of(runner, ranges)
+    objective = Objective(runner.cg, metric, _cases(cases, runner), keep)
+    inputs = items_of([case.inputs for case in objective.cases], runner)
+    items = tuple(
+        Item(number, case.name or item.name, item.payload)
+        for number, (case, item) in enumerate(zip(objective.cases, inputs, strict=True))
+    )
+    work = _Evaluation(runner, objective, items, executor, stop)
+    at_once = 1 if executor is None else worker_count(executor)
+    with opened_store(store) as opened:
+        url, digests, study = None, {}, name or ""
+        if opened is not None:
+            url, digests = opened.url, search_digests(runner, axes, objective, items, is_named=bool(name))
+            study = name or search_name(objective.name, direction, axes, digests)
+        search = Search(
+            axes, runner.hyperparameters, direction, seed=seed, at_once=at_once, url=url, name=study, digests=digests
+        )
+        with contextlib.closing(search):
+            was_stopped = _searched(search, work, n, on_trial, progress)
+            if opened is not None:
+                search.forget_changed(code_digests(runner, objective, is_named=True))
+    result = OptimizeResult(search.trials, direction, objective.name, axes, search.study, was_stopped)
+    if result.trials and not was_stopped and all(trial.value is None for trial in result.trials):
+        first = result.trials[0]
+        text = f"None of {len(result.trials)} trials completed. The first one failed: {ended(first.failure)}"
+        raise ScaleError(f"{text} Its values: {first.setting}.")
+    return result
+
+
+def _cases(given: Any, runner: CompGraphRunner) -> tuple[Case, ...]:
+    """Return the cases with their labels read."""
+    if isinstance(given, str | Path) and Path(given).suffix != _CASE_FILE:
+        return tuple(Case(item.payload, name=item.name) for item in items_of(given, runner))
+    return tuple(with_labels_read(case, runner.cg) for case in cases_of(given))
+
+
+@dataclass(frozen=True, slots=True)
+class _Evaluation:
+    """Runs the cases of one setting after another, and measures them."""
+
+    runner: CompGraphRunner
+    objective: Objective
+    items: tuple[Item, ...]
+    executor: Executor | None
+    stop: threading.Event | None
+
+    @property
+    def is_stopped(self) -> bool:
+        return self.stop is not None and self.stop.is_set()
+
+    @property
+    def own(self) -> list[Mapping[str, Any]]:
+        """The hyperparameters of each case that are its own."""
+        return [case.hyperparameters or {} for case in self.objective.cases]
+
+    def scores(self, search: Search, count: int) -> Generator[tuple[Suggestion, Score]]:
+        """Yield the scores of the next settings as they come; fewer if the search is stopped."""
+        asked = (search.ask() for _ in range(count))
+        return self._in_this_thread(asked) if self.executor is None else self._on_executor(asked, self.executor)
+
+    def _in_this_thread(self, asked: Iterator[Suggestion]) -> Generator[tuple[Suggestion, Score]]:
+        runners = CaseRunners(self.runner, self.items, self.own, self.objective.keep, self.stop)
+        while not self.is_stopped and (one := next(asked, None)) is not None:
+            try:
+                score = self.objective.score(runners.outcomes(one.setting))
+            except SearchStopped:
+                return
+            yield one, score
+
+    def _on_executor(self, asked: Iterator[Suggestion], executor: Executor) -> Generator[tuple[Suggestion, Score]]:
+        pending: dict[int, tuple[Suggestion, dict[int, Outcome]]] = {}
+        keep, count = self.objective.keep, len(self.items)
+
+        def jobs() -> Iterator[Job]:
+            """Yield a job for each case of each trial, when there is room; a trial is asked for with its first."""
+            for number, one in enumerate(asked):
+                pending[number] = one, {}
+                for item, own in zip(self.items, self.own, strict=True):
+                    marked = Item(number * count + item.number, item.name, item.payload)
+                    yield Job((marked,), ({**one.setting, **own},), keep=keep, targets=keep)
+
+        for outcomes in run_jobs(self.runner, jobs(), executor, ahead=worker_count(executor), stop=self.stop):
+            for outcome in outcomes:
+                number, index = divmod(outcome.number, count)
+                one, found = pending[number]
+                found[index] = outcome
+                if len(found) == count:
+                    del pending[number]
+                    yield one, self.objective.score([found[index] for index in range(count)])
+
+
+def _searched(
+    search: Search,
+    work: _Evaluation,
+    n: int,
+    on_trial: Callable[[Trial], object] | None,
+    progress: bool | None,
+) -> bool:
+    """Run the trials that are still to be run; return whether the search was stopped before its end."""
+    done = search.trials
+    with progress_bar(progress, n, f"optimize {work.objective.name}", unit="trial") as advance:
+        if done:
+            advance(len(done), sum(trial.value is None for trial in done))
+        try:
+            with contextlib.closing(work.scores(search, n - len(done))) as coming:
+                for number, (asked, score) in enumerate(coming):
+                    if number == 0 and score.unreadable:
+                        raise ScaleError(
+                            f"No trial can complete: {ended(score.unreadable)} Mend the file, or leave it out."
+                        )
+                    trial = search.tell(asked, score.value, score.failure, score.total_ns)
+                    advance(1, trial.value is None)
+                    if on_trial is not None:
+                        on_trial(trial)
+        except KeyboardInterrupt:
+            return True
+    return work.is_stopped

@@ -1,0 +1,340 @@
+"""Outcomes of items, as JSON, as a pandas table and as an HTML table."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+from epypes.display.durations import duration_text
+from epypes.display.markup import content, escape
+from epypes.display.previews.short import float_text
+from epypes.errors import ImageFileError, ScaleError
+from epypes.graph import CompGraph
+from epypes.optional import optional_import
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+# What reading a file raises.
+_UNREADABLE: Final = frozenset({ImageFileError.__name__, ScaleError.__name__})
+# Python can be told to refuse numbers of more than 640 digits.
+_MOST_BITS: Final = 2_126
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorInfo:
+    """What failed.
+
+    Attributes
+    ----------
+    function
+        Its name in the graph; "" if the input could not be read, or is none that the graph takes.
+    kind
+        Name of the exception's class.
+    message
+        What the exception says.
+    """
+
+    function: str
+    kind: str
+    message: str
+
+    @property
+    def is_unreadable(self) -> bool:
+        """Whether it is a file of the input that could not be read: with other hyperparameters it can't be either."""
+        return not self.function and self.kind in _UNREADABLE
+
+    def __str__(self) -> str:
+        where = f"{self.function}: " if self.function else ""
+        return f"{where}{self.kind}{': ' + self.message if self.message else ''}"
+
+
+@dataclass(frozen=True, slots=True)
+class Thumbnail:
+    """A small picture of a token's value.
+
+    Attributes
+    ----------
+    media_type
+        ``"image/jpeg"``, ``"image/png"`` or ``"image/svg+xml"``.
+    data
+        The bytes of such a file.
+    caption
+        What it is of, as ``"uint8 400 x 600"``.
+    """
+
+    media_type: str
+    data: bytes
+    caption: str
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What is left of one item under one setting.
+
+    Attributes
+    ----------
+    number, name
+        Of the item.
+    setting
+        The hyperparameters that were varied, by token; nothing in a map.
+    values
+        By sink token: a number, text or truth value as it is, of anything else a short text.
+    times_ns
+        Nanoseconds by function that ran; what was reused from the setting before is not among them.
+    total_ns
+        Nanoseconds of the run, without reading files.
+    trouble
+        What failed; None if nothing did.
+    thumbnails
+        By token, if they were asked for.
+    kept
+        Whole values by token, if they were asked for.
+    texts
+        Of tokens whose pictures were asked for and that have none: what is said of them instead.
+    """
+
+    number: int
+    name: str
+    setting: Mapping[str, Any] = field(default_factory=dict)
+    values: Mapping[str, Any] = field(default_factory=dict)
+    times_ns: Mapping[str, int] = field(default_factory=dict)
+    total_ns: int = 0
+    error_info: ErrorInfo | None = None
+    thumbnails: Mapping[str, Thumbnail] = field(default_factory=dict)
+    kept: Mapping[str, Any] = field(default_factory=dict)
+    texts: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether something failed."""
+        return self.error_info is not None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what JSON can hold of it: all but ``kept``."""
+        return {
+            "number": self.number,
+            "name": self.name,
+            "setting": {token: _plain(value) for token, value in self.setting.items()},
+            "values": dict(self.values),
+            "times_ns": dict(self.times_ns),
+            "total_ns": self.total_ns,
+            "error_info": None if self.error_info is None else asdict(self.error_info),
+            "thumbnails": {
+                token: {
+                    "media_type": shown.media_type,
+                    "data": base64.b64encode(shown.data).decode(),
+                    "caption": shown.caption,
+                }
+                for token, shown in self.thumbnails.items()
+            },
+            "texts": dict(self.texts),
+        }
+
+    @staticmethod
+    def from_json(data: Mapping[str, Any]) -> Outcome:
+        """Return the outcome that ``to_json`` wrote."""
+        error_info = data["error_info"]
+        return Outcome(
+            data["number"],
+            data["name"],
+            {token: _read(value) for token, value in data["setting"].items()},
+            dict(data["values"]),
+            dict(data["times_ns"]),
+            data["total_ns"],
+            None if error_info is None else ErrorInfo(**error_info),
+            {
+                token: Thumbnail(shown["media_type"], base64.b64decode(shown["data"]), shown["caption"])
+                for token, shown in data["thumbnails"].items()
+            },
+            texts=dict(data.get("texts", {})),
+        )
+
+
+def _plain(value: Any) -> Any:
+    """Return a hyperparameter's value as JSON can hold it; a tuple is told from a list."""
+    if isinstance(value, int) and is_endless(value):
+        return {"text": long_number(value)}
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, tuple | list):
+        items = [_plain(item) for item in value]
+        return {"tuple": items} if isinstance(value, tuple) else items
+    number = plain_number(value)
+    return {"text": str(value)} if number is None else number
+
+
+def _read(data: Any) -> Any:
+    if isinstance(data, list):
+        return [_read(item) for item in data]
+    if not isinstance(data, Mapping):
+        return data
+    return tuple(_read(item) for item in data["tuple"]) if "tuple" in data else data["text"]
+
+
+def is_endless(value: int) -> bool:
+    """Whether a number has more digits than can be read from a text, whatever Python is told to refuse."""
+    return value.bit_length() > _MOST_BITS
+
+
+def long_number(value: int) -> str:
+    """Return what a table says of a number that nobody reads."""
+    return f"int of {value.bit_length():,} bits"
+
+
+def plain_number(value: Any) -> bool | int | float | None:
+    """Return numpy's numbers and truth values as Python's; None for what is neither."""
+    if getattr(value, "shape", None) != () or not hasattr(value, "item"):
+        return None
+    item = value.item()
+    return item if isinstance(item, bool | int | float) else None
+
+
+_FIXED: Final = ("name", "failure", "total_ms")
+
+
+def outcomes_frame(
+    outcomes: Sequence[Outcome], cg: CompGraph | None = None, extra: Mapping[str, Sequence[Any]] | None = None
+) -> pd.DataFrame:
+    """Return a table with one row per outcome.
+
+    Parameters
+    ----------
+    outcomes
+        The rows.
+    cg
+        Gives the order of sink tokens and functions; without, it is the one in which outcomes have them.
+    extra
+        Columns by name, each with a value per outcome; they stand after ``name``.
+
+    Returns
+    -------
+    pandas.DataFrame
+        ``name``, the extra columns, ``failure`` (None, or what failed), one column per sink token, ``total_ms``, and
+        ``"<function> ms"`` of what ran. A token that is called like another column has `` (token)`` after its name.
+    """
+    columns: dict[str, Sequence[Any]] = {"name": [outcome.name for outcome in outcomes]}
+    columns |= {column: object_column(values) for column, values in (extra or {}).items()}
+    columns["failure"] = object_column(
+        [None if outcome.error_info is None else " ".join(str(outcome.error_info).split()) for outcome in outcomes]
+    )
+    tokens = _all((outcome.values for outcome in outcomes), () if cg is None else cg.sink_tokens)
+    functions = _all((outcome.times_ns for outcome in outcomes), () if cg is None else cg.functions)
+    for token in tokens:
+        is_taken = token in columns or token in _FIXED
+        columns[f"{token} (token)" if is_taken else token] = _column(
+            [outcome.values.get(token) for outcome in outcomes]
+        )
+    columns["total_ms"] = [outcome.total_ns / 1e6 for outcome in outcomes]
+    for function in functions:
+        columns[f"{function} ms"] = [_in_ms(outcome.times_ns.get(function)) for outcome in outcomes]
+    with optional_import():
+        import pandas as pd
+    return pd.DataFrame(columns)
+
+
+def _column(values: list[Any]) -> Any:
+    """Return values as a column; integers and truth values of which some are missing stay what they are."""
+    kinds = {type(value) for value in values if value is not None}
+    if None in values and len(kinds) == 1 and kinds <= {bool, int}:
+        with optional_import():
+            import pandas as pd
+        try:
+            return pd.array(values, dtype="boolean" if bool in kinds else "Int64")
+        except OverflowError:  # above 64 bits
+            return values
+    return values
+
+
+def object_column(values: Sequence[Any]) -> Any:
+    """Return values as a column; where None is one of them it stays None, since NaN is another value."""
+    has_none = any(value is None for value in values)
+    if not has_none:
+        return values
+    with optional_import():
+        import pandas as pd
+    return pd.Series(list(values), dtype=object)
+
+
+def _in_ms(duration_ns: int | None) -> float:
+    return float("nan") if duration_ns is None else duration_ns / 1e6
+
+
+def _all(found: Iterable[Mapping[str, Any]], first: Iterable[str]) -> list[str]:
+    """Return the names in all mappings: those of ``first`` in that order, then the others as they come."""
+    order = dict.fromkeys(first)
+    for names in found:
+        order |= dict.fromkeys(names)
+    return list(order)
+
+
+_MOST_ROWS: Final = 30
+_THUMBNAIL_CHARACTERS: Final = 80_000
+_MESSAGE_CHARACTERS: Final = 160
+_ERROR: Final = "var(--jp-error-color1,var(--vscode-errorForeground,#cf222e))"
+_LEFT: Final = ' style="text-align:left"'
+
+
+def outcomes_html(outcomes: Sequence[Outcome], cg: CompGraph, caption: str) -> str:
+    """Return a table as HTML: the failed and the first others, in order, with the thumbnails there is room for."""
+    chosen = _chosen(outcomes)
+    shown = [token for token in cg.tokens if any(token in outcome.thumbnails for outcome in chosen)]
+    # A sink token with a picture says the rest in the picture's title.
+    sinks = [token for token in cg.sink_tokens if token not in shown]
+    head = _row("th", ["name", *shown, *sinks, "time"])
+    room, rows = _THUMBNAIL_CHARACTERS, []
+    for outcome in chosen:
+        pictures = [_picture(outcome.thumbnails.get(token)) for token in shown]
+        room -= sum(map(len, pictures))
+        rows.append(_outcome_row(outcome, pictures if room >= 0 else [""] * len(shown), sinks))
+    left_out = len(outcomes) - len(chosen)
+    more = f"<p>and {left_out} more: to_frame() has all of them</p>" if left_out else ""
+    return f"<table><caption>{content(caption)}</caption>{head}{''.join(rows)}</table>{more}"
+
+
+def _chosen(outcomes: Sequence[Outcome]) -> list[Outcome]:
+    if len(outcomes) <= _MOST_ROWS:
+        return list(outcomes)
+    places = [place for place, outcome in enumerate(outcomes) if outcome.has_failed][: _MOST_ROWS // 2]
+    others = (place for place, outcome in enumerate(outcomes) if not outcome.has_failed)
+    places += [place for place, _ in zip(others, range(_MOST_ROWS - len(places)), strict=False)]
+    return [outcomes[place] for place in sorted(places)]
+
+
+def _outcome_row(outcome: Outcome, pictures: list[str], sinks: Sequence[str]) -> str:
+    name = content(outcome.name)
+    if outcome.error_info is None:
+        values = [content(value_text(outcome.values[token])) if token in outcome.values else "" for token in sinks]
+        return _row("td", [name, *pictures, *values, duration_text(outcome.total_ns)])
+    said = " ".join(str(outcome.error_info).split())
+    cut = said if len(said) <= _MESSAGE_CHARACTERS else f"{said[:_MESSAGE_CHARACTERS]}..."
+    style = f'style="text-align:left;color:{_ERROR}" title="{escape(said)}"'
+    failure = f'<td colspan="{len(sinks) + 1}" {style}>\u2717 {content(cut)}</td>'
+    cells = "".join(f"<td{_LEFT}>{cell}</td>" for cell in (name, *pictures))
+    return f"<tr>{cells}{failure}</tr>"
+
+
+def _row(kind: str, cells: Iterable[str]) -> str:
+    return f"<tr>{''.join(f'<{kind}{_LEFT}>{cell}</{kind}>' for cell in cells)}</tr>"
+
+
+def _picture(shown: Thumbnail | None) -> str:
+    return (
+        ""
+        if shown is None
+        else f'<img src="{data_uri(shown)}" alt="{escape(shown.caption)}" title="{escape(shown.caption)}">'
+    )
+
+
+def data_uri(shown: Thumbnail) -> str:
+    """Return a thumbnail as the address that an image element of a page has."""
+    return f"data:{shown.media_type};base64,{base64.b64encode(shown.data).decode()}"
+
+
+def value_text(value: Any) -> str:
+    """Return a value of an outcome as a table shows it: a float to six digits."""
+    text = float_text(value) if isinstance(value, float) else str(value)
+    return text if len(text) <= _MESSAGE_CHARACTERS else f"{text[:_MESSAGE_CHARACTERS]}..."

@@ -1,0 +1,224 @@
+"""File access of a bundle while it is replayed: files outside of it, connections and processes.
+
+An audit hook hears of every file that Python opens. Libraries in C open files without it; their names are looked for in
+the text of the module and in the values of hyperparameters.
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+import sys
+import sysconfig
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final, Self
+
+_SYSTEM: Final = ("/bin", "/boot", "/dev", "/etc", "/lib", "/lib32", "/lib64", "/proc", "/run", "/sbin", "/sys", "/usr")
+_SYSTEM_TOO: Final = ("/System", "/Library", "/var/cache", "/var/lib")
+_NOT_READ: Final = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
+_WAY_OUT: Final = (
+    "The bundle is not alone with it. Pass its content in as a token, keep it in a variable of the notebook, or put "
+    "it into the data of a package that is installed and read it with importlib.resources."
+)
+_LONGEST: Final = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Named:
+    """A text that may name a file, and where it stands."""
+
+    text: str
+    what: str
+
+
+class FileAccess:
+    """While its block runs, it is noted what the bundle's functions open, connect to and start.
+
+    Parameters
+    ----------
+    folder
+        The bundle.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._is_on = False
+        self._files: dict[str, str] = {}
+        self._notes: dict[str, None] = {}
+        self._made: set[str] = set()
+
+    def __enter__(self) -> Self:
+        self._is_on = True
+        sys.addaudithook(self._on_event)  # which can't be taken away again
+        self._before = {named: _state(named.text) for named in named_in(self._folder)}
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._is_on = False
+
+    def also_in(self, values: Mapping[str, Any]) -> None:
+        """Look for names of files in values of hyperparameters too."""
+        self._before.update({named: _state(named.text) for named in _in_values(values)})
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Why the bundle is not alone: a sentence for each file that is not its own."""
+        own = self._own_places()
+        opened = {path: what for path, what in self._files.items() if not _is_in(path, own) and path not in self._made}
+        found = [f"{what} opens {path}. {_WAY_OUT}" for path, what in opened.items()]
+        for named, before in self._before.items():
+            path = os.path.realpath(named.text)
+            # What is another one now was written, not read.
+            if before is None or path in opened or _is_in(path, own) or _state(named.text) != before:
+                continue
+            found.append(f"{named.what} names {named.text}, which is there. {_WAY_OUT}")
+        return tuple(found)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What else the bundle's functions need of the world, as sentences."""
+        return tuple(self._notes)
+
+    def _own_places(self) -> tuple[str, ...]:
+        """Return the folders whose files are there wherever the bundle's requirements are."""
+        packages = [folder for module in [*sys.modules.values()] for folder in _folders_of(module)]
+        installed = [sys.prefix, sys.base_prefix, sys.exec_prefix, *sysconfig.get_paths().values()]
+        home = Path("~").expanduser()
+        caches = [os.environ.get("XDG_CACHE_HOME", ""), home / ".cache", os.environ.get("XDG_CONFIG_HOME", "")]
+        places = [self._folder, os.getcwd(), *installed, *packages, *caches, home / ".config", *_SYSTEM, *_SYSTEM_TOO]
+        return tuple(
+            {os.path.realpath(str(place)) for place in places if str(place)} - {os.sep, os.path.realpath(home)}
+        )
+
+    def _on_event(self, event: str, given: tuple[Any, ...]) -> None:
+        if not self._is_on or event not in _EVENTS:
+            return
+        what = self._function_at_work()
+        if what:
+            _EVENTS[event](self, what, given)
+
+    def _function_at_work(self) -> str:
+        """Return which function of the bundle is at work; "" if none is, or a module is being imported by it."""
+        frame: FrameType | None = sys._getframe(2)
+        while frame is not None:
+            file = frame.f_code.co_filename
+            if file.startswith("<frozen importlib"):
+                return ""
+            if Path(file).parent == self._folder:
+                return _place(frame.f_code.co_name, Path(file).name, frame.f_lineno)
+            frame = frame.f_back
+        return ""
+
+    def _opened(self, what: str, given: tuple[Any, ...]) -> None:
+        if not isinstance(given[0], str | bytes | os.PathLike):
+            return  # a descriptor, which was opened before
+        path = os.path.realpath(os.fsdecode(given[0]))
+        flags = given[2] if len(given) > 2 and isinstance(given[2], int) else 0
+        if (flags & _NOT_READ and not os.path.exists(path)) or flags & os.O_TRUNC:
+            self._made.add(path)
+        elif os.path.exists(path) and not flags & os.O_WRONLY:
+            self._files.setdefault(path, what)
+
+    def _connected(self, what: str, given: tuple[Any, ...]) -> None:
+        address = given[1]
+        found = ":".join(map(str, address[:2])) if isinstance(address, tuple) else os.fsdecode(address)
+        self._notes[f"{what} connects to {found}."] = None
+
+    def _started(self, what: str, given: tuple[Any, ...]) -> None:
+        arguments = given[1] if len(given) > 1 else given[0]
+        words = [arguments] if isinstance(arguments, str | bytes | os.PathLike) else [*(arguments or ())]
+        self._notes[f"{what} starts {' '.join(map(os.fsdecode, words)):.80}."] = None
+
+
+_EVENTS: Final = {
+    "open": FileAccess._opened,
+    "os.listdir": FileAccess._opened,
+    "os.scandir": FileAccess._opened,
+    "sqlite3.connect": FileAccess._opened,
+    "socket.connect": FileAccess._connected,
+    "subprocess.Popen": FileAccess._started,
+    "os.system": FileAccess._started,
+    "os.posix_spawn": FileAccess._started,
+}
+
+
+def named_here(folder: Path) -> list[str]:
+    """Return a sentence for each text of a bundle that names a file in the current folder, which a replay has not."""
+    found = [named for named in named_in(folder, relative=True) if _looks_like_a_file(named.text)]
+    return [
+        f"{named.what} names {named.text!r}, a file in the current folder here. The current folder is another one "
+        f"there. {_WAY_OUT}"
+        for named in found
+    ]
+
+
+def named_in(folder: Path, *, relative: bool = False) -> list[Named]:
+    """Return the absolute paths, or the texts that may be relative ones, in a bundle's module."""
+    module = folder / "pipeline.py"
+    try:
+        tree = ast.parse(module.read_bytes())
+    except (OSError, SyntaxError, ValueError):
+        return []
+    return [named for named in _texts(tree, "<module>", module.name) if os.path.isabs(named.text) != relative]
+
+
+def _texts(node: ast.AST, function: str, file: str) -> Iterator[Named]:
+    """Give the strings in a module, but for those that nothing reads, as docstrings."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Expr) and isinstance(child.value, ast.Constant):
+            continue
+        if isinstance(child, ast.Constant) and isinstance(child.value, str) and child.value[:_LONGEST] == child.value:
+            if child.value.isprintable():
+                yield Named(child.value, _place(function, file, child.lineno))
+            continue
+        yield from _texts(child, child.name if isinstance(child, ast.FunctionDef | ast.ClassDef) else function, file)
+
+
+def _in_values(values: Mapping[str, Any]) -> Iterator[Named]:
+    for token, value in values.items():
+        waiting = [value]
+        while waiting:
+            part = waiting.pop()
+            if isinstance(part, dict):
+                waiting += part.values()
+            elif isinstance(part, tuple | list):
+                waiting += part
+            elif isinstance(part, str) and os.path.isabs(part) and part.isprintable():
+                yield Named(part, f"Hyperparameter {token!r} (pipeline.toml)")
+
+
+def _place(function: str, file: str, line: int) -> str:
+    return f"The module ({file}, line {line})" if function == "<module>" else f"{function}() ({file}, line {line})"
+
+
+def _state(path: str) -> tuple[int, ...] | None:
+    """Return what changes when a file is written; None for what is not there, and for a folder that all have."""
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):
+        return None
+    if len(Path(path).parts) < 3 or os.path.realpath(path) == os.path.realpath(tempfile.gettempdir()):
+        return None
+    return found.st_ino, found.st_size, found.st_mtime_ns
+
+
+def _looks_like_a_file(text: str) -> bool:
+    try:
+        return bool(text.strip(". /")) and (os.path.isfile(text) or (os.sep in text and os.path.isdir(text)))
+    except ValueError:
+        return False
+
+
+def _folders_of(module: Any) -> list[str]:
+    """Return the folders of a package; a module outside of one has none of its own."""
+    name = getattr(module, "__name__", "")
+    is_top = isinstance(name, str) and "." not in name
+    return [str(folder) for folder in getattr(module, "__path__", ())] if is_top else []
+
+
+def _is_in(path: str, places: tuple[str, ...]) -> bool:
+    return any(path == place or path.startswith(place.rstrip(os.sep) + os.sep) for place in places)

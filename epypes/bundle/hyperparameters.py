@@ -1,0 +1,355 @@
+"""Hyperparameters in TOML: how a value is written and read back, and which values it may take.
+
+What TOML has stands there as it is. Anything else is a table with its ``kind``: beside the value where the whole value
+is meant, as an inline table where it is inside a list or a table. Every entry is ready for JSON too.
+
+The range of a hyperparameter is what an annotation says, the branches of a switch, or what is usual for the functions
+that take it. What is usual is a ``soft`` range and forbids nothing.
+"""
+
+from __future__ import annotations
+
+import enum
+import numbers
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+from epypes.catalog import entry_of, parameter_names, uses, usual
+from epypes.graph import CompGraph, annotated_params, as_switch
+from epypes.hints import Param, Roi
+from epypes.run.guard import is_plain_array
+
+# What a person still reads, and a line of a diff still shows.
+MOST_NUMBERS: Final = 400
+_KIND: Final = "kind"
+_SMALL: Final = range(-(2**63), 2**63)
+_DEEPEST: Final = 20
+
+
+class Unwritable(ValueError):
+    """A value that no entry holds to the last bit; its text says of which kind it is."""
+
+
+class LargeArray(Unwritable):
+    """An array of numbers that is too large for text."""
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """A member of an enumeration that is known by its names alone, where the bundle's module is not executed."""
+
+    enum: str
+    name: str
+
+
+def plain(value: Any) -> Any:
+    """Return a scalar of NumPy's as Python's own, for what compares it."""
+    is_scalar = type(value).__module__ == "numpy" and getattr(value, "shape", None) == ()
+    return value.item() if is_scalar else value
+
+
+def alike(entry: Mapping[str, Any], value: Any) -> Any:
+    """Return a number as one of the kind that an entry has: NumPy's of its dtype, else Python's own."""
+    number = plain(value)
+    if entry.get(_KIND) != "numpy" or not isinstance(number, bool | int | float):
+        return number
+    import numpy as np
+
+    return np.dtype(entry["dtype"]).type(number)
+
+
+def fits(value: Any) -> bool:
+    """Whether an entry holds a value to the last bit."""
+    try:
+        written(value)
+    except Unwritable:
+        return False
+    return True
+
+
+def written(value: Any) -> dict[str, Any]:
+    """Return the entry of a value: ``value``, with its ``kind`` and what else that needs where TOML has none like it.
+
+    Raises
+    ------
+    Unwritable
+        There is no entry for a value of this kind, or of this size.
+    """
+    return _written(value, _DEEPEST)
+
+
+def _written(value: Any, depth: int) -> dict[str, Any]:
+    if depth < 0:
+        raise Unwritable("nested too deep")
+    write = _WRITERS.get(type(value))
+    if write is not None:
+        return write(value, depth - 1)
+    if is_plain_array(value):
+        return _array(value)
+    if _is_numpy_number(value):
+        return {"value": _of_number(value), _KIND: "numpy", "dtype": value.dtype.name}
+    if isinstance(value, enum.Enum) and value.name in type(value).__members__:
+        return {"value": value.name, _KIND: "enum", "enum": type(value).__qualname__}
+    if isinstance(value, Member):
+        return {"value": value.name, _KIND: "enum", "enum": value.enum}
+    raise Unwritable(f"a {type(value).__name__}")
+
+
+def _part(value: Any, depth: int) -> Any:
+    """Return a value as it stands inside a list or table."""
+    entry = _written(value, depth)
+    return entry if _KIND in entry else entry["value"]
+
+
+def _whole(part: Any, enums: Mapping[str, Any]) -> Any:
+    if isinstance(part, dict):
+        if _KIND in part:
+            return read(part, enums)
+        return {key: _whole(item, enums) for key, item in part.items()}
+    return [_whole(item, enums) for item in part] if isinstance(part, list) else part
+
+
+def read(entry: Mapping[str, Any], enums: Mapping[str, Any] | None = None) -> Any:
+    """Return the value of an entry.
+
+    Parameters
+    ----------
+    entry
+        What :func:`written` returned; other keys are passed over.
+    enums
+        The enumerations by name. Members of others are read as :class:`Member`.
+
+    Raises
+    ------
+    KeyError
+        The entry lacks something.
+    TypeError
+        It makes no sense.
+    """
+    known = {} if enums is None else enums
+    kind = entry.get(_KIND)
+    if kind is None:
+        return _whole(entry["value"], known)
+    if not isinstance(kind, str) or kind not in _READERS:
+        raise TypeError(f"no value has the kind {kind!r}")
+    return _READERS[kind](entry, known)
+
+
+def members_in(value: Any) -> Iterator[enum.Enum | Member]:
+    """Give the members of enumerations that are in a value."""
+    if isinstance(value, enum.Enum | Member):
+        yield value
+    elif isinstance(value, dict):
+        for pair in value.items():
+            yield from members_in(pair)
+    elif type(value) in (tuple, list, set, frozenset):
+        for item in value:
+            yield from members_in(item)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+
+
+def _is_numpy_number(value: Any) -> bool:
+    """Whether this is a scalar of NumPy's that Python's own numbers hold to the last bit."""
+    numpy = sys.modules.get("numpy")
+    if numpy is None or not isinstance(value, numpy.number | numpy.bool_):
+        return False
+    return value.dtype.kind in "biuf" and value.dtype.itemsize <= 8
+
+
+def _of_number(number: Any) -> Any:
+    """Return a number of NumPy's as the shortest one of Python's that makes it again."""
+    whole = number.item()
+    if number.dtype.kind != "f":
+        return _part(whole, 0)
+    short = float(str(number))
+    return _part(short if number.dtype.type(short).tobytes() == number.tobytes() else whole, 0)
+
+
+def _as_it_is(value: Any, depth: int) -> dict[str, Any]:
+    return {"value": value}
+
+
+def _text(value: str, depth: int) -> dict[str, Any]:
+    if any("\ud800" <= character <= "\udfff" for character in value):
+        raise Unwritable("a text with half a character in it")
+    return {"value": value}
+
+
+def _integer(value: int, depth: int) -> dict[str, Any]:
+    return {"value": value} if value in _SMALL else {"value": hex(value), _KIND: "int"}
+
+
+def _float(value: float, depth: int) -> dict[str, Any]:
+    import struct
+
+    if value == value or struct.pack("d", value) == struct.pack("d", float("nan")):
+        return {"value": value}
+    return {"value": struct.pack(">d", value).hex(), _KIND: "nan"}
+
+
+def _read_nan(entry: Mapping[str, Any], enums: Mapping[str, Any]) -> float:
+    import struct
+
+    (value,) = struct.unpack(">d", bytes.fromhex(entry["value"]))
+    return float(value)
+
+
+def _sequence(value: Any, depth: int) -> dict[str, Any]:
+    items = [_part(item, depth) for item in value]
+    return {"value": items} if type(value) is list else {"value": items, _KIND: type(value).__name__}
+
+
+def _set(value: Any, depth: int) -> dict[str, Any]:
+    items = sorted((_part(item, depth) for item in value), key=repr)
+    return {"value": items, _KIND: type(value).__name__}
+
+
+def _mapping(value: dict[Any, Any], depth: int) -> dict[str, Any]:
+    if _KIND not in value and all(type(key) is str and fits(key) for key in value):
+        return {"value": {key: _part(item, depth) for key, item in value.items()}}
+    return {"value": [[_part(key, depth), _part(item, depth)] for key, item in value.items()], _KIND: "dict"}
+
+
+def _array(array: Any) -> dict[str, Any]:
+    import numpy as np
+
+    if array.dtype.kind not in "biuf" or array.dtype.itemsize > 8:
+        raise Unwritable(f"an array of {array.dtype}")
+    if array.size > MOST_NUMBERS:
+        raise LargeArray(f"an array of {array.size} numbers")
+    dtype = array.dtype.name if array.dtype.isnative else array.dtype.str
+    numbers = [_of_number(number) for number in array.astype(array.dtype.newbyteorder("=")).reshape(-1)]
+    value = numbers[0] if array.shape == () else _nested(numbers, array.shape)
+    entry = {"value": value, _KIND: "array", "dtype": dtype}
+    if array.size == 0:
+        entry["shape"] = list(array.shape)
+    if np.asarray(read(entry)).tobytes() != array.tobytes():
+        raise Unwritable(f"an array of {array.dtype} with numbers that TOML has not")
+    return entry
+
+
+def _nested(numbers: list[Any], shape: tuple[int, ...]) -> list[Any]:
+    if len(shape) <= 1:
+        return numbers
+    stride = len(numbers) // shape[0] if shape[0] else 0
+    return [_nested(numbers[row * stride : (row + 1) * stride], shape[1:]) for row in range(shape[0])]
+
+
+def _read_array(entry: Mapping[str, Any], enums: Mapping[str, Any]) -> Any:
+    import numpy as np
+
+    dtype = np.dtype(entry["dtype"])
+    if "shape" in entry:
+        return np.zeros(entry["shape"], dtype)
+    return np.array(_whole(entry["value"], enums), dtype)
+
+
+def _read_number(entry: Mapping[str, Any], enums: Mapping[str, Any]) -> Any:
+    import numpy as np
+
+    return np.dtype(entry["dtype"]).type(_whole(entry["value"], enums))
+
+
+def _read_member(entry: Mapping[str, Any], enums: Mapping[str, Any]) -> Any:
+    name, member = entry["enum"], entry["value"]
+    return enums[name][member] if name in enums else Member(name, member)
+
+
+_WRITERS: Final[Mapping[type, Callable[[Any, int], dict[str, Any]]]] = {
+    type(None): lambda value, depth: {_KIND: "none"},
+    bool: _as_it_is,
+    int: _integer,
+    float: _float,
+    str: _text,
+    complex: lambda value, depth: {"value": [_part(value.real, 0), _part(value.imag, 0)], _KIND: "complex"},
+    bytes: lambda value, depth: {"value": value.hex(), _KIND: "bytes"},
+    tuple: _sequence,
+    list: _sequence,
+    set: _set,
+    frozenset: _set,
+    dict: _mapping,
+}
+
+_READERS: Final[Mapping[str, Callable[[Mapping[str, Any], Mapping[str, Any]], Any]]] = {
+    "none": lambda entry, enums: None,
+    "int": lambda entry, enums: int(entry["value"], 16),
+    "nan": _read_nan,
+    "complex": lambda entry, enums: complex(*_whole(entry["value"], enums)),
+    "bytes": lambda entry, enums: bytes.fromhex(entry["value"]),
+    "tuple": lambda entry, enums: tuple(_whole(entry["value"], enums)),
+    "set": lambda entry, enums: set(_whole(entry["value"], enums)),
+    "frozenset": lambda entry, enums: frozenset(_whole(entry["value"], enums)),
+    "dict": lambda entry, enums: {_whole(key, enums): _whole(item, enums) for key, item in entry["value"]},
+    "array": _read_array,
+    "numpy": _read_number,
+    "enum": _read_member,
+}
+
+
+def range_of(cg: CompGraph, token: str, value: Any) -> Param | Roi | None:
+    """Return the values that a hyperparameter may take, of which its present one is one; None if nothing says so.
+
+    Values are any objects, so whatever one raises when it is compared, it has no range then.
+    """
+    number = plain(value)
+    for source in (_annotated, _selected, _by_function, _by_name):
+        try:
+            found = next((param for param in source(cg, token, number) if _holds(param, number)), None)
+        except Exception:  # noqa: S112
+            continue
+        if found is not None:
+            return _without_negative(found, number) if source in (_by_function, _by_name) else found
+    return None
+
+
+def _takers(cg: CompGraph, token: str) -> Iterator[tuple[Any, str]]:
+    """Give the functions that take a token, and what each calls it."""
+    for name in cg.digraph.consumers.get(token, ()):
+        function = cg.functions[name]
+        parameters, position = parameter_names(function), cg.func_inputs(name).index(token)
+        yield function, parameters[position] if position < len(parameters) else ""
+
+
+def _annotated(cg: CompGraph, token: str, value: Any) -> Iterator[Param | Roi]:
+    return annotated_params(cg, token)
+
+
+def _selected(cg: CompGraph, token: str, value: Any) -> Iterator[Param]:
+    for name in cg.digraph.consumers.get(token, ()):
+        found = as_switch(cg.functions[name])
+        if found is not None and cg.func_inputs(name)[0] == token:
+            yield Param(choices=found.branches)
+
+
+def _by_function(cg: CompGraph, token: str, value: Any) -> Iterator[Param]:
+    for function, parameter in _takers(cg, token):
+        known = [entry_of(function, parameter), *(use.entry for use in uses(function, parameter))]
+        yield from (param for param in (entry.resolved() for entry in known if entry) if param is not None)
+
+
+def _by_name(cg: CompGraph, token: str, value: Any) -> Iterator[Param]:
+    if isinstance(value, int | float | str):
+        names = dict.fromkeys([*(parameter for _, parameter in _takers(cg, token)), token])
+        yield from filter(None, (usual(name, value) for name in names if name))
+
+
+def _holds(param: Param | Roi, value: Any) -> bool:
+    """Whether a value is within a range of its own type: 1 is not True, and only integers are odd."""
+    if isinstance(param, Param) and param.choices is None:
+        if isinstance(value, bool) or not isinstance(value, numbers.Real):
+            return False
+        return param.allows(value) and (isinstance(value, numbers.Integral) or not param.odd)
+    if isinstance(param, Param) and param.choices:
+        return isinstance(value, bool) == isinstance(param.choices[0], bool) and param.allows(value)
+    return param.allows(value)
+
+
+def _without_negative(param: Param | Roi, value: Any) -> Param | Roi:
+    """Return a range that offers no negative values to one that is not negative."""
+    if isinstance(param, Roi) or param.soft is None or value < 0 or param.soft[0] >= 0:
+        return param
+    return replace(param, soft=(type(param.soft[0])(0), max(param.soft[1], value)))

@@ -1,0 +1,324 @@
+"""The manifest of a bundle: a digest of every file, the lines that were changed since, and what it was recorded on.
+
+The manifest can be checked by ``sha256sum --check MANIFEST.sha256``, which passes over its comments. They name what the
+samples were recorded with, so that a replay that differs can be explained. It is no signature: it shows accidents and
+careless changes, and anyone who can write the files can write the manifest anew.
+
+A bundle holds regular files only. A FIFO, a device or a link is refused before anything is read, since opening a FIFO
+blocks, a device has no end, and a link leads out of the folder.
+"""
+
+from __future__ import annotations
+
+import difflib
+import errno
+import hashlib
+import io
+import os
+import platform
+import stat
+import sys
+import zlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Final
+
+from epypes.errors import BundleChanged, BundleError
+
+MANIFEST: Final = "MANIFEST.sha256"
+_TEXTS: Final = ("pipeline.py", "pipeline.toml", "requirements.txt")
+# What every manifest names.
+_NEEDED: Final = frozenset({"pipeline.py", "pipeline.toml"})
+# What a comment of the manifest begins with.
+_FACT: Final = "# "
+_LINES: Final = "lines of "
+_WHOLE: Final = "recorded "
+# Bounds on what is read and hashed of a folder that may be anything. Samples and weights are large, text is not.
+MOST_BYTES: Final = 8 * 1024**3
+MOST_FILES: Final = 10_000
+_MOST_TEXT_BYTES: Final = 64 * 1024**2
+
+
+def write_manifest(folder: Path, environment: Mapping[str, str] | None = None) -> str:
+    """Write the manifest, in the format of ``sha256sum``; return the bundle's digest.
+
+    Parameters
+    ----------
+    folder
+        The bundle.
+    environment
+        What its samples have been recorded on; without, what the manifest said before is kept.
+    """
+    names = _files(folder)
+    facts = _facts(folder) if environment is None else {**environment, **_recorded(folder, names)}
+    lines = [f"{_FACT}{name}: {value}\n" for name, value in facts.items()]
+    lines += [f"{_hash(folder / name)}  {name}\n" for name in names]
+    (folder / MANIFEST).write_text("".join(lines), encoding="utf-8")
+    return digest(folder)
+
+
+def digest(folder: Path) -> str:
+    """Return the SHA-256 of the manifest, which stands for the whole bundle."""
+    return _hash(folder / MANIFEST)
+
+
+def check_manifest(folder: Path) -> str:
+    """Compare every file with the manifest; return the bundle's digest.
+
+    Raises
+    ------
+    BundleChanged
+        A file was changed, is missing or was added; all of them are named.
+    BundleError
+        There is no bundle, or something in it is not a regular file or is too large.
+    """
+    if not os.path.lexists(folder / MANIFEST):
+        raise BundleError(folder, _no_bundle(folder))
+    recorded = _read_manifest(folder)
+    present = set(_files(folder))
+    findings = [f"{name} is missing" for name in recorded if name not in present]
+    findings += [f"{name} was added" for name in sorted(present - recorded.keys())]
+    facts = _facts(folder)
+    findings += [
+        f"{name} was changed{_changed_line(folder, name, facts)}"
+        for name, value in recorded.items()
+        if name in present and _hash(folder / name) != value
+    ]
+    if findings:
+        text = f"{folder} is not what was promoted: {'; '.join(findings)}. Restore it, or promote again."
+        raise BundleChanged(folder, text)
+    return digest(folder)
+
+
+def check_files(folder: Path) -> None:
+    """Check that a bundle whose manifest is not compared holds regular files only, within bounds.
+
+    Raises
+    ------
+    BundleError
+        Something else is named, or there is too much.
+    """
+    _files(folder)
+
+
+def why_no_bundle(folder: Path) -> str:
+    """Return as a sentence why a folder is not a bundle and nothing else; "" if it is.
+
+    A file that was changed or removed since is no reason; one that the manifest does not name is somebody's own.
+    """
+    no_bundle = f"{folder} exists and is not a bundle."
+    try:
+        named = _read_manifest(folder)
+    except BundleError:
+        return no_bundle
+    if not named.keys() >= _NEEDED:
+        return no_bundle
+    try:
+        foreign = [name for name in _files(folder, _is_bytecode) if name not in named]
+    except BundleError as error:
+        return str(error)
+    return f"{folder} has files that are not the bundle's: {', '.join(foreign):.200}." if foreign else ""
+
+
+def recorded_environment(folder: Path) -> dict[str, str]:
+    """Return what the samples of a bundle were recorded on."""
+    return {name: value for name, value in _facts(folder).items() if not name.startswith((_LINES, _WHOLE))}
+
+
+def changed_since_recorded(folder: Path) -> list[str]:
+    """Return as sentences which files, at which line, are not those that the samples were recorded with."""
+    facts = _facts(folder)
+    found = [
+        f"Since the samples were recorded, {name} was changed{_changed_line(folder, name, facts)}."
+        for name in _TEXTS
+        if f"{_LINES}{name}" in facts and (folder / name).is_file() and _sums(folder / name) != facts[_LINES + name]
+    ]
+    samples = {name.removeprefix(_WHOLE): value for name, value in facts.items() if name.startswith(_WHOLE)}
+    found += [
+        f"{name} is not the file that was recorded."
+        for name, value in samples.items()
+        if not (folder / name).is_file() or _hash(folder / name)[:16] != value
+    ]
+    return found
+
+
+def _recorded(folder: Path, names: list[str]) -> dict[str, str]:
+    """Return what stands for each text's lines and for each sample."""
+    lines = {f"{_LINES}{name}": _sums(folder / name) for name in names if name in _TEXTS}
+    whole = {f"{_WHOLE}{name}": _hash(folder / name)[:16] for name in names if name not in _TEXTS}
+    return {**lines, **whole}
+
+
+def _sums(path: Path) -> str:
+    """Return four hexadecimal digits for each line: enough to find the one that was changed."""
+    return " ".join(f"{zlib.crc32(line) & 0xFFFF:04x}" for line in _read(path).splitlines())
+
+
+def _changed_line(folder: Path, name: str, facts: Mapping[str, str]) -> str:
+    """Return where a text was changed first, as ``" at line 3: ..."``; "" if that can't be told."""
+    if f"{_LINES}{name}" not in facts:
+        return ""
+    path = folder / name
+    before, now = facts[_LINES + name].split(), _sums(path).split()
+    changes = difflib.SequenceMatcher(None, before, now, autojunk=False).get_opcodes()
+    what, first, _, at, _ = next((change for change in changes if change[0] != "equal"), ("", 0, 0, 0, 0))
+    if what == "delete":
+        return f", where line {first + 1} is missing"
+    text = [*_read(path).decode(errors="replace").splitlines(), ""][at].strip()
+    return f" at line {at + 1}: {text:.80}" if what else ""
+
+
+def _no_bundle(folder: Path) -> str:
+    if folder.is_dir():
+        return f"{folder} is not a bundle: it has no {MANIFEST}. Name the folder that epypes promote wrote."
+    if folder.exists():
+        return f"{folder} is a file. Name the folder of a bundle, which epypes promote writes."
+    return f"{folder} does not exist. Make a bundle with: epypes promote NOTEBOOK --to {folder}"
+
+
+def _manifest_lines(folder: Path) -> list[str]:
+    try:
+        return _read(folder / MANIFEST).decode().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise BundleError(folder, f"{folder / MANIFEST} can't be read: {error}. Promote again.") from error
+
+
+def _facts(folder: Path) -> dict[str, str]:
+    lines = _manifest_lines(folder) if os.path.lexists(folder / MANIFEST) else []
+    facts = (line.removeprefix(_FACT).partition(": ") for line in lines if line.startswith(_FACT))
+    return {name: value for name, _, value in facts}
+
+
+def _read_manifest(folder: Path) -> dict[str, str]:
+    recorded: dict[str, str] = {}
+    for line in _manifest_lines(folder):
+        value, spaces, name = line.partition("  ")
+        if line.startswith(_FACT):
+            continue
+        if not spaces:
+            raise BundleError(
+                folder, f"{folder / MANIFEST} can't be read: {line!r:.60} is no line of it. Promote again."
+            )
+        if recorded.setdefault(name, value) != value:
+            raise BundleError(folder, f"{folder / MANIFEST} has two digests for {name!r}. Promote again.")
+    return recorded
+
+
+def _is_cached(path: Path) -> bool:
+    return "__pycache__" in path.parts
+
+
+def _is_bytecode(path: Path) -> bool:
+    return _is_cached(path) and path.suffix == ".pyc"
+
+
+def _files(folder: Path, is_passed_over: Callable[[Path], bool] = _is_cached) -> list[str]:
+    """Return everything but folders and the manifest; bytecode, which is never read, does not count.
+
+    Raises
+    ------
+    BundleError
+        There is a link, something else that is neither a file nor a folder, or more than a bundle may hold.
+    """
+    found, total_bytes = [], 0
+    for number, path in enumerate(folder.rglob("*"), 1):
+        if number > MOST_FILES:
+            raise BundleError(folder, f"{folder} holds more than {MOST_FILES:,} files. It is no bundle.")
+        status, name = path.lstat(), path.relative_to(folder)
+        if stat.S_ISDIR(status.st_mode):
+            continue
+        if not stat.S_ISREG(status.st_mode):
+            raise _not_regular(path, folder)
+        if name.as_posix() in _TEXTS:
+            _check_text(path, status.st_size)
+        total_bytes += status.st_size
+        if total_bytes > MOST_BYTES:
+            limit = f"{MOST_BYTES // 1024**3} GB"
+            raise BundleError(folder, f"{folder} holds more than {limit}, up to {name}. Keep large data elsewhere.")
+        if name.as_posix() != MANIFEST and not is_passed_over(name):
+            found.append(name)
+    return [name.as_posix() for name in sorted(found)]
+
+
+def _not_regular(path: Path, folder: Path) -> BundleError:
+    name = path.relative_to(folder).as_posix()
+    return BundleError(folder, f"{folder} holds {name}, which is not a plain file. Remove it.")
+
+
+def _opened(path: Path) -> io.BufferedReader:
+    """Open a regular file. Neither waits for the writer of a FIFO nor follows a link."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.ENXIO):
+            raise _not_regular(path, path.parent) from error
+        raise
+    file = os.fdopen(descriptor, "rb")
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        file.close()
+        raise _not_regular(path, path.parent)
+    return file
+
+
+def _read(path: Path) -> bytes:
+    """Return the bytes of a text."""
+    with _opened(path) as file:
+        _check_text(path, os.fstat(file.fileno()).st_size)
+        return file.read()
+
+
+def _check_text(path: Path, size: int) -> None:
+    if size > _MOST_TEXT_BYTES:
+        limit = f"{_MOST_TEXT_BYTES // 1024**2} MB"
+        raise BundleError(path.parent, f"{path} is larger than {limit}, which no text of a bundle is. Promote again.")
+
+
+def _hash(path: Path) -> str:
+    with _opened(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+_CPU_INFO: Final = Path("/proc/cpuinfo")
+# What is told of each difference, by the name of what differs.
+_TOLD: Final = {
+    "python": "another Python",
+    "platform": "another platform",
+    "processor": "another processor",
+    "opencv": "another build of OpenCV",
+    "opencv processor features": "a processor of which OpenCV uses other features",
+    "opencv threads": "another number of threads of OpenCV",
+}
+
+
+def environment() -> dict[str, str]:
+    """Return Python, platform and processor; and OpenCV's build, features and threads where it is imported."""
+    facts = {
+        "python": platform.python_version(),
+        "platform": f"{platform.system()} {platform.machine()}",
+        "processor": _processor(),
+    }
+    cv2 = sys.modules.get("cv2")
+    if cv2 is not None:
+        build = hashlib.sha256(cv2.getBuildInformation().encode()).hexdigest()[:12]
+        facts["opencv"] = f"{cv2.__version__} {build}"
+        facts["opencv processor features"] = cv2.getCPUFeaturesLine()
+        facts["opencv threads"] = str(cv2.getNumThreads())
+    return {name: " ".join(value.split()) for name, value in facts.items()}
+
+
+def _processor() -> str:
+    try:
+        lines = _CPU_INFO.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor()) or f"{os.cpu_count()} of unknown kind"
+
+
+def environment_differences(recorded: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """Return as sentences what is not as it was when the samples were recorded."""
+    return [
+        f"It was recorded on {what}: {recorded[name]}, here it is {now[name]}."
+        for name, what in _TOLD.items()
+        if name in recorded and name in now and recorded[name] != now[name]
+    ]

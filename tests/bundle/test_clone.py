@@ -1,0 +1,39 @@
+"""A clone of a graph computes the same, and leaves no trace in the user's nodes."""
+
+from __future__ import annotations
+
+import epypes as ep
+from epypes.bundle.clone import clone_graph
+
+
+def times(x, gain=2.0):
+    return x * gain
+
+
+def test_a_graph_of_functions_is_its_own_and_keeps_its_defaults():
+    cg = ep.CompGraph.from_functions(times)
+    assert clone_graph(cg) is cg
+    node = ep.CompGraph.from_functions(ep.Node("times", times))
+    assert clone_graph(node).functions["times"] is times
+    assert dict(clone_graph(node).defaults) == {"gain": 2.0}
+
+
+def test_what_a_pipeline_was_set_to_goes_along_and_what_was_unfrozen_stays_an_input():
+    pipeline = ep.Pipeline("times", ep.CompGraph.from_functions(times), {"gain": 5.0}, workers=2)
+    cg = ep.CompGraph({"times": pipeline}, {"times": ("x", "y")})
+    own = clone_graph(cg).functions["times"]
+    assert own is not pipeline
+    assert (own(3), own.runner.workers, pipeline.run_count) == (15.0, 2, 0)
+    pipeline.runner.unfreeze("gain")
+    cg = ep.CompGraph({"times": pipeline}, {"times": (("x", "gain"), "y")})
+    assert clone_graph(cg).functions["times"](3, 4) == 12
+
+
+def test_a_node_that_does_something_of_its_own_is_kept():
+    class Louder(ep.Node):
+        def compute(self, *args):
+            return 2 * super().compute(*args)
+
+    louder = Louder("times", times)
+    cg = ep.CompGraph({"times": louder}, {"times": (("x", "gain"), "y")})
+    assert clone_graph(cg).functions["times"] is louder

@@ -1,0 +1,91 @@
+"""Promotion replays under other conditions: what depends on one is refused with its token and the condition."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import epypes as ep
+from epypes.errors import PromotionRefused
+from tests.bundle.cells import cell
+
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("fresh_interpreter")]
+
+X = np.random.default_rng(5).random(10_000, dtype=np.float32)
+# By what it depends on: a cell that defines `use`, and what the reason names.
+DEPENDS = {
+    "the order of a set of strings": (
+        "def use(x):\n    return ' '.join({'canny', 'sobel', 'scharr', 'prewitt', 'laplace', 'roberts'})",
+        "the hash seed (PYTHONHASHSEED)",
+    ),
+    "a hash": ("def use(x):\n    return hash('canny') % 1000", "the hash seed (PYTHONHASHSEED)"),
+    "the working folder": ("import os\ndef use(x):\n    return os.getcwd()", "the working folder"),
+    "a relative path": ("import os\ndef use(x):\n    return os.path.abspath('calibration')", "the working folder"),
+    "the local time": (
+        "import time\ndef use(x):\n    return time.strftime('%H:%M', time.localtime(0))",
+        "the time zone (TZ)",
+    ),
+    "the locale": (
+        "import locale\ndef use(x):\n    locale.setlocale(locale.LC_ALL, '')\n"
+        "    return str(locale.getlocale()) + locale.format_string('%.2f', x[0], grouping=True)",
+        "the locale (LC_ALL)",
+    ),
+    "the parts of a sum": (
+        "import cv2, numpy as np\ndef use(x):\n    parts = np.array_split(x, cv2.getNumThreads() + 1)\n"
+        "    return sum(np.cumsum(part)[-1] for part in parts)",
+        "the number of threads (OMP_NUM_THREADS, cv2.setNumThreads)",
+    ),
+    "two of them": (
+        "import os, time\ndef use(x):\n    return os.getcwd() + time.strftime('%H:%M', time.localtime(0))",
+        "the working folder and the time zone (TZ)",
+    ),
+    "the process": ("import os\ndef use(x):\n    return os.getpid()", "the process that computes it"),
+}
+
+
+def refusal(source, to):
+    """Run a cell that defines ``use`` as often as a notebook does, and return why it is not promoted."""
+    cg = ep.CompGraph({"use": cell(source)["use"], "length": np.size}, {"use": ("x", "used"), "length": ("x", "size")})
+    runner = ep.CompGraphRunner(cg, {})
+    for _ in range(3):
+        runner.run(x=X)
+    with pytest.raises(PromotionRefused) as caught:
+        ep.promote(runner, to)
+    assert not to.exists()
+    assert not [*to.parent.iterdir()]
+    return "\n".join(caught.value.reasons)
+
+
+@pytest.mark.parametrize("what", DEPENDS)
+def test_what_depends_on_a_condition_is_refused_with_token_and_condition(what, tmp_path):
+    source, condition = DEPENDS[what]
+    text = refusal(source, tmp_path / "bundle")
+    assert "token 'used': " in text
+    assert f"It depends on {condition}, something that is not a token." in text
+    assert "'size'" not in text
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        # Neither the text nor the snapshot of mutable objects shows it, and in the notebook it is constant by now.
+        "import numpy as np\ndef use(x):\n    return np.seterr(all='ignore')['over']",
+        "import sys\ndef use(x):\n    before = sys.getrecursionlimit()\n    sys.setrecursionlimit(1500)\n    return before",
+    ],
+)
+def test_a_function_that_keeps_something_from_call_to_call_is_refused(source, tmp_path):
+    text = refusal(source, tmp_path / "bundle")
+    assert "token 'used': " in text
+    assert "It depends on how often and in which order it is called" in text
+
+
+def test_a_function_that_fails_under_a_condition_is_refused_with_it(tmp_path):
+    source = "import time\ndef use(x):\n    assert time.localtime(0).tm_min != 37, 'late'\n    return x"
+    text = refusal(source, tmp_path / "bundle")
+    assert "AssertionError: late" in text
+    assert "It depends on the time zone (TZ), something that is not a token. Use UTC" in text
+
+
+def test_a_function_that_counts_is_refused(tmp_path):
+    text = refusal("import itertools\nN = itertools.count()\ndef use(x):\n    return next(N)", tmp_path / "bundle")
+    assert "'use'" in text
