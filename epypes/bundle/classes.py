@@ -17,6 +17,7 @@ from functools import cached_property
 from typing import Any
 
 from epypes.bundle.cells import place_in
+from epypes.bundle.literal import is_same_data
 from epypes.bundle.side_effects import unrepeatable
 from epypes.bundle.source import Refused
 from epypes.bundle.text import (
@@ -119,12 +120,22 @@ def class_definition(kind: type, around: Mapping[str, Any], what: str) -> ClassD
 
 def _fits(kind: type, node: ast.ClassDef, text: str) -> bool:
     """Whether a class statement may be the one of a class, which may have been changed since."""
-    methods = {
-        one.name: list(_functions_in(vars(kind).get(one.name))) for one in node.body if isinstance(one, ast.FunctionDef)
-    }
+    names = [one.name for one in node.body if isinstance(one, ast.FunctionDef)]
+    methods = {name: list(_functions_in(vars(kind).get(name))) for name in names}
+    fields = vars(kind).get("__dataclass_fields__", {})
+    values = {**vars(kind), **dict.fromkeys(vars(kind).get("_fields", ())), **vars(kind).get("_field_defaults", {})}
+    values |= {name: field.default for name, field in fields.items()}
+    values |= {name: member.value for name, member in getattr(kind, "__members__", {}).items()}
     bound = {part.id for part in own_parts(node) if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store)}
-    fields = {*vars(kind).get("__dataclass_fields__", ()), *vars(kind).get("_fields", ())}
-    return bound <= {*vars(kind), *fields, *getattr(kind, "_member_map_", ())} and not same_methods(text, node, methods)
+    if not bound <= values.keys() or same_methods(text, node, methods):
+        return False
+    for part in node.body:
+        if isinstance(part, ast.Assign | ast.AnnAssign) and isinstance(part.value, ast.Constant):
+            targets = part.targets if isinstance(part, ast.Assign) else [part.target]
+            for name in (target.id for target in targets if isinstance(target, ast.Name)):
+                if not is_same_data(part.value.value, values[name]):
+                    return False
+    return True
 
 
 def statements_of_class(kind: type) -> Iterator[tuple[str, ast.ClassDef]]:

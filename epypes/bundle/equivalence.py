@@ -17,6 +17,7 @@ import builtins
 import dataclasses
 import enum
 import functools
+import linecache
 import reprlib
 import tempfile
 import traceback
@@ -44,6 +45,7 @@ from epypes.pipeline import Node, Pipeline
 from epypes.run.guard import as_written, is_plain_array, is_unguarded
 
 _PLAIN: Final = frozenset({int, float, complex, bool, str, bytes, type(None), type(...), set, frozenset})
+_DRAFT: Final = "epypes-draft-"
 _LOST: Final = object()
 # What an attribute in a slot, or the dict of all others, takes of an object.
 _SLOT: Final = tuple.__itemsize__
@@ -122,26 +124,33 @@ def refusal(
         The reason, and the id of the closure whose factory makes another one by now, 0 if it is something else.
     """
     known = called or {}
-    with tempfile.TemporaryDirectory(prefix="epypes-draft-") as folder:
+    with tempfile.TemporaryDirectory(prefix=_DRAFT) as folder:
         path = Path(folder) / MODULE
         path.write_text(text, encoding="utf-8")
         write_arrays(path.parent, arrays)
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # the notebook has shown them
-                module = execute(path, path.read_bytes())
-        except (Exception, SystemExit) as error:  # whatever the notebook's own code raises
-            frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
-            line = str(frames[0].line) if frames else ""
-            closure = next((one for one, name in known.items() if line.startswith(f"{name} = ")), 0)
-            where = f", at {line!r}" if line else ""
-            return f"The module fails when it is imported{where}: {type(error).__name__}: {error}. {_WAY_OUT}", closure
-        walk = _Walk(known)
-        walk.waiting.extend((_Path(what, _placed(what, ours)), ours, theirs) for what, ours, theirs in pairs(module))
-        try:
-            walk.finish()
-        except _Different as found:
-            return f"{found} {_WAY_OUT}", found.closure
+            return _refusal(path, pairs, known)
+        finally:
+            linecache.cache.pop(str(path), None)
+
+
+def _refusal(path: Path, pairs: Callable[[Any], Iterable[Pair]], called: Mapping[int, str]) -> tuple[str, int]:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the notebook has shown them
+            module = execute(path, path.read_bytes())
+    except (Exception, SystemExit) as error:  # whatever the notebook's own code raises
+        frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        line = str(frames[0].line) if frames else ""
+        closure = next((one for one, name in called.items() if line.startswith(f"{name} = ")), 0)
+        where = f", at {line!r}" if line else ""
+        return f"The module fails when it is imported{where}: {type(error).__name__}: {error}. {_WAY_OUT}", closure
+    walk = _Walk(called)
+    walk.waiting.extend((_Path(what, _placed(what, ours)), ours, theirs) for what, ours, theirs in pairs(module))
+    try:
+        walk.finish()
+    except _Different as found:
+        return f"{found} {_WAY_OUT}", found.closure
     return "", 0
 
 
@@ -245,7 +254,7 @@ class _Walk:
         self._add(path.to(" bases"), ours.__bases__, theirs.__bases__)
         self._add(path.to(" options"), _options(ours), _options(theirs))
         mine, others = _attributes(ours), _attributes(theirs)
-        for part in sorted(mine.keys() | others.keys()):
+        for part in sorted(mine.keys() | others.keys(), key=lambda name: (name.startswith("__"), name)):
             self._add(path.to(f" {part!r}"), mine.get(part, _LOST), others.get(part, _LOST))
 
 
@@ -262,7 +271,8 @@ def _placed(what: str, value: Any) -> str:
     innermost = layers(_bare(value))[-1]
     if isinstance(innermost, types.FunctionType):
         return f"{what} ({place_of(innermost.__code__)})"
-    found = next(statements_of_class(value), None) if isinstance(value, type) else None
+    statements = statements_of_class(value) if isinstance(value, type) else iter(())
+    found = next((pair for pair in statements if _DRAFT not in pair[0]), None)
     return f"{what} ({place_in(found[0], found[1].lineno)})" if found else what
 
 
@@ -361,19 +371,18 @@ def _meaning(function: types.FunctionType, name: str) -> Any:
 
 def _attributes(kind: type) -> dict[str, Any]:
     """Return the attributes of a class but for those that follow from its other parts."""
-    added = _ADDED_TO_CLASSES | (_OF_DATACLASSES if "__dataclass_fields__" in vars(kind) else frozenset())
-    members = getattr(kind, "_member_map_", {})
-    return {
+    members = {*_ADDED_TO_CLASSES, *getattr(kind, "_member_map_", ())}
+    found = {
         name: value
         for name, value in vars(kind).items()
-        if name not in members
-        and not isinstance(value, types.MemberDescriptorType | types.GetSetDescriptorType)
-        and not (name in added and (name not in _OF_DATACLASSES or _node_of_method(value) is None))
+        if name not in members and not isinstance(value, types.MemberDescriptorType | types.GetSetDescriptorType)
     }
-
-
-def _node_of_method(value: Any) -> Any:
-    return _node(value.__code__) if isinstance(value, types.FunctionType) else None
+    if "__dataclass_fields__" in found:
+        # Of what dataclasses write, only the defaults may have been changed since.
+        for name in _OF_DATACLASSES & found.keys():
+            if isinstance(found[name], types.FunctionType) and _node(found[name].__code__) is None:
+                found |= {f"{name}{part}": value for part, value in _defaults(found.pop(name)).items()}
+    return found
 
 
 def _options(kind: type) -> str:

@@ -336,11 +336,12 @@ def _read_by(tree: ast.AST) -> Iterator[tuple[str, ...]]:
 
 
 def _imports_of(tree: ast.AST) -> dict[str, Any]:
-    """Return the modules that a definition imports itself, by name."""
+    """Return what a definition imports itself, by name, and the modules of which it imports names."""
     found: dict[str, Any] = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module:
-            found[f"from {node.module}"] = sys.modules.get(node.module)
+            module = found[f"from {node.module}"] = sys.modules.get(node.module)
+            found |= {alias.asname or alias.name: getattr(module, alias.name, None) for alias in node.names}
         for alias in node.names if isinstance(node, ast.Import) else ():
             dotted = alias.name if alias.asname else alias.name.partition(".")[0]
             found[alias.asname or dotted] = sys.modules.get(dotted)
@@ -352,8 +353,8 @@ def _imports_of(tree: ast.AST) -> dict[str, Any]:
 # Calls that give the same wherever and whenever they are made.
 _REPEATABLE: Final[Mapping[str, frozenset[str]]] = {
     "builtins": frozenset((
-        "abs", "all", "any", "bool", "bytes", "callable", "chr", "complex", "dict", "divmod", "enumerate", "filter",
-        "float", "frozenset", "getattr", "hasattr", "int", "isinstance", "issubclass", "iter", "len", "list", "map",
+        "abs", "all", "any", "bool", "bytes", "chr", "complex", "dict", "divmod", "enumerate",
+        "float", "frozenset", "int", "isinstance", "issubclass", "iter", "len", "list",
         "max", "min", "next", "object", "ord", "pow", "property", "range", "repr", "reversed", "round", "set", "slice",
         "sorted", "str", "sum", "super", "tuple", "type", "zip",
     )),
@@ -372,6 +373,7 @@ _REPEATABLE_MODULES: Final = frozenset(
         *("math", "operator", "re", "types", "typing"),
     }
 )
+_ORDER_FREE: Final = frozenset({"all", "any", "frozenset", "len", "max", "min", "set", "sorted", "sum"})
 _REPEATABLE_METHODS: Final = frozenset(
     {
         *(
@@ -417,14 +419,23 @@ def _unrepeatable(
 ) -> ast.expr | None:
     parts = [*_at_once(node, inner)]
     own = {part.id for part in parts if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store)}
-    names = {**names, **dict.fromkeys(own)}
+    names = {**names, **dict.fromkeys(own), **_imports_of(node)}
     unused = {part.value for part in parts if isinstance(part, ast.Expr)}
     for part in parts:
+        if isinstance(part, ast.For | ast.comprehension) and _has_no_order(part.iter, names):
+            return part.iter
         if isinstance(part, ast.Call) and not _is_repeatable(part, names, seen, part in unused):
             return part
         if isinstance(part, ast.Attribute | ast.Name) and evaluated(part, names) is os.environ:
             return part
     return None
+
+
+def _has_no_order(node: ast.expr, names: Mapping[str, Any]) -> bool:
+    """Whether this is a set, whose order changes from process to process."""
+    if isinstance(node, ast.Call):
+        return isinstance(node.func, ast.Name) and node.func.id in ("set", "frozenset")
+    return isinstance(node, ast.Set | ast.SetComp) or isinstance(evaluated(node, names), set | frozenset)
 
 
 def _at_once(node: ast.AST, inner: types.CodeType | None) -> Iterator[ast.AST]:
@@ -463,6 +474,9 @@ def _is_repeatable(call: ast.Call, names: Mapping[str, Any], seen: set[types.Cod
         known = function.__code__ in seen
         seen.add(function.__code__)
         return known or (node is not None and _unrepeatable(node, function.__globals__, None, seen) is None)
+    is_free = isinstance(called, ast.Name) and called.id in _ORDER_FREE
+    if not is_free and any(_has_no_order(argument, names) for argument in call.args):
+        return False
     if is_unused or (isinstance(function, type) and importable(function) is None):
         return True
     owner = evaluated(called.value, names) if isinstance(called, ast.Attribute) else None

@@ -58,6 +58,7 @@ PROMOTED: dict[str, tuple[str, ...]] = {
     "factory that counts": (
         "COUNT = [0]\ndef make(k):\n    COUNT[0] += 1\n    n = COUNT[0]\n    def f(a):\n        return a + k * n\n    return f\nf = make(3)",
     ),
+    "factory with the order of a set": (MAKES.format("w = len(list({'red', 'blue', 'green'})[0])"),),
     "factory that takes from an iterator": (f"IT = iter([4, 5, 6])\n{MAKES.format('w = next(IT)')}",),
     "factories of which one makes another thing by now": (
         "GAIN = 2\ndef make(k):\n    w = GAIN\n    def g(a):\n        return a * w + k\n    return g\n"
@@ -114,6 +115,18 @@ REFUSED: dict[str, tuple[str, str]] = {
     "decorator with an argument that was read": (
         "import os\ndef d(k):\n    def deco(g):\n        @functools.wraps(g)\n        def w(a):\n            return g(a) * k\n"
         "        return w\n    return deco\n@d(os.getpid())\ndef f(a):\n    return a", r"its argument 'os.getpid\(\)' may be something else",
+    ),
+    "class that reads the environment by a name of its own": (
+        "class C:\n    from os import environ as env\n    K = len(env.get('HOME', ''))\ndef f(a):\n    return a * C.K",
+        r"Class 'C', .*\(cell \[1\], line 3\) when it is defined",
+    ),
+    "class with the order of a set": (
+        "class C:\n    NAMES = {'red', 'green', 'blue'}\n    K = [*map(len, NAMES)]\n    L = tuple(NAMES)\ndef f(a):\n    return a * C.K[0]",
+        r"Class 'C', .*\(cell \[1\], line 3\) when it is defined",
+    ),
+    "default of a dataclass that was set later": (
+        "import dataclasses\n@dataclasses.dataclass\nclass C:\n    k: int = 2\nC.__init__.__defaults__ = (7,)\ndef f(a):\n    return a * C().k",
+        r"Class 'C' \(cell \[1\], line 3\), which function 'f' needs: its .*__init__ default of 'k'.* is 7 in the notebook and 2",
     ),
     "class that reads the environment": (
         "import os\nclass C:\n    K = len(os.environ)\ndef f(a):\n    return a * C.K", r"Class 'C', .* 'os.environ' \(cell \[1\], line 3\)",
