@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
-from typing import Any
+from typing import Any, Final
+
+UNKNOWN: Final = object()
 
 
 def is_data(value: object) -> bool:
@@ -58,3 +60,11 @@ def is_same_data(written: Any, value: Any) -> bool:
         return type(written) is type(value) and literal(written) == literal(value)
     except (ValueError, RecursionError):
         return False
+
+
+def literal_value(expression: ast.expr) -> Any:
+    """Return the value of a literal, UNKNOWN for any other expression."""
+    try:
+        return ast.literal_eval(expression)
+    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
+        return UNKNOWN
