@@ -7,7 +7,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from epypes.bundle.seal import seal
+from epypes.bundle.manifest import write_manifest
 
 import epypes as ep
 from epypes.acquisition import read_image, write_image
@@ -131,7 +131,7 @@ def test_files_are_given_to_tokens(epypes, bundle, tokens, given, said):
     settings = bundle.path / "pipeline.toml"
     text = settings.read_text().replace('inputs = ["image"]', f"inputs = {tokens.split()}".replace("'", '"'))
     settings.write_text(text)
-    seal(bundle.path)
+    write_manifest(bundle.path)
     assert said in one_line(epypes("call", bundle.path, *given))
 
 
