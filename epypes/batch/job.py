@@ -51,7 +51,7 @@ class Job:
     targets: tuple[str, ...] = ()
 
 
-def do(runner: CompGraphRunner, job: Job, stop: threading.Event | None = None) -> list[Outcome]:
+def run_job(runner: CompGraphRunner, job: Job, stop: threading.Event | None = None) -> list[Outcome]:
     """Return the outcomes of a job: item by item, setting by setting.
 
     Parameters

@@ -199,7 +199,7 @@ def test_a_module_next_to_the_notebook_is_named_first_with_who_can_run_it(proces
     assert first.startswith("Module 'beside_the_notebook' is not installed")
     assert "a ThreadPoolExecutor, or no executor" in first
     assert second.startswith("The replay of the graph's bundle failed at pipeline.py")
-    assert "epypes-parcel" not in str(refused.value)
+    assert "epypes-package" not in str(refused.value)
 
 
 @pytest.mark.slow

@@ -7,11 +7,11 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from epypes.bundle.manifest import write_manifest
 
 import epypes as ep
 from epypes.acquisition import read_image, write_image
 from epypes.bundle.load import read_bundle
+from epypes.bundle.manifest import write_manifest
 from epypes.service import Service
 from epypes.service.state_file import StateLock
 from tests.colours import red_image, red_runner
