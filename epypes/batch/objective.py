@@ -166,7 +166,7 @@ def search_digests(
     """
     varied = {axis.token for axis in axes}
     fixed = {token: value for token, value in runner.hyperparameters.items() if token not in varied}
-    choices = {axis.token: axis.values for axis in axes if isinstance(axis, ChoiceAxis)}
+    choices = {axis.token: axis.choices for axis in axes if isinstance(axis, ChoiceAxis)}
     labels = [(case.name, dict(case.expected or {}), dict(case.hyperparameters or {})) for case in objective.cases]
     data = {
         "hyperparameters": lambda: value_digest(fixed),
