@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 from weakref import WeakKeyDictionary
 
 from epypes.store import Store, opened_store
-from epypes.store.later import SeriesWriter
+from epypes.store.writer import SeriesWriter
 from epypes_widgets.history import Entry, History, changed
 from epypes_widgets.places import Tunable
 from epypes_widgets.plain import plain
