@@ -1,23 +1,35 @@
-"""The commands: each parses, calls and prints, in a file of its own."""
+"""The command line: each command parses its arguments, calls the room that does the work, and prints the result."""
 
 from __future__ import annotations
 
 import sys
+from typing import Final
+
+_INTERRUPTED: Final = 130
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run a command; what EPypes refuses is one line on standard error and exit status 1."""
+    """Run a command; an error of EPypes is printed as one line on standard error, with exit status 1."""
+    import click
+
     from epypes.cli.app import app
     from epypes.errors import EpypesError
-    from epypes.optional import missing_package
 
     try:
-        app(args=arguments, prog_name="epypes")
+        status = app.main(arguments, prog_name="epypes", standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        status = error.exit_code
+    except click.Abort:  # by Ctrl+C
+        status = _INTERRUPTED
     except EpypesError as error:
-        sys.exit(f"epypes: {error}")
+        status = f"epypes: {error}"
     except ModuleNotFoundError as error:
-        # Only what an extra brings: another module that is missing is a bug and shows its traceback.
+        from epypes.optional import missing_package
+
+        # Only a package that an extra brings: any other missing module is a bug and shows its traceback.
         missing = missing_package(error)
         if missing is None:
             raise
-        sys.exit(f"epypes: {missing}")
+        status = f"epypes: {missing}"
+    sys.exit(status)

@@ -1,4 +1,4 @@
-"""Runs the command line without its script: ``python -m epypes.cli``."""
+"""The command line without its script: ``python -m epypes.cli``."""
 
 from epypes.cli import main
 

@@ -1,4 +1,4 @@
-"""``epypes call``: one event to a running service, and its answer to files or the terminal."""
+"""The command call: one event to a running service, and its answer to files or the terminal."""
 
 from __future__ import annotations
 
@@ -7,35 +7,39 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import typer
+import click
 
-from epypes.cli.options import Allow, Keys
-from epypes.cli.terminal import out, print_answer
+from epypes.cli.options import allow_option, bundle_argument, keys_option, seconds_option
+from epypes.cli.terminal import print_table
 from epypes.errors import ServiceError, UnknownName
 
 if TYPE_CHECKING:
     from epypes.images import Order
+    from epypes.service import Answer
 
 
-def call(
-    bundle: Annotated[Path, typer.Argument(help="The folder of the bundle that is being served.")],
-    images: Annotated[
-        list[str], typer.Argument(help="An image file or a number; or TOKEN=FILE, TOKEN=NUMBER for each input token.")
-    ],
-    out_file: Annotated[
-        list[str] | None, typer.Option("--out", help="The file for the output token, or TOKEN=FILE; an image or .npy.")
-    ] = None,
-    timeout: Annotated[float, typer.Option(help="How long to wait for the answer, in seconds.", min=0.001)] = 10.0,
-    count: Annotated[int, typer.Option(help="How often to send it; the times are those of the fastest.", min=1)] = 1,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the times as JSON, in nanoseconds.")] = False,
-    keys: Keys = None,
-    allow: Allow = None,
-    sub: Annotated[str, typer.Option(help="As of epypes serve, where a broker asks for a password.")] = "",
-    pub: Annotated[str, typer.Option(help="As of epypes serve.")] = "",
-) -> None:
-    """Send one image, or other values, to the service of a bundle; write the answer to files and print the rest."""
+@click.command()
+@bundle_argument
+@click.argument(
+    "images", nargs=-1, required=True, help="Image file or number; or TOKEN=FILE, TOKEN=NUMBER for each input token."
+)
+@click.option(
+    "--out", multiple=True, help="File for the output token: an image or .npy; or TOKEN=FILE; may be repeated."
+)
+@seconds_option("--timeout", 10.0, "Longest wait for the answer", least=0.001)
+@click.option("--count", type=click.IntRange(1), default=1, help="Number of calls; the times are those of the fastest.")
+@click.option("--json", "as_json", is_flag=True, help="Print the times as JSON, in nanoseconds.")
+@keys_option
+@allow_option
+@click.option("--sub", default="", show_default=False, help="As of epypes serve, if a broker asks for a password.")
+@click.option("--pub", default="", show_default=False, help="As of epypes serve, if a broker asks for a password.")
+def call(bundle: Path, images: Sequence[str], out: Sequence[str], count: int, as_json: bool, **options: Any) -> None:
+    """Send an image to a service, and write its answer to a file.
+
+    Or other values: one for each input token. An answer without a file is printed.
+    """
     from epypes.bundle.load import SETTINGS
     from epypes.bundle.manifest import check_manifest
     from epypes.bundle.settings import read_settings
@@ -44,32 +48,46 @@ def call(
 
     check_manifest(bundle)
     settings = read_settings(bundle / SETTINGS)
-    given = by_token(images, settings.inputs, "input")
-    targets = by_token(out_file or [], settings.outputs, "output")
-    payload = {token: _read(text, settings.order(token)) for token, text in given.items()}
-    with Client(bundle, timeout_s=timeout, keys=keys, allow=allow, sub=sub, pub=pub) as client:
+    inputs = _by_token(images, settings.inputs, "input")
+    files = _by_token(out, settings.outputs, "output")
+    payload = {token: _read(text, settings.order(token)) for token, text in inputs.items()}
+    with Client(bundle, **options) as client:
         answers = [client.call(payload) for _ in range(count)]
     answer = min(answers, key=lambda answer: answer.round_trip_ns)
-    for token, file in targets.items():
+    for token, file in files.items():
         _write(file, answer.tokens[token], settings.order(token))
-    for token, value in answer.tokens.items():
-        if token not in targets and not as_json:
-            out.print(f"{token} = {preview(value).text}")
     if as_json:
-        out.print(json.dumps(asdict(replace(answer, tokens={}))))
-    else:
-        print_answer(" ".join([f"{bundle}:", *targets.values()]), answer)
+        click.echo(json.dumps(asdict(replace(answer, tokens={}))))
+        return
+    for token, value in answer.tokens.items():
+        if token not in files:
+            click.echo(f"{token} = {preview(value).text}")
+    print_answer(" ".join([f"{bundle}:", *files.values()]), answer)
 
 
-def by_token(given: Sequence[str], tokens: Sequence[str], kind: str) -> dict[str, str]:
-    """Read ``FILE`` or ``TOKEN=FILE`` arguments; a file alone is the one token's.
+def print_answer(title: str, answer: Answer) -> None:
+    """Print the times of a service's answer as a table."""
+    from epypes.display.durations import duration_text
+
+    totals = {
+        "graph overhead": answer.overhead_ns,
+        "run in all": answer.total_ns,
+        "round trip": answer.round_trip_ns,
+    }
+    functions = [(f"function {name}", duration_text(time)) for name, time in answer.timings_ns.items()]
+    rows = [*functions, (), *((name, duration_text(time)) for name, time in totals.items())]
+    print_table({"where": {}, "time": {"justify": "right"}}, rows, title)
+
+
+def _by_token(given: Sequence[str], tokens: Sequence[str], kind: str) -> dict[str, str]:
+    """Parse ``FILE`` or ``TOKEN=FILE`` arguments; ``FILE`` alone is for the one token.
 
     Raises
     ------
     UnknownName
         There is no such token.
     ServiceError
-        A token is missing, or it is not clear which one a file is for.
+        An input token is missing, or a file is not for one certain token.
     """
     found: dict[str, str] = {}
     for text in given:
@@ -81,9 +99,8 @@ def by_token(given: Sequence[str], tokens: Sequence[str], kind: str) -> dict[str
         elif len(tokens) == 1 and len(given) == 1:
             found[tokens[0]] = text
         else:
-            raise ServiceError(
-                text, f"Which {kind} is {text!r}? Write one of: {', '.join(f'{t}=FILE' for t in tokens)}"
-            )
+            choices = ", ".join(f"{token}=FILE" for token in tokens)
+            raise ServiceError(text, f"Which {kind} is {text!r}? Write one of: {choices}")
     missing = [token for token in tokens if token not in found] if kind == "input" else []
     if missing:
         raise ServiceError(missing, f"Missing {kind}: {', '.join(f'{token}=FILE' for token in missing)}")
@@ -114,4 +131,4 @@ def _write(file: str, value: Any, order: Order) -> None:
         write_image(file, value, order)
     else:
         kind = type(value).__name__
-        raise ServiceError(file, f"The answer is of type {kind}, not an image. Leave out --out, and it is printed.")
+        raise ServiceError(file, f"The answer is of type {kind}, not an image. Leave out --out to print it.")

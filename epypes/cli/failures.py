@@ -1,40 +1,42 @@
-"""``epypes failures``: what failed in a service, and where."""
+"""Commands on events that failed in a service: failures, replay."""
 
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Any, Final
 
-import typer
+import click
 
-from epypes.cli.options import Allow, Keys
-from epypes.cli.terminal import err, out
+from epypes.cli.options import PATH, allow_option, any_source_argument, keys_option, seconds_option
+from epypes.cli.terminal import print_table
 from epypes.errors import ServiceError
 
 if TYPE_CHECKING:
     from epypes.service.failures.record import FailedEvent
+    from epypes.service.failures.reproduce import Reproduction
 
-_MOST_CHARACTERS: Final = 200
+_MAX_CHARACTERS: Final = 200
 
 
+@click.command()
+@any_source_argument
+@click.option("--limit", type=click.IntRange(1), default=20, help="Number of failures, newest first.")
+@click.option("--json", "as_json", is_flag=True, help="Print each failure as a line of JSON.")
+@click.option("--follow", is_flag=True, help="Print new failures as they happen, until Ctrl+C.")
+@keys_option
+@allow_option
 def failures(
-    source: Annotated[
-        str | None,
-        typer.Argument(help="The bundle, or the http URL of its service; without it all failures of this machine."),
-    ] = None,
-    limit: Annotated[int, typer.Option(help="How many, the newest first.", min=1)] = 20,
-    as_json: Annotated[bool, typer.Option("--json", help="Print each failure as a line of JSON.")] = False,
-    follow: Annotated[bool, typer.Option("--follow", help="Tell of each that happens from now on, until Ctrl+C.")] = (
-        False
-    ),
-    keys: Keys = None,
-    allow: Allow = None,
+    source: str | None, limit: int, as_json: bool, follow: bool, keys: Path | None, allow: Sequence[Path] | None
 ) -> None:
-    """List the failures that were kept; epypes replay ID runs one again."""
+    """List the failures of a service.
+
+    epypes replay ID runs one of them again.
+    """
     from epypes.service.failures.source import failures_of
 
     if follow:
@@ -43,63 +45,100 @@ def failures(
     found = failures_of(source).records(limit)
     if as_json:
         for record in found:
-            out.print(json.dumps(asdict(record)))
+            click.echo(json.dumps(asdict(record)))
     elif found:
-        _print_table(found)
-        out.print(f"Again, in a process of its own: epypes replay {found[0].id}")
-        out.print(f"In a notebook: ep.load_failure({found[0].id!r})")
+        _print_failures(found)
+        click.echo(f"Again, in a process of its own: epypes replay {found[0].id}")
+        click.echo(f"In a notebook: ep.load_failure({found[0].id!r})")
     else:
-        out.print(f"No failures of {source} were kept." if source else "No failures were kept.")
+        click.echo(f"No failures of {source} were kept." if source else "No failures were kept.")
 
 
-def _follow(source: str | None, as_json: bool, keys: Path | None, allow: list[Path] | None) -> None:
-    """Print a line for each failure as it happens."""
+def _follow(source: str | None, as_json: bool, keys: Path | None, allow: Sequence[Path] | None) -> None:
     from epypes.service.failures.source import follow_failures
 
     if source is None:
-        raise ServiceError("", "Whose failures? Say: epypes failures --follow BUNDLE, or the http URL of its service.")
+        raise ServiceError("", "Name the service: epypes failures --follow BUNDLE, or the http URL of the service.")
     try:
         for record in follow_failures(source, keys=keys, allow=allow):
             if record is None:
-                err.print(f"Listening for failures of {source}. Ctrl+C ends it.")
+                click.echo(f"Listening for failures of {source}. Ctrl+C ends it.", err=True)
             elif as_json:
-                out.print(json.dumps(asdict(record)))
+                click.echo(json.dumps(asdict(record)))
             else:
                 dead = ", dead letter" if record.dead_letter else ""
-                told = f"{record.function}: {_raised(record)} (attempt {record.attempt}{dead})"
-                out.print(f"{record.id} {_when(record)} {told}")
+                what = f"{record.function}: {_describe(record)} (attempt {record.attempt}{dead})"
+                click.echo(f"{record.id} {_format_time(record)} {what}")
     except KeyboardInterrupt:
         return
 
 
-def _when(record: FailedEvent) -> str:
+def _format_time(record: FailedEvent) -> str:
     when = datetime.fromtimestamp(record.when_ns / 1e9).astimezone()
     is_today = when.date() == datetime.now().astimezone().date()
     return f"{when:%H:%M:%S}" if is_today else f"{when:%Y-%m-%d %H:%M}"
 
 
-def _raised(record: FailedEvent) -> str:
+def _describe(record: FailedEvent) -> str:
     summary = record.summary if record.kind == "raised" else f"{record.kind}: {record.text}"
-    return summary[:_MOST_CHARACTERS]
+    return summary[:_MAX_CHARACTERS]
 
 
-def _print_table(records: Sequence[FailedEvent]) -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
+def _print_failures(records: Sequence[FailedEvent]) -> None:
+    # One line each at any width: the exception has the room that the others leave.
+    columns: dict[str, dict[str, Any]] = {
+        "id": {"no_wrap": True, "min_width": 14},
+        "when": {"no_wrap": True, "min_width": 8},
+        "function": {"no_wrap": True, "min_width": 8, "max_width": 24},
+        "exception": {"no_wrap": True, "overflow": "ellipsis", "ratio": 1},
+    }
+    rows = [[each.id, _format_time(each), each.function, _describe(each)] for each in records]
+    # Only where they tell something.
+    if any(each.attempt != 1 for each in records):
+        columns["attempt"] = {"justify": "right", "min_width": 7}
+        rows = [[*row, str(each.attempt)] for row, each in zip(rows, records, strict=True)]
+    if any(each.dead_letter for each in records):
+        columns["dead\nletter"] = {"min_width": 6}
+        rows = [[*row, "yes" if each.dead_letter else ""] for row, each in zip(rows, records, strict=True)]
+    print_table(columns, rows)
 
-    # In one line each, whatever the width: the exception gets what the others leave.
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True, expand=True)
-    table.add_column("id", no_wrap=True, min_width=14)
-    table.add_column("when", no_wrap=True, min_width=8)
-    table.add_column("function", no_wrap=True, min_width=8, max_width=24)
-    table.add_column("exception", no_wrap=True, overflow="ellipsis", ratio=1)
-    # A column that has nothing to say would only take its room.
-    has_attempts, has_dead = any(each.attempt != 1 for each in records), any(each.dead_letter for each in records)
-    if has_attempts:
-        table.add_column("attempt", justify="right", min_width=7)
-    if has_dead:
-        table.add_column("dead\nletter", min_width=6)
-    for record in records:
-        more = [str(record.attempt)] * has_attempts + ["yes" if record.dead_letter else ""] * has_dead
-        table.add_row(record.id, _when(record), record.function, _raised(record), *more)
-    out.print(table)
+
+@click.command()
+@click.argument("failure", metavar="ID", help="Id of the failure, its beginning or end, its event's id, or latest.")
+@any_source_argument
+@click.option("--bundle", type=PATH, help="Folder of the bundle, if it was served from another path.")
+@seconds_option("--timeout", 30.0, "Longest time for the event", least=0.001)
+@click.option("--trace", is_flag=True, help="Print the whole traceback.")
+def replay(failure: str, source: str | None, bundle: Path | None, timeout_s: float, trace: bool) -> None:
+    """Run an event that failed again, in a process of its own.
+
+    Exit 0 only if no function fails now.
+    """
+    from epypes.service.failures.reproduce import reproduce
+    from epypes.service.failures.source import bundle_of, failures_of, find_failure, path_of
+
+    store = failures_of(source)
+    record = find_failure(store, failure)
+    event = store.event(record.id)
+    folder, changed = bundle_of(record, bundle or path_of(source))
+    if changed:
+        click.echo(f"{changed}.")
+    found = reproduce(record, event, folder, timeout_s=timeout_s)
+    if trace:
+        click.echo("\n".join(found.trace))
+    click.echo(f"{record.id} {_describe_replay(record, found)}")
+    if found.ending != "fine":
+        sys.exit(1)
+
+
+def _describe_replay(record: FailedEvent, found: Reproduction) -> str:
+    if found.ending == "fine":
+        return f"is fine now: no function fails. It was {record.function!r}: {record.summary}."
+    if found.ending == "stuck":
+        return f"is stuck: {found.message} {found.place}. The process was ended."
+    if found.ending == "killed":
+        return f"kills the process ({found.exception}) {found.place}."
+    is_same = (found.function, found.exception) == (record.function, record.exception)
+    how = "fails again" if is_same else f"fails otherwise than in the service ({record.function!r}: {record.summary})"
+    message = " ".join(found.message.split())
+    return f"{how}: {found.place}: {found.exception}{': ' * bool(message)}{message}"

@@ -1,4 +1,9 @@
-"""``epypes lab``: JupyterLab, with answers of the kernel that don't wait on their way to the page."""
+"""The command lab: JupyterLab, whose kernel's messages reach the page without delay.
+
+JupyterLab loads this module as a server extension when ``epypes lab`` starts it. TCP holds a small message back while
+an earlier one is not acknowledged (Nagle, RFC 896), and the other end delays its acknowledgement by 40 ms;
+``TCP_NODELAY`` ends that.
+"""
 
 from __future__ import annotations
 
@@ -6,46 +11,46 @@ import importlib.util
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Any, Final
 
-import typer
+import click
 
 from epypes.errors import ServiceError
 
-_EXTENSION = "epypes.cli.websocket"
-_ADDRESS = ("--ip", "--ServerApp.ip")
+if TYPE_CHECKING:
+    from jupyter_server.serverapp import ServerApp
+
+_ADDRESS: Final = ("--ip", "--ServerApp.ip")
+_CONNECTION_CLASS: Final = "kernel_websocket_connection_class"
 
 
-def lab(
-    words: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="[FOLDER] [-- OPTIONS]",
-            help="The folder that it shows, the current one without; after two dashes what JupyterLab is given.",
-            show_default=False,
-        ),
-    ] = None,
-) -> None:
-    """Start JupyterLab on this machine alone, with a kernel websocket that sends at once, until Ctrl+C."""
-    arguments = lab_arguments(words or [], is_root=os.geteuid() == 0)
+@click.command()
+@click.argument("arguments", nargs=-1, metavar="[FOLDER] [-- OPTIONS]", help="Folder to open; options of JupyterLab.")
+def lab(arguments: tuple[str, ...]) -> None:
+    """Start JupyterLab on this machine.
+
+    Without a folder it opens the current one. It listens on this machine alone, and its kernel websocket sends at once
+    (TCP_NODELAY). Ctrl+C ends it.
+    """
+    command = lab_command(*arguments, is_root=os.geteuid() == 0)
     if importlib.util.find_spec("jupyterlab") is None:
         raise ModuleNotFoundError("JupyterLab is not installed.", name="jupyterlab")
     sys.stdout.flush()
     # In place of this process: signals reach JupyterLab, and its exit status is this command's.
-    os.execv(sys.executable, [sys.executable, *arguments])  # noqa: S606 - our own interpreter, no shell
+    os.execv(sys.executable, [sys.executable, *command])  # noqa: S606 - our own interpreter, no shell
 
 
-def lab_arguments(words: list[str], *, is_root: bool = False) -> tuple[str, ...]:
-    """Return what Python is started with.
+def lab_command(*arguments: str, is_root: bool = False) -> tuple[str, ...]:
+    """Return the arguments for Python.
 
     Raises
     ------
     ServiceError
         There is no such folder.
     """
-    # Two dashes are gone by now, so an option shows itself by its own.
-    has_folder = bool(words) and not words[0].startswith("-")
-    folder, options = (words[0], words[1:]) if has_folder else (".", words)
+    # The parser has removed the two dashes: an option begins with a dash of its own.
+    has_folder = bool(arguments) and not arguments[0].startswith("-")
+    folder, options = (arguments[0], arguments[1:]) if has_folder else (".", arguments)
     if not Path(folder).is_dir():
         raise ServiceError(folder, f"There is no folder {folder!r} to show in JupyterLab. Name one that exists.")
     return (
@@ -56,6 +61,30 @@ def lab_arguments(words: list[str], *, is_root: bool = False) -> tuple[str, ...]
         # JupyterLab refuses an address that is given twice.
         *(() if any(option.partition("=")[0] in _ADDRESS for option in options) else ("--ip=127.0.0.1",)),
         *(("--allow-root",) if is_root else ()),
-        f"--ServerApp.jpserver_extensions={_EXTENSION}=True",
+        f"--ServerApp.jpserver_extensions={__name__}=True",
         *options,
     )
+
+
+def _jupyter_server_extension_points() -> list[dict[str, str]]:
+    return [{"module": __name__}]
+
+
+def _load_jupyter_server_extension(server: ServerApp) -> None:
+    from jupyter_server.services.kernels.connection.channels import ZMQChannelsWebsocketConnection
+
+    # The class that the user configured is extended. That of a gateway is left alone: its kernels are elsewhere.
+    settings = server.web_app.settings
+    if issubclass(settings[_CONNECTION_CLASS], ZMQChannelsWebsocketConnection):
+        settings[_CONNECTION_CLASS] = _undelayed(settings[_CONNECTION_CLASS])
+
+
+def _undelayed(connection: type[Any]) -> type[Any]:
+    """Return a subclass of a connection between page and kernel whose socket sends at once."""
+
+    def connect(self: Any) -> Any:
+        # Before anything is sent.
+        self.websocket_handler.set_nodelay(True)
+        return connection.connect(self)
+
+    return type("Undelayed", (connection,), {"connect": connect})

@@ -1,216 +1,211 @@
-"""``epypes status``: what runs, in which state, and what became of its events."""
+"""The command status: the state of services and of the replicas that share a broker's events."""
 
 from __future__ import annotations
 
 import json
 import socket
-from typing import TYPE_CHECKING, Annotated, Any
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, Final
 
-import typer
+import click
 
-from epypes.cli.source import Source, connected, is_url, states_of
-from epypes.cli.terminal import failures_at, out
+from epypes.cli.options import json_option, replica_option, source_argument
+from epypes.cli.services import connect_to, describe_failures, is_url, states_of
 from epypes.errors import EpypesError
 
 if TYPE_CHECKING:
     from epypes.service.state_file import ServiceState
 
-_COUNTS = ("received", "answered", "failed", "dropped", "waiting")
-# What is counted besides where a broker delivers the events.
-_OF_BROKER = ("dead_letters", "redelivered", "duplicates", "given_back")
-_DIGITS = 12
-_UNKNOWN = "RUNNING"
-_NO_HTTP = "no --http"
-# In what replicas of one group should be alike.
-_MAY_DIFFER = ("name", "digest")
+_COUNTS: Final = ("received", "answered", "failed", "dropped", "waiting")
+# Counted besides where a broker delivers the events.
+_BROKER_COUNTS: Final = ("dead_letters", "redelivered", "duplicates", "given_back")
+_NO_GROUP: Final[dict[str, Any]] = {"members": [], "lost": [], "trouble": ""}
+# The state of a service that can't be asked, since it has no HTTP control.
+_UNKNOWN: Final = "RUNNING"
+_NO_HTTP: Final = "no --http"
+_DIGITS: Final = 12
+
+# A service as JSON: the answer of its HTTP control (`Service.info`, its parameters and its group), or its state file.
+Info = dict[str, Any]
 
 
-def status(
-    source: Source,
-    as_json: Annotated[bool, typer.Option("--json", help="Print all that is known as JSON.")] = False,
-    replica: Annotated[
-        str,
-        typer.Option(help="Which of several services of the bundle here; without, all of them and their whole group."),
-    ] = "",
-) -> None:
-    """Say in which state a running service is, where it listens, and how many events it has answered."""
-    found = [_of_url(source)] if is_url(source) else _of_all(source, states_of(source, replica))
+@click.command()
+@source_argument
+@json_option
+@replica_option
+def status(source: str, as_json: bool, replica: str) -> None:
+    """Show the state of a running service.
+
+    Also its addresses, its counts of events and its parameters; and the replicas that share its events, unless one is
+    named.
+    """
+    if is_url(source):
+        services = [_ask(source)]
+    else:
+        states = states_of(source, replica)
+        services = [_ask_or_read(source, state, is_alone=len(states) == 1) for state in states]
     if as_json:
-        out.print(json.dumps(found[0] if len(found) == 1 else found))
+        click.echo(json.dumps(services[0] if len(services) == 1 else services))
         return
-    shared = {each["addresses"]["sub"].partition("?")[0] for each in found if _is_shared(each)}
-    alone = [each for each in found if replica or not _is_shared(each)]
-    for line in (line for each in alone for line in _lines(each)):
-        out.print(line)
-    for sub in sorted(shared):
-        of_sub = [each for each in found if each["addresses"]["sub"].partition("?")[0] == sub]
-        for line in _group_lines(of_sub, is_one=bool(replica)):
-            out.print(line)
+    groups: dict[str, list[Info]] = {}
+    for service in services:
+        queue = _shared_queue(service)
+        if queue:
+            groups.setdefault(queue, []).append(service)
+        if replica or not queue:
+            _print_service(service)
+    for _, group in sorted(groups.items()):
+        _print_group(group, with_members=not replica)
 
 
-def _is_shared(found: dict[str, Any]) -> bool:
-    """Whether a service takes its events from a broker, as others may."""
+def _ask(url: str) -> Info:
+    with connect_to(url, None) as service:
+        values = service.parameters().entries
+        parameters = {token: entry.get("value") for token, entry in values.items()}
+        return {**service.info(), "group": service.group(), "parameters": parameters}
+
+
+def _ask_or_read(source: str, state: ServiceState, *, is_alone: bool) -> Info:
+    """Return a service's answer; its state file, if it has no HTTP control or, beside others, does not answer."""
+    silence = {}
+    if state.http:
+        try:
+            return _ask(state.http)
+        except EpypesError as error:
+            if is_alone:
+                raise
+            silence = {"state": "SILENT", "reason": str(error)}
+    return {
+        "bundle": source,
+        "digest": state.digest,
+        "pid": state.pid,
+        "replica": state.replica,
+        "addresses": {"sub": state.sub, "pub": state.pub, "failures": state.failures},
+        "shows_failures": state.shows_failures,
+        **silence,
+    }
+
+
+def _shared_queue(service: Info) -> str:
+    """Return the address of the broker's queue that a service shares with its replicas; empty without a broker."""
     from epypes.transport.address import is_broker
 
-    return is_broker(found["addresses"]["sub"])
+    sub: str = service["addresses"]["sub"]
+    return sub.partition("?")[0] if is_broker(sub) else ""
 
 
-def _of_all(source: str, states: list[ServiceState]) -> list[dict[str, Any]]:
-    """Return what there is to know of each; one that says nothing keeps nobody from hearing of the others."""
-    if len(states) == 1:
-        return [_of(source, states[0])]
-    found = []
-    for state in states:
-        try:
-            found.append(_of(source, state))
-        except EpypesError as error:
-            found.append({**_written(source, state), "state": "SILENT", "reason": str(error)})
-    return found
+# -- one service ------------------------------------------------------------------------------------------------------
 
 
-def _of(source: str, state: ServiceState) -> dict[str, Any]:
-    return _of_url(state.http) if state.http else _written(source, state)
+def _print_service(service: Info) -> None:
+    reason = f" ({service['reason']})" if service.get("reason") else ""
+    replica = f", replica {service['replica']}" if service.get("replica") else ""
+    no_http = "" if service.get("state") else f", {_NO_HTTP}"
+    described = f"{_describe_bundle(service)}{replica}, process {service['pid']}{no_http}"
+    click.echo(f"{service.get('state', _UNKNOWN)}{reason} {described}.")
+    if "counts" in service:
+        _print_counts(service["counts"])
+    _print_parameters_and_addresses(service)
 
 
-def _written(source: str, state: ServiceState) -> dict[str, Any]:
-    """Return what a service has left in its state file."""
-    addresses = {"sub": state.sub, "pub": state.pub, "failures": state.failures}
-    served = {"bundle": source, "digest": state.digest, "pid": state.pid, "replica": state.replica}
-    return {**served, "addresses": addresses, "shows_failures": state.shows_failures}
+def _describe_bundle(service: Info) -> str:
+    return f"{service['bundle']} ({service['digest'][:_DIGITS]})"
 
 
-def _of_url(url: str) -> dict[str, Any]:
-    with connected(url, None) as service:
-        found = service.info()
-        values = service.parameters().entries
-        group = service.group()
-    return {**found, "group": group, "parameters": {token: entry.get("value") for token, entry in values.items()}}
+def _print_counts(counts: dict[str, int]) -> None:
+    names = (*_COUNTS, *_BROKER_COUNTS) if "redelivered" in counts else _COUNTS
+    texts = (f"{counts[name]} {name.replace('_', ' ')}" for name in names if name in counts)
+    click.echo(f"Events: {', '.join(texts)}.")
 
 
-def _lines(found: dict[str, Any]) -> list[str]:
-    reason = f" ({found['reason']})" if found.get("reason") else ""
-    named = f", replica {found['replica']}" if found.get("replica") else ""
-    more = "" if found.get("state") else f", {_NO_HTTP}"
-    served = f"{found['bundle']} ({found['digest'][:_DIGITS]}){named}, process {found['pid']}{more}"
-    lines = [f"{found.get('state', _UNKNOWN)}{reason} {served}."]
-    if "counts" in found:
-        lines.append(_events_line(found["counts"]))
-    return [*lines, *_parameters_line(found), _addresses_line(found)]
-
-
-def _events_line(counts: dict[str, int]) -> str:
-    names = (*_COUNTS, *_OF_BROKER) if "redelivered" in counts else _COUNTS
-    told = (f"{counts[name]} {name.replace('_', ' ')}" for name in names if name in counts)
-    return f"Events: {', '.join(told)}."
-
-
-def _parameters_line(found: dict[str, Any]) -> list[str]:
-    if not found.get("parameters"):
-        return []
-    values = ", ".join(f"{token}={json.dumps(value)}" for token, value in found["parameters"].items())
-    return [f"Parameters, revision {found['revision']}: {values}"]
-
-
-def _addresses_line(found: dict[str, Any]) -> str:
-    at = found["addresses"]
-    more = failures_at(at["failures"], found.get("shows_failures", True))
-    return f"Events at {at['sub']}, answers at {at['pub']}{more}."
+def _print_parameters_and_addresses(service: Info) -> None:
+    if service.get("parameters"):
+        values = ", ".join(f"{token}={json.dumps(value)}" for token, value in service["parameters"].items())
+        click.echo(f"Parameters, revision {service['revision']}: {values}")
+    at = service["addresses"]
+    failures = describe_failures(at["failures"], service.get("shows_failures", True))
+    click.echo(f"Events at {at['sub']}, answers at {at['pub']}{failures}.")
 
 
 # -- replicas that share the events of a broker -----------------------------------------------------------------------
 
 
-def _group_lines(found: list[dict[str, Any]], *, is_one: bool) -> list[str]:
-    """Return what all replicas are like that take events from one place, wherever they run: a line for each.
-
-    Parameters
-    ----------
-    found
-        Those that were asked, or have left word here.
-    is_one
-        Whether one was asked for by name, and is told of already.
-    """
-    # Whom the broker is away for hears nobody: who hears most is asked.
-    asked = sorted((each for each in found if "group" in each), key=_hears, reverse=True)
-    first = asked[0] if asked else found[0]
-    group = first.get("group", {"members": [], "lost": [], "trouble": ""})
-    lines = _head_lines(first, group) if asked else []
-    if is_one:
-        return lines
+def _print_group(services: list[Info], *, with_members: bool) -> None:
+    """Print what the replicas of one queue have in common, then a line for each, on whichever machine it runs."""
+    # A replica that is cut off from the broker hears no other: the one that hears most describes the group.
+    asked = [service for service in services if "group" in service]
+    first = max(asked, key=_heard, default=services[0])
+    group = first.get("group", _NO_GROUP)
+    if asked:
+        click.echo(_describe_group(first, group))
+    if not with_members:
+        return
     if not asked:
-        lines = [f"{first['bundle']} ({first['digest'][:_DIGITS]})."]
+        click.echo(f"{_describe_bundle(first)}.")
     elif not group["trouble"]:
-        lines.append(_events_line(group["counts"]))
-    lines += [*_parameters_line(first), _addresses_line(first)]
-    differ = {name: len({each[name] for each in group["members"] if name in each}) > 1 for name in _MAY_DIFFER}
-    told = {_gist(group["trouble"])}
-    members, lost = _members(found, group)
-    lines += [_member_line(member, differ, told) for member in members]
-    # Each of them is lost for himself, though all may have been heard last at the same time.
-    return [*lines, *(_member_line(member, differ, set()) for member in lost)]
+        _print_counts(group["counts"])
+    _print_parameters_and_addresses(first)
+    members, lost = _merge_members(services, group)
+    bundles = {(member.get("name", ""), member["digest"]) for member in group["members"]}
+    # One broker is away for all of them: its reason is printed once. A lost replica has a reason of its own.
+    known = {_without_addresses(group["trouble"])}
+    for member in members:
+        click.echo(_describe_member(member, _new_reasons(member, known), with_bundle=len(bundles) > 1))
+    for member in lost:
+        click.echo(_describe_member(member, _new_reasons(member, set()), with_bundle=len(bundles) > 1))
 
 
-def _hears(found: dict[str, Any]) -> tuple[bool, int]:
-    return not found["group"]["trouble"], len(found["group"]["members"])
+def _heard(service: Info) -> tuple[bool, int]:
+    return not service["group"]["trouble"], len(service["group"]["members"])
 
 
-def _head_lines(found: dict[str, Any], group: dict[str, Any]) -> list[str]:
-    served = f"{found['bundle']} ({found['digest'][:_DIGITS]})"
+def _describe_group(service: Info, group: dict[str, Any]) -> str:
     if group["trouble"]:
-        return [f"Group of {served}: the other replicas are not heard: {group['trouble']}"]
+        return f"Group of {_describe_bundle(service)}: the other replicas are not heard: {group['trouble']}"
     agree = "all with" if group["agree"] else "not all with"
     lost = f", lost {len(group['lost'])}" if group["lost"] else ""
-    said = f"Group: replicas {group['replicas']}, ready {group['ready']}{lost}, {agree} the same bundle and parameters"
-    return [f"{said}: {served}."]
+    counts = f"replicas {group['replicas']}, ready {group['ready']}{lost}"
+    return f"Group: {counts}, {agree} the same bundle and parameters: {_describe_bundle(service)}."
 
 
-def _members(found: list[dict[str, Any]], group: dict[str, Any]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Return who is in a group or runs here besides, and who is lost; with what was seen of them here."""
-    here = {(each["replica"], each["pid"]): each for each in found}
+def _merge_members(services: Iterable[Info], group: dict[str, Any]) -> tuple[list[Info], list[Info]]:
+    """Return the members of a group and the lost ones; with the services of this machine that are no members."""
+    host = socket.gethostname()
+    here = {(service["replica"], service["pid"]): service for service in services}
 
-    def seen(member: dict[str, Any]) -> dict[str, Any]:
-        own = here.pop((member["replica"], member["pid"]), {}) if _is_here(member) else {}
-        return {**member, "silent": own.get("reason", "") if own.get("state") == "SILENT" else ""}
+    def merged(member: Info) -> Info:
+        own = here.pop((member["replica"], member["pid"]), {}) if member["host"] == host else {}
+        return {**member, "silence": own["reason"]} if own.get("state") == "SILENT" else member
 
-    members, lost = [seen(each) for each in group["members"]], [seen(each) for each in group["lost"]]
-    return [*members, *(_member_of(each) for each in here.values())], lost
-
-
-def _is_here(member: dict[str, Any]) -> bool:
-    return bool(member["host"] == socket.gethostname())
-
-
-def _member_of(found: dict[str, Any]) -> dict[str, Any]:
-    """Return what is known of a replica that is no member of the group that was asked."""
-    own = [each for each in found.get("group", {}).get("members", ()) if each["is_self"]]
-    served = {"http": found["addresses"].get("http", ""), "host": socket.gethostname(), **found}
-    return {"state": _UNKNOWN, "reason": "", "trouble": "", **served, **(own[0] if own else {})}
+    members, lost = [merged(each) for each in group["members"]], [merged(each) for each in group["lost"]]
+    for service in here.values():
+        itself = [each for each in service.get("group", _NO_GROUP)["members"] if each["is_self"]]
+        about = {"state": _UNKNOWN, "http": service["addresses"].get("http", ""), "host": host, **service}
+        members.append({**about, **(itself[0] if itself else {})})
+    return members, lost
 
 
-def _member_line(member: dict[str, Any], differ: dict[str, bool], told: set[str]) -> str:
-    """Return what there is to say of a member, but for reasons that were told before: one broker is away for all."""
+def _new_reasons(member: Info, known: set[str]) -> str:
+    """Return the reasons for a member's state that are not known yet, and add them."""
     reasons = []
-    for text in filter(None, (member.get(name, "") for name in ("reason", "trouble", "silent"))):
-        if _gist(text) not in told:
+    for text in filter(None, (member.get(name) for name in ("reason", "trouble", "silence"))):
+        if _without_addresses(text) not in known:
             reasons.append(text)
-            told.add(_gist(text))
-    why = f" ({' '.join(reasons)})" if reasons else ""
-    parts = [f"{member['state']}{why}"]
+            known.add(_without_addresses(text))
+    return f" ({' '.join(reasons)})" if reasons else ""
+
+
+def _without_addresses(reason: str) -> str:
+    return " ".join(part for part in reason.split() if "://" not in part)
+
+
+def _describe_member(member: Info, reasons: str, *, with_bundle: bool) -> str:
+    parts = [f"{member['state']}{reasons}"]
     if "counts" in member:
         parts += [f"{member['counts'].get('answered', 0)} answered", f"revision {member['revision']}"]
-    parts += _differences(member, differ)
-    at = member["http"] or (_NO_HTTP if member["state"] != "SILENT" else "")
-    parts += [member["host"], f"process {member['pid']}", *filter(None, [at])]
+    if with_bundle:
+        parts.append(f"bundle {member.get('name', '')} ({member['digest'][:_DIGITS]})".replace("  ", " "))
+    parts += [member["host"], f"process {member['pid']}"]
+    if member["http"] or member["state"] != "SILENT":
+        parts.append(member["http"] or _NO_HTTP)
     return f"- {member['replica'] or 'one'}: {', '.join(parts)}"
-
-
-def _gist(reason: str) -> str:
-    """Return a reason without places, of which a broker has several."""
-    return " ".join(word for word in reason.split() if "://" not in word)
-
-
-def _differences(member: dict[str, Any], differ: dict[str, bool]) -> list[str]:
-    """Return which bundle a member serves, if not all serve the same one."""
-    if not any(differ.values()):
-        return []
-    return [f"bundle {member.get('name', '')} ({member['digest'][:_DIGITS]})".replace("  ", " ")]

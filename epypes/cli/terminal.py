@@ -1,55 +1,59 @@
-"""Output of the command line.
+"""Tables and progress displays.
 
-Results go to standard output, progress to standard error, so that a result can be piped.
+Results go to standard output, progress to standard error, so that a result can be piped. Lines are printed by
+`click.echo`; rich is imported where a table or a progress display is drawn, since its import takes as long as all else.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Final
-
-from rich.console import Console
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.progress import Progress
 
-    from epypes.service import Answer
 
-# What is printed may hold anything: a [word] or :word: in it is no markup.
-_PLAIN: Final[dict[str, Any]] = {"highlight": False, "soft_wrap": True, "markup": False, "emoji": False}
-out = Console(**_PLAIN)
-err = Console(stderr=True, **_PLAIN)
+def print_table(columns: Mapping[str, Mapping[str, Any]], rows: Iterable[Sequence[str]], title: str = "") -> None:
+    """Print a table.
+
+    Parameters
+    ----------
+    columns
+        For each name the options of `rich.table.Column`.
+    rows
+        The cells of each row; an empty row draws a line.
+    title
+        Printed above. A table without a title is as wide as the terminal and has no frame.
+    """
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    plain: dict[str, Any] = {"box": SIMPLE_HEAD, "pad_edge": False, "collapse_padding": True, "expand": True}
+    table = Table(title=title, title_justify="left") if title else Table(**plain)
+    for name, options in columns.items():
+        table.add_column(name, **options)
+    for row in rows:
+        if row:
+            table.add_row(*row)
+        else:
+            table.add_section()
+    _console().print(table)
 
 
 @contextmanager
-def progress(*, auto_refresh: bool = True, disable: bool = False) -> Iterator[Progress]:
-    """Show a progress display while the block runs; without ``auto_refresh`` it is drawn when it is told to."""
+def progress() -> Iterator[Progress]:
+    """Show a progress display while the block runs."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, TimeElapsedColumn(), console=err, auto_refresh=auto_refresh, disable=disable) as shown:
+    with Progress(*columns, TimeElapsedColumn(), console=_console(stderr=True)) as shown:
         yield shown
 
 
-def failures_at(address: str, is_shown: bool) -> str:
-    """Return what is said after other addresses of where failures are published; nothing where nobody asks for it."""
-    return f", failures at {address}" if is_shown else ""
+def _console(*, stderr: bool = False) -> Console:
+    from rich.console import Console
 
-
-def print_answer(title: str, answer: Answer) -> None:
-    """Print the times of a service's answer as a table."""
-    from rich.table import Table
-
-    from epypes.display.durations import duration_text
-
-    table = Table(title=title, title_justify="left")
-    table.add_column("where")
-    table.add_column("time", justify="right")
-    for name, duration_ns in answer.timings_ns.items():
-        table.add_row(f"function {name}", duration_text(duration_ns))
-    table.add_section()
-    table.add_row("graph overhead", duration_text(answer.overhead_ns))
-    table.add_row("run in all", duration_text(answer.total_ns))
-    table.add_row("round trip", duration_text(answer.round_trip_ns))
-    out.print(table)
+    # Printed text may hold anything: a [name] or :name: in it is no markup.
+    return Console(stderr=stderr, highlight=False, soft_wrap=True, markup=False, emoji=False)

@@ -19,7 +19,7 @@ from epypes.optional import EXTRAS
 ROOT = Path(__file__).parents[2]
 MODULES = sorted([*(ROOT / "epypes").rglob("*.py"), *(ROOT / "widgets").rglob("*.py")])
 HEAVY = {"numpy", "cv2", "networkx", "zmq", "google", "ipywidgets", "anywidget", "traitlets", "matplotlib", "pandas",
-         "IPython", "PIL", "graphviz", "pygraphviz", "typer", "rich", "tomlkit", "logging", "skimage"}  # fmt: skip
+         "IPython", "PIL", "graphviz", "pygraphviz", "click", "rich", "tomlkit", "logging", "skimage"}  # fmt: skip
 
 
 def test_importing_epypes_imports_no_other_package():
@@ -120,7 +120,7 @@ def required(extra):
 
 @pytest.mark.slow
 def test_every_package_that_is_imported_is_brought_by_an_extra_that_an_error_names():
-    own = {*sys.stdlib_module_names, "epypes", "epypes_widgets", "packaging", "rich", "typer"}
+    own = {*sys.stdlib_module_names, "epypes", "epypes_widgets", "packaging", "rich", "click"}
     assert {name for path in MODULES for name in imported(path)} - own <= EXTRAS.keys()
     # What these bring by themselves: nothing asks for them by name.
     within = {"ipython": "ipykernel", "traitlets": "ipywidgets", "jupyter-client": "nbclient", "jupyter-server": "jupyterlab",

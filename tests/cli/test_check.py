@@ -142,17 +142,3 @@ def test_json_has_every_check(labelled, cases, epypes):
     assert [check["check"] for check in found["checks"]] == ["equal of edges", "count of edges", "iou of edges"]
     assert found["checks"][2]["value"] < 0.99
     assert found["checks"][2]["reason"].endswith("is not at least 0.99")
-
-
-def test_the_help_documents_the_keys_of_a_case(epypes):
-    said = epypes("check", "--help").stdout
-    for word in (
-        "[[case]]",
-        "[[case.check]]",
-        "inputs = ",
-        "hyperparameters = ",
-        "token = ",
-        "expected = ",
-        "metric = ",
-    ):
-        assert word in said

@@ -7,14 +7,11 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from rich.table import Table
 
 import epypes as ep
 from epypes.acquisition import read_image, write_image
 from epypes.bundle.load import read_bundle
-from epypes.cli import terminal
-from epypes.cli.call import by_token
-from epypes.errors import ServiceError, UnknownName
+from epypes.bundle.manifest import write_manifest
 from epypes.service import Service
 from epypes.service.state_file import StateLock
 from tests.colours import red_image, red_runner
@@ -45,16 +42,11 @@ def one_line(done) -> str:
     return done.stderr
 
 
-@pytest.mark.parametrize("console", [terminal.out, terminal.err])
-def test_what_looks_like_markup_is_printed_as_it_is(console, capsys):
-    key = "4]a>O]PvB[)ZdSU8ZPY?0+]c[r5vV]7Gr>oaju/f :dog:"
-    table = Table(title=key)
-    table.add_column(key)
-    table.add_row(key)
-    console.print(key)
-    console.print(table)
-    said = capsys.readouterr()
-    assert (said.out + said.err).count(key) == 4
+def test_what_looks_like_markup_is_printed_as_it_is(epypes, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
+    folder = tmp_path / "4]a>O]PvB[)ZdSU8ZPY?0+]c[r5vV]7Gr>oaju[/f] :dog:"
+    assert epypes("keys", "camera", "--to", folder).stdout.count(str(folder)) == 3
+    assert f"Public keys in {folder}" in epypes("keys", "--list", "--to", folder).stdout
 
 
 @pytest.mark.slow
@@ -121,32 +113,39 @@ def test_help_names_every_command(epypes):
         assert command in done.stdout
 
 
-def test_files_are_given_to_tokens():
-    assert by_token(["a.png"], ["image"], "input") == {"image": "a.png"}
-    assert by_token(["a-b=c.png"], ["image"], "input") == {"image": "a-b=c.png"}, "a file may be called so"
-    with pytest.raises(UnknownName, match="Did you mean 'image'"):
-        by_token(["imag=a.png"], ["image"], "input")
-    assert by_token([], ["edges"], "output") == {}
-    assert by_token(["right=r.png", "left=l.png"], ["left", "right"], "input") == {"right": "r.png", "left": "l.png"}
-    with pytest.raises(ServiceError, match="Missing input: right=FILE"):
-        by_token(["left=l.png"], ["left", "right"], "input")
-    with pytest.raises(ServiceError, match="Which input is 'l.png'"):
-        by_token(["l.png", "r.png"], ["left", "right"], "input")
-    with pytest.raises(UnknownName, match="Did you mean 'left'"):
-        by_token(["lefd=l.png", "right=r.png"], ["left", "right"], "input")
+@pytest.mark.parametrize(
+    ("tokens", "given", "said"),
+    [
+        ("image", ["imag=a.png"], "Did you mean 'image'"),
+        ("image", ["a-b=c.png"], "Image 'a-b=c.png' can't be read"),
+        ("image", ["image=a-b=c.png"], "Image 'a-b=c.png' can't be read"),
+        ("image", ["a.png", "--out", "edge=b.png"], "No output token 'edge'"),
+        ("image", ["a.png", "b.png"], "Which input is 'a.png'? Write one of: image=FILE"),
+        ("left right", ["left=l.png"], "Missing input: right=FILE"),
+        ("left right", ["l.png", "r.png"], "Which input is 'l.png'? Write one of: left=FILE, right=FILE"),
+        ("left right", ["lefd=l.png", "right=r.png"], "Did you mean 'left'"),
+        ("left right", ["right=r.png", "left=l.png"], "Image 'r.png' can't be read"),
+    ],
+)
+def test_files_are_given_to_tokens(epypes, bundle, tokens, given, said):
+    settings = bundle.path / "pipeline.toml"
+    text = settings.read_text().replace('inputs = ["image"]', f"inputs = {tokens.split()}".replace("'", '"'))
+    settings.write_text(text)
+    write_manifest(bundle.path)
+    assert said in one_line(epypes("call", bundle.path, *given))
 
 
 @pytest.mark.slow
 def test_a_module_that_an_extra_brings_is_named():
     code = (
         "import sys; sys.modules['tomlkit'] = None\n"
-        "from epypes.cli import main, app\n"
-        "@app.app.command()\n"
+        "from epypes.cli import main\n"
+        "from epypes.cli.app import app\n"
+        "@app.command()\n"
         "def probe() -> None:\n"
         "    import tomlkit\n"
         "main(['probe'])\n"
     )
-    code = "import epypes.cli.app\n" + code
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 1
     assert done.stderr.strip() == "epypes: Package 'tomlkit' is missing. Run: pip install 'epypes[serve]'"

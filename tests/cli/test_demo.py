@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import epypes.cli.demo as demo_command
-from epypes.acquisition import read_image, write_image
+import epypes.acquisition as epypes_acquisition
+from epypes.acquisition import read_image
 from epypes.bundle import verify
-from epypes.errors import ServiceError
 from tests.service.processes import run_cli
 
 ROOT = Path(__file__).parents[2]
@@ -39,21 +38,16 @@ def test_the_demo_does_the_main_job_and_says_so(tutorial, tmp_path, straight_edg
     assert verify(out / "bundle").identical
 
 
-def test_an_answer_that_differs_ends_the_demo_with_an_error(tutorial, tmp_path, monkeypatch):
-    real_call = demo_command._call
-
-    def spoiled(bundle, images, output, file):
-        answer = real_call(bundle, images, output, file)
-        edges = read_image(file).copy()
+def test_an_answer_that_differs_ends_the_demo_with_an_error(tutorial, tmp_path, monkeypatch, epypes):
+    def spoiled(file, *rest):
+        edges = read_image(file, *rest).copy()
         edges[7, 9] ^= 255
-        write_image(file, edges)
-        return answer
+        return edges
 
-    monkeypatch.setattr(demo_command, "_call", spoiled)
-    with pytest.raises(
-        ServiceError, match=r"differs from the notebook's: 1 of 240000 values differ, first at \[7, 9\]"
-    ):
-        demo_command.demo(tutorial, tmp_path / "out", "runner", "edges")
+    monkeypatch.setattr(epypes_acquisition, "read_image", spoiled)
+    done = epypes("demo", tutorial, "--to", tmp_path / "out")
+    assert done.returncode == 1
+    assert "differs from the notebook's: 1 of 240000 values differ, first at [7, 9]" in done.stderr
 
 
 def test_a_notebook_that_cannot_be_promoted_ends_the_demo_with_exit_status_1(tmp_path):

@@ -13,7 +13,6 @@ import sys
 import cv2
 import numpy as np
 import pytest
-import typer.main
 
 import epypes as ep
 from epypes.bundle.manifest import write_manifest
@@ -64,7 +63,7 @@ ROWS = {
     ],
     "deploy": [
         (["{bundle}", "--http", "http://127.0.0.1:9"], "No service answers at http://127.0.0.1:9. Start one: "),
-        (["{bundle}"], "Which service? Say --http URL, or --service and the bundle"),
+        (["{bundle}"], "Name one service: --http URL, or --service and the bundle"),
         (["{bundle}", "--service", "{bundle}"], "No service of yours runs for {bundle}."),
     ],
     "rollback": [(["--http", "nonsense"], "'nonsense' is no address of a service. Write it as http://127.0.0.1:8642")],
@@ -145,7 +144,7 @@ def one_line(done):
 
 
 def test_every_command_has_a_row():
-    commands = set(typer.main.get_command(app).commands)
+    commands = set(app.commands)
     assert commands - ROWS.keys() == set(), "give each new command a row of what makes it fail, and what it says then"
 
 
@@ -157,7 +156,7 @@ def test_a_command_that_fails_says_so_in_one_line(command, row, places, epypes):
     assert says.format(**places) in one_line(done)
 
 
-@pytest.mark.parametrize("command", sorted(typer.main.get_command(app).commands))
+@pytest.mark.parametrize("command", sorted(app.commands))
 def test_an_option_that_there_is_not_exits_with_2(command, epypes):
     done = epypes(command, "--no-such-option")
     assert done.returncode == 2

@@ -172,4 +172,4 @@ def test_failures_are_told_as_they_happen_with_the_id_to_replay_them(epypes, bun
 
 def test_who_follows_a_service_that_is_not_there_is_told_so(epypes, bundle):
     assert "No service runs for" in epypes("failures", bundle, "--follow").stderr
-    assert "Whose failures?" in epypes("failures", "--follow").stderr
+    assert "Name the service" in epypes("failures", "--follow").stderr

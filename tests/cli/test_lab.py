@@ -11,8 +11,7 @@ import time
 
 import pytest
 
-from epypes.cli.lab import lab_arguments
-from epypes.cli.websocket import SETTING, _load_jupyter_server_extension
+from epypes.cli.lab import _load_jupyter_server_extension, lab_command
 from epypes.errors import ServiceError
 from tests.apart import apart
 from tests.browser.jupyter import JupyterLab
@@ -91,21 +90,21 @@ def test_options_reach_jupyterlab_and_its_exit_status_comes_back(tmp_path):
 
 
 def test_it_listens_on_this_machine_alone_unless_told_otherwise(tmp_path):
-    assert "--ip=127.0.0.1" in lab_arguments([str(tmp_path)])
-    told = lab_arguments([str(tmp_path), "--ServerApp.ip=0.0.0.0"])
+    assert "--ip=127.0.0.1" in lab_command(str(tmp_path))
+    told = lab_command(str(tmp_path), "--ServerApp.ip=0.0.0.0")
     assert "--ServerApp.ip=0.0.0.0" in told
     assert "--ip=127.0.0.1" not in told, "JupyterLab refuses two"
 
 
 def test_root_may_start_it_too():
-    assert "--allow-root" in lab_arguments([], is_root=True)
-    assert "--allow-root" not in lab_arguments([])
+    assert "--allow-root" in lab_command(is_root=True)
+    assert "--allow-root" not in lab_command()
 
 
 @pytest.mark.slow
 def test_a_folder_that_is_not_there_is_said_in_a_sentence(tmp_path):
     with pytest.raises(ServiceError, match="There is no folder '.*nowhere' to show in JupyterLab"):
-        lab_arguments([str(tmp_path / "nowhere")])
+        lab_command(str(tmp_path / "nowhere"))
     done = run_lab(tmp_path / "nowhere")
     assert done.returncode == 1
     assert len(done.stderr.splitlines()) == 1
@@ -121,6 +120,9 @@ def test_without_jupyterlab_it_says_what_to_install(tmp_path):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=DEADLINE_S)
     assert done.returncode == 1
     assert done.stderr.strip() == "epypes: Package 'jupyterlab' is missing. Run: pip install 'epypes[notebook]'"
+
+
+SETTING = "kernel_websocket_connection_class"
 
 
 class Server:

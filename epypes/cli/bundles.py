@@ -1,0 +1,182 @@
+"""Commands that make and test a bundle: promote, verify, check."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from epypes.cli.options import PATH, bundle_argument, json_option
+from epypes.cli.terminal import print_table, progress
+from epypes.errors import BundleError, ReplayDiffers, ScaleError
+from epypes.wording import counted, ended
+
+if TYPE_CHECKING:
+    from epypes.batch.check import CheckOutcome
+    from epypes.bundle.replay import ReplayReport
+
+_MAX_ROWS: Final = 100
+
+
+@click.command()
+@click.argument("notebook", type=PATH, help="Notebook; it is executed in a new kernel and not changed.")
+@click.option("--to", type=PATH, required=True, help="Folder of the bundle; an existing bundle is replaced.")
+@click.option("--name", default="runner", help="Variable that holds the runner or pipeline.")
+@click.option("--output", multiple=True, help="Token of the service's answers; may be repeated.")
+@click.option("--sample", multiple=True, help="Variable with a further payload, or a list of them; may be repeated.")
+def promote(notebook: Path, to: Path, name: str, output: Sequence[str], sample: Sequence[str]) -> None:
+    """Execute a notebook, write its graph as a bundle, and prove it.
+
+    The bundle is replayed in a fresh process; it must compute the same as the notebook.
+    """
+    run_promotion(notebook, to, name, output, sample)
+    click.echo(f"Promoted {name!r} of {notebook} to {to}: replayed identical in a fresh process.")
+
+
+def run_promotion(notebook: Path, to: Path, name: str, outputs: Sequence[str], samples: Sequence[str] = ()) -> None:
+    """Promote with a progress display."""
+    from epypes.bundle.notebook import promote_notebook
+
+    with progress() as shown:
+        task = shown.add_task("executing the notebook", total=None)
+
+        def on_cell(done: int, total: int) -> None:
+            shown.update(task, completed=done, total=total)
+
+        def on_step(text: str) -> None:
+            shown.update(task, description=text)
+
+        promote_notebook(notebook, name, to, list(outputs) or None, on_cell, on_step, list(samples))
+        shown.update(task, description="promoted")
+
+
+@click.command()
+@bundle_argument
+@click.option("--fresh-env", is_flag=True, help="Replay in a new environment, made from requirements.txt alone.")
+@click.option(
+    "--run-anyway", is_flag=True, help="Replay changed files too, which runs the changed code; exits non-zero."
+)
+@json_option
+def verify(bundle: Path, fresh_env: bool, run_anyway: bool, as_json: bool) -> None:
+    """Replay a bundle's samples in a fresh process.
+
+    Exit 0 only if every token is as it was recorded.
+
+    A bundle is code: trust it like code. The manifest shows changes, and is no signature.
+
+    If a file is not what the manifest says, nothing of the bundle is run.
+    """
+    from epypes.bundle import verify as verify_bundle
+
+    try:
+        report = verify_bundle(bundle, fresh_env=fresh_env, run_anyway=run_anyway)
+    except BundleError as error:
+        found = error.report if isinstance(error, ReplayDiffers) else None
+        if as_json:
+            fields = found.to_dict() if found else {"identical": False}
+            click.echo(json.dumps({**fields, "bundle": str(bundle), "error": str(error)}, indent=1))
+        elif found:
+            click.echo(str(found))
+        raise BundleError(bundle, _describe_difference(bundle, found) if found else str(error)) from error
+    if as_json:
+        click.echo(json.dumps({**report.to_dict(), "bundle": str(bundle)}, indent=1))
+        return
+    click.echo(f"{bundle}: {report}{' in a new environment' if fresh_env else ''}.")
+    for note in report.notes:
+        click.echo(f"Note: {note}", err=True)
+
+
+def _describe_difference(bundle: Path, report: ReplayReport) -> str:
+    """Return in one line what differs, and the likely cause."""
+    tokens = ", ".join(dict.fromkeys(repr(difference.token) for difference in report.differences))
+    found = f"in {counted(len(report.differences), 'place')}, token {tokens}" if tokens else "it has no samples"
+    cause = f" Likely: {report.causes[0]}" if report.causes else ""
+    return f"{bundle} does not compute what was recorded: {found}.{cause}"
+
+
+@click.command()
+@bundle_argument
+@click.argument("cases", type=PATH, metavar="CASES.toml", help="File of the cases.")
+@click.option("--junit", type=PATH, help="File for JUnit XML, for continuous integration.")
+@json_option
+def check(bundle: Path, cases: Path, junit: Path | None, as_json: bool) -> None:
+    """Run a bundle on a labelled set of images.
+
+    Exit 0 only if every case passes.
+
+    A file of cases:
+
+    \b
+    [[case]]
+    name = "left"                      # default: the name of its file, or its number
+    inputs = {image = "left.png"}      # by free source token
+    hyperparameters = {canny_lo = 90}  # those that differ in this case
+
+    \b
+    [[case.check]]
+    token = "edges"                    # default: the one sink token
+    expected = "left_edges.png"        # a value, or an image, .npy or .npz
+    metric = "iou"                     # default: equal, if there is an expected value
+    min = 0.9                          # the lowest value that passes
+    max = 1.0                          # the highest value that passes
+
+    A text with the suffix of an image, .npy or .npz is a file; its path is relative to the file of cases.
+    Metrics, with their options: equal, close (atol, rtol), iou (boxes), count (of), value, mean_abs_difference,
+    psnr (data_range). A check may have a name. A case without a check passes if it runs.
+    """  # noqa: D301 - click keeps the lines of a paragraph that begins with it
+    from epypes.batch.cases import cases_of
+    from epypes.batch.check import check as check_runner
+    from epypes.batch.check import require_writable
+    from epypes.bundle import load
+
+    if junit is not None:
+        require_writable(junit)
+    labelled = cases_of(cases)
+    result = check_runner(load(bundle), labelled)
+    if as_json:
+        checks = [_to_json(outcome) for outcome in result.outcomes]
+        found = {"bundle": str(bundle), "passed": result.passed, "cases": result.cases, "checks": checks}
+        click.echo(json.dumps(found, indent=1))
+    elif result.failures:
+        _print_failures(result.failures)
+    # After the failures are printed, since this may fail too.
+    if junit is not None:
+        result.to_junit(junit, f"epypes check {bundle.resolve().name}")
+    if not result.passed:
+        first = result.failures[0]
+        reason = f"First: {first.case}, {first.check}: {ended(first.reason)}"
+        raise ScaleError(f"{bundle} does not pass {cases}: {result}. {reason}")
+    if not as_json:
+        click.echo(f"{bundle}: {result}, {counted(len(result), 'check')} in all.")
+
+
+def _to_json(outcome: CheckOutcome) -> dict[str, Any]:
+    value = outcome.value
+    return {
+        "case": outcome.case,
+        "check": outcome.check,
+        "token": outcome.token,
+        # JSON has no infinity.
+        "value": str(value) if value is not None and abs(value) == float("inf") else value,
+        "threshold": outcome.threshold,
+        "passed": outcome.passed,
+        "reason": outcome.reason,
+        "is_error": outcome.error_info is not None,
+        "run_ms": outcome.total_ns / 1e6,
+    }
+
+
+def _print_failures(failures: Sequence[CheckOutcome]) -> None:
+    short: dict[str, Any] = {"no_wrap": True, "min_width": 8, "max_width": 24}
+    columns: dict[str, dict[str, Any]] = {
+        "case": short,
+        "check": short,
+        "must be": {"no_wrap": True, "max_width": 24},
+        "reason": {"overflow": "fold", "ratio": 1},
+    }
+    print_table(columns, ((each.case, each.check, each.threshold, each.reason) for each in failures[:_MAX_ROWS]))
+    if len(failures) > _MAX_ROWS:
+        click.echo(f"and {counted(len(failures) - _MAX_ROWS, 'check')} more")

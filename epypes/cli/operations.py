@@ -1,0 +1,97 @@
+"""Commands that prepare a machine for a service: doctor, export."""
+
+from __future__ import annotations
+
+import getpass
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Final
+
+import click
+
+from epypes.cli.options import PATH, bundle_argument, json_option
+from epypes.errors import ServiceError
+
+_COLOURS: Final = {"ok": "green", "warning": "yellow", "failed": "red"}
+
+_serve_options: Final = click.argument("options", nargs=-1, metavar="-- OPTIONS", help="Options of epypes serve.")
+
+
+@click.command()
+@click.argument("bundle", type=PATH, required=False, help="Bundle to serve, or being served.")
+@click.option("--address", multiple=True, help="Address to bind, or of a broker; may be repeated.")
+@click.option("--keys", type=PATH, multiple=True, help="File of keys to be used; may be repeated.")
+@json_option
+def doctor(bundle: Path | None, address: Sequence[str], keys: Sequence[Path], as_json: bool) -> None:
+    """Check versions, ports, Graphviz, browser, keys, round trips.
+
+    Exit 1 if a check failed.
+    """
+    from epypes.service.ops.doctor import examine
+
+    checks = []
+    for check in examine(bundle, addresses=address, keys=keys):
+        checks.append(check)
+        if not as_json:
+            colour = _COLOURS[check.outcome]
+            click.echo(f"{click.style(f'{check.outcome:>7}', fg=colour)}  {check.name}: {check.found}")
+            if check.way_out:
+                click.secho(f"{'':9}{check.way_out}", fg=colour)
+    if as_json:
+        click.echo(json.dumps([asdict(check) for check in checks], indent=1))
+    failed = [check.name for check in checks if check.outcome == "failed"]
+    if failed:
+        text = f"Not ready: {', '.join(failed)}. See the advice beside each check above."
+        raise ServiceError(bundle or "this machine", text)
+
+
+@click.group()
+def export() -> None:
+    """Write a systemd unit or a container file for a bundle.
+
+    Options of epypes serve follow after two dashes.
+    """
+
+
+@export.command()
+@bundle_argument
+@_serve_options
+@click.option("--to", type=PATH, help="File, or folder for it; default: standard output.")
+@click.option("--user", default=getpass.getuser, show_default="you", help="User that runs the service.")
+def systemd(bundle: Path, options: Sequence[str], to: Path | None, user: str) -> None:
+    """Write a unit by which systemd starts the service at boot, and again when it ends."""
+    from epypes.service.ops.export import systemd_unit, unit_name
+
+    _check_serve_options(bundle, options)
+    unit = systemd_unit(bundle, options, user=user)
+    if to is None:
+        click.echo(unit, nl=False)
+        return
+    file = to / unit_name(bundle, options) if to.is_dir() else to
+    try:
+        file.write_text(unit, encoding="utf-8")
+    except OSError as error:
+        raise ServiceError(file, f"{file} can't be written: {error.strerror or error}.") from error
+    click.echo(f"Wrote {file}. What to do with it stands at its top.")
+
+
+@export.command()
+@bundle_argument
+@_serve_options
+@click.option("--to", type=PATH, required=True, help="Folder to write; it must not exist yet.")
+def docker(bundle: Path, options: Sequence[str], to: Path) -> None:
+    """Write a folder from which docker or podman builds the service: container file, requirements, bundle."""
+    from epypes.service.ops.export import write_container
+
+    _check_serve_options(bundle, options)
+    path = write_container(bundle, to, options)
+    click.echo(f"Wrote {path}. What to do with it stands at its top.")
+
+
+def _check_serve_options(bundle: Path, options: Sequence[str]) -> None:
+    """Refuse now, with the same error, options that ``epypes serve`` would refuse at every boot."""
+    from epypes.cli.services import serve
+
+    serve.make_context("epypes serve", [str(bundle), *options])

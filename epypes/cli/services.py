@@ -1,0 +1,306 @@
+"""Commands that run and control a service: serve, stop, set, deploy, rollback; and how they find it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import resource
+import select
+import signal
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from time import monotonic
+from typing import TYPE_CHECKING, Any, Final, TextIO, cast
+
+import click
+
+from epypes.cli.options import (
+    PATH,
+    allow_option,
+    bundle_argument,
+    insecure_option,
+    keys_option,
+    replica_option,
+    seconds_option,
+    source_argument,
+    token_file_option,
+)
+from epypes.errors import KeysError, ServiceError
+
+if TYPE_CHECKING:
+    from epypes.service.remote.connection import Connection
+    from epypes.service.state_file import ServiceState
+
+_ANY_PORT: Final = "tcp://127.0.0.1:*"
+_DIGITS: Final = 12
+
+_http_option: Final = click.option(
+    "--http", default="", show_default=False, help="URL of the service, as http://127.0.0.1:8642."
+)
+_service_option: Final = click.option(
+    "--service", default="", show_default=False, help="Instead of --http: the bundle that the service started with."
+)
+
+
+# -- which service a command is about ---------------------------------------------------------------------------------
+
+
+def is_url(source: str) -> bool:
+    """Whether a source is the URL of a service, not a path."""
+    return source.startswith(("http://", "https://"))
+
+
+def states_of(source: str, replica: str = "") -> list[ServiceState]:
+    """Return the states of this user's running services of a bundle or URL: one, or one per replica.
+
+    Raises
+    ------
+    ServiceError
+        No service runs for this bundle, or at this address.
+    """
+    from epypes.service.state_file import read_states, running_at
+
+    if is_url(source):
+        found = [state for state in [running_at(source)] if state is not None]
+        way_out = "Is it another user's, or another machine's?"
+    else:
+        if not Path(source).is_dir():
+            raise ServiceError(source, f"{source} does not exist. Name the bundle that is served, or its http URL.")
+        found, way_out = read_states(Path(source), replica), f"Start it: epypes serve {source}"
+    if not found:
+        named = f" as replica {replica!r}" if replica else ""
+        raise ServiceError(source, f"No service of yours runs for {source}{named}. {way_out}")
+    return found
+
+
+def connect_to(source: str, token_file: Path | None, replica: str = "") -> Connection:
+    """Connect to the HTTP control of a service; of several replicas to the first that has one.
+
+    Raises
+    ------
+    ServiceError
+        No service runs, or it has no HTTP address.
+    KeysError
+        The token can't be read.
+    """
+    from epypes.service.remote.connection import connect
+
+    url = source if is_url(source) else next((state.http for state in states_of(source, replica) if state.http), "")
+    if not url:
+        raise ServiceError(source, f"The service of {source} has no HTTP address. Start it with --http 127.0.0.1:8642.")
+    try:
+        token = None if token_file is None else token_file.read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise KeysError(token_file, f"The token file {token_file} can't be read: {error}.") from error
+    return connect(url, token=token)
+
+
+def describe_failures(address: str, is_shown: bool) -> str:
+    """Return the address of failures, to be printed after other addresses; empty where no option names one."""
+    return f", failures at {address}" if is_shown else ""
+
+
+# -- the commands -----------------------------------------------------------------------------------------------------
+
+
+@click.command()
+@bundle_argument
+@click.option("--sub", default=_ANY_PORT, help="Address of events: one to bind, connect:ADDRESS, or a broker's queue.")
+@click.option("--pub", default=_ANY_PORT, help="Address of answers: one to bind, connect:ADDRESS, or a broker's queue.")
+@click.option("--failures", default=_ANY_PORT, help="Extra address that receives only failures, as --pub.")
+@click.option("--http", default="", help="Address of the HTTP control, as 127.0.0.1:8642.", show_default="none")
+@click.option("--threads", type=click.IntRange(1, 64), default=1, help="Number of events computed at once, in order.")
+@seconds_option("--job-timeout", 30.0, "Longest time for one event, until the worker is replaced", least=0.01)
+@seconds_option("--drain-timeout", 5.0, "Longest wait for accepted events after SIGTERM")
+@click.option("--retries", type=click.IntRange(0), default=1, help="Retries of an event that kills the worker.")
+@click.option("--mailbox", default="drop_oldest", help="When too many events wait: drop_oldest, latest or fault.")
+@click.option("--mailbox-size", type=click.IntRange(1), default=8, help="Number of events that may wait; 1 for latest.")
+@insecure_option
+@keys_option
+@allow_option
+@click.option("--token-file", type=PATH, help="File with the token of the HTTP control; default: a new one.")
+@click.option("--store", help="SQLite file (extra store) or database URL (extra postgres), for a row per event.")
+@click.option("--replica", default="", show_default="a number", help="Name among the replicas that share a queue.")
+def serve(bundle: Path, sub: str, pub: str, mailbox: str, mailbox_size: int, **options: Any) -> None:
+    """Serve a bundle until SIGTERM or Ctrl+C.
+
+    Events come from a SUB socket or a broker's queue, answers go to a PUB socket or a broker's queue. Failures also
+    arrive as answers.
+
+    A broker's address is amqp://, nats:// or mqtt://[USER@]HOST/NAME.
+
+    Its password is in a file, which ?password_file=PATH names: lists of processes show addresses.
+
+    More options follow with & (quote the address): create=true, attempts=3, dead=NAME, group=NAME, kind=broadcast,
+    vhost=NAME, ca=FILE.
+    """
+    from epypes.service import serve as serve_bundle
+    from epypes.service.standard_error import STANDARD_ERROR
+
+    # No thread of the service waits for a reader of standard error.
+    handler = logging.StreamHandler(cast("TextIO", STANDARD_ERROR))
+    logging.basicConfig(
+        level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", handlers=[handler]
+    )
+    # Connections take descriptors; the soft limit is often 1,024, for programs that call select().
+    with contextlib.suppress(OSError, ValueError):
+        hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+
+    def on_fault(reason: str) -> None:
+        STANDARD_ERROR.write(f"FAULTED {bundle}: {reason}\n")
+
+    counts = serve_bundle(
+        bundle,
+        sub,
+        pub,
+        mailbox_policy=mailbox,
+        mailbox_size=1 if mailbox == "latest" else mailbox_size,
+        on_ready=lambda state: _print_ready(bundle, state),
+        on_fault=on_fault,
+        **options,
+    )
+    click.echo("STOPPED " + ", ".join(f"{name} {count}" for name, count in counts.items()))
+
+
+def _print_ready(bundle: Path, state: ServiceState) -> None:
+    named = f" (replica {state.replica})" if state.replica else ""
+    failures = describe_failures(state.failures, state.shows_failures)
+    http = f", control at {state.http}" if state.http else ""
+    addresses = f"events at {state.sub}, answers at {state.pub}{failures}{http}"
+    click.echo(f"READY {bundle}{named}: {addresses}, process {state.pid}.")
+    if state.http:
+        # The token is for the terminal alone: other users may read a log.
+        token = Path(state.token_file).read_text(encoding="utf-8").strip() if sys.stdout.isatty() else ""
+        page = f"{state.http}/{f'#token={token}' if token else ''}"
+        click.echo(f"Live page: {page} (the token for changes is in {state.token_file})")
+
+
+@click.command()
+@source_argument
+@seconds_option("--timeout", 30.0, "Longest wait for its end")
+@replica_option
+def stop(source: str, timeout_s: float, replica: str) -> None:
+    """End a running service; accepted events are answered first.
+
+    All services of the bundle that this user runs here are ended, or the replica that is named, as by SIGTERM.
+    """
+    states = states_of(source, replica)
+    end_s = monotonic() + timeout_s
+    with ExitStack() as opened:
+        processes = [(state, _terminate(source, state, opened)) for state in states]
+        late = []
+        for state, process in processes:
+            if process is not None and not _wait_for_end(process, max(end_s - monotonic(), 0.0)):
+                late.append(_describe_process(source, state))
+                continue
+            named = f", replica {state.replica}" if state.replica else ""
+            click.echo(f"STOPPED {source}{named}, process {state.pid}.")
+    if late:
+        raise ServiceError(source, f"{' '.join(late)} has not ended within {timeout_s:g} s. Wait longer: --timeout.")
+
+
+def _describe_process(source: str, state: ServiceState) -> str:
+    return f"Process {state.pid}, which serves {source},"
+
+
+def _terminate(source: str, state: ServiceState, opened: ExitStack) -> int | None:
+    """Send SIGTERM to a process; return its file descriptor, or None if it has ended already.
+
+    Unlike a process number, the descriptor never means a later process.
+    """
+    try:
+        process = os.pidfd_open(state.pid)
+        opened.callback(os.close, process)
+        signal.pidfd_send_signal(process, signal.SIGTERM)
+    except ProcessLookupError:
+        return None
+    except OSError as error:
+        text = f"{_describe_process(source, state)} can't be ended: {error.strerror}."
+        raise ServiceError(source, text) from error
+    return process
+
+
+def _wait_for_end(process: int, timeout_s: float) -> bool:
+    poll = select.poll()
+    poll.register(process, select.POLLIN)
+    return bool(poll.poll(timeout_s * 1000))
+
+
+@click.command("set")
+@source_argument
+@click.argument("values", nargs=-1, required=True, help="NAME=VALUE, as sigma=1.4 or method=sobel.")
+@token_file_option
+@replica_option
+def set_parameters(source: str, values: Sequence[str], token_file: Path | None, replica: str) -> None:
+    """Set hyperparameters of a running service.
+
+    They change between two events, all or none. Replicas that share a queue follow the one that is set. epypes deploy
+    forgets them.
+    """
+    wanted = dict(_parse_assignment(text) for text in values)
+    with connect_to(source, token_file, replica) as service:
+        before = service.parameters().entries
+        now = service.set(**wanted)
+    old, new = ({name: json.dumps(entries[name].get("value")) for name in wanted} for entries in (before, now.entries))
+    changes = ", ".join(f"{name} {old[name]} -> {new[name]}" for name in wanted)
+    click.echo(f"SET {changes}: revision {now.revision}.")
+
+
+def _parse_assignment(text: str) -> tuple[str, Any]:
+    """Return name and value: JSON if it is that, else the text itself."""
+    name, sign, value = text.partition("=")
+    if not sign or not name:
+        raise ServiceError(text, f"{text!r} sets nothing. Write NAME=VALUE, as sigma=1.4.")
+    try:
+        return name, json.loads(value)
+    except ValueError:
+        return name, value
+
+
+@click.command()
+@click.argument("bundle", type=PATH, help="Folder of the bundle, on the service's machine.")
+@_http_option
+@_service_option
+@token_file_option
+def deploy(bundle: Path, http: str, service: str, token_file: Path | None) -> None:
+    """Have a running service serve another bundle.
+
+    The service replays the bundle first; if it computes something else, the service keeps the old one.
+    """
+    with connect_to(_one_source(http, service), token_file) as connection:
+        before = connection.info()
+        click.echo(f"{bundle} is replayed beside {before['bundle']}, which goes on meanwhile.", err=True)
+        _print_exchange("DEPLOYED", before, connection.deploy(bundle))
+
+
+@click.command()
+@_http_option
+@_service_option
+@token_file_option
+def rollback(http: str, service: str, token_file: Path | None) -> None:
+    """Have a running service serve the previous bundle again.
+
+    A second rollback returns to the bundle before the first.
+    """
+    with connect_to(_one_source(http, service), token_file) as connection:
+        _print_exchange("ROLLED BACK", connection.info(), connection.rollback())
+
+
+def _one_source(http: str, service: str) -> str:
+    if bool(http) == bool(service):
+        raise ServiceError("", "Name one service: --http URL, or --service and the bundle that it was started with.")
+    # Anything but a URL is refused as an address, not looked for as a folder.
+    if http and not is_url(http):
+        raise ServiceError(http, f"{http!r:.200} is no address of a service. Write it as http://127.0.0.1:8642.")
+    return http or service
+
+
+def _print_exchange(verb: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    served, left = (f"{info['bundle']} ({info['digest'][:_DIGITS]})" for info in (now, before))
+    changed = "".join(f" {line}." for line in now.get("changed", ()))
+    click.echo(f"{verb} {served} in place of {left}: {now['state']}.{changed}")
