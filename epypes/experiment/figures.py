@@ -58,6 +58,7 @@ _SIGMAS_LEFT: Final = 2.5
 _BINS: Final = 60
 # What is beside the outermost mark, as a factor.
 _MARGIN: Final = 1.5
+_NO_CURVE: Final = "no curve, since there are no values that differ"
 # On more decades there is no room for numbers at 2 and 5.
 _FEW_DECADES: Final = 3.6
 
@@ -134,7 +135,7 @@ def figure_14(table: pd.DataFrame) -> Figure:
     has_times = answered(table, *_PARTS)[:_SHOWN_REQUESTS]
     figure, axes = _blank("Figure 14: where the time of each request goes")
     if not has_times.any():
-        return _with_message(figure, axes, _why_nothing(has_times))
+        return _without_data(figure, axes, has_times)
     shown = table[:_SHOWN_REQUESTS]
     negative = _stack(axes, np.flatnonzero(has_times), shown[has_times])
     failed = np.flatnonzero(~has_times)
@@ -145,8 +146,8 @@ def figure_14(table: pd.DataFrame) -> Figure:
         figure,
         axes,
         _of_experiments(len(shown), "request", shown["experiment"].nunique()),
-        f"{counted(negative, 'negative time')} not drawn" * bool(negative),
-        _failures(has_times),
+        _note(negative, "negative time", "not drawn"),
+        _note(np.sum(~has_times), "request", "failed"),
         columns=4,
     )
 
@@ -204,7 +205,7 @@ def _densities(table: pd.DataFrame, column: str, title: str, meaning: str) -> Fi
     has_times = answered(table, column)
     figure, axes = _blank(title)
     if not has_times.any():
-        return _with_message(figure, axes, _why_nothing(has_times))
+        return _without_data(figure, axes, has_times)
     rows = table[has_times]
     whole = lognormal_fit(rows[column])
     if not whole.count:
@@ -212,6 +213,7 @@ def _densities(table: pd.DataFrame, column: str, title: str, meaning: str) -> Fi
             figure, axes, f"Of {counted(len(rows), 'value')} none is positive, so there is nothing to fit."
         )
     experiments = [lognormal_fit(values) for _, values in rows.groupby("experiment")[column]]
+    flat = sum(not fitted.has_curve for fitted in experiments)
     positive = rows.loc[rows[column] > 0, column]
     _axis(axes, positive, whole, PAPER[column])
     axes.set_xlabel(meaning)
@@ -221,9 +223,9 @@ def _densities(table: pd.DataFrame, column: str, title: str, meaning: str) -> Fi
         figure,
         axes,
         _of_experiments(whole.count, "value", len(experiments)),
-        f"{counted(whole.left_out, 'value')} not positive, left out" * bool(whole.left_out),
-        _without_curve(whole, experiments),
-        _failures(has_times),
+        _note(whole.left_out, "value", "not positive, left out"),
+        _note(flat, "experiment", "without a curve") if whole.has_curve else _NO_CURVE,
+        _note(np.sum(~has_times), "request", "failed"),
     )
 
 
@@ -276,27 +278,18 @@ def _density(fitted: LogNormal, low: float, high: float) -> tuple[np.ndarray, np
     return times, fitted.pdf(times / _US) / _US
 
 
-def _why_nothing(has_times: np.ndarray) -> str:
-    requests = len(has_times)
-    if not requests:
-        return "There is no request."
-    return "The only request failed." if requests == 1 else f"All {requests} requests failed."
+def _without_data(figure: Drawing, axes: Axes, has_times: np.ndarray) -> Drawing:
+    texts = {0: "There is no request.", 1: "The only request failed."}
+    return _with_message(figure, axes, texts.get(len(has_times), f"All {len(has_times)} requests failed."))
 
 
 def _of_experiments(count: int, noun: str, experiments: int) -> str:
     return f"{count:,} {noun}{'s' * (count != 1)} of {counted(experiments, 'experiment')}"
 
 
-def _failures(has_times: np.ndarray) -> str:
-    failed = int(np.sum(~has_times))
-    return f"{counted(failed, 'request')} failed" * bool(failed)
-
-
-def _without_curve(whole: LogNormal, experiments: list[LogNormal]) -> str:
-    if not whole.has_curve:
-        return "no curve, since there are no values that differ"
-    flat = sum(not fitted.has_curve for fitted in experiments)
-    return f"{counted(flat, 'experiment')} without a curve" * bool(flat)
+def _note(count: int, noun: str, text: str) -> str:
+    """Return a note on how many there are; empty if there is none."""
+    return f"{counted(int(count), noun)} {text}" if count else ""
 
 
 def _number(time: float) -> str:
