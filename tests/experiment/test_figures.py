@@ -15,7 +15,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from epypes.experiment.figures import figure_14, figure_15, figure_16
-from epypes.experiment.fits import lognormal_fit
+from epypes.experiment.results import lognormal_fit
 
 pytestmark = pytest.mark.slow  # each draws figures
 
