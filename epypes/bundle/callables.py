@@ -8,9 +8,9 @@ from functools import partial
 from typing import Any
 
 from epypes.bundle.cells import place_of, place_of_object
-from epypes.bundle.changes import CHANGING
 from epypes.bundle.decorators import decorated, has_decorators, layers
 from epypes.bundle.literal import literal_source
+from epypes.bundle.side_effects import CHANGING
 from epypes.bundle.source import Definition, Importable, Refused, definition, importable
 
 

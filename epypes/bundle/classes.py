@@ -11,30 +11,25 @@ import dis
 import linecache
 import sys
 import types
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Final
+from typing import Any
 
 from epypes.bundle.cells import place_in
-from epypes.bundle.classvalues import (
-    IN_STEPS,
-    bound_names,
-    defaults_in,
-    is_other,
-    is_value,
-    names_in,
-    unknown_in,
-    values_of_fields,
-)  # fmt: skip
-from epypes.bundle.source import Refused, evaluated
-from epypes.bundle.text import class_code, lines_in, nested_codes, own_text, parsed, same_methods
-from epypes.bundle.uses import names_from_outside
-
-# What Python itself puts into every class.
-_ALWAYS: Final = frozenset({"__module__", "__qualname__", "__annotations__", "__doc__", "__classcell__"})
-# What a NamedTuple has of its own.
-_OF_TUPLES: Final = frozenset({"_fields", "_field_defaults", "_field_types"})
+from epypes.bundle.literal import is_same_data
+from epypes.bundle.side_effects import unrepeatable
+from epypes.bundle.source import Refused
+from epypes.bundle.text import (
+    class_code,
+    lines_in,
+    names_from_outside,
+    nested_codes,
+    own_parts,
+    own_text,
+    parsed,
+    same_methods,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,28 +94,19 @@ def class_definition(kind: type, around: Mapping[str, Any], what: str) -> ClassD
     if kind.__qualname__ != kind.__name__:
         text = f"{what} is defined inside {kind.__qualname__.rpartition('.')[0]!r}"
         raise Refused(f"{text}. Define it at the margin of a cell.")
-    why = ""
-    for file in _files(kind):
-        lines = lines_in(file)
-        for node in _classes(lines, kind.__name__):
-            problem = next(_differences(kind, node, "".join(lines), around), "")
-            if not problem:
-                return _definition(kind, around, what, file, lines, node)
-            why = why or f"{problem} ({place_in(file, node.lineno)})"
-    if not why:
+    found = [*statements_of_class(kind)]
+    if not found:
         way_out = "Write a class statement for it, as class P(typing.NamedTuple), and make again what was made of it."
         raise Refused(f"{what} has no class statement: it was made by a call. {way_out}")
-    raise Refused(f"{what} is not to be had as text: {why}. Define it in a cell again, and what was made of it.")
-
-
-def _definition(
-    kind: type, around: Mapping[str, Any], what: str, file: str, lines: list[str], node: ast.ClassDef
-) -> ClassDefinition:
-    names = _names(kind, around)
+    file, node = next((pair for pair in found if _fits(kind, pair[1], "".join(lines_in(pair[0])))), found[0])
+    names = next((function.__globals__ for function in functions_of(kind).values()), around)
     place = place_in(file, node.lineno)
-    _check_bases(kind, node, names, f"{what} ({place})")
-    _check_known(kind, node, names, what, file)
-    text = own_text(lines, node, ())
+    part = unrepeatable(node, names)
+    if part is not None:
+        text = f"{what} calls {ast.unparse(part)!r} ({place_in(file, part.lineno)}) when it is defined"
+        way_out = "Compute it above the class under a name of its own, VALUE = ..., and use that name in the class"
+        raise Refused(f"{text}: that may give something else in a service. {way_out}.")
+    text = own_text(lines_in(file), node, ())
     code = class_code(text, node)
     if code is None:
         raise Refused(f"{what} means something else if its text is moved to another place ({place}).")
@@ -130,6 +116,33 @@ def _definition(
                 text = f"{what} changes the global {instruction.argval!r} ({place})."
                 raise Refused(f"{text} Keep it in the object.")
     return ClassDefinition(kind.__name__, text, node, place, code, names, file)
+
+
+def _fits(kind: type, node: ast.ClassDef, text: str) -> bool:
+    """Whether a class statement may be the one of a class, which may have been changed since."""
+    names = [one.name for one in node.body if isinstance(one, ast.FunctionDef)]
+    methods = {name: list(_functions_in(vars(kind).get(name))) for name in names}
+    fields = vars(kind).get("__dataclass_fields__", {})
+    values = {**vars(kind), **dict.fromkeys(vars(kind).get("_fields", ())), **vars(kind).get("_field_defaults", {})}
+    values |= {name: field.default for name, field in fields.items()}
+    values |= {name: member.value for name, member in getattr(kind, "__members__", {}).items()}
+    bound = {part.id for part in own_parts(node) if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store)}
+    if not bound <= values.keys() or same_methods(text, node, methods):
+        return False
+    for part in node.body:
+        if isinstance(part, ast.Assign | ast.AnnAssign) and isinstance(part.value, ast.Constant):
+            targets = part.targets if isinstance(part, ast.Assign) else [part.target]
+            for name in (target.id for target in targets if isinstance(target, ast.Name)):
+                if not is_same_data(part.value.value, values[name]):
+                    return False
+    return True
+
+
+def statements_of_class(kind: type) -> Iterator[tuple[str, ast.ClassDef]]:
+    """Give the class statements that may be the one of a class, each with its file: the last one first."""
+    for file in _files(kind):
+        for node in _classes(lines_in(file), kind.__name__):
+            yield file, node
 
 
 def class_names(found: ClassDefinition) -> Iterator[str]:
@@ -177,96 +190,3 @@ def _classes(lines: list[str], name: str) -> list[ast.ClassDef]:
     tree = parsed(text) if f"class {name}" in text else None
     found = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef) and node.name == name] if tree else []
     return found[::-1]
-
-
-def _differences(kind: type, node: ast.ClassDef, text: str, around: Mapping[str, Any]) -> Iterator[str]:
-    """Give what a class is otherwise than a text says."""
-    own, bound = vars(kind), _bound(node)
-    plain = {name for name, expression in bound.items() if expression is not IN_STEPS}
-    gone = plain - own.keys() - values_of_fields(kind).keys() - {"_ignore_"}
-    if gone:
-        yield f"the class has no {sorted(gone)[0]!r}, which its text gives it"
-    methods = _methods(kind, node)
-    changed = same_methods(text, node, methods)
-    if changed:
-        yield f"its {changed!r} is not what its text says: one of the two was changed since"
-    names = names_in(kind, bound, _names(kind, around))
-    for name, expression in bound.items():
-        if expression is not None and is_other(kind, name, expression, names):
-            yield f"its {name!r} has another value by now than its text gives it"
-    for name, default, is_changed in defaults_in(node, methods, names):
-        if is_changed:
-            yield f"its {name!r} has another default by now than {ast.unparse(default)!r}, which its text gives it"
-    yield from _added(kind, bound.keys(), node)
-
-
-def _methods(kind: type, node: ast.ClassDef) -> dict[str, list[types.FunctionType]]:
-    """Return the functions that a class has by the names of the methods in its text."""
-    names = {function.name for function in node.body if isinstance(function, ast.FunctionDef)}
-    return {name: list(_functions_in(vars(kind).get(name))) for name in names}
-
-
-def _names(kind: type, around: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the names of the notebook that a class was defined in."""
-    return next((function.__globals__ for function in functions_of(kind).values()), around)
-
-
-def _check_known(kind: type, node: ast.ClassDef, names: Mapping[str, Any], what: str, file: str) -> None:
-    """Refuse values of which nobody can tell whether the text still makes them."""
-    bound = _bound(node)
-    names = names_in(kind, bound, names)
-    found = [
-        (name, part)
-        for name, expression in bound.items()
-        for part in (unknown_in(kind, name, expression, names) if expression is not None else ())
-    ]
-    found += [
-        (name, default)
-        for name, default, is_changed in defaults_in(node, _methods(kind, node), names)
-        if not is_changed
-    ]
-    for name, part in found:
-        how = "makes in steps" if part is IN_STEPS else f"computes by {ast.unparse(part)!r}"
-        text = f"{what} has {name!r} ({place_in(file, getattr(part, 'lineno', node.lineno))}), which its text {how}"
-        way_out = (
-            f"Compute it above the class under a name of its own, {name.upper()} = ..., and use that name in the class"
-        )
-        raise Refused(f"{text}: it may be another value by the time it is served. {way_out}.")
-
-
-def _added(kind: type, said: Collection[str], node: ast.ClassDef) -> Iterator[str]:
-    """Give what was hung on a class besides its text, but for what Python and its decorators make of it."""
-    fields = values_of_fields(kind)
-    for name, value in vars(kind).items():
-        if name in said or name in _ALWAYS or name in fields or _is_of_python(kind, name):
-            continue
-        is_own = any(True for _ in _functions_in(value))
-        if is_own or (is_value(value) and not (name.startswith("_") and node.decorator_list)):
-            yield f"it has {name!r}, which its text does not give it"
-
-
-def _is_of_python(kind: type, name: str) -> bool:
-    """Whether a name is one that Python or a library gives to the classes of its kind, as Enum does."""
-    if name.startswith("__") and name.endswith("__"):
-        return name not in _functions_named(kind)
-    bases = (above for above in kind.__mro__[1:] if above.__module__ != kind.__module__)
-    return name in _OF_TUPLES or any(name in vars(above) for above in bases)
-
-
-def _functions_named(kind: type) -> set[str]:
-    return {name for name, value in vars(kind).items() if any(True for _ in _functions_in(value))}
-
-
-def _bound(node: ast.ClassDef) -> dict[str, ast.expr | None]:
-    """Return the names that the body of a class binds, each with its expression if it is a plain assignment."""
-    return {name: value for name, value in bound_names(node.body).items() if name not in _ALWAYS}
-
-
-def _check_bases(kind: type, node: ast.ClassDef, names: Mapping[str, Any], what: str) -> None:
-    """Refuse a class whose base was defined again since: the module would have the new one."""
-    known = (*kind.__bases__, *getattr(kind, "__orig_bases__", ()))
-    for expression in node.bases:
-        base = evaluated(expression, names)
-        if isinstance(base, type) and not any(base is one for one in known):
-            text = f"{what} is made from {ast.unparse(expression)!r}, which was defined again since."
-            raise Refused(f"{text} Define the class again too, and what was made of it.")

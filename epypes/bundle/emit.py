@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import ast
 import enum
+import functools
 import itertools
 import json
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -18,6 +19,7 @@ from epypes.bundle.formatting import LINE, one_per_line
 from epypes.bundle.graphs import Graphs, GraphText
 from epypes.bundle.hyperparameters import members_in
 from epypes.bundle.literal import literal, quoted
+from epypes.bundle.load import MAKER
 from epypes.bundle.order import ordered
 from epypes.bundle.settings import Settings
 from epypes.bundle.slicer import Slice
@@ -25,6 +27,7 @@ from epypes.bundle.source import Refused
 from epypes.bundle.subject import Subject, own_lines
 from epypes.errors import run_call
 from epypes.graph import CompGraph
+from epypes.pipeline import FullPipeline
 
 # The folder is wherever the bundle is: it may be moved.
 _TEXT: Final = '''"""{title}
@@ -39,9 +42,14 @@ lets it answer events. The values of its hyperparameters stand in pipeline.toml.
 """'''
 
 
-def write_module(subject: Subject, settings: Settings) -> tuple[str, Settings, Mapping[str, Any], list[str]]:
-    """Return the text of ``pipeline.py``, the settings with what it has of its own, its arrays, the reasons against."""
-    gathered = Slice(keeps_arrays=True)
+def write_module(
+    subject: Subject, settings: Settings, uncalled: Collection[int] = ()
+) -> tuple[str, Settings, Mapping[str, Any], list[str]]:
+    """Return the text of ``pipeline.py``, the settings with what it has of its own, its arrays, the reasons against.
+
+    Closures whose ids are in ``uncalled`` are written with what they have captured, not as calls of their factories.
+    """
+    gathered = Slice(keeps_arrays=True, uncalled=uncalled)
     graphs = Graphs(gathered)
     ports = {f"Function {name!r}": function for name, function in subject.ports.items()}
     text = graphs.write(subject.cg, {**ports, **subject.classes})
@@ -51,10 +59,17 @@ def write_module(subject: Subject, settings: Settings) -> tuple[str, Settings, M
             gathered.keep_name("func_groups")
     blocks = [*filter(None, own.values()), *_enums(gathered, settings)]
     settings = replace(settings, own=tuple(own))
+    if gathered.refusals and gathered.called:
+        again = write_module(subject, settings, {*uncalled, *gathered.called})
+        if not again[3]:
+            return again
     if gathered.refusals:
         return "", settings, {}, list(dict.fromkeys(gathered.refusals))
     text_of_all = emit_module(settings, subject.cg, gathered, text, graphs.blocks, blocks)
-    why = refusal(text_of_all, gathered.arrays.by_name, lambda module: _pairs(subject, settings, module))
+    pairs = functools.partial(_pairs, subject, settings)
+    why, closure = refusal(text_of_all, gathered.arrays.by_name, pairs, gathered.called)
+    if closure:
+        return write_module(subject, settings, {*uncalled, closure})
     return text_of_all, settings, gathered.arrays.by_name, [why] if why else []
 
 
@@ -68,6 +83,11 @@ def _pairs(subject: Subject, settings: Settings, module: Any) -> Iterator[Pair]:
         yield what, kind, getattr(module, kind.__name__)
     for enumeration in _enums_in(settings):
         yield f"Class {enumeration.__name__!r}", enumeration, module.enums[enumeration.__qualname__]
+    pipeline = subject.pipeline
+    if MAKER in settings.own and isinstance(pipeline, FullPipeline):
+        given = (pipeline.q_in, pipeline.q_out, *(getattr(pipeline, name, None) for name in ("f_in", "f_out")))
+        made = module.make_pipeline(pipeline.source_cg, *given, dict(pipeline.runner.hyperparameters))
+        yield f"Pipeline {pipeline.name!r}", pipeline, made
 
 
 def _enums(gathered: Slice, settings: Settings) -> list[list[str]]:
@@ -150,9 +170,10 @@ def module_text(head: Sequence[str], needed: Slice, tail: Sequence[str]) -> str:
 def _import_lines(statements: Iterable[str]) -> str:
     """Return imports in order: Python's own first, whole modules before names from modules."""
     in_order = sorted(dict.fromkeys(statements), key=lambda text: (text.startswith("from"), text.lower(), text))
-    own = [text for text in in_order if text.split()[1].partition(".")[0] in sys.stdlib_module_names]
-    others = [text for text in in_order if text not in own]
-    return "\n".join([*own, *[""][: bool(own and others)], *others])
+    first = [text for text in in_order if text.startswith("from __future__")]
+    others = [text for text in in_order if text.split()[1].partition(".")[0] not in sys.stdlib_module_names]
+    own = [text for text in in_order if text not in first and text not in others]
+    return "\n\n".join("\n".join(part) for part in (first, own, others) if part)
 
 
 def _spaced(blocks: Sequence[str]) -> str:

@@ -17,6 +17,7 @@ import builtins
 import dataclasses
 import enum
 import functools
+import linecache
 import reprlib
 import tempfile
 import traceback
@@ -24,24 +25,27 @@ import types
 import warnings
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 from epypes.bundle.arrays import write_arrays
-from epypes.bundle.cells import place_of
+from epypes.bundle.cells import place_in, place_of
+from epypes.bundle.classes import statements_of_class
+from epypes.bundle.decorators import layers
 from epypes.bundle.instances import is_set_elsewhere
 from epypes.bundle.lambdas import lambdas_of
 from epypes.bundle.literal import is_data, is_same_data
 from epypes.bundle.load import MODULE, execute
 from epypes.bundle.source import importable
-from epypes.bundle.text import computes_the_same, definition_of, nested_codes, spelled_tree
-from epypes.bundle.uses import names_from_outside
-from epypes.graph import CompGraph, as_switch
+from epypes.bundle.text import computes_the_same, definition_of, names_from_outside, nested_codes, spelled_tree
+from epypes.bundle.uses import annotated_names
+from epypes.graph import CompGraph, Switch
 from epypes.pipeline import Node, Pipeline
 from epypes.run.guard import as_written, is_plain_array, is_unguarded
 
 _PLAIN: Final = frozenset({int, float, complex, bool, str, bytes, type(None), type(...), set, frozenset})
+_DRAFT: Final = "epypes-draft-"
 _LOST: Final = object()
 # What an attribute in a slot, or the dict of all others, takes of an object.
 _SLOT: Final = tuple.__itemsize__
@@ -70,6 +74,7 @@ class _Path:
     root: str
     owner: str
     part: str = ""
+    closure: int = 0
 
     def to(self, more: str) -> _Path:
         return dataclasses.replace(self, part=self.part + more)
@@ -79,7 +84,8 @@ class _Path:
         return f"its{self.part}" if self.part else "it"
 
     def __str__(self) -> str:
-        return self.owner if self.owner.startswith(self.root) else f"{self.owner}, which {self.root} needs"
+        is_root = self.owner.startswith(self.root)
+        return self.owner if is_root else f"{self.owner}, which {self.root[0].lower()}{self.root[1:]} needs"
 
 
 class _Different(Exception):
@@ -87,29 +93,18 @@ class _Different(Exception):
 
     def __init__(self, path: _Path, text: str) -> None:
         super().__init__(f"{path}: {text}")
+        self.closure = path.closure
 
 
 Pair = tuple[str, Any, Any]
 
 
-def difference(pairs: Iterable[Pair]) -> str:
-    """Return the first difference between a notebook's objects and a module's, as a reason; "" if they are equal.
-
-    Parameters
-    ----------
-    pairs
-        How a reason calls an object, the notebook's object and the module's.
-    """
-    walk = _Walk()
-    walk.waiting.extend((_Path(what, what), ours, theirs) for what, ours, theirs in pairs)
-    try:
-        walk.finish()
-    except _Different as found:
-        return f"{found} {_WAY_OUT}"
-    return ""
-
-
-def refusal(text: str, arrays: Mapping[str, Any], pairs: Callable[[Any], Iterable[Pair]]) -> str:
+def refusal(
+    text: str,
+    arrays: Mapping[str, Any],
+    pairs: Callable[[Any], Iterable[Pair]],
+    called: Mapping[int, str] | None = None,
+) -> tuple[str, int]:
     """Execute a module that was emitted, and return why its objects are not the notebook's; "" if they are.
 
     Parameters
@@ -119,27 +114,51 @@ def refusal(text: str, arrays: Mapping[str, Any], pairs: Callable[[Any], Iterabl
     arrays
         What it reads from files, by name.
     pairs
-        Returns of the module what is compared, as :func:`difference` takes it.
+        Returns of the module what is compared: how a reason calls an object, the notebook's object and the module's.
+    called
+        The names of closures that the module makes by a call of their factory, by id of the notebook's closure.
+
+    Returns
+    -------
+    tuple
+        The reason, and the id of the closure whose factory makes another one by now, 0 if it is something else.
     """
-    with tempfile.TemporaryDirectory(prefix="epypes-draft-") as folder:
+    known = called or {}
+    with tempfile.TemporaryDirectory(prefix=_DRAFT) as folder:
         path = Path(folder) / MODULE
         path.write_text(text, encoding="utf-8")
         write_arrays(path.parent, arrays)
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # the notebook has shown them
-                module = execute(path, path.read_bytes())
-        except (Exception, SystemExit) as error:  # whatever the notebook's own code raises
-            frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
-            line = f", at {frames[0].line!r}" if frames else ""
-            return f"The module fails when it is imported{line}: {type(error).__name__}: {error}. {_WAY_OUT}"
-        return difference(pairs(module))
+            return _refusal(path, pairs, known)
+        finally:
+            linecache.cache.pop(str(path), None)
+
+
+def _refusal(path: Path, pairs: Callable[[Any], Iterable[Pair]], called: Mapping[int, str]) -> tuple[str, int]:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the notebook has shown them
+            module = execute(path, path.read_bytes())
+    except (Exception, SystemExit) as error:  # whatever the notebook's own code raises
+        frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        line = str(frames[0].line) if frames else ""
+        closure = next((one for one, name in called.items() if line.startswith(f"{name} = ")), 0)
+        where = f", at {line!r}" if line else ""
+        return f"The module fails when it is imported{where}: {type(error).__name__}: {error}. {_WAY_OUT}", closure
+    walk = _Walk(called)
+    walk.waiting.extend((_Path(what, _placed(what, ours)), ours, theirs) for what, ours, theirs in pairs(module))
+    try:
+        walk.finish()
+    except _Different as found:
+        return f"{found} {_WAY_OUT}", found.closure
+    return "", 0
 
 
 class _Walk:
     """A walk over two graphs of objects that compares each pair of objects once."""
 
-    def __init__(self) -> None:
+    def __init__(self, called: Collection[int]) -> None:
+        self._called = called
         self.waiting: deque[tuple[_Path, Any, Any]] = deque()
         # The objects by their ids. They are kept here, so that no id is used again.
         self._seen: dict[tuple[int, int], tuple[Any, Any]] = {}
@@ -184,7 +203,7 @@ class _Walk:
             if _bits(ours) != _bits(theirs):
                 raise _unlike(path, ours, theirs)
             return
-        if kind in _PLAIN:
+        if kind in _PLAIN and kind not in (set, frozenset):
             raise _unlike(path, ours, theirs)
         try:
             mine, others = _parts(ours), _parts(theirs)
@@ -202,19 +221,20 @@ class _Walk:
             only = sorted(mine.keys() ^ others.keys())
             if not only:
                 raise _Different(path, f"{path.name} has another order in the module.")
-            raise _Different(path, f"{path.name} has{only[0]} only in the {_side(only[0] in mine)}.")
+            raise _Different(path, f"{path.name} has {only[0].strip()} only in the {_side(only[0] in mine)}.")
         for part, value in mine.items():
             self._add(path.to(part), value, others[part])
 
     def _compare_functions(self, path: _Path, ours: types.FunctionType, theirs: types.FunctionType) -> None:
+        closure = id(ours) if id(ours) in self._called else path.closure
         if ours.__code__ is not theirs.__code__:
             node = _node(ours.__code__)
-            owner = path.owner if not path.part else f"Function {ours.__name__!r}"
-            path = _Path(path.root, f"{owner} ({place_of(ours.__code__)})")
+            owner = _placed(f"Function {ours.__name__!r}", ours) if path.part else path.owner
+            path = _Path(path.root, owner, closure=closure)
             if not _is_same_text(ours.__code__, theirs.__code__, node):
                 raise _Different(path, "the notebook has it with another text than the cells have now.")
             self._asks_for_identity |= node is not None and any(map(_asks_for_identity, ast.walk(node)))
-            for name in _annotated(node):
+            for name in annotated_names(node) if node is not None else ():
                 if _LOST not in (pair := (_meaning(ours, name), _meaning(theirs, name))):
                     self._add(path.to(f" {name!r}"), *pair)
         elif ours.__globals__ is not theirs.__globals__:
@@ -229,12 +249,12 @@ class _Walk:
     def _compare_classes(self, path: _Path, ours: type, theirs: type) -> None:
         if importable(ours) is not None or ours.__name__ != theirs.__name__:
             raise _unlike(path, ours, theirs)
-        path = _Path(path.root, f"Class {ours.__name__!r}")
+        path = _Path(path.root, _placed(f"Class {ours.__name__!r}", ours), closure=path.closure)
         self._add(path.to(" metaclass"), type(ours), type(theirs))
         self._add(path.to(" bases"), ours.__bases__, theirs.__bases__)
         self._add(path.to(" options"), _options(ours), _options(theirs))
         mine, others = _attributes(ours), _attributes(theirs)
-        for part in sorted(mine.keys() | others.keys()):
+        for part in sorted(mine.keys() | others.keys(), key=lambda name: (name.startswith("__"), name)):
             self._add(path.to(f" {part!r}"), mine.get(part, _LOST), others.get(part, _LOST))
 
 
@@ -244,6 +264,16 @@ def _bare(value: Any) -> Any:
     while type(value) is Node:
         value = as_written(value.func)
     return value
+
+
+def _placed(what: str, value: Any) -> str:
+    """Return how a reason calls an object, with its cell and line if it is a function or class of the notebook."""
+    innermost = layers(_bare(value))[-1]
+    if isinstance(innermost, types.FunctionType):
+        return f"{what} ({place_of(innermost.__code__)})"
+    statements = statements_of_class(value) if isinstance(value, type) else iter(())
+    found = next((pair for pair in statements if _DRAFT not in pair[0]), None)
+    return f"{what} ({place_in(found[0], found[1].lineno)})" if found else what
 
 
 def _side(is_notebook: bool) -> str:
@@ -274,7 +304,7 @@ def _is_same_text(code: types.CodeType, other: types.CodeType, node: ast.Functio
     if node is None or second is None:
         return node is second and computes_the_same(code, other)
     # The annotations of a class inside are names only where they are not read late.
-    return _spelled(node) == _spelled(second) and _has_same_names(code, other, {*_annotated(node)})
+    return _spelled(node) == _spelled(second) and _has_same_names(code, other, {*annotated_names(node)})
 
 
 def _spelled(node: ast.FunctionDef | ast.Lambda) -> list[object]:
@@ -303,14 +333,6 @@ def _asks_for_identity(node: ast.AST) -> bool:
     if not isinstance(node, ast.Compare) or not any(isinstance(one, ast.Is | ast.IsNot) for one in node.ops):
         return False
     return not any(isinstance(side, ast.Constant) for side in (node.left, *node.comparators))
-
-
-def _annotated(node: ast.AST | None) -> Iterator[str]:
-    """Give the names in all annotations of a definition."""
-    for part in ast.walk(node) if node is not None else ():
-        for annotation in (getattr(part, "annotation", None), getattr(part, "returns", None)):
-            names = ast.walk(annotation) if annotation is not None else ()
-            yield from (name.id for name in names if isinstance(name, ast.Name))
 
 
 def _defaults(function: types.FunctionType) -> dict[str, Any]:
@@ -349,19 +371,18 @@ def _meaning(function: types.FunctionType, name: str) -> Any:
 
 def _attributes(kind: type) -> dict[str, Any]:
     """Return the attributes of a class but for those that follow from its other parts."""
-    added = _ADDED_TO_CLASSES | (_OF_DATACLASSES if "__dataclass_fields__" in vars(kind) else frozenset())
-    members = getattr(kind, "_member_map_", {})
-    return {
+    members = {*_ADDED_TO_CLASSES, *getattr(kind, "_member_map_", ())}
+    found = {
         name: value
         for name, value in vars(kind).items()
-        if name not in members
-        and not isinstance(value, types.MemberDescriptorType | types.GetSetDescriptorType)
-        and not (name in added and (name not in _OF_DATACLASSES or _node_of_method(value) is None))
+        if name not in members and not isinstance(value, types.MemberDescriptorType | types.GetSetDescriptorType)
     }
-
-
-def _node_of_method(value: Any) -> Any:
-    return _node(value.__code__) if isinstance(value, types.FunctionType) else None
+    if "__dataclass_fields__" in found:
+        # Of what dataclasses write, only the defaults may have been changed since.
+        for name in _OF_DATACLASSES & found.keys():
+            if isinstance(found[name], types.FunctionType) and _node(found[name].__code__) is None:
+                found |= {f"{name}{part}": value for part, value in _defaults(found.pop(name)).items()}
+    return found
 
 
 def _options(kind: type) -> str:
@@ -384,13 +405,12 @@ def _parts(value: Any) -> dict[str, Any]:
     for kind, names in _PARTS:
         if isinstance(value, kind):
             return {f" {name}": getattr(value, name) for name in names}
-    switch = as_switch(value)
-    if switch is not None:
-        return {" branches": switch.branches}
     if isinstance(value, functools._lru_cache_wrapper):
         return {" parameters": value.cache_parameters(), " function": value.__wrapped__}
     if isinstance(value, weakref.WeakKeyDictionary | weakref.WeakValueDictionary):
         return {}  # a cache, as of functools.singledispatch
+    if type(value) in (set, frozenset):
+        return {" elements": sorted(value, key=repr)}
     if type(value) in (tuple, list):
         return {f"[{number}]": part for number, part in enumerate(value)}
     if type(value) in (dict, types.MappingProxyType):
@@ -421,13 +441,13 @@ def _of_node(node: Node) -> dict[str, Any]:
     else:
         found[" function"] = node.func
     own = {name: value for name, value in vars(node).items() if not is_set_elsewhere(node, name)}
-    return found | {f" {name!r}": own[name] for name in sorted(own)}
+    return found | {f" attribute {name!r}": own[name] for name in sorted(own)}
 
 
 def _own(value: Any) -> dict[str, Any]:
     """Return the attributes of an object, also those in slots."""
-    found = {f" {name!r}": part for name, part in sorted(getattr(value, "__dict__", {}).items())}
-    return found | {f" {name!r}": getattr(value, name, _LOST) for name in _slots(type(value))}
+    found = {f" attribute {name!r}": part for name, part in sorted(getattr(value, "__dict__", {}).items())}
+    return found | {f" attribute {name!r}": getattr(value, name, _LOST) for name in _slots(type(value))}
 
 
 def _slots(kind: type) -> list[str]:
@@ -467,4 +487,5 @@ _PARTS: Final[tuple[tuple[Any, tuple[str, ...]], ...]] = (
     ((staticmethod, classmethod), ("__func__",)),
     (functools.cached_property, ("func", "attrname")),
     (dataclasses.Field, _OF_FIELDS),
+    (Switch, ("branches",)),
 )

@@ -1,7 +1,6 @@
-"""With which arguments was a node or pipeline made?
+"""The arguments that a node or pipeline was made with.
 
-They are read back from its attributes. An object made again with them must be like it, or it is refused: what was set
-on it later would be lost in the bundle.
+They are read back from its attributes. What was set on it later is found by the comparison with the module's objects.
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 import dis
 import inspect
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any, Final
 
 from epypes.bundle.classes import functions_of
@@ -28,7 +27,7 @@ def arguments_of(made: Node, what: str) -> dict[str, Any]:
     Raises
     ------
     Refused
-        An argument is not kept by the object, or the object is another by now than a new one would be.
+        An argument is not kept by the object.
     """
     found: dict[str, Any] = {}
     for parameter in parameters_of(type(made)):
@@ -38,7 +37,6 @@ def arguments_of(made: Node, what: str) -> dict[str, Any]:
             raise Refused(f"{what} is made with {parameter.name!r}, which it does not keep. {way_out}")
         if value is not _MISSING and not _is_same(value, parameter.default):
             found[parameter.name] = value
-    _check_made_again(made, found, what)
     return found
 
 
@@ -93,35 +91,6 @@ def _is_same(left: Any, right: Any) -> bool:
     if is_plain_array(left):
         return bool(left.dtype == right.dtype and left.shape == right.shape and left.tobytes() == right.tobytes())
     return is_same_data(left, right) if is_data(left) else False
-
-
-def _check_made_again(made: Node, given: Mapping[str, Any], what: str) -> None:
-    kind = type(made)
-    try:
-        again = kind(**given)
-    except Exception as error:  # whatever a user's constructor raises
-        told = f"{type(error).__name__}: {error}"
-        text = f"{what} can't be made again with {', '.join(given) or 'no argument'}: {told}."
-        raise Refused(f"{text} Keep every argument of __init__ as an attribute of its name.") from error
-    ours = vars(again).keys() & {*vars(Node("node", len)), *_PIPELINES, "__wrapped__"}
-    by_runs = set(_set_by_runs(kind, _called_by(made)))
-    by_runs |= {name for name, value in vars(made).items() if as_written(value) is not value}
-    for name in sorted((vars(made).keys() | vars(again).keys()) - ours - by_runs):
-        one, other = vars(made).get(name, _MISSING), vars(again).get(name, _MISSING)
-        if not _is_alike(one, other):
-            text = f"{what} has another {name!r} by now than one that is made anew."
-            raise Refused(f"{text} Make it an argument of __init__, and give it there.")
-
-
-def _is_alike(one: Any, other: Any, seen: frozenset[int] = frozenset()) -> bool:
-    """Whether two attributes are the same, or objects of one class whose own attributes are."""
-    if id(one) in seen or _is_same(one, other):
-        return True
-    if type(one) is not type(other) or is_data(one) or is_plain_array(one):
-        return False
-    left, right = (dict(getattr(value, "__dict__", {})) for value in (one, other))
-    inside = seen | {id(one)}
-    return left.keys() == right.keys() and all(_is_alike(left[name], right[name], inside) for name in left)
 
 
 # What EPypes calls of an object when it runs.

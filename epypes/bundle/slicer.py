@@ -5,8 +5,10 @@ Imports, constants and other functions of the notebook are followed; everything 
 
 from __future__ import annotations
 
+import ast
 import builtins
 import dataclasses
+import enum
 import sys
 import types
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -18,17 +20,22 @@ from epypes.bundle.callables import found_definition, holds_functions, is_functi
 from epypes.bundle.classes import class_definition, class_names
 from epypes.bundle.closures import FactoryCall, factory_call
 from epypes.bundle.constants import Remark, imported_as, remark_on
-from epypes.bundle.defaults import check_defaults
 from epypes.bundle.expressions import expression
 from epypes.bundle.formatting import laid_out
-from epypes.bundle.literal import is_data
+from epypes.bundle.literal import is_data, is_same_data, literal_source
 from epypes.bundle.names import Names, of_object
 from epypes.bundle.order import AnyDefinition, Position, Positions
-from epypes.bundle.patches import check_home, check_patches
-from epypes.bundle.source import Definition, Importable, Refused, importable
-from epypes.bundle.state import check_asked, check_state
-from epypes.bundle.text import renamed
-from epypes.bundle.uses import global_names, replaced, submodules
+from epypes.bundle.side_effects import check_asked, check_home, check_patches, check_state
+from epypes.bundle.source import Definition, Importable, Refused, evaluated, importable
+from epypes.bundle.text import renamed, with_defaults
+from epypes.bundle.uses import (
+    default_values,
+    defaults_in,
+    global_names,
+    only_in_annotations,
+    replaced,
+    submodules,
+)
 from epypes.run.guard import WATCH
 
 _CONSTANT_CHARACTERS: Final = 400
@@ -52,6 +59,8 @@ class Slice:
         The names that the module keeps for the graph.
     keeps_arrays
         Whether large arrays are kept as files beside the module.
+    uncalled
+        The ids of closures that are written with what they have captured, since a call of their factory gives another.
 
     Attributes
     ----------
@@ -71,9 +80,13 @@ class Slice:
         The names that they read from outside, as far as that is known.
     refusals
         Why something can't be promoted.
+    called
+        The names of closures that are made by a call of their factory, by id.
     """
 
-    def __init__(self, reserved: Collection[str] = RESERVED, *, keeps_arrays: bool = False) -> None:
+    def __init__(
+        self, reserved: Collection[str] = RESERVED, *, keeps_arrays: bool = False, uncalled: Collection[int] = ()
+    ) -> None:
         self.names = Names(reserved)
         self.keeps_arrays, self.arrays = keeps_arrays, Arrays(keeps_arrays)
         self.imports: dict[tuple[str, str], str] = {}
@@ -81,6 +94,8 @@ class Slice:
         self.remarks: dict[str, Remark] = {}
         self.definitions: dict[str, Written] = {}
         self.refusals: list[str] = []
+        self.uncalled = frozenset(uncalled)
+        self.called: dict[int, str] = {}
         self._known: dict[int, str] = {}
         self.positions: dict[str, Position] = {}
         self.reads: dict[str, frozenset[str]] = {}
@@ -186,16 +201,41 @@ class Slice:
         name = self.names.name_for(function, found, wanted)
         self.names.claim(name, of_object(function), what)
         self._known[id(function)] = name
-        made = factory_call(found) if found.captured and function is found.function else None
+        check_state(found.function, found.node, what)
+        is_plain = function is found.function and id(function) not in self.uncalled
+        made = factory_call(found) if found.captured and is_plain else None
         if made is not None:
+            self.called[id(function)] = name
             self._add_made(name, made, found, what)
             return self.definitions[name]
-        check_defaults(found, what)
-        names = list(global_names(found))
-        check_state(found, names, what)
-        self._add_names(name, names, found, what)
-        self._write(name, renamed(found.text, found.name, name), self._places.of_definition(found))
+        defaults = self._defaults(found, what)
+        self._add_names(name, list(global_names(found, defaults)), found, what)
+        text = with_defaults(found.text, [defaults.get(default, "") for default in defaults_in(found.node)])
+        self._write(name, renamed(text, found.name, name), self._places.of_definition(found))
         return self.definitions[name]
+
+    def _defaults(self, found: Definition, what: str) -> dict[ast.expr, str]:
+        """Return the defaults whose text makes another value than the function has, with an expression that does."""
+        return {
+            default: self._default(parameter, default, value, found, what)
+            for parameter, default, value in default_values(found.node, found.function)
+            if not _is_kept(parameter, default, value, found)
+        }
+
+    def _default(self, parameter: str, default: ast.expr, value: Any, found: Definition, what: str) -> str:
+        text = f"{what} has the default {ast.unparse(default)!r} ({found.place_in(default)})"
+        if isinstance(default, ast.List | ast.Dict | ast.Set):
+            raise Refused(f"{text}, which has another value by now. Copy it in the function, and define that again.")
+        owner = evaluated(default.value, found.names) if isinstance(default, ast.Attribute) else None
+        if isinstance(owner, types.ModuleType) and not _is_constant(value):
+            raise Refused(f"{text}, which is no literal and no constant of a module. Write the value itself.")
+        inner = f"Its default of {parameter!r}"
+        source = expression(self, value, what, lambda function: self._callable(function, inner, ""))
+        if not source or len(source) > _CONSTANT_CHARACTERS:
+            raise Refused(
+                f"{text}, which no short expression makes again. Make it a token, or make it in the function."
+            )
+        return source
 
     def _add_names(self, name: str, names: Sequence[str], found: AnyDefinition, what: str) -> None:
         """Add what a definition has from outside."""
@@ -223,7 +263,6 @@ class Slice:
 
     def _add_made(self, name: str, made: FactoryCall, found: Definition, what: str) -> None:
         """Add a closure as a call of the function that made it."""
-        check_state(found, list(global_names(found)), what)
         arguments = [self._argument(value, what) for value in made.positional]
         arguments += [f"{word}={self._argument(value, what)}" for word, value in made.named.items()]
         inner = f"Function {made.factory.__name__!r}, which makes {what[0].lower()}{what[1:]},"
@@ -242,6 +281,9 @@ class Slice:
         value = names.get(name)
         check_asked(name, value, found, what)
         if name not in names:
+            if isinstance(found, Definition) and not hasattr(builtins, name) and name in only_in_annotations(found):
+                self.imports["annotations", "__future__.annotations"] = "from __future__ import annotations"
+                return
             if not hasattr(builtins, name):
                 place = found.place_of(name)
                 raise Refused(f"{what} uses {name!r}, which is not defined ({place}). Define it, or rename.")
@@ -362,9 +404,30 @@ class Slice:
         self.imports[name, f"{home.module}.{top}"] = f"from {home.module} import {top}{alias}"
 
 
+def _is_kept(parameter: str, default: ast.expr, value: Any, found: Definition) -> bool:
+    """Whether the text of a default makes its value: a literal, or a name or attribute that means the same by now."""
+    if isinstance(default, ast.Name | ast.Attribute):
+        # A lambda's default is often the variable of a loop.
+        is_own = isinstance(default, ast.Name) and default.id == parameter and found.is_lambda and literal_source(value)
+        is_fixed = isinstance(default, ast.Name) or _is_constant(value)
+        return is_fixed and not is_own and evaluated(default, {**vars(builtins), **found.names}) is value
+    try:
+        return is_same_data(ast.literal_eval(default), value)
+    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
+        return False
+
+
+def _is_constant(value: object) -> bool:
+    return (
+        callable(value)
+        or isinstance(value, enum.Enum)
+        or type(value) in (bool, int, float, complex, str, bytes, type(None))
+    )
+
+
 def slice_functions(gathered: Slice, functions: Sequence[tuple[str, Callable[..., Any]]]) -> list[str]:
     """Add functions of graphs, each given with how reasons call it; return the expressions that refer to them."""
-    survey = Slice(gathered.names.reserved, keeps_arrays=gathered.keeps_arrays)
+    survey = Slice(gathered.names.reserved, keeps_arrays=gathered.keeps_arrays, uncalled=gathered.uncalled)
     _add_all(survey, functions)
     gathered.names.read.update(survey.names.read)
     return _add_all(gathered, functions)

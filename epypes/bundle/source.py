@@ -15,9 +15,7 @@ from inspect import CO_ASYNC_GENERATOR, CO_COROUTINE
 from typing import Any, TypeGuard
 
 from epypes.bundle.cells import place_in, place_of
-from epypes.bundle.evaluate import is_same
 from epypes.bundle.lambdas import UNNAMED, as_function, lambdas_of
-from epypes.bundle.literal import literal_source
 from epypes.bundle.text import code_on_its_own, definition_of, own_text
 from epypes.graph import outputs
 from epypes.run.guard import unguarded
@@ -180,7 +178,6 @@ def definition(function: types.FunctionType, what: str, decorated: Collection[as
     if node is None:
         raise Refused(what)
     _check_decorators(node, function, what, place, {ast.unparse(decorator) for decorator in decorated})
-    _check_attributes(function, what, place)
     names = function.__globals__
     text = own_text(lines, node, [mark for mark in node.decorator_list if _names_outputs(mark, names)])
     return _defined(function, text, _without_outputs(node, names), what, place)
@@ -192,33 +189,12 @@ def _lambda(function: types.FunctionType, what: str, place: str) -> Definition:
     if len(nodes) > 1:
         text = f"{what} is one of {len(nodes)} lambdas on a line, which nothing tells apart ({place})."
         raise Refused(f"{text} Give each a line of its own, and run the cell again.")
-    _check_attributes(function, what, place)
-    _give_values(nodes[0].args, function)
     text, node = as_function(lines, nodes[0])
     return _defined(function, text, node, what, place)
 
 
-def _give_values(arguments: ast.arguments, function: types.FunctionType) -> None:
-    """Write the values into the defaults of a lambda whose names mean something else by now, as in a loop (``k=k``)."""
-    by_position, by_name = function.__defaults__ or (), function.__kwdefaults__ or {}
-    every = [*arguments.posonlyargs, *arguments.args][-len(by_position) :] if by_position else []
-    names = function.__globals__
-    values = zip(every, arguments.defaults, by_position, strict=False)
-    arguments.defaults = [_given(argument, default, value, names) for argument, default, value in values]
-    arguments.kw_defaults = [
-        default and _given(argument, default, by_name.get(argument.arg), names)
-        for argument, default in zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True)
-    ]
-
-
-def _given(argument: ast.arg, default: ast.expr, value: Any, names: Mapping[str, Any]) -> ast.expr:
-    is_own_name = isinstance(default, ast.Name) and default.id == argument.arg
-    source = literal_source(value) if is_own_name or not is_same(default, value, names) else ""
-    return ast.parse(source, mode="eval").body if source else default
-
-
 def _defined(function: types.FunctionType, text: str, node: ast.FunctionDef, what: str, place: str) -> Definition:
-    _check_kept(function, node, what)
+    check_nonlocal(function, node, what)
     code = code_on_its_own(text, node, function.__code__)
     if code is None:
         reason = f"{what} computes something else if its text is moved to another place ({place})."
@@ -227,7 +203,7 @@ def _defined(function: types.FunctionType, text: str, node: ast.FunctionDef, wha
     return Definition(node.name, function, text, node, place, code, captured, node.name == UNNAMED)
 
 
-def _check_kept(function: types.FunctionType, node: ast.FunctionDef, what: str) -> None:
+def check_nonlocal(function: types.FunctionType, node: ast.AST, what: str) -> None:
     """Refuse a function that keeps something from call to call in the function around it."""
     code = function.__code__
     for part in ast.walk(node):
@@ -269,15 +245,6 @@ def _check_decorators(
         if ast.unparse(decorator) not in known:
             text = f"{what} is decorated by @{ast.unparse(decorator)} ({place}), and does not say so itself."
             raise Refused(f"{text} Use functools.wraps in the decorator, or call its work inside the function.")
-
-
-def _check_attributes(function: types.FunctionType, what: str, place: str) -> None:
-    """Refuse what was hung on a function besides our marks: its text does not say it, and its code may read it."""
-    own = [name for name in function.__dict__ if not name.startswith("__epypes_") and name != "__wrapped__"]
-    if own:
-        listed = ", ".join(map(repr, own))
-        text = f"{what} has attributes that its text does not give it, {listed} ({place})."
-        raise Refused(f"{text} Make them constants or tokens, and define the function again.")
 
 
 def other_decorators(node: ast.FunctionDef, names: Mapping[str, Any]) -> list[ast.expr]:

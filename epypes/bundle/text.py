@@ -8,6 +8,7 @@ from __future__ import annotations
 import __future__
 
 import ast
+import dis
 import io
 import linecache
 import os
@@ -114,6 +115,26 @@ def nested_codes(code: types.CodeType) -> Iterator[types.CodeType]:
             yield from nested_codes(constant)
 
 
+def names_from_outside(code: types.CodeType) -> Iterator[str]:
+    """Return the names that code reads, but for those that the body of a class has given a meaning before."""
+    own = {"__name__"}  # a class reads the module's, whichever that is
+    for instruction in dis.get_instructions(code):
+        if instruction.opname == "STORE_NAME":
+            own.add(instruction.argval)
+        elif instruction.opname == "LOAD_GLOBAL" or (
+            instruction.opname == "LOAD_NAME" and instruction.argval not in own
+        ):
+            yield instruction.argval
+
+
+def own_parts(node: ast.AST) -> Iterator[ast.AST]:
+    """Return the parts of a function or class, but not those of functions and classes inside of it."""
+    for part in ast.iter_child_nodes(node):
+        yield part
+        if not isinstance(part, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda | ast.ClassDef):
+            yield from own_parts(part)
+
+
 def computes_the_same(one: types.CodeType, other: types.CodeType) -> bool:
     """Whether two pieces of code are the same, but for the place where they stand."""
     return _bare(one) == _bare(other)
@@ -170,6 +191,29 @@ def renamed(text: str, old: str, new: str) -> str:
     lines = text.splitlines(keepends=True)
     lines[number] = re.sub(rf"\bdef(\s+){old}\b", rf"def\g<1>{new}", lines[number], count=1)
     return "".join(lines)
+
+
+def with_defaults(text: str, sources: Sequence[str]) -> str:
+    """Return a definition with other defaults: those of parameters by position, then by name; "" for one that stays."""
+    if not any(sources):
+        return text
+    node, lines = ast.parse(text).body[0], text.encode().splitlines(keepends=True)
+    if not isinstance(node, ast.FunctionDef):
+        raise TypeError(type(node).__name__)
+    starts = [sum(map(len, lines[:number])) for number in range(len(lines))]
+    defaults = [*node.args.defaults, *(default for default in node.args.kw_defaults if default is not None)]
+    whole = text.encode()
+    places = [
+        (
+            starts[one.lineno - 1] + one.col_offset,
+            starts[(one.end_lineno or one.lineno) - 1] + (one.end_col_offset or 0),
+        )
+        for one in defaults
+    ]
+    for (start, end), source in sorted(zip(places, sources, strict=True), reverse=True):
+        if source:
+            whole = whole[:start] + source.encode() + whole[end:]
+    return whole.decode()
 
 
 def is_comment(line: str, number: int) -> bool:

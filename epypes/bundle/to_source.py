@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import builtins
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any, Final
 
 from epypes.bundle.clone import called_by, is_plain_pipeline
 from epypes.bundle.emit import module_text
-from epypes.bundle.equivalence import refusal
+from epypes.bundle.equivalence import Pair, refusal
 from epypes.bundle.expressions import expression_or_none
 from epypes.bundle.formatting import LINE, Item, laid_out, one_per_line
 from epypes.bundle.identifiers import identifier_of, identifiers_of, is_identifier
@@ -96,26 +97,42 @@ def to_source(
         raise TypeError(f'name is what the function is called, a string as "run_graph", not {type(name).__name__!r}.')
     graph, values = _subject(cg, hparams)
     wanted = _wanted(graph, returns)
-    parts = _with_pipelines(_Part(name, graph, values, wanted))
+    return _written(name, graph, values, wanted)
+
+
+def _written(
+    name: str,
+    cg: CompGraph,
+    values: Mapping[str, Any],
+    wanted: tuple[str, ...] | None,
+    uncalled: Collection[int] = (),
+) -> str:
+    """Return the text; closures whose ids are in ``uncalled`` are written with what they have captured."""
+    parts = _with_pipelines(_Part(name, cg, values, wanted))
     missing = [function for part in parts for function in part.cg.placeholders if function in set(part.functions)]
     if missing:
         raise PlaceholderNeeded(missing)
-    gathered = Slice(reserved=(name,))
+    gathered = Slice(reserved=(name,), uncalled=uncalled)
     gathered.refusals += _unwritable(parts, name, wanted)
     _slice(gathered, parts)
     for part in parts:
         _write_values(gathered, part)
+    if gathered.refusals and gathered.called:
+        with suppress(SourceRefused):
+            return _written(name, cg, values, wanted, {*uncalled, *gathered.called})
     if gathered.refusals:
         raise SourceRefused(tuple(dict.fromkeys(gathered.refusals)))
     text = module_text([], gathered, [part.text() for part in parts])
-    why = _difference(text, parts)
+    why, closure = _difference(text, parts, gathered)
+    if closure:
+        return _written(name, cg, values, wanted, {*uncalled, closure})
     if why:
         raise SourceRefused((why,))
     return text
 
 
-def _difference(text: str, parts: Sequence[_Part]) -> str:
-    """Return why what a module calls is not what the graph calls; "" if it is."""
+def _difference(text: str, parts: Sequence[_Part], gathered: Slice) -> tuple[str, int]:
+    """Return why what a module calls is not what the graph calls, as ``refusal`` returns it."""
     compared: list[tuple[str, Any, str]] = []
     for part in parts:
         for name, source in part.references.items():
@@ -124,9 +141,11 @@ def _difference(text: str, parts: Sequence[_Part]) -> str:
         for token, source in part.defaults.items():
             compared.append((f"Hyperparameter {token!r}{part.where}", part.values[token], source))
     whole = "\n".join([text, *one_per_line("references = [", [("", source) for _, _, source in compared], "]"), ""])
-    return refusal(whole, {}, lambda module: [
-        (what, ours, theirs) for (what, ours, _), theirs in zip(compared, module.references, strict=True)
-    ])  # fmt: skip
+
+    def pairs(module: Any) -> list[Pair]:
+        return [(what, ours, made) for (what, ours, _), made in zip(compared, module.references, strict=True)]
+
+    return refusal(whole, {}, pairs, gathered.called)
 
 
 @dataclass(eq=False, slots=True)

@@ -3,24 +3,31 @@
 from __future__ import annotations
 
 import ast
-import dis
 import types
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any
 
 from epypes.bundle.source import Definition
-from epypes.bundle.text import nested_codes
+from epypes.bundle.text import LATE_ANNOTATIONS, names_from_outside, nested_codes
 
 
-def global_names(found: Definition) -> Iterator[str]:
-    """Return the global names that a function reads when it is called or defined, each once, in order of use."""
+def global_names(found: Definition, replaced_defaults: Collection[ast.expr] = ()) -> Iterator[str]:
+    """Return the global names that a function reads when it is called or defined, each once, in order of use.
+
+    Parameters
+    ----------
+    found
+        Its definition.
+    replaced_defaults
+        Defaults that are written otherwise.
+    """
     names: dict[str, None] = {}
     for code in nested_codes(found.code):
         names.update(dict.fromkeys(names_from_outside(code)))
     arguments = found.node.args
     every = (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs, arguments.vararg, arguments.kwarg)
     outside = [argument.annotation for argument in every if argument] + [found.node.returns]
-    outside += [*arguments.defaults, *arguments.kw_defaults]
+    outside += [default for default in defaults_in(found.node) if default not in replaced_defaults]
     for expression in (*outside, *found.node.decorator_list):
         for node in ast.walk(expression) if expression else ():
             if isinstance(node, ast.Name):
@@ -28,16 +35,44 @@ def global_names(found: Definition) -> Iterator[str]:
     return iter(names)
 
 
-def names_from_outside(code: types.CodeType) -> Iterator[str]:
-    """Return the names that code reads, but for those that the body of a class has given a meaning before."""
-    own = {"__name__"}  # a class reads the module's, whichever that is
-    for instruction in dis.get_instructions(code):
-        if instruction.opname == "STORE_NAME":
-            own.add(instruction.argval)
-        elif instruction.opname == "LOAD_GLOBAL" or (
-            instruction.opname == "LOAD_NAME" and instruction.argval not in own
-        ):
-            yield instruction.argval
+def only_in_annotations(found: Definition) -> set[str]:
+    """Return the names in annotations of a function that was compiled not to read them; none of any other function."""
+    code = found.function.__code__
+    if not code.co_flags & LATE_ANNOTATIONS:
+        return set()
+    read = {name for inner in nested_codes(code) for name in names_from_outside(inner)}
+    others = [*defaults_in(found.node), *found.node.decorator_list]
+    read |= {part.id for expression in others for part in ast.walk(expression) if isinstance(part, ast.Name)}
+    return set(annotated_names(found.node)) - read
+
+
+def annotated_names(node: ast.AST) -> Iterator[str]:
+    """Give the names in all annotations of a definition."""
+    for part in ast.walk(node):
+        for annotation in (getattr(part, "annotation", None), getattr(part, "returns", None)):
+            names = ast.walk(annotation) if annotation is not None else ()
+            yield from (name.id for name in names if isinstance(name, ast.Name))
+
+
+def defaults_in(node: ast.FunctionDef | ast.Lambda) -> list[ast.expr]:
+    """Return the defaults of a definition: of parameters by position, then of those by name."""
+    return [*node.args.defaults, *(default for default in node.args.kw_defaults if default is not None)]
+
+
+def default_values(node: ast.FunctionDef, function: types.FunctionType) -> list[tuple[str, ast.expr, Any]]:
+    """Return the defaults by parameter, as they are written and as they are; none if it has others than are written."""
+    by_position, by_name = function.__defaults__ or (), function.__kwdefaults__ or {}
+    every = [*node.args.posonlyargs, *node.args.args]
+    named = [
+        (one.arg, default) for one, default in zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True) if default
+    ]
+    if len(by_position) != len(node.args.defaults) or by_name.keys() != {name for name, _ in named}:
+        return []
+    last = every[len(every) - len(by_position) :]
+    found = [
+        (one.arg, *pair) for one, pair in zip(last, zip(node.args.defaults, by_position, strict=True), strict=True)
+    ]
+    return found + [(name, default, by_name[name]) for name, default in named]
 
 
 def submodules(tree: ast.AST, name: str, module: types.ModuleType) -> tuple[str, ...]:

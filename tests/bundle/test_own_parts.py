@@ -353,7 +353,9 @@ def test_nodes_that_cannot_be_made_again_are_refused_with_the_way_out(names, tmp
     runner.run(x=1)
     told = refusals(runner, tmp_path / "b")
     assert "'a' is made with 'secret', which it does not keep. Keep it in __init__: self.secret = secret." in told
-    assert "'b' has another 'more' by now than one that is made anew. Make it an argument" in told
+    runner = ep.CompGraphRunner(ep.CompGraph({"b": adding}, {"b": ("y", "z")}))
+    runner.run(y=1)
+    assert "its attribute 'more' is 5 in the notebook and 0 in the module." in refusals(runner, tmp_path / "b")
 
 
 SET_LATER = """
@@ -389,8 +391,8 @@ def test_what_was_set_on_a_node_by_a_method_that_no_run_calls_is_refused(change,
     if change == "none":
         assert ep.promote(runner, tmp_path / "b").digest
         return
-    named = "low" if change == "low" else "settings"
-    assert f"'n' has another '{named}' by now than one that is made anew" in refusals(runner, tmp_path / "b")
+    named = "'low' is 15" if change == "low" else "'settings' state['high'] is 50"
+    assert f"Function 'n': its attribute {named} in the notebook and" in refusals(runner, tmp_path / "b")
 
 
 def test_pipelines_that_cannot_serve_are_refused_with_the_way_out(tmp_path):

@@ -1,0 +1,494 @@
+"""Static checks that name the line: writes to state that outlives a call, monkeypatches, and what only a notebook has.
+
+What syntax can't see is found by the replays, and by the snapshot that guards the functions of a loaded bundle.
+"""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import dis
+import linecache
+import os
+import sys
+import types
+from collections import deque
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from typing import Any, Final
+
+from epypes.bundle.cells import executed_cells, place_in
+from epypes.bundle.source import Importable, Refused, check_nonlocal, evaluated, importable
+from epypes.bundle.text import definition_of, first_line, names_from_outside, nested_codes, parsed
+from epypes.run.guard import is_plain_array
+
+# -- writes to what outlives a call ----------------------------------------------------------------------------------
+
+# Methods of lists, dicts, sets, deques and arrays that change them.
+CHANGING: Final = frozenset(
+    {
+        *("append", "appendleft", "extend", "extendleft", "insert", "pop", "popleft", "popitem", "remove", "clear"),
+        *("update", "setdefault", "add", "discard", "sort", "reverse", "fill", "itemset", "put", "resize"),
+        *("difference_update", "intersection_update", "symmetric_difference_update", "setfield", "setflags"),
+    }
+)
+# Functions of libraries that write into one of their arguments, with its place.
+_WRITES: Final = {
+    **dict.fromkeys(("accumulate", "accumulateSquare", "accumulateWeighted"), 1),
+    "accumulateProduct": 2,
+    **dict.fromkeys(("line", "circle", "rectangle", "ellipse", "putText", "polylines", "fillPoly", "drawContours"), 0),
+    **dict.fromkeys(("fillConvexPoly", "arrowedLine", "drawMarker", "drawChessboardCorners", "floodFill"), 0),
+    **dict.fromkeys(("copyto", "put", "place", "putmask", "fill_diagonal", "at", "shuffle"), 0),
+    **dict.fromkeys(("heappush", "heappop", "heapify", "heapreplace", "insort", "insort_left", "insort_right"), 0),
+    **dict.fromkeys(("setattr", "delattr", "setitem", "delitem"), 0),
+}
+_INTO: Final = frozenset(("out", "dst"))
+# A function that hands its argument on may do so to another one.
+_DEEPEST: Final = 4
+
+
+def changes(tree: ast.AST, names: Mapping[str, Any], depth: int = _DEEPEST) -> Iterator[tuple[ast.AST, str]]:
+    """Return what changes the object that a name means, with the name.
+
+    Parameters
+    ----------
+    tree
+        A function.
+    names
+        What names mean that it has from outside.
+    depth
+        How deep functions that it calls are followed.
+    """
+    aliases = _aliases(tree, names)
+    for node in ast.walk(tree):
+        for written in _written(node, names, depth):
+            root = root_of(written)
+            yield node, aliases.get(root, root)
+        if isinstance(node, ast.AugAssign) and isinstance(node.target, ast.Name) and node.target.id in aliases:
+            of = aliases[node.target.id]
+            if is_container(names.get(of)):
+                yield node, of
+
+
+def _written(node: ast.AST, names: Mapping[str, Any], depth: int) -> Iterator[ast.expr]:
+    """Return the expressions whose objects a part of a function writes into."""
+    if isinstance(node, ast.Subscript | ast.Attribute) and isinstance(node.ctx, ast.Store | ast.Del):
+        yield node
+    if not isinstance(node, ast.Call):
+        return
+    if isinstance(node.func, ast.Attribute) and node.func.attr in CHANGING:
+        of = node.func.value
+        if isinstance(of, ast.Name | ast.Subscript) or is_container(evaluated(of, names)):
+            yield of
+    function = evaluated(node.func, names)
+    if isinstance(function, types.FunctionType) and function.__module__ == "__main__" and depth:
+        yield from _into_arguments(node, function, depth - 1)
+        return
+    yield from (part.value for part in node.keywords if part.arg in _INTO)
+    place = _WRITES.get(getattr(node.func, "attr", getattr(node.func, "id", "")), len(node.args))
+    yield from node.args[place : place + 1]
+
+
+def _into_arguments(node: ast.Call, function: types.FunctionType, depth: int) -> Iterator[ast.expr]:
+    """Return the arguments of a call that a function of the notebook writes into."""
+    _, definition = definition_of(function.__code__)
+    if definition is None:
+        return
+    every = (*definition.args.posonlyargs, *definition.args.args)
+    # Whatever the arguments are, they count as containers here: the caller's are looked at later.
+    own: dict[str, Any] = {argument.arg: [] for argument in (*every, *definition.args.kwonlyargs)}
+    written = {root for _, root in changes(definition, {**function.__globals__, **own}, depth)}
+    written = {name for name in written if _stores(definition, name) == _augmented(definition, name)}
+    by_place = zip(every, node.args, strict=False)
+    yield from (given for argument, given in by_place if argument.arg in written)
+    yield from (part.value for part in node.keywords if part.arg in written)
+
+
+def _aliases(tree: ast.AST, names: Mapping[str, Any]) -> dict[str, str]:
+    """Return the locals that mean nothing but what a name from outside means, or a part of that."""
+    known: dict[str, set[str]] = {}
+    for node in ast.walk(tree):
+        pairs = [(node.targets[0], node.value)] if isinstance(node, ast.Assign) and len(node.targets) == 1 else []
+        pairs += [(node.target, node.iter)] if isinstance(node, ast.For) else []
+        for target, value in pairs:
+            if isinstance(target, ast.Name):
+                known.setdefault(target.id, set()).add(_shared(value, names))
+    arguments = {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
+    once = {
+        name: next(iter(of))
+        for name, of in known.items()
+        if len(of) == 1 and _stores(tree, name) - _augmented(tree, name) == 1 and name not in arguments
+    }
+    for _ in once:
+        once = {name: once.get(of, of) for name, of in once.items()}
+    return {name: of for name, of in once.items() if of and of != name}
+
+
+def _stores(tree: ast.AST, name: str) -> int:
+    """Return how often a name is given a value."""
+    names = (node for node in ast.walk(tree) if isinstance(node, ast.Name) and node.id == name)
+    return sum(isinstance(node.ctx, ast.Store) for node in names)
+
+
+def _augmented(tree: ast.AST, name: str) -> int:
+    parts = (node.target for node in ast.walk(tree) if isinstance(node, ast.AugAssign))
+    return sum(isinstance(target, ast.Name) and target.id == name for target in parts)
+
+
+def _shared(value: ast.expr, names: Mapping[str, Any]) -> str:
+    """Return the name whose object an expression shares; "" if it makes another."""
+    node = value
+    is_sliced = False
+    while isinstance(node, ast.Subscript | ast.Attribute):
+        is_sliced |= isinstance(node, ast.Subscript) and not isinstance(node.slice, ast.Constant | ast.Name)
+        node = node.value
+    root = node.id if isinstance(node, ast.Name) else ""
+    # A slice of an array shares its memory, one of a list is a copy.
+    return "" if is_sliced and not is_plain_array(names.get(root)) else root
+
+
+def is_container(value: Any) -> bool:
+    """Whether a value is of a kind that is written into."""
+    return isinstance(value, list | dict | set | bytearray | deque) or is_plain_array(value)
+
+
+def root_of(node: ast.expr) -> str:
+    """Return the name of what a subscript or attribute is of; "" if that is no name."""
+    while isinstance(node, ast.Subscript | ast.Attribute):
+        node = node.value
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+_ASKED: Final = {
+    "get_ipython": "the notebook itself, as magics and shell escapes do. Write it in Python, or elsewhere",
+    "display": "which shows something in the notebook; a service has nobody to show it to. Return it as a token",
+    "input": "which asks a person. Make the answer a token",
+    "breakpoint": "which waits for a person. Leave it out",
+    "exit": "which ends the notebook. Raise an exception",
+    "quit": "which ends the notebook. Raise an exception",
+    "globals": "all names of the notebook. Use those that you need by name",
+    "eval": "which may use any name. Write what it evaluates",
+    "exec": "which may use any name. Write what it runs",
+    "In": "the notebook's cells. Make the text a token",
+    "Out": "what the notebook's cells have shown. Make the value a token",
+}
+_OF_A_MODULE: Final = frozenset(
+    ["__name__", "__file__", "__doc__", "__spec__", "__loader__", "__package__", "__builtins__", "__cached__"]
+)
+
+
+def check_state(function: types.FunctionType, node: ast.AST, what: str) -> None:
+    """Refuse a function of the notebook that changes something outside of it.
+
+    Parameters
+    ----------
+    function
+        The function.
+    node
+        Its definition.
+    what
+        How a reason calls it.
+    """
+    code = function.__code__
+    for inner in nested_codes(code):
+        for instruction in dis.get_instructions(inner):
+            if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
+                place = place_in(code.co_filename, line_of(node, instruction.argval, code.co_firstlineno))
+                raise Refused(f"{what} changes the global {instruction.argval!r} ({place}). Return the value.")
+    check_nonlocal(function, node, what)
+    names = {**function.__globals__, **captured_by(function)}
+    outside = {*code.co_freevars, *(name for inner in nested_codes(code) for name in names_from_outside(inner))}
+    for part, name in changes(node, names):
+        if name in outside and (not isinstance(part, ast.Call) or _may_change(names.get(name))):
+            place = place_in(code.co_filename, getattr(part, "lineno", code.co_firstlineno))
+            text = f"{what} writes into {name!r}, which outlives the call ({place})"
+            raise Refused(f"{text}: the next event would find it different. Copy it first, or make it a token.")
+
+
+def line_of(node: ast.AST, name: str, otherwise: int) -> int:
+    """Return the first line of a definition that has a name."""
+    uses = (part.lineno for part in ast.walk(node) if isinstance(part, ast.Name) and part.id == name)
+    return next(uses, otherwise)
+
+
+def captured_by(function: types.FunctionType) -> dict[str, Any]:
+    """Return what a function has from the functions around it, by name; nothing of a name without a value."""
+    cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
+    return {name: cell.cell_contents for name, cell in cells if cell != types.CellType()}
+
+
+def _may_change(value: Any) -> bool:
+    """Whether a call of a method may have changed a value."""
+    return is_container(value) or isinstance(value, type)
+
+
+def check_asked(name: str, value: Any, found: Any, what: str) -> None:
+    """Refuse a name that means something in a notebook alone."""
+    if name in _ASKED and not (isinstance(value, types.FunctionType) and value.__module__ == "__main__"):
+        raise Refused(f"{what} uses {name!r} ({found.place_of(name)}), {_ASKED[name]}.")
+    if name == "vars" and any(map(_asks_for_names, ast.walk(found.node))):
+        raise Refused(f"{what} uses 'vars()' ({found.place_of(name)}), all names there are. Use those that you need.")
+    if name in _OF_A_MODULE:
+        text = f"{what} uses {name!r} ({found.place_of(name)}), which is another one in a bundle"
+        raise Refused(f"{text}. Write the value itself, or make it a token.")
+
+
+def _asks_for_names(node: ast.AST) -> bool:
+    """Whether this is ``vars()``, or a module's."""
+    is_call = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "vars"
+    return isinstance(node, ast.Call) and is_call and not any(isinstance(part, ast.Name) for part in node.args)
+
+
+# -- monkeypatches ---------------------------------------------------------------------------------------------------
+
+_Key = tuple[int, str]
+
+
+def check_patches(found: Any, what: str) -> None:
+    """Refuse a definition that reads what the notebook has changed in a module."""
+    known = _patched()
+    for chain in _read_by(found.node) if known else ():
+        key = _key(chain, {**found.names, **_imports_of(found.node)})
+        if key in known:
+            _refuse(what, ".".join(chain), known[key])
+
+
+def check_home(home: Importable, what: str) -> None:
+    """Refuse what can be imported only as the notebook has changed it."""
+    place = _patched().get((id(sys.modules.get(home.module)), home.qualname.partition(".")[0]))
+    if place:
+        _refuse(what, f"{home.module}.{home.qualname}", place)
+
+
+def _refuse(what: str, name: str, place: str) -> None:
+    text = f"{what} uses {name!r}, which the notebook has changed ({place}); a service has it as it was installed"
+    raise Refused(f"{text}. Call yours by a name of its own, or make the value a token.")
+
+
+def _patched() -> dict[_Key, str]:
+    """Return what the notebook has changed, by module and name there, each with its place."""
+    names = vars(sys.modules["__main__"])
+    texts = executed_cells(names)
+    script = names.get("__file__")
+    if not texts and isinstance(script, str):
+        texts = [(0, "".join(linecache.getlines(script)))]
+    found = {}
+    for cell, text in texts:
+        for chain, line in _patches_in(text):
+            key = _key(chain, names)
+            if key:
+                found[key] = f"cell [{cell}], line {line}" if cell else place_in(str(script), line)
+    return found
+
+
+def _key(chain: tuple[str, ...], names: Mapping[str, Any]) -> _Key | None:
+    """Return the module of a dotted name, and what is read of it; None for what is of no module."""
+    reached = names.get(chain[0])
+    for part in chain[1:]:
+        if not isinstance(reached, types.ModuleType):
+            return None
+        inner = getattr(reached, part, None)
+        if not isinstance(inner, types.ModuleType):
+            return id(reached), part
+        reached = inner
+    return None
+
+
+@lru_cache(maxsize=512)  # every function of a graph asks for every cell
+def _patches_in(text: str) -> tuple[tuple[tuple[str, ...], int], ...]:
+    """Return the dotted names that a cell writes into, with their lines."""
+    tree = parsed(text)
+    found = [(chain, getattr(node, "lineno", 1)) for node in ast.walk(tree) for chain in _targets(node)] if tree else []
+    return tuple(found)
+
+
+def _targets(node: ast.AST) -> Iterator[tuple[str, ...]]:
+    parts: list[ast.AST] = []
+    more: tuple[str, ...] = ()
+    if isinstance(node, ast.Attribute | ast.Subscript) and isinstance(node.ctx, ast.Store | ast.Del):
+        parts = [node]
+    elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in CHANGING:
+        parts = [node.func.value]
+    elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("setattr", "delattr"):
+        parts, name = list(node.args[:1]), node.args[1] if len(node.args) > 1 else None
+        more = (str(name.value),) if isinstance(name, ast.Constant) else ()
+    chains = (_dotted(part) + more for part in parts)
+    yield from (chain for chain in chains if len(chain) > 1)
+
+
+def _dotted(node: ast.AST) -> tuple[str, ...]:
+    """Return the dotted name that an expression begins with; nothing if it is none."""
+    parts: list[str] = []
+    while isinstance(node, ast.Attribute | ast.Subscript):
+        parts = [node.attr, *parts] if isinstance(node, ast.Attribute) else []
+        node = node.value
+    return (node.id, *parts) if isinstance(node, ast.Name) else ()
+
+
+def _read_by(tree: ast.AST) -> Iterator[tuple[str, ...]]:
+    """Give the dotted names that a definition reads, and what it imports from modules."""
+    for node in ast.walk(tree):
+        chain = _dotted(node) if isinstance(node, ast.Attribute) else ()
+        if len(chain) > 1:
+            yield chain
+        if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield from ((f"from {node.module}", alias.name) for alias in node.names)
+
+
+def _imports_of(tree: ast.AST) -> dict[str, Any]:
+    """Return what a definition imports itself, by name, and the modules of which it imports names."""
+    found: dict[str, Any] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            module = found[f"from {node.module}"] = sys.modules.get(node.module)
+            found |= {alias.asname or alias.name: getattr(module, alias.name, None) for alias in node.names}
+        for alias in node.names if isinstance(node, ast.Import) else ():
+            dotted = alias.name if alias.asname else alias.name.partition(".")[0]
+            found[alias.asname or dotted] = sys.modules.get(dotted)
+    return found
+
+
+# -- calls when a module is imported ---------------------------------------------------------------------------------
+
+# Calls that give the same wherever and whenever they are made.
+_REPEATABLE: Final[Mapping[str, frozenset[str]]] = {
+    "builtins": frozenset((
+        "abs", "all", "any", "bool", "bytes", "chr", "complex", "dict", "divmod", "enumerate",
+        "float", "frozenset", "int", "isinstance", "issubclass", "iter", "len", "list",
+        "max", "min", "next", "object", "ord", "pow", "property", "range", "repr", "reversed", "round", "set", "slice",
+        "sorted", "str", "sum", "super", "tuple", "type", "zip",
+    )),
+    "numpy": frozenset((
+        "arange", "array", "asarray", "ascontiguousarray", "asfortranarray", "concatenate", "cumsum", "diag", "dtype",
+        "eye", "full", "hstack", "identity", "linspace", "logspace", "max", "mean", "meshgrid", "min", "ones",
+        "ones_like", "outer", "prod", "stack", "sum", "tri", "vstack", "zeros", "zeros_like",
+    )),
+    "cv2": frozenset(("getGaborKernel", "getGaussianKernel", "getRotationMatrix2D", "getStructuringElement")),
+    "pathlib": frozenset(("Path", "PurePath", "PurePosixPath")),
+    "logging": frozenset(("getLogger",)),
+}  # fmt: skip
+_REPEATABLE_MODULES: Final = frozenset(
+    {
+        *("abc", "collections", "contextlib", "dataclasses", "decimal", "enum", "fractions", "functools", "itertools"),
+        *("math", "operator", "re", "types", "typing"),
+    }
+)
+_ORDER_FREE: Final = frozenset({"all", "any", "frozenset", "len", "max", "min", "set", "sorted", "sum"})
+_REPEATABLE_METHODS: Final = frozenset(
+    {
+        *(
+            "append",
+            "astype",
+            "copy",
+            "extend",
+            "format",
+            "get",
+            "items",
+            "join",
+            "keys",
+            "lower",
+            "max",
+            "mean",
+            "min",
+        ),
+        *("ravel", "replace", "reshape", "split", "strip", "sum", "transpose", "update", "upper", "values"),
+    }
+)
+
+
+def unrepeatable(node: ast.AST, names: Mapping[str, Any], inner: types.CodeType | None = None) -> ast.expr | None:
+    """Return the first part that may give something else in another process; None if there is none.
+
+    The comparison with the notebook's objects finds what differs from call to call. What depends on the machine, such
+    as a file, a variable of the environment or an address in memory, it can't tell.
+
+    Parameters
+    ----------
+    node
+        A class, or a function that is called when the module is imported.
+    names
+        What names mean there.
+    inner
+        The code of a function inside, which that function returns and which is called later.
+    """
+    return _unrepeatable(node, names, inner, set())
+
+
+def _unrepeatable(
+    node: ast.AST, names: Mapping[str, Any], inner: types.CodeType | None, seen: set[types.CodeType]
+) -> ast.expr | None:
+    parts = [*_at_once(node, inner)]
+    own = {part.id for part in parts if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store)}
+    names = {**names, **dict.fromkeys(own), **_imports_of(node)}
+    unused = {part.value for part in parts if isinstance(part, ast.Expr)}
+    for part in parts:
+        if isinstance(part, ast.For | ast.comprehension) and _has_no_order(part.iter, names):
+            return part.iter
+        if isinstance(part, ast.Call) and not _is_repeatable(part, names, seen, part in unused):
+            return part
+        if isinstance(part, ast.Attribute | ast.Name) and evaluated(part, names) is os.environ:
+            return part
+    return None
+
+
+def _has_no_order(node: ast.expr, names: Mapping[str, Any]) -> bool:
+    """Whether this is a set, whose order changes from process to process."""
+    if isinstance(node, ast.Call):
+        return isinstance(node.func, ast.Name) and node.func.id in ("set", "frozenset")
+    return isinstance(node, ast.Set | ast.SetComp) or isinstance(evaluated(node, names), set | frozenset)
+
+
+def _at_once(node: ast.AST, inner: types.CodeType | None) -> Iterator[ast.AST]:
+    """Give what of a function or class runs when it is called or defined; of functions inside only their defaults."""
+    for part in ast.iter_child_nodes(node):
+        if isinstance(part, ast.arguments):
+            continue
+        if not isinstance(part, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            yield part
+            yield from _at_once(part, inner)
+            continue
+        for default in (*part.args.defaults, *part.args.kw_defaults):
+            yield from ast.walk(default) if default is not None else ()
+        if inner is not None and not is_definition_of(part, inner) and any(_is_in(part, inner)):
+            yield from _at_once(part, inner)
+
+
+def _is_in(node: ast.AST, code: types.CodeType) -> Iterator[bool]:
+    return (is_definition_of(part, code) for part in ast.walk(node))
+
+
+def is_definition_of(node: ast.AST, code: types.CodeType) -> bool:
+    """Whether a part of the text that some code is from is its definition."""
+    if isinstance(node, ast.Lambda):
+        return code.co_name == "<lambda>" and node.lineno == code.co_firstlineno
+    is_function = isinstance(node, ast.FunctionDef) and node.name == code.co_name
+    return is_function and isinstance(node, ast.FunctionDef) and first_line(node) == code.co_firstlineno
+
+
+def _is_repeatable(call: ast.Call, names: Mapping[str, Any], seen: set[types.CodeType], is_unused: bool) -> bool:
+    called, function = call.func, evaluated(call.func, names)
+    if function is None and isinstance(called, ast.Name) and called.id not in names:
+        function = getattr(builtins, called.id, None)
+    if isinstance(function, types.FunctionType) and importable(function) is None:
+        _, node = definition_of(function.__code__)
+        known = function.__code__ in seen
+        seen.add(function.__code__)
+        return known or (node is not None and _unrepeatable(node, function.__globals__, None, seen) is None)
+    is_free = isinstance(called, ast.Name) and called.id in _ORDER_FREE
+    if not is_free and any(_has_no_order(argument, names) for argument in call.args):
+        return False
+    if is_unused or (isinstance(function, type) and importable(function) is None):
+        return True
+    owner = evaluated(called.value, names) if isinstance(called, ast.Attribute) else None
+    if function is None or type(owner) in (str, bytes, tuple, list, dict) or is_plain_array(owner):
+        return isinstance(called, ast.Attribute) and called.attr in _REPEATABLE_METHODS
+    home = importable(function)
+    if home is None:
+        return False
+    top = home.module.partition(".")[0]
+    is_number = top == "numpy" and (type(function).__name__ == "ufunc" or _is_numpy_number(function))
+    return is_number or top in _REPEATABLE_MODULES or home.qualname in _REPEATABLE.get(top, ())
+
+
+def _is_numpy_number(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, sys.modules["numpy"].generic)

@@ -1,0 +1,183 @@
+"""A bundle has what the notebook has, however that was made and whatever was rebound since; or it is refused."""
+
+from __future__ import annotations
+
+import functools
+import operator
+
+import cv2
+import numpy as np
+import pytest
+
+import epypes as ep
+from epypes.bundle.compare import first_difference
+from epypes.errors import PromotionRefused
+from tests.bundle.hostile import in_notebook
+
+KNOWN = {"functools": functools, "operator": operator, "cv2": cv2, "np": np}
+ARRAY = np.arange(12.0).reshape(3, 4)
+
+FACTORY = "GAIN = 2\ndef make(k):\n    w = k * GAIN\n    def f(a):\n        return a * w + k\n    return f\nf = make(3)"
+MAKES = "GAIN = 2\ndef make(k):\n    {}\n    def f(a):\n        return a * w + k\n    return f\nf = make(3)"
+OWN_DEFAULT = "G = 2\ndef make(k):\n    def f(a, g=G):\n        return a * k + g\n    return f\nf = make(3)"
+BOX = "class Box(typing.NamedTuple):\n    low: int = 2\n    high: int = 7\n"
+BOXED = "def f(a, box: Box = Box(high=5)):\n    return a * box.low + box.high\n"
+LATE = "from __future__ import annotations\n"
+
+# By name: the cells. All of them define f, which takes an array.
+PROMOTED: dict[str, tuple[str, ...]] = {
+    "factory": (FACTORY,),
+    "factory that reads what has changed since": (FACTORY, "GAIN = 9"),
+    "two closures of one factory with computed arrays": (
+        "def make(size):\n    weights = np.ones(size) / size\n    shape = cv2.getStructuringElement(cv2.MORPH_RECT, (size, size))\n"
+        "    def f(a):\n        return cv2.erode(cv2.filter2D(a, -1, weights), shape) + size\n    return f\nthree, five = make(3), make(5)\n"
+        "def f(a):\n    return three(a) + five(a)",
+    ),
+    "factory that draws random numbers": (MAKES.format("w = np.random.rand()"),),
+    "factory that reads a file": (MAKES.format("w = np.fromfile('/proc/version', 'u1').size"),),
+    "factory with a condition": (MAKES.format("w = GAIN if k else 0"), "GAIN = 3"),
+    "factory in steps": (MAKES.format("w = 0\n    w = GAIN"), "GAIN = 3"),
+    "factory with a comprehension": (MAKES.format("w = [x for x in (GAIN,)][0]"),),
+    "factory that fails by now": (MAKES.format("w = GAIN['w']").replace("GAIN = 2", "GAIN = {'w': 2}"), "GAIN = {}"),
+    "factory that writes into its argument": (
+        "def make(t):\n    t.append(1)\n    def f(a):\n        return a + len(t)\n    return f\nf = make([0])",
+    ),
+    "factory that chooses what it defines": (
+        "FAST = True\ndef make(k):\n    if FAST:\n        def f(a):\n            return a + k\n    else:\n"
+        "        def f(a):\n            return a - k\n    return f\nf = make(3)",
+        "FAST = False",
+    ),
+    "factory that copied what has changed since": (
+        "def make(t):\n    w = dict(t)\n    def f(a):\n        return a + w['k'] + t['k']\n    return f\nT = {'k': 1}\nf = make(T)",
+        "T['k'] = 9",
+    ),
+    "factory with helpers inside": (
+        "def make(k):\n    twice = k * 2\n    def inner(a):\n        return a * twice\n    def f(a):\n        return inner(a) + k\n"
+        "    return f\nf = make(3)",
+    ),
+    "factory that counts": (
+        "COUNT = [0]\ndef make(k):\n    COUNT[0] += 1\n    n = COUNT[0]\n    def f(a):\n        return a + k * n\n    return f\nf = make(3)",
+    ),
+    "factory with the order of a set": (MAKES.format("w = len(list({'red', 'blue', 'green'})[0])"),),
+    "factory that takes from an iterator": (f"IT = iter([4, 5, 6])\n{MAKES.format('w = next(IT)')}",),
+    "factories of which one makes another thing by now": (
+        "GAIN = 2\ndef make(k):\n    w = GAIN\n    def g(a):\n        return a * w + k\n    return g\n"
+        "def plain(n):\n    def h(a):\n        return a * n\n    return h\none, two, three = make(1), plain(2), plain(3)\n"
+        "def f(a):\n    return one(a) + two(a) * three(a)\nGAIN = 5",
+    ),
+    "closure with a default": (OWN_DEFAULT,),
+    "closure with a default that has another value by now": (OWN_DEFAULT, "G = 5"),
+    "default of a name that has another value by now": ("K = 5\ndef f(a, k=K):\n    return a * k\nK = 9",),
+    "default by name, and of a class that was defined again": (
+        "class C:\n    K = 2\ndef f(a, *, k=C.K, l=len('abc')):\n    return a * k + l\nclass C:\n    K = 3",
+    ),
+    "default that is an array": ("K = np.array([1.5, 2, 3, 4])\ndef f(a, k=K):\n    return a * k\nK = None",),
+    "default that is a function": ("def g(a):\n    return a + 1\ndef f(a, g=g):\n    return g(a)\ndef g(a):\n    return a + 2",),
+    "default of a NamedTuple": (f"import typing\n{BOX}{BOXED}",),
+    "default of a NamedTuple under a name": (
+        f"import typing\n{BOX}BEST = Box(4)\ndef f(a, box=BEST):\n    return a * box.low + (box is BEST)\n",
+    ),
+    "default of a NamedTuple under a name that has another value by now": (
+        f"import typing\n{BOX}BEST = Box(4)\ndef f(a, box=BEST):\n    return a * box.low\nBEST = Box(9)",
+    ),
+    "default of a frozen dataclass": (
+        f"import dataclasses\n@dataclasses.dataclass(frozen=True)\nclass Box:\n    low: int = 2\n    high: int = 7\n{BOXED}",
+    ),
+    "default of a member of an enumeration": (
+        "import enum\nclass Way(enum.Enum):\n    UP = 1\n    DOWN = -1\ndef f(a, way: Way = Way.DOWN):\n    return a * way.value",
+    ),
+    "annotation that nothing defines": (f"{LATE}def f(a: Picture, k: Missing = 3) -> Picture:\n    return a * k",),
+    "annotation inside that nothing defines": (
+        f"{LATE}def f(a):\n    def g(b: Missing) -> list[Missing]:\n        return b * 2\n    c: Missing = g(a)\n    return c",
+    ),
+    "annotation of a class that is defined": (f"{LATE}import typing\n{BOX}{BOXED}",),
+    "set of members, logger and pattern in a class": (
+        "import enum\nimport logging\nimport re\nclass Way(enum.Enum):\n    UP = 1\n    DOWN = -1\n"
+        "class C:\n    WAYS = {Way.UP, Way.DOWN}\n    LOG = logging.getLogger('c')\n    WORD = re.compile('a+')\n"
+        "def f(a):\n    C.LOG.debug('f')\n    return a * len(C.WAYS) + len(C.WORD.findall('aab'))",
+    ),
+}  # fmt: skip
+
+# By name: a cell that defines f, and what the reason says.
+REFUSED: dict[str, tuple[str, str]] = {
+    "one object in the notebook, two in the module": (
+        "import dataclasses\n@dataclasses.dataclass(frozen=True)\nclass Box:\n    low: int = 2\nBEST = Box()\n"
+        "def f(a, box=BEST):\n    return a * (box is OTHER)\nOTHER, BEST = BEST, None",
+        "is one object in the notebook and several in the module",
+    ),
+    "class with an object that can't be seen through": (
+        "class C:\n    ROWS = (i for i in range(3))\ndef f(a):\n    return a, C.ROWS", r"Class .C. .*ROWS.* can.t be compared. Make it inside the function",
+    ),
+    "decorator that reads the environment": (
+        "import os\ndef d(g):\n    k = os.environ.get('K', '2')\n    @functools.wraps(g)\n    def w(a):\n        return g(a) * int(k)\n"
+        "    return w\n@d\ndef f(a):\n    return a", r"@d \(cell \[1\], line 8\): it calls .*\(cell \[1\], line 3\).* Compute it above",
+    ),
+    "decorator with an argument that was read": (
+        "import os\ndef d(k):\n    def deco(g):\n        @functools.wraps(g)\n        def w(a):\n            return g(a) * k\n"
+        "        return w\n    return deco\n@d(os.getpid())\ndef f(a):\n    return a", r"its argument 'os.getpid\(\)' may be something else",
+    ),
+    "class that reads the environment by a name of its own": (
+        "class C:\n    from os import environ as env\n    K = len(env.get('HOME', ''))\ndef f(a):\n    return a * C.K",
+        r"Class 'C', .*\(cell \[1\], line 3\) when it is defined",
+    ),
+    "class with the order of a set": (
+        "class C:\n    NAMES = {'red', 'green', 'blue'}\n    K = [*map(len, NAMES)]\n    L = tuple(NAMES)\ndef f(a):\n    return a * C.K[0]",
+        r"Class 'C', .*\(cell \[1\], line 3\) when it is defined",
+    ),
+    "default of a dataclass that was set later": (
+        "import dataclasses\n@dataclasses.dataclass\nclass C:\n    k: int = 2\nC.__init__.__defaults__ = (7,)\ndef f(a):\n    return a * C().k",
+        r"Class 'C' \(cell \[1\], line 3\), which function 'f' needs: its .*__init__ default of 'k'.* is 7 in the notebook and 2",
+    ),
+    "class that reads the environment": (
+        "import os\nclass C:\n    K = len(os.environ)\ndef f(a):\n    return a * C.K", r"Class 'C', .* 'os.environ' \(cell \[1\], line 3\)",
+    ),
+}  # fmt: skip
+
+
+def runner_of(monkeypatch: pytest.MonkeyPatch, *cells: str) -> ep.CompGraphRunner:
+    names = in_notebook(monkeypatch, *cells, **KNOWN)
+    runner = ep.CompGraphRunner(ep.CompGraph({"f": names["f"]}, {"f": ("a", "b")}, types=False))
+    runner.run(a=ARRAY)
+    return runner
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cells", PROMOTED.values(), ids=PROMOTED)
+def test_a_bundle_computes_the_same_on_another_input(monkeypatch, tmp_path, cells):
+    runner = runner_of(monkeypatch, *cells)
+    again = ep.load(ep.promote(runner, tmp_path / "b").path)
+    for other in (ARRAY, 3 - 2 * ARRAY, ARRAY[:1] * 1e6):
+        assert first_difference(runner.run(a=other)["b"], again.run(a=other)["b"]) is None
+    names: dict = {}
+    exec(compile(ep.to_source(runner), "straight", "exec", dont_inherit=True), names)
+    assert first_difference(runner.run(a=-ARRAY)["b"], names["run_graph"](-ARRAY)) is None
+
+
+@pytest.mark.parametrize(("cell", "words"), REFUSED.values(), ids=REFUSED)
+def test_what_the_module_would_not_have_is_refused(monkeypatch, tmp_path, cell, words):
+    with pytest.raises(PromotionRefused, match=words):
+        ep.promote(runner_of(monkeypatch, cell), tmp_path / "b")
+
+
+def test_a_factory_is_called_where_that_makes_what_the_notebook_has(monkeypatch):
+    assert "\nf = make(3)\n" in ep.to_source(runner_of(monkeypatch, FACTORY))
+    text = ep.to_source(runner_of(monkeypatch, FACTORY, "GAIN = 9"))
+    assert sorted(text.splitlines()[:2]) == [
+        f"{each}  # as make() had it in the notebook" for each in ("k = 3", "w = 6")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("cell", "known"),
+    [
+        ("K = [0]\ndef g(k):\n    operator.iadd(k, [1])\ndef f(a):\n    g(K)\n    return a", "K"),
+        ("K = np.zeros(3)\ndef f(a):\n    np.ndarray.__iadd__(K, 1)\n    return a", "K"),
+        (
+            "def make(k):\n    def f(a):\n        operator.iadd(k, [1])\n        return a\n    return f\nf = make([1])",
+            "k",
+        ),
+    ],
+)
+def test_what_a_function_changes_out_of_sight_is_seen_when_it_is_run_again(monkeypatch, tmp_path, cell, known):
+    with pytest.raises(PromotionRefused, match=f"'f' changes '{known}' from run to run.* make it a token"):
+        ep.promote(runner_of(monkeypatch, cell), tmp_path / "b")
