@@ -338,3 +338,33 @@ def test_an_array_keeps_its_layout(made):
 def test_an_array_that_is_part_of_another_is_refused_with_the_way_out(made):
     _, refusals = promoted(f"M = np.arange(6.0).reshape(2, 3)\nK = {made}\ndef f(x):\n    return K\n")
     assert "Make it a whole one in the notebook: np.ascontiguousarray(" in refusals[0]
+
+
+CONSTANTS = {
+    "several lines with comments": ("K = (1,  # low\n     'two')  # in mm\n", "K = (1,  # low\n     'two')  # in mm\n"),
+    "a text over lines": ('K = """a\n    b"""\n', 'K = """a\n    b"""\n'),
+    "inside of a block": ("if True:\n    # why\n    K = [1,\n         2]\n", "# why\nK = [1,\n         2]\n"),
+    "two on one line": ("K = 1.50; L = 2  # both\n", "K = 1.50\n"),
+    "with an annotation": ("K: int = 0x10  # bits\n", "K = 16  # bits\n"),
+    "in brackets over lines": ("K = (1 +\n     2)\n", "K = (1 +\n     2)\n"),
+    "computed from another": ("L = 2\nK = L * 3\n", "K = 6  # L * 3 in the notebook\n"),
+    "changed since": ("K = [1]  # one\nK.append(2)\n", "K = [1, 2]\n"),
+    "given by a call": ("K = dict(a='x')\n", "K = {\"a\": \"x\"}  # dict(a='x') in the notebook\n"),
+    "too long for a line": (
+        "K = tuple(f'number {i}' for i in range(8))\n",
+        "# tuple((f'number {i}' for i in range(8))) in the notebook\nK = (\n    \"number 0\",\n    \"number 1\",\n",
+    ),
+    "a call too long for a line": (
+        "K = np.arange(16.0).reshape(2, 8) / 3 + 100\n",
+        "# np.arange(16.0).reshape(2, 8) / 3 + 100 in the notebook\nK = np.array(\n    [\n        [\n            100.0,\n",
+    ),
+}
+
+
+@pytest.mark.parametrize(("source", "written"), CONSTANTS.values(), ids=CONSTANTS)
+def test_a_constant_stands_as_the_notebook_has_it_or_with_how_it_was_computed(source, written):
+    source += "def f(x):\n    return repr(K)\n"
+    text, refusals = promoted(source)
+    assert refusals == []
+    assert f"\n{written}" in text
+    assert executed(text).func_dict["f"](0) == notebook(source)["f"](0)
