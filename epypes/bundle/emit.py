@@ -17,7 +17,7 @@ from epypes.bundle.expressions import noted_refusals
 from epypes.bundle.formatting import LINE, one_per_line
 from epypes.bundle.graphs import Graphs, GraphText
 from epypes.bundle.hyperparameters import members_in
-from epypes.bundle.literal import literal, quoted
+from epypes.bundle.literal import quoted
 from epypes.bundle.order import ordered
 from epypes.bundle.settings import Settings
 from epypes.bundle.slicer import Slice
@@ -120,7 +120,7 @@ def emit_module(
     text = written if isinstance(written, GraphText) else GraphText(written)
     tail = [*blocks, text.functions("func_dict"), text.io("func_io", cg)]
     if cg.groups:
-        items = [(f"{quoted(name)}: ", literal(list(functions))) for name, functions in cg.groups.items()]
+        items = [(f"{quoted(name)}: ", f"[{', '.join(map(quoted, part))}]") for name, part in cg.groups.items()]
         tail.append(["# Drawn as one box each.", *one_per_line("func_groups = {", items, "}")])
     return module_text([_docstring(settings)], needed, [_spaced(["\n".join(block) for block in [*tail, *own]])])
 

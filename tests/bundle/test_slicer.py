@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import functools
 import linecache
 import re
@@ -349,10 +350,10 @@ CONSTANTS = {
     "in brackets over lines": ("K = (1 +\n     2)\n", "K = (1 +\n     2)\n"),
     "computed from another": ("L = 2\nK = L * 3\n", "K = 6  # L * 3 in the notebook\n"),
     "changed since": ("K = [1]  # one\nK.append(2)\n", "K = [1, 2]\n"),
-    "given by a call": ("K = dict(a='x')\n", "K = {\"a\": \"x\"}  # dict(a='x') in the notebook\n"),
+    "given by a call": ("K = dict(a='x')\n", 'K = {"a": "x"}  # dict(a=\'x\') in the notebook\n'),
     "too long for a line": (
         "K = tuple(f'number {i}' for i in range(8))\n",
-        "# tuple((f'number {i}' for i in range(8))) in the notebook\nK = (\n    \"number 0\",\n    \"number 1\",\n",
+        '# tuple((f\'number {i}\' for i in range(8))) in the notebook\nK = (\n    "number 0",\n    "number 1",\n',
     ),
     "a call too long for a line": (
         "K = np.arange(16.0).reshape(2, 8) / 3 + 100\n",
@@ -368,3 +369,18 @@ def test_a_constant_stands_as_the_notebook_has_it_or_with_how_it_was_computed(so
     assert refusals == []
     assert f"\n{written}" in text
     assert executed(text).func_dict["f"](0) == notebook(source)["f"](0)
+
+
+class Token(enum.StrEnum):
+    INPUT = "the image"
+    MASK = "mask"
+
+
+def test_members_of_an_enumeration_as_names_are_written_as_their_text():
+    names = notebook("def f(*numbers):\n    return sum(numbers)\n")
+    cg = ep.CompGraph({Token.MASK: names["f"]}, {Token.MASK: ([Token.INPUT, Token.MASK], "sum")})
+    cg = ep.group(cg, Token.INPUT, [Token.MASK])
+    needed, references = slice_graph(cg.functions)
+    module = executed(emit_module(SETTINGS, cg, needed, references))
+    assert repr(module.func_io) == "{'mask': (('the image', 'mask'), 'sum')}"
+    assert repr(module.func_groups) == "{'the image': ['mask']}"
