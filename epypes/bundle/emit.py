@@ -143,7 +143,10 @@ def module_text(head: Sequence[str], needed: Slice, tail: Sequence[str]) -> str:
     sections = ["\n\n".join([*head, *imports, *([] if reader else constants)])]
     if reader:
         sections += [reader, *constants]
-    sections += [texts[name] for name in ordered(texts, positions, needed.reads)]
+    names = ordered(texts, positions, needed.reads)
+    for are_constants, group in itertools.groupby(names, needed.constants.__contains__):
+        found = [texts[name] for name in group]
+        sections += ["\n".join(found)] if are_constants else found
     return "\n\n\n".join([*filter(None, sections), *tail]) + "\n"
 
 

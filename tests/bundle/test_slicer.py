@@ -49,7 +49,7 @@ def promoted(source: str, function: str = "f", arity: int = 1):
 
 def executed(text: str) -> types.SimpleNamespace:
     names: dict = {"__name__": "bundle"}
-    exec(compile(text, "bundle", "exec"), names)
+    exec(compile(text, "bundle", "exec", dont_inherit=True), names)
     return types.SimpleNamespace(**names)
 
 
@@ -384,3 +384,28 @@ def test_members_of_an_enumeration_as_names_are_written_as_their_text():
     module = executed(emit_module(SETTINGS, cg, needed, references))
     assert repr(module.func_io) == "{'mask': (('the image', 'mask'), 'sum')}"
     assert repr(module.func_groups) == "{'the image': ['mask']}"
+
+
+RECORD = "from dataclasses import dataclass\n@dataclass(frozen=True)\nclass Cfg:\n    k: int = 3\n"
+ORDERED = {
+    "a class that reads records": f"def f(x):\n    return D.z + x\n{RECORD}A, B = Cfg(1), Cfg(2)\nclass D:\n    z = A.k + B.k\n",
+    "a decorator that reads a record when it decorates": (
+        f"{RECORD}def deco(g):\n    by = CFG.k\n    @functools.wraps(g)\n    def w(x):\n        return g(x) + by\n    return w\n"
+        "CFG = Cfg(5)\n@deco\ndef f(x):\n    return x\n"
+    ),
+    "a factory that reads a table at once": (
+        "def make():\n    by = T['a']\n    def inner(x):\n        return x + by(x)\n    return inner\n"
+        "def twice(x):\n    return 2 * x\nT = {'a': twice}\nf = make()\n"
+    ),
+    "classes that make each other": (
+        "class A:\n    n = 1\n    def other(self):\n        return B()\nclass B(A):\n    n = 2\n    def back(self):\n        return A().n\n"
+        "def f(x):\n    return A().other().n + B().back() + x\n"
+    ),
+}
+
+
+@pytest.mark.parametrize("source", ORDERED.values(), ids=ORDERED)
+def test_what_importing_a_definition_reads_stands_before_it(source):
+    text, refusals = promoted(source)
+    assert refusals == []
+    assert executed(text).func_dict["f"](3) == notebook(source)["f"](3)
