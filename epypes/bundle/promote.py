@@ -18,6 +18,7 @@ from epypes.bundle.arrays import write_arrays
 from epypes.bundle.compare import Tolerance
 from epypes.bundle.determinism import learn
 from epypes.bundle.emit import write_module
+from epypes.bundle.hyperparameters import store_arrays, write_stored_arrays
 from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
 from epypes.bundle.manifest import MANIFEST, why_no_bundle
 from epypes.bundle.proof import prove, swap_folders
@@ -131,9 +132,10 @@ def _write(
     wanted = cg.sink_tokens if outputs is None else tuple(outputs)
     for token in wanted:
         cg.require_token(token)
-    reasons = [*_unready(runner, wanted), *unwritable(runner.hyperparameters)]
+    hyperparameters, stored = store_arrays(runner.hyperparameters)
+    reasons = [*_unready(runner, wanted), *unwritable(hyperparameters)]
     reasons += unwritable(subject.attributes, "Attribute")
-    hyperparameters, free = runner.hyperparameters, runner.free_source_tokens
+    free = runner.free_source_tokens
     rgb = tuple(token for token in dict.fromkeys((*free, *wanted)) if colour_order(cg, token) == "rgb")
     settings = Settings(
         target.name, free, wanted, hyperparameters, rgb, writable_defaults(cg, hyperparameters), cg.types,
@@ -148,6 +150,7 @@ def _write(
     (draft / MODULE).write_text(module, encoding="utf-8")
     write_settings(draft / SETTINGS, settings, cg)
     write_arrays(draft, arrays)
+    write_stored_arrays(draft, stored)
     for number, run in enumerate(runs):
         _record(draft / SAMPLES / f"{number:03}.npz", target, run, settings)
         # An answer is compared to the last bit, which noise would change.

@@ -222,7 +222,7 @@ def test_a_token_without_codec_refuses_promotion_by_name(tmp_path):
 
 def test_a_hyperparameter_that_toml_cannot_hold_is_refused_by_name(tmp_path):
     cg = ep.CompGraph({"add": np.add}, {"add": (("x", "k"), "y")})
-    runner = ep.CompGraphRunner(cg, {"k": np.ones(999)})
+    runner = ep.CompGraphRunner(cg, {"k": [np.ones(999)]})
     runner.run(x=np.zeros(999))
     with pytest.raises(
         PromotionRefused, match=r"'k' is or holds an array of 999 numbers; 400 are the most that pipeline\.toml holds"
