@@ -1,4 +1,4 @@
-"""How does a bundle become a runner or a pipeline again?"""
+"""Loading: a bundle becomes a runner or a pipeline again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stands in pipeline.toml, and how is it read back?"""
+"""The settings of a bundle, written to pipeline.toml and read back."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Settings:
     defaults
         The graph's defaults of hyperparameters by token: what they are where the graph is used without these settings.
     types
-        Whether the graph compares annotations, as CompGraph does unless told otherwise.
+        Whether the graph compares annotations, as CompGraph does by default.
     tolerances
         How far outputs may be from what was recorded, by token; those of all others not at all.
     own

@@ -347,7 +347,7 @@ def test_what_is_put_there_while_the_promotion_runs_is_kept(when, was_there, bun
     if when == "exchanging" and not was_there:
         bundle.path.mkdir()
     with pytest.raises(PromotionRefused, match=re.escape(str(bundle.path))):
-        ep.promote(runner, bundle.path, told=lambda text: put() if when in text else None)
+        ep.promote(runner, bundle.path, on_progress=lambda text: put() if when in text else None)
     assert mine.read_text() == "important"
     assert [path.name for path in bundle.path.parent.iterdir()] == [bundle.path.name]
 
