@@ -151,7 +151,8 @@ def test_an_outcome_comes_back_from_json_as_it_was():
         {"f": 12}, 15, ErrorInfo("f", "ValueError", "no"), {"edges": Thumbnail("image/png", b"\x89PNG", "uint8 2 x 2")},
         {"edges": np.zeros((2, 2))},
     )  # fmt: skip
-    assert Outcome.from_json(json.loads(json.dumps(outcome.to_json()))) == replace(outcome, kept={})
+    again = Outcome.from_json(json.loads(json.dumps(outcome.to_json())), Item(4, "b.png", {}), outcome.setting)
+    assert again == replace(outcome, number=4, name="b.png", kept={})
 
 
 def test_the_table_has_failures_as_rows_and_whole_numbers_stay_whole(counted):
