@@ -50,17 +50,8 @@ _DATA_MODULES: Final = frozenset({"builtins", "collections", "datetime", "decima
 _CODE: Final = (types.FunctionType, type, types.ModuleType)
 # Entries of a class that say where it stands, or that Python makes from the others, some when an object is pickled.
 _NO_BEHAVIOUR: Final = frozenset(
-    [
-        "__annotations_cache__",
-        "__dict__",
-        "__doc__",
-        "__firstlineno__",
-        "__module__",
-        "__slotnames__",
-        "__static_attributes__",
-        "__weakref__",
-        "_abc_impl",
-    ]
+    {"__annotations_cache__", "__dict__", "__doc__", "__firstlineno__", "__module__", "__slotnames__"}
+    | {"__static_attributes__", "__weakref__", "_abc_impl"}
 )
 # Attributes that an object fills when it is used: caches and counters.
 _DERIVED: Final = {

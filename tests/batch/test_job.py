@@ -1,4 +1,4 @@
-"""What is left of an item that was run?"""
+"""Jobs of one worker, and their outcomes."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_a_function_that_leaves_the_interpreter_is_a_failure_of_its_item():
     assert outcome.error_info.kind == "SystemExit"
 
 
-def test_numbers_texts_and_truth_values_stay_and_others_are_told_in_short(crops):
+def test_numbers_texts_and_truth_values_stay_and_others_become_a_short_text(crops):
     kinds = {
         "count": np.int64(3),
         "share": np.float32(0.5),
