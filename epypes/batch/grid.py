@@ -1,4 +1,7 @@
-"""Grids of hyperparameter values: the settings that they stand for, and the order in which they run."""
+"""Grids of hyperparameter values: the settings that they stand for, and the order in which they run.
+
+Settings are counted before any is written out, so that a grid which is too large costs nothing.
+"""
 
 from __future__ import annotations
 
@@ -159,7 +162,9 @@ def _hint(runner: CompGraphRunner, name: str) -> Param:
     found = range_of(runner.cg, name, runner.hyperparameters[name])
     if isinstance(found, Param):
         return found
-    raise ScaleError(f"Nothing says which values {name!r} may take. Give a list of values, or a range, as (low, high).")
+    raise ScaleError(
+        f"No hint gives the values that {name!r} may take. Give a list of values, or a range, as (low, high)."
+    )
 
 
 def _product(runner: CompGraphRunner, values: Mapping[str, Sequence[Any]]) -> Grid:
@@ -174,9 +179,10 @@ def _product(runner: CompGraphRunner, values: Mapping[str, Sequence[Any]]) -> Gr
 def _zipped(runner: CompGraphRunner, values: Mapping[str, Sequence[Any]]) -> Grid:
     lengths = {name: len(given) for name, given in values.items()}
     if len(set(lengths.values())) > 1:
-        told = ", ".join(f"{name} has {length}" for name, length in lengths.items())
+        counts = ", ".join(f"{name} has {length}" for name, length in lengths.items())
         raise ScaleError(
-            f"how='zip' takes the first values together, then the second, and so on, but {told}. Give as many of each."
+            f"how='zip' takes the first values together, then the second, and so on, but {counts}. "
+            "Give as many of each."
         )
     names = tuple(values)
 

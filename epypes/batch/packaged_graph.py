@@ -120,7 +120,7 @@ def _reasons(reasons: Sequence[str], folder: Path) -> list[str]:
 
 
 def _key_of(runner: CompGraphRunner) -> str | None:
-    """Return what tells a graph from others that compute something else; None if that can't be written as text.
+    """Return a text that differs for graphs that compute something else; None if the graph can't be written as text.
 
     Values of hyperparameters are not in it: they travel beside the package.
     """

@@ -150,7 +150,7 @@ def test_a_logarithmic_range_is_drawn_as_often_below_its_geometric_mean_as_above
         ({"offset": np.int64(5)}, {"how": "zip"}, r"no list of values"),
         ({"offset": np.array(5)}, {"how": "random", "n": 3}, "offset=5 is neither a range"),
         ({"method": "near"}, {}, r"Write method=\['near'"),
-        ({"method": None}, {}, "Nothing says which values 'method' may take"),
+        ({"method": None}, {}, "No hint gives the values that 'method' may take"),
         ({"scale": None}, {}, "no end of values for 'scale'"),
         ({"offset": (0, 4)}, {"how": "random"}, "Say how many"),
         ({"offset": [1]}, {"n": 5}, "goes with how='random'"),

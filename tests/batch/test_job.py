@@ -1,4 +1,4 @@
-"""What is left of an item that was run?"""
+"""Jobs of one worker, and their outcomes."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_a_function_that_leaves_the_interpreter_is_a_failure_of_its_item():
     assert outcome.error_info.kind == "SystemExit"
 
 
-def test_numbers_texts_and_truth_values_stay_and_others_are_told_in_short(crops):
+def test_numbers_texts_and_truth_values_stay_and_others_become_a_short_text(crops):
     kinds = {
         "count": np.int64(3),
         "share": np.float32(0.5),
@@ -151,7 +151,8 @@ def test_an_outcome_comes_back_from_json_as_it_was():
         {"f": 12}, 15, ErrorInfo("f", "ValueError", "no"), {"edges": Thumbnail("image/png", b"\x89PNG", "uint8 2 x 2")},
         {"edges": np.zeros((2, 2))},
     )  # fmt: skip
-    assert Outcome.from_json(json.loads(json.dumps(outcome.to_json()))) == replace(outcome, kept={})
+    again = Outcome.from_json(json.loads(json.dumps(outcome.to_json())), Item(4, "b.png", {}), outcome.setting)
+    assert again == replace(outcome, number=4, name="b.png", kept={})
 
 
 def test_the_table_has_failures_as_rows_and_whole_numbers_stay_whole(counted):
