@@ -136,7 +136,7 @@ def count(value: Any, *, of: Literal["items", "nonzero", "labels"] | None = None
     of
         ``"items"``: what ``len`` counts, rows of an array; ``"nonzero"``: pixels that are not zero; ``"labels"``:
         different numbers in a label image but 0. Without: the items, of a mask (bool) the pixels that are True. Other
-        arrays of integers with two axes may be either, so there it must be said.
+        arrays of integers with two axes may be either, so there it must be given.
 
     Raises
     ------
@@ -293,7 +293,7 @@ def _boxes_iou(value: Any, expected: Any, form: BoxForm) -> float:
 
 
 def _is_label_image(array: Any) -> bool:
-    """Whether an array tells objects from each other: integers, of which more than one is not zero."""
+    """Whether an array is a label image: integers with more than one value besides 0."""
     import numpy as np
 
     if array.dtype.kind not in "iu":
@@ -360,10 +360,10 @@ def _same_shape(value: Any, expected: Any) -> tuple[Any, Any]:
 def _numbers(value: Any, expected: Any) -> tuple[Any, Any]:
     import numpy as np
 
-    got, wanted = _same_shape(value, expected)
-    for array in (got, wanted):
+    for array in map(_array, (value, expected)):
         if array.dtype.kind not in "biufc":
             raise ValueError(f"{_kind(array)} are no numbers.")
+    got, wanted = _same_shape(value, expected)
     dtype = np.result_type(got.dtype, wanted.dtype, np.float64)
     return got.astype(dtype), wanted.astype(dtype)
 
