@@ -2,8 +2,8 @@
 
 Optuna's tree-structured Parzen estimator suggests settings (Bergstra, Bardenet, Bengio and Kegl 2011, "Algorithms for
 hyper-parameter optimization", NeurIPS 24). A study is computed in memory; each trial that has ended is written to a
-database, if there is one, in Optuna's own tables, so that its dashboard reads them too: a trial that is asked for and
-told in the database itself took 179 ms.
+database, if there is one, in Optuna's own tables, so that its dashboard reads them too. A study that is computed in the
+database itself took 179 ms per trial.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Does a search find good hyperparameters, run no more than it must, and end when it is asked to?"""
+"""A search finds good hyperparameters, runs no more than it must, continues from a store, and ends when it is asked to."""
 
 from __future__ import annotations
 
@@ -486,11 +486,13 @@ def test_without_a_name_it_follows_from_what_is_searched(tmp_path: Path) -> None
     def another(tokens: Mapping[str, Any], _case: ep.Case) -> float:
         return float(tokens["y"].max())
 
-    stop = threading.Event()
+    levels = iter_levels()
     another.__name__ = metric.__name__
     assert len(ep.optimize(runner, another, [image], 1, **options)) == 1
-    with pytest.raises(ScaleError, match="name='...'"):
-        ep.optimize(runner_of(lambda x, k: (stop, k), k=1), "y", [0], 1, store=tmp_path / "s.sqlite", ranges={"k": [1]})
+    with pytest.raises(ScaleError, match="its graph from others: a 'generator'.*\\n.*name='...'"):
+        ep.optimize(
+            runner_of(lambda x, k: (levels, k), k=1), "y", [0], 1, store=tmp_path / "s.sqlite", ranges={"k": [1]}
+        )
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Does every outcome stand where it belongs on a contact sheet, and is the sheet small enough for a notebook?"""
+"""The contact sheet of a sweep: where each outcome stands, and the size of its page."""
 
 from __future__ import annotations
 

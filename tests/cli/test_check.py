@@ -1,4 +1,4 @@
-"""Does ``epypes check`` tell continuous integration what it must know?"""
+"""``epypes check``: exit codes, messages, JSON and JUnit XML."""
 
 from __future__ import annotations
 
