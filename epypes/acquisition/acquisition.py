@@ -1,4 +1,4 @@
-"""Which recent frames of several cameras belong together?"""
+"""Several cameras at once, and their frames nearest to a time."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from epypes.acquisition.cameras import camera, has_twins
-from epypes.acquisition.frames import Frame
-from epypes.acquisition.ring import Ring
+from epypes.acquisition.frames import Frame, Ring
 from epypes.acquisition.worker import Counts, Ending, State, Worker
 from epypes.errors import StillRunning
 

@@ -1,4 +1,4 @@
-"""What does one camera's thread do?"""
+"""The thread of one camera, which reads its frames into a ring."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
-from epypes.acquisition.frames import Frame, take_image
+from epypes.acquisition.frames import Frame, Ring, take_image
 from epypes.acquisition.pace import Alarm, Camera
-from epypes.acquisition.ring import Ring
 from epypes.errors import CameraUnavailable
 
 State = Literal["stopped", "running", "ended", "failed"]
