@@ -23,7 +23,7 @@ _started: weakref.WeakSet[Worker] = weakref.WeakSet()
 
 
 class ImageAcquisition:
-    """Captures from several cameras, each on a thread of its own, and answers with the frames nearest to a time.
+    """Captures from several cameras, each on a thread of its own, and returns the frames nearest to a time.
 
     No camera waits for another one, or for a request: each fills a ring of recent frames.
 
