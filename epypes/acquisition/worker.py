@@ -63,7 +63,7 @@ class Ending:
         return not self.reading.is_alive()
 
 
-class Worker:
+class CameraWorker:
     """One camera, its ring, and its thread, which waits for the camera alone.
 
     Parameters
