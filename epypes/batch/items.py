@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.acquisition.files import read_image
-from epypes.acquisition.pictures import IMAGE_ENDINGS, image_files, natural_order
+from epypes.acquisition.files import IMAGE_ENDINGS, image_files, natural_order, read_image
 from epypes.bundle.clone import clone_runner
 from epypes.errors import ScaleError
 from epypes.graph import CompGraph, colour_order

@@ -136,7 +136,7 @@ class SeriesWriter:
         As for `Store.series`.
     most
         How many rows may wait.
-    told
+    report
         Called on the thread with a sentence on what goes wrong; without, it goes to the log.
 
     Raises
@@ -157,7 +157,7 @@ class SeriesWriter:
         *,
         about: Mapping[str, Any] | None = None,
         most: int = _MAX_ROWS,
-        told: Callable[[str], object] = _log.warning,
+        report: Callable[[str], object] = _log.warning,
     ) -> None:
         self._kind, self._name, self._about = kind, name, about
         self._store = store if isinstance(store, Store) else None
@@ -168,7 +168,7 @@ class SeriesWriter:
                 from epypes.store.database import check_place
             check_place(self._place)
         self._series: Series | None = None
-        self._told = told
+        self._on_problem = report
         self._is_away = False
         self._counts = {"written": 0, "skipped": 0, "unwritten": 0}
         self._lock = threading.Lock()
@@ -240,7 +240,7 @@ class SeriesWriter:
 
     def _report(self, text: str) -> None:
         try:
-            self._told(text)
+            self._on_problem(text)
         except Exception:  # the rows must be written, whatever is wrong with the caller's function
             _log.exception("the function that gets reports of %s %r failed", self._kind, self._name)
 

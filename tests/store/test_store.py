@@ -55,7 +55,7 @@ def test_what_is_written_is_json_that_every_reader_understands(place):
         with engine.connect() as connection:
             text = connection.execute(sa.text("SELECT data FROM epypes_rows")).scalar()
         engine.dispose()
-    assert json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))["text"] == ODD["text"]
+    assert json.loads(text, parse_constant=lambda text: pytest.fail(f"{text} is no JSON"))["text"] == ODD["text"]
 
 
 def test_numbers_of_numpy_are_numbers(store):
@@ -168,7 +168,7 @@ def test_to_look_into_a_series_does_not_make_it(store):
     assert (len(looked), looked.keys(), looked.get("a"), looked.about) == (0, frozenset(), None, {})
     assert looked.to_frame().empty
     assert store.names("map") == ()
-    # Whoever makes it says what it is, and who has looked before sees it.
+    # Its maker describes it, and a series object from before sees that.
     store.series("map", "edges", about={"k": 1}).append("a", {"n": 1})
     assert (looked.keys(), looked.about) == ({"a"}, {"k": 1})
     looked.append("b", {"n": 2})
@@ -218,8 +218,8 @@ def test_processes_write_to_a_new_database_at_once_and_nothing_is_lost_or_twice(
         child.stdin.write(b"\n")
         child.stdin.flush()
     for child in children:
-        _, said = child.communicate(timeout=120)
-        assert child.returncode == 0, said.decode()
+        _, message = child.communicate(timeout=120)
+        assert child.returncode == 0, message.decode()
     with Store(place) as store:
         assert store.names("map") == ("edges",)
         found = [key for key, _ in store.series("map", "edges").items()]

@@ -57,7 +57,7 @@ def test_what_can_not_be_written_at_all_holds_nothing_else_up(store, caplog):
 
 
 @pytest.mark.slow
-def test_who_hands_over_rows_waits_for_nobody_and_what_does_not_fit_is_counted(tmp_path, monkeypatch):
+def test_a_caller_does_not_wait_for_the_database_and_rows_that_do_not_fit_are_counted(tmp_path, monkeypatch):
     path = tmp_path / "results.sqlite"
     with Store(path) as store:
         series = store.series("events", "edges")
@@ -106,6 +106,25 @@ def test_a_place_that_can_never_be_is_refused_at_once(tmp_path):
         SeriesWriter(tmp_path / "none" / "results.sqlite", "events", "edges")
     with pytest.raises(StoreError, match="SQLAlchemy knows no"):
         SeriesWriter("nosuch://host/db", "events", "edges")
+
+
+@pytest.mark.slow
+def test_rows_wait_for_a_database_also_if_the_report_of_it_fails(tmp_path, caplog):
+    folder = tmp_path / "results"
+    folder.mkdir()
+
+    def report(text):
+        raise RuntimeError("no such panel")
+
+    writer = SeriesWriter(folder / "results.sqlite", "events", "edges", report=report)
+    folder.rmdir()
+    writer.append("a", {"n": 1})
+    writer.append("bad", {"n": object()})
+    assert not writer.flush(0.5)
+    folder.mkdir()
+    assert writer.close(60)
+    assert writer.counts() == {"written": 1, "skipped": 0, "unwritten": 1, "waiting": 0}
+    assert "no such panel" in caplog.text
 
 
 @pytest.mark.slow

@@ -52,7 +52,7 @@ class StoredHistory:
         self._told: Callable[[str], object] = _log.warning
         self._writer: SeriesWriter | None = None
         if store is not None:
-            self._writer = SeriesWriter(store, KIND, self._name, told=lambda text: self._told(text))
+            self._writer = SeriesWriter(store, KIND, self._name, report=lambda text: self._told(text))
         self._lock = threading.Lock()
         self._last: Entry | None = None
         self._forget: Callable[[], None] | None = None
