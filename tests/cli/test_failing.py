@@ -1,4 +1,4 @@
-"""Does every command that fails exit non-zero with one actionable line?
+"""Every command that fails exits non-zero with one actionable line.
 
 Each command has a row here: a new one without a row fails the first test.
 """
@@ -102,7 +102,6 @@ ROWS = {
 # By command: what does not fail before it is looked for what an extra brings.
 FIRST = {
     "promote": ["{text}", "--to", "{folder}/b"],
-    "demo": ["{text}", "--to", "{folder}/demo"],
     "lab": ["{folder}"],
     "serve": ["{bundle}"],
 }
@@ -169,7 +168,6 @@ def test_an_option_that_there_is_not_exits_with_2(command, epypes):
     [
         ("promote", "nbclient", "nbclient", "service"),
         ("promote", "nbformat", "nbformat", "service"),
-        ("demo", "nbclient", "nbclient", "service"),
         ("lab", "jupyterlab", "jupyterlab", "notebook"),
         ("serve", "zmq", "pyzmq", "serve"),
     ],
