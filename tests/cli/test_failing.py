@@ -162,6 +162,24 @@ def test_an_option_that_there_is_not_exits_with_2(command, epypes):
     assert "No such option" in done.stderr
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "record tcp://127.0.0.1:5555 {folder}/a.mcap --seconds nan",
+        "record tcp://127.0.0.1:5555 {folder}/a.mcap --seconds -1",
+        "play {folder}/none.mcap --speed nan",
+        "stop {bundle} --timeout nan",
+        "serve {bundle} --job-timeout nan",
+        "serve {bundle} --threads 65",
+        "experiment --requests 1.5",
+    ],
+)
+def test_a_number_out_of_range_exits_with_2(words, places, epypes):
+    done = epypes(*words.format(**places).split())
+    assert done.returncode == 2
+    assert "Error: Invalid value for '--" in done.stderr
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "module", "package", "extra"),
