@@ -60,7 +60,9 @@ def record(
 
 @click.command()
 @click.argument("file", type=PATH, help="MCAP file that epypes record wrote.")
-@click.argument("address", default="tcp://127.0.0.1:*", help="Address to bind; connect:ADDRESS connects.")
+@click.argument(
+    "address", default="tcp://127.0.0.1:*", help="Address to bind (default: any port); connect:ADDRESS connects."
+)
 @click.option(
     "--speed", type=_SPEED, default=1.0, callback=refuse_nan, help="2 is twice as fast; 0 as fast as possible."
 )
