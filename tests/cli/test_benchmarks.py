@@ -1,4 +1,4 @@
-"""Do the benchmarks run, compare equals and keep every row? No speed is asserted."""
+"""The benchmarks run, compare equals and keep every row. No speed is asserted."""
 
 from __future__ import annotations
 

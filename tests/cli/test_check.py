@@ -1,4 +1,4 @@
-"""``epypes check``: exit codes, messages, JSON and JUnit XML."""
+"""``epypes check`` reports each case, by its output, its exit status and JUnit XML."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Do acquisition and vision answer, with their times, whatever comes?"""
+"""Acquisition and vision answer, with their times, whatever comes."""
 
 from __future__ import annotations
 

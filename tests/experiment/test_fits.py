@@ -1,4 +1,4 @@
-"""Are the log-normal distributions those of maximum likelihood, and is the summary that of the table?"""
+"""The log-normal distributions are those of maximum likelihood, and the summary is that of the table."""
 
 from __future__ import annotations
 

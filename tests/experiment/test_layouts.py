@@ -1,4 +1,4 @@
-"""Do layouts differ in their wiring alone, and does everything end?"""
+"""Layouts differ in their wiring alone, and everything ends."""
 
 from __future__ import annotations
 

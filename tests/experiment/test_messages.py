@@ -1,4 +1,4 @@
-"""Does what travels between the nodes arrive as it was sent?"""
+"""Messages between the nodes arrive as they were sent."""
 
 from __future__ import annotations
 

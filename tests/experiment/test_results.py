@@ -1,4 +1,4 @@
-"""Are the durations of a row those of the paper?"""
+"""The durations of a row are those of the paper."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Does the robot take the right answer, and never wait for ever?"""
+"""The robot takes the right answer, and never waits for ever."""
 
 from __future__ import annotations
 

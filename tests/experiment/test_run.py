@@ -1,4 +1,4 @@
-"""Can the experiment be run, and does it refuse what makes no sense?"""
+"""The experiment runs, and refuses options that make no sense."""
 
 from __future__ import annotations
 
