@@ -1,4 +1,4 @@
-"""Which recent frames of several cameras belong together?"""
+"""Several cameras at once, and their frames nearest to a time."""
 
 from __future__ import annotations
 
@@ -13,18 +13,17 @@ from types import TracebackType
 from typing import Any, Self
 
 from epypes.acquisition.cameras import camera, has_twins
-from epypes.acquisition.frames import Frame
-from epypes.acquisition.ring import Ring
-from epypes.acquisition.worker import Counts, Ending, State, Worker
+from epypes.acquisition.frames import Frame, Ring
+from epypes.acquisition.worker import CameraWorker, Counts, Ending, State
 from epypes.errors import StillRunning
 
 _AT_EXIT_S = 0.5
 
-_started: weakref.WeakSet[Worker] = weakref.WeakSet()
+_started: weakref.WeakSet[CameraWorker] = weakref.WeakSet()
 
 
 class ImageAcquisition:
-    """Captures from several cameras, each on a thread of its own, and answers with the frames nearest to a time.
+    """Captures from several cameras, each on a thread of its own, and returns the frames nearest to a time.
 
     No camera waits for another one, or for a request: each fills a ring of recent frames.
 
@@ -88,7 +87,7 @@ class ImageAcquisition:
 
         # The workers don't know this object, so that it can be collected while they run, and warn.
         self._workers = tuple(
-            Worker(index, made, size, on_error, on_change) for index, made in enumerate(map(camera, cameras))
+            CameraWorker(index, made, size, on_error, on_change) for index, made in enumerate(map(camera, cameras))
         )
         self._finalizer: weakref.finalize[Any, Any] | None = None
 
@@ -185,7 +184,7 @@ class ImageAcquisition:
         return f"<ImageAcquisition {state}: {len(self._workers)} cameras, {frames} frames>"
 
 
-def _is_settled(worker: Worker) -> bool:
+def _is_settled(worker: CameraWorker) -> bool:
     return worker.has_frame or worker.state in ("ended", "failed")
 
 
@@ -194,13 +193,13 @@ def _require_ended(busy: Sequence[str], timeout_s: float) -> None:
         raise StillRunning("ImageAcquisition", busy, timeout_s)
 
 
-def _end(workers: Sequence[Worker], deadline_s: float) -> list[Ending]:
+def _end(workers: Sequence[CameraWorker], deadline_s: float) -> list[Ending]:
     for worker in workers:
         worker.ask_to_stop()
     return [ending for worker in workers if (ending := worker.end_read(deadline_s)) is not None]
 
 
-def _abandon(workers: Sequence[Worker]) -> None:
+def _abandon(workers: Sequence[CameraWorker]) -> None:
     # By the garbage collector or at exit: so no waiting, no locks.
     for worker in workers:
         worker.ask_to_stop()

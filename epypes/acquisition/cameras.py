@@ -1,4 +1,4 @@
-"""Which source of images becomes which camera?"""
+"""Cameras made of paths, arrays, devices, iterables and functions."""
 
 from __future__ import annotations
 
@@ -7,23 +7,19 @@ from numbers import Integral
 from pathlib import Path
 from typing import Any, Final
 
-from epypes.acquisition import captures
-from epypes.acquisition.files import read_image
-from epypes.acquisition.pace import Camera, paced, require_fps
-from epypes.acquisition.pictures import Sequence, Still, folder
-from epypes.acquisition.quiet import quiet
+from epypes.acquisition.files import image_files, quiet_opencv, read_image
+from epypes.acquisition.frames import lasting_copy
+from epypes.acquisition.pace import USUAL_FPS, Camera, paced, require_fps
 from epypes.errors import ImageFileError
 from epypes.optional import optional_import
 from epypes.run.guard import is_array
 
-# Of sources that would give frames as fast as a processor can.
-USUAL_FPS: Final = 10.0
 # OpenCV takes the number of a device as a C int.
 LAST_DEVICE: Final = 2**31 - 1
 
 
 def camera(source: Any, fps: float | None = None, *, loop: bool = True) -> Camera:
-    """Return a camera: whatever gives images, behind ``read`` and ``close``.
+    """Return a camera: any source of images, behind ``read`` and ``close``.
 
     Parameters
     ----------
@@ -64,7 +60,7 @@ def camera(source: Any, fps: float | None = None, *, loop: bool = True) -> Camer
     if isinstance(source, Integral) and not isinstance(source, bool):
         return _of_number(int(source), fps)
     if is_array(source):
-        return paced(Still(source, loop), fps or USUAL_FPS)
+        return paced(StillCamera(source, loop), fps or USUAL_FPS)
     if _is_capture(source):
         return _of_capture(source, None, fps, loop)
     if _has_methods(source, "read", "close"):
@@ -83,8 +79,10 @@ def has_twins(sources: Iterable[Any]) -> bool:
 
 
 def _of_text(source: str | Path, fps: float | None, loop: bool) -> Camera:
+    with optional_import():
+        from epypes.acquisition.captures import device_camera, video_camera
     if isinstance(source, str) and "://" in source:
-        return captures.device(source, fps)
+        return device_camera(source, fps)
     path = Path(source)
     try:
         is_device, is_folder = path.is_char_device(), path.is_dir()
@@ -92,44 +90,62 @@ def _of_text(source: str | Path, fps: float | None, loop: bool) -> Camera:
         text = f"Image '{source!s:.80}' can't be read: {error.strerror}. Check the path."
         raise ImageFileError(str(path), text) from error
     if is_device:
-        return captures.device(str(path), fps)
+        return device_camera(str(path), fps)
     if is_folder:
-        return paced(folder(path, loop), fps or USUAL_FPS)
+        return paced(_folder_camera(path, loop), fps or USUAL_FPS)
     if not path.is_file() or _is_image(path):
-        return paced(Still(read_image(path), loop), fps or USUAL_FPS)
-    video, recorded_fps = captures.video_file(path, loop)
-    return paced(video, fps or recorded_fps or USUAL_FPS)
+        return paced(StillCamera(read_image(path), loop), fps or USUAL_FPS)
+    return video_camera(path, fps, loop)
 
 
 def _is_image(path: Path) -> bool:
+    """Whether a file has the first bytes of an image, or is named as one, which would open as an empty film.
+
+    It is not read as an image: that would load a film into the memory.
+    """
     with optional_import():
         import cv2
-
-    # By its first bytes: reading the whole file as an image would load a film into the memory. What only is called like
-    # an image would open as a film without a frame.
-    with quiet():
+    with quiet_opencv():
         return bool(cv2.haveImageReader(str(path)) or (path.suffix and cv2.haveImageWriter(str(path))))
 
 
+def _folder_camera(path: Path, loop: bool) -> SequenceCamera:
+    """Return a camera that reads the images of a folder, by name; a file with an image's ending that is none is named.
+
+    Hidden files, folders and files without the ending of an image are left out.
+    """
+    with optional_import():
+        import cv2
+    files = image_files(path)
+    if not files:
+        raise ImageFileError(str(path), f"There are no images in folder {str(path)!r}. Put PNG, JPEG or TIFF into it.")
+    with quiet_opencv():
+        broken = [file for file in files if not cv2.haveImageReader(str(file))]
+    if broken:
+        read_image(broken[0])  # which says more, if it fails too
+        raise ImageFileError(str(broken[0]), f"{str(broken[0])!r} is not an image that OpenCV can read. Take it out.")
+    return SequenceCamera(lambda: map(read_image, files), loop)
+
+
 def _of_number(number: int, fps: float | None) -> Camera:
+    with optional_import():
+        from epypes.acquisition.captures import device_camera
     if not 0 <= number <= LAST_DEVICE:
         raise ValueError(f"No camera has the number {number}. They go from 0 to {LAST_DEVICE}.")
-    return captures.device(number, fps)
+    return device_camera(number, fps)
 
 
 def _of_capture(capture: Any, opening: Callable[[], Any] | None, fps: float | None, loop: bool) -> Camera:
-    captures.require_open(capture)
-    handle = captures.Handle(capture, opening)
-    if captures.is_recorded(capture):
-        return paced(captures.Video(handle, "a capture", loop), fps or captures.recorded_fps(capture) or USUAL_FPS)
-    return captures.Live(handle, "The capture", fps)
+    with optional_import():
+        from epypes.acquisition.captures import capture_camera
+    return capture_camera(capture, opening, fps, loop)
 
 
 def _of_many(source: Any, fps: float | None, loop: bool) -> Camera:
     if isinstance(source, Iterator):
-        return paced(Sequence(lambda: source, loop=False), fps)
+        return paced(SequenceCamera(lambda: source, loop=False), fps)
     if isinstance(source, Iterable) and not isinstance(source, bytes | bytearray | memoryview | dict | set | frozenset):
-        return paced(Sequence(lambda: source, loop), fps or USUAL_FPS)
+        return paced(SequenceCamera(lambda: source, loop), fps or USUAL_FPS)
     if callable(source):
         return _of_function(source, fps, loop)
     raise TypeError(
@@ -149,7 +165,7 @@ def _of_function(source: Callable[[], Any], fps: float | None, loop: bool) -> Ca
             "Return an iterator of arrays or a cv2.VideoCapture; a generator function does the former."
         )
     first = [made]
-    return paced(Sequence(lambda: first.pop() if first else source(), loop), fps)
+    return paced(SequenceCamera(lambda: first.pop() if first else source(), loop), fps)
 
 
 def _is_capture(source: Any) -> bool:
@@ -158,3 +174,79 @@ def _is_capture(source: Any) -> bool:
 
 def _has_methods(source: Any, *names: str) -> bool:
     return not isinstance(source, type) and all(callable(getattr(source, name, None)) for name in names)
+
+
+# -- images in files or in memory --------------------------------------------------------------------------------------
+
+
+class StillCamera:
+    """The same image again and again, or once.
+
+    Parameters
+    ----------
+    image
+        (y, x) or (y, x, channels); a copy is taken, and every frame is that copy.
+    loop
+        Whether it comes again after the first time.
+    """
+
+    def __init__(self, image: Any, loop: bool = True) -> None:
+        self._image = lasting_copy(image)
+        self._loop, self._was_given = loop, False
+
+    def read(self) -> Any:
+        """Return the image; None from the second time on, if it comes only once."""
+        if self._was_given and not self._loop:
+            return None
+        self._was_given = True
+        return self._image
+
+    def close(self) -> None:
+        """Begin anew."""
+        self._was_given = False
+
+    def __repr__(self) -> str:
+        return f"<StillCamera: {self._image.shape} {self._image.dtype}>"
+
+
+class SequenceCamera:
+    """The items of an iterable, one after the other, and from the beginning again.
+
+    Parameters
+    ----------
+    start
+        Returns an iterable; called when the first frame is wanted, and for each further round.
+    loop
+        Whether there is another round.
+    """
+
+    def __init__(self, start: Callable[[], Iterable[Any]], loop: bool = True) -> None:
+        self._start, self._loop = start, loop
+        self._items: Iterator[Any] | None = None
+
+    def read(self) -> Any:
+        """Return the next item; None if there are no more."""
+        items = self._items
+        if items is not None:
+            for item in items:
+                return _required(item)
+            if not self._loop:
+                return None
+        self._items = items = iter(self._start())
+        # A round without any item would be followed by others for ever.
+        for item in items:
+            return _required(item)
+        return None
+
+    def close(self) -> None:
+        """Begin anew with the next `read`; an iterator, which can't, goes on where it was."""
+        self._items = None
+
+    def __repr__(self) -> str:
+        return f"<SequenceCamera of {getattr(self._start, '__qualname__', 'frames'):.60}>"
+
+
+def _required(item: Any) -> Any:
+    if item is None:
+        raise TypeError("The iterator gave None, which is no image. Let it end, or wait inside it for the next one.")
+    return item

@@ -1,11 +1,14 @@
-"""How does an image file become an array, and an array a file?"""
+"""Image files and folders of them: reading, writing, and their order by name."""
 
 from __future__ import annotations
 
+import re
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
-from epypes.acquisition.quiet import quiet
 from epypes.errors import ImageFileError
 from epypes.images import swapped
 from epypes.optional import optional_import
@@ -15,6 +18,17 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from epypes.images import Order
+
+# Endings of the formats that OpenCV reads. A folder may hold notes and tables too.
+IMAGE_ENDINGS: Final = frozenset(
+    {".avif", ".bmp", ".dib", ".exr", ".gif", ".hdr", ".jp2", ".jpe", ".jpeg", ".jpg", ".pbm"}
+    | {".pgm", ".png", ".pnm", ".ppm", ".ras", ".sr", ".tif", ".tiff", ".webp"}
+)
+# cv2.utils.logging.LOG_LEVEL_SILENT
+_SILENT: Final = 0
+_quiet_lock = threading.Lock()
+_quiet_blocks = 0
+_level_before = 0
 
 
 def read_image(path: str | Path, order: Order = "bgr") -> npt.NDArray[np.uint8 | np.uint16]:
@@ -37,8 +51,8 @@ def read_image(path: str | Path, order: Order = "bgr") -> npt.NDArray[np.uint8 |
     except OSError as error:
         text = f"Image {str(path)!r} can't be read: {error.strerror}. Check the path."
         raise ImageFileError(str(path), text) from error
-    # Reading the bytes first tells a missing file from a broken one; what OpenCV would print of that is ours to say.
-    with quiet():
+    # Reading the bytes first tells a missing file from a broken one.
+    with quiet_opencv():
         image: Any = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if image is None:
         text = f"{str(path)!r} is not an image that OpenCV can read. Use PNG, JPEG, TIFF, BMP or WebP."
@@ -87,3 +101,55 @@ def write_image(path: str | Path, image: npt.NDArray[Any], order: Order = "bgr")
 
 def _in_other_order(image: Any) -> Any:
     return swapped(image) if image.ndim == 3 and image.shape[2] in (3, 4) else image
+
+
+def image_files(path: Path) -> list[Path]:
+    """Return the files of a folder that have the ending of an image, by name: ``img2`` before ``img10``.
+
+    Raises
+    ------
+    ImageFileError
+        The folder can't be read.
+    """
+    try:
+        named = (file for file in path.iterdir() if file.suffix.lower() in IMAGE_ENDINGS and file.name[0] != ".")
+        return sorted(filter(Path.is_file, named), key=natural_order)
+    except OSError as error:
+        raise ImageFileError(str(path), f"Folder {str(path)!r} can't be read: {error.strerror}.") from error
+
+
+def natural_order(file: Path) -> tuple[list[str | int], str]:
+    """Return the key that sorts files so that ``img2`` comes before ``img10``."""
+    # Texts and numbers alternate, so texts are compared with texts, and numbers with numbers.
+    parts = re.split(r"(\d+)", file.name.casefold())
+    return [int(part) if place % 2 else part for place, part in enumerate(parts)], file.name
+
+
+@contextmanager
+def quiet_opencv() -> Iterator[None]:
+    """Silence OpenCV's log in a block whose failures are reported as errors.
+
+    The level belongs to the whole process and cameras read side by side, so the last block to end sets it back.
+    """
+    global _quiet_blocks, _level_before
+    with _quiet_lock:
+        if _quiet_blocks == 0:
+            _level_before = _set_log_level(_SILENT)
+        _quiet_blocks += 1
+    try:
+        yield
+    finally:
+        with _quiet_lock:
+            _quiet_blocks -= 1
+            if _quiet_blocks == 0:
+                _set_log_level(_level_before)
+
+
+def _set_log_level(level: int) -> int:
+    """Set the level of OpenCV's log, and return the one before."""
+    with optional_import():
+        import cv2
+
+    # Up to OpenCV 4.12 the function is in cv2 itself.
+    logging = getattr(cv2.utils, "logging", cv2)
+    return int(logging.setLogLevel(level))

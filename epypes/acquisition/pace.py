@@ -1,4 +1,4 @@
-"""How is a source that never waits kept to a number of frames per second?"""
+"""The protocol of a camera, and cameras that are kept to a number of frames per second."""
 
 from __future__ import annotations
 
@@ -7,18 +7,21 @@ import math
 import threading
 from numbers import Real
 from time import monotonic
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Final, Protocol, runtime_checkable
+
+# Of sources that would give frames as fast as a processor can.
+USUAL_FPS: Final = 10.0
 
 
 @runtime_checkable
 class Camera(Protocol):
-    """Where frames come from, one after the other; anything with these two methods will do."""
+    """A source of frames, one after the other: any object with these two methods."""
 
     def read(self) -> Any:
         """Return the next frame, (y, x) or (y, x, channels), when there is one; None: there are no more.
 
-        Called on the camera's own thread. It may fill one buffer again and again: what it returns is copied where
-        others could write to it. ``errors.CameraUnavailable`` means: no frame just now, try again later. Any other
+        Called on the camera's own thread. It may fill one buffer again and again: a frame is copied where other
+        code could write to it. ``errors.CameraUnavailable`` means: no frame just now, try again later. Any other
         exception ends this camera.
         """
 
@@ -30,15 +33,15 @@ class Camera(Protocol):
 
 
 class Alarm:
-    """A wait that anybody can end, finalizers included.
+    """A wait that any thread can end, and a finalizer too.
 
-    It holds no lock while it waits, which `threading.Event` does for a moment: a garbage collector that comes in that
-    moment, and whose finalizer rings, would wait for itself. It also costs a third less.
+    It holds no lock while it waits, as `threading.Event` does for a moment: a finalizer that rings, called by the
+    garbage collector in that moment, would wait for itself. It also costs a third less.
     """
 
     def __init__(self) -> None:
         self.has_rung = False
-        # Held, but for the moment in which somebody rings.
+        # Held, but for the moment in which it rings.
         self._asleep = threading.Lock()
         self._asleep.acquire()
 

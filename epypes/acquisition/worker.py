@@ -1,4 +1,4 @@
-"""What does one camera's thread do?"""
+"""The thread of one camera, which reads its frames into a ring."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
-from epypes.acquisition.frames import Frame, take_image
+from epypes.acquisition.frames import Frame, Ring, take_image
 from epypes.acquisition.pace import Alarm, Camera
-from epypes.acquisition.ring import Ring
 from epypes.errors import CameraUnavailable
 
 State = Literal["stopped", "running", "ended", "failed"]
@@ -19,7 +18,7 @@ State = Literal["stopped", "running", "ended", "failed"]
 # A camera that gives nothing is asked again after 10, 20, 40 ms ..., at last every second.
 _FIRST_RETRY_S: Final = 0.01
 _LAST_RETRY_S: Final = 1.0
-# One frame that is missed is nothing to talk about; this many in a row are.
+# One missed frame is not reported; this many in a row are.
 _MISSES_REPORTED: Final = 5
 # close() may come in the moment before a read begins, which opens the camera again; so it is repeated.
 _CLOSE_AGAIN_S: Final = 0.05
@@ -29,7 +28,7 @@ _log = logging.getLogger("epypes.acquisition")
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """What has happened with one camera since it was given to an ImageAcquisition.
+    """Frames, missed reads and failures of one camera since it was given to an ImageAcquisition.
 
     Attributes
     ----------
@@ -64,8 +63,8 @@ class Ending:
         return not self.reading.is_alive()
 
 
-class Worker:
-    """One camera, its ring, and the thread that never waits for anybody but the camera.
+class CameraWorker:
+    """One camera, its ring, and its thread, which waits for the camera alone.
 
     Parameters
     ----------
@@ -101,7 +100,7 @@ class Worker:
 
     @property
     def counts(self) -> Counts:
-        """What has happened so far."""
+        """Frames, missed reads and failures so far."""
         return Counts(self._frames, self._missed, self._failed)
 
     @property
@@ -117,7 +116,7 @@ class Worker:
         self._thread.start()
 
     def ask_to_stop(self) -> None:
-        """Tell the thread to end after the read under way."""
+        """Have the thread end after the read under way."""
         self._stop.ring()
 
     def end_read(self, deadline_s: float) -> Ending | None:
@@ -144,7 +143,7 @@ class Worker:
             self._capture(stop)
             self._end("stopped" if stop.has_rung else "ended")
         except BaseException as exception:  # a generator's SystemExit must not end the thread in silence
-            # A read that was ended by close() may raise anything, and that is nobody's fault.
+            # A read that was ended by close() may raise anything: that is no failure.
             if stop.has_rung:
                 self._end("stopped")
             else:
@@ -154,7 +153,7 @@ class Worker:
         self._close()
 
     def _capture(self, stop: Alarm) -> None:
-        """Read frames until told to stop, or until there are no more."""
+        """Read frames until the camera is stopped, or has no more."""
         while not stop.has_rung:
             try:
                 given = [self.camera.read()]
@@ -177,7 +176,7 @@ class Worker:
         image = self._image if is_known else take_image(given)
         self._image = image
         frame = Frame(image, captured_ns, self._frames + 1)
-        # Counted before: whoever has a frame must find it counted.
+        # Counted before, so that a caller that has a frame finds it counted.
         self._frames += 1
         self.ring.append(frame)
         if not self.has_frame:

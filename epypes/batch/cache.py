@@ -10,7 +10,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 from typing import Any, Final, Self
@@ -51,7 +51,7 @@ _SHORT: Final = (type(None), bool, int, float, complex, str)
 
 
 class NoDigest(TypeError):
-    """A value holds, or a function uses, an object whose content can't be told."""
+    """A value holds, or a function uses, an object whose content can't be digested."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ class Fingerprint:
     state
         Of what is in lists, dicts, arrays and objects that functions use: a call may change it.
     unknown
-        The first object whose content can't be told, in words; "" if there is none. A computation with one may be
+        The first object whose content can't be digested, in words; "" if there is none. A computation with one may be
         another one although the digests are the same.
     """
 
@@ -90,7 +90,7 @@ def graph_fingerprint(cg: CompGraph, source: str | None) -> Fingerprint:
     cg
         The graph.
     source
-        What `source_of` returned: if the graph has a text, that says how objects are made whose content can't be told.
+        What `source_of` returned: the text of a graph has the expressions of objects whose content can't be digested.
 
     Notes
     -----
@@ -109,7 +109,7 @@ def function_digest(function: Any) -> str:
     Raises
     ------
     NoDigest
-        It uses an object whose content can't be told.
+        It uses an object whose content can't be digested.
     """
     return _digest(Digester(), function)
 
@@ -120,7 +120,7 @@ def value_digest(value: Any) -> str:
     Raises
     ------
     NoDigest
-        It is, or holds, an object whose content can't be told.
+        It is, or holds, an object whose content can't be digested.
     """
     return _digest(Digester(of_data=True), value)
 
@@ -138,7 +138,7 @@ def payload_digest(payload: Mapping[str, Any]) -> str:
     Raises
     ------
     NoDigest
-        A file can't be read, or the content of a value can't be told.
+        A file can't be read, or the content of a value can't be digested.
     """
     parts: list[str] = []
     for token, value in sorted(payload.items()):
@@ -207,7 +207,7 @@ def outcome_cache(
     Warns
     -----
     UserWarning
-        A function uses an object whose content can't be told, so nothing that is stored counts.
+        A function uses an object whose content can't be digested, so nothing that is stored counts.
 
     Raises
     ------
@@ -283,7 +283,7 @@ class OutcomeCache:
 
     Notes
     -----
-    An item whose content can't be told is run each time, and not written.
+    An item whose content can't be digested is run each time, and not written.
     """
 
     def __init__(self, series: Series, suffix: str = "", *, reads: bool = True) -> None:
@@ -306,7 +306,7 @@ class OutcomeCache:
         if found is None:
             self._keys[item.number, id(setting)] = key
             return None
-        return replace(Outcome.from_json(found), number=item.number, name=item.name, setting=setting)
+        return Outcome.from_json(found, item, setting)
 
     def _label_of_item(self, item: Item) -> str | None:
         if self._item_label[0] != item.number:

@@ -1,12 +1,13 @@
-"""Where does each outcome of a sweep stand on its contact sheet?
+"""The contact sheet of a sweep: the outcomes laid out by their settings, and how that looks on a page.
 
 Rows and columns are the values of two hyperparameters; what else varies, a third one or the image, gives further
-blocks. Settings that fill no such table, as those drawn by chance, stand one after another.
+blocks. Settings that fill no such table, as random ones, stand one after another. The page is a table whose cells hold
+pictures, so that a screen reader reads it as one, and it stays one where a page strips styles. It is no larger than
+other pictures of a notebook: pictures become smaller first, then those at the end are left out, which the page states.
 """
 
 from __future__ import annotations
 
-import base64
 import io
 import math
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
@@ -15,7 +16,7 @@ from itertools import accumulate
 from typing import Any, Final
 
 from epypes.batch.grid import identity
-from epypes.batch.results import Outcome, Thumbnail
+from epypes.batch.results import Outcome, Thumbnail, data_uri
 from epypes.display.limits import CHARACTERS, THUMBNAIL_CHARACTERS
 from epypes.display.markup import content, escape, fitted, size
 from epypes.display.previews.preview import sketch
@@ -30,16 +31,16 @@ from epypes.wording import counted
 
 @dataclass(frozen=True, slots=True)
 class Tile:
-    """What is shown of one outcome.
+    """One outcome on a sheet.
 
     Attributes
     ----------
     place
         Of the outcome in the result.
     label
-        The setting, as far as row, column and block do not say it.
+        The setting, as far as row, column and block do not state it.
     text
-        What failed, or the value where there is no picture.
+        The error, or the value where there is no picture.
     has_failed
         Whether the setting failed.
     thumbnail
@@ -58,7 +59,7 @@ Cell = tuple[Tile, ...]
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """One table of tiles: by row, by column, those of a cell. What stands one after another is one row."""
+    """One table of tiles: by row, by column, those of a cell. Tiles one after another are one row."""
 
     title: str
     rows: tuple[tuple[Cell, ...], ...]
@@ -75,7 +76,7 @@ class Sheet:
     rows, columns
         The hyperparameters by which they are laid out; None for none.
     row_labels, column_labels
-        Their values; without any, what stands one after another is labelled itself.
+        Their values; without any, tiles have labels of their own.
     blocks
         The tables.
     """
@@ -102,9 +103,8 @@ class Sheet:
         return f"<Sheet of {str(self.token)!r:.30}: {counted(len(tiles), 'outcome')}, {failed} failed>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-
         try:
-            return {"text/plain": repr(self), "text/html": page_of(self)}
+            return {"text/plain": repr(self), "text/html": sheet_page(self)}
         except Exception as error:  # a notebook shows the result whatever is wrong with its pictures
             return {"text/plain": f"{self!r}\n(no picture: {reason(error)})"}
 
@@ -113,16 +113,18 @@ def _first_of(blocks: Iterable[Block], most: int) -> Iterator[Block]:
     for block in blocks:
         rows: list[tuple[Cell, ...]] = []
         for row in block.rows:
-            kept = tuple(cell if count <= most else () for count, cell in zip(_counts(row), row, strict=True))
+            counts = accumulate(map(len, row))
+            kept = tuple(cell if count <= most else () for count, cell in zip(counts, row, strict=True))
             most -= sum(map(len, kept))
             rows += [kept] * any(kept)
         if rows:
             yield Block(block.title, tuple(rows))
 
 
-def _counts(row: Iterable[Cell]) -> Iterator[int]:
-    """Yield how many tiles stand in the cells up to the end of each."""
-    return accumulate(len(cell) for cell in row)
+# -- the layout -------------------------------------------------------------------------------------------------
+
+# By hyperparameter, the label of each of its values.
+_Axes = Mapping[str, Mapping[Hashable, str]]
 
 
 def sheet_of(
@@ -154,33 +156,34 @@ def sheet_of(
     """
     shown = _pictured(cg, outcomes) if token is None else _require_shown(cg, outcomes, token)
     axes = _axes(outcomes)
-    is_full = math.prod(map(len, axes.values())) == len({_key(outcome, axes) for outcome in outcomes})
-    laid = _laid_out(axes, is_full, rows, columns)
-    rest = tuple(name for name in axes if name not in laid)
-    has_blocks = is_full and laid != (None, None)
-    plan = _Plan(axes, laid, rest if has_blocks else (), () if has_blocks else rest, shown)
-    row_labels, column_labels = (tuple(axes[name].values()) if name else () for name in laid)
-    return Sheet(shown, *laid, row_labels, column_labels, _blocks(outcomes, plan))
+    keys = [{name: identity(outcome.setting.get(name)) for name in axes} for outcome in outcomes]
+    is_full = math.prod(map(len, axes.values())) == len({tuple(key.values()) for key in keys})
+    rows, columns = _rows_and_columns(axes, is_full, rows, columns)
+    is_table = (rows, columns) != (None, None)
+    rest = [name for name in axes if name not in (rows, columns)]
+    by_block, by_tile = (rest, []) if is_full and is_table else ([], rest)
+    has_images = len({outcome.number for outcome in outcomes}) > 1
 
+    def labels(place: int, names: Iterable[str]) -> list[str]:
+        return [f"{name} {axes[name][keys[place][name]]}" for name in names]
 
-# By hyperparameter, what each of its values is called.
-_Axes = Mapping[str, Mapping[Hashable, str]]
-
-
-@dataclass(frozen=True, slots=True)
-class _Plan:
-    """What row and column say, what blocks say, and what each tile says of its setting."""
-
-    axes: _Axes
-    laid: tuple[str | None, str | None]
-    by_block: tuple[str, ...]
-    by_tile: tuple[str, ...]
-    token: str | None
-
-
-def said(value: Any) -> str:
-    """Return a value in at most 30 characters."""
-    return sketch(value, Look()).shown.text
+    grouped: dict[tuple[Hashable, ...], list[int]] = {}
+    for place, outcome in enumerate(outcomes):
+        grouped.setdefault((outcome.number, *(keys[place][name] for name in by_block)), []).append(place)
+    blocks = []
+    for places in grouped.values():
+        cells: dict[tuple[Hashable, ...], list[Tile]] = {}
+        for place in places:
+            at = (keys[place].get(rows or ""), keys[place].get(columns or "")) if is_table else (None, place)
+            cells.setdefault(at, []).append(_tile(place, outcomes[place], ", ".join(labels(place, by_tile)), shown))
+        across: Iterable[Hashable] = axes.get(columns or "", [None]) if is_table else places
+        table = tuple(
+            tuple(tuple(cells.get((row, column), ())) for column in across) for row in axes.get(rows or "", [None])
+        )
+        title = [outcomes[places[0]].name] * has_images + labels(places[0], by_block)
+        blocks.append(Block(", ".join(title), table))
+    row_labels, column_labels = (tuple(axes[name].values()) if name else () for name in (rows, columns))
+    return Sheet(shown, rows, columns, row_labels, column_labels, tuple(blocks))
 
 
 def _axes(outcomes: Sequence[Outcome]) -> _Axes:
@@ -190,15 +193,13 @@ def _axes(outcomes: Sequence[Outcome]) -> _Axes:
         for name, value in outcome.setting.items():
             of_name, key = found.setdefault(name, {}), identity(value)
             if key not in of_name:
-                of_name[key] = said(value)
+                of_name[key] = short_text(value)
     return {name: values for name, values in found.items() if len(values) > 1} or found
 
 
-def _key(outcome: Outcome, names: Sequence[str] | _Axes) -> tuple[Hashable, ...]:
-    return tuple(identity(outcome.setting.get(name)) for name in names)
-
-
-def _laid_out(axes: _Axes, is_full: bool, rows: str | None, columns: str | None) -> tuple[str | None, str | None]:
+def _rows_and_columns(
+    axes: _Axes, is_full: bool, rows: str | None, columns: str | None
+) -> tuple[str | None, str | None]:
     for name in (rows, columns):
         if name is not None and name not in axes:
             raise UnknownName("hyperparameter", name, axes, "that this sweep has varied")
@@ -211,50 +212,24 @@ def _laid_out(axes: _Axes, is_full: bool, rows: str | None, columns: str | None)
     return (other if rows is None else rows), (other if columns is None else columns)
 
 
-def _blocks(outcomes: Sequence[Outcome], plan: _Plan) -> tuple[Block, ...]:
-    has_images = len({outcome.number for outcome in outcomes}) > 1
-    places: dict[tuple[Hashable, ...], list[int]] = {}
-    for place, outcome in enumerate(outcomes):
-        places.setdefault((outcome.number, *_key(outcome, plan.by_block)), []).append(place)
-    return tuple(_block(outcomes, found, plan, has_images) for found in places.values())
-
-
-def _block(outcomes: Sequence[Outcome], places: Sequence[int], plan: _Plan, has_images: bool) -> Block:
-    first = outcomes[places[0]]
-    title = ", ".join([first.name] * has_images + [_named(first, name, plan) for name in plan.by_block])
-    if plan.laid == (None, None):
-        return Block(title, (tuple((_tile(place, outcomes[place], plan),) for place in places),))
-    lines = [list(plan.axes[name]) if name else [None] for name in plan.laid]
-    cells: dict[tuple[Hashable, ...], list[Tile]] = {}
-    for place in places:
-        at = tuple(identity(outcomes[place].setting[name]) if name else None for name in plan.laid)
-        cells.setdefault(at, []).append(_tile(place, outcomes[place], plan))
-    rows, columns = lines
-    return Block(title, tuple(tuple(tuple(cells.get((row, column), ())) for column in columns) for row in rows))
-
-
-def _named(outcome: Outcome, name: str, plan: _Plan) -> str:
-    return f"{name} {plan.axes[name][identity(outcome.setting[name])]}"
-
-
-def _tile(place: int, outcome: Outcome, plan: _Plan) -> Tile:
-    label = ", ".join(_named(outcome, name, plan) for name in plan.by_tile)
-    thumbnail = None if plan.token is None else outcome.thumbnails.get(plan.token)
+def _tile(place: int, outcome: Outcome, label: str, shown: str | None) -> Tile:
+    thumbnail = None if shown is None else outcome.thumbnails.get(shown)
     if outcome.error_info is not None:
         return Tile(place, label, str(outcome.error_info), True, thumbnail)
-    return Tile(place, label, thumbnail.caption if thumbnail else _told(outcome, plan.token), False, thumbnail)
+    if thumbnail is not None:
+        text = thumbnail.caption
+    elif shown is not None and shown in outcome.texts:
+        text = outcome.texts[shown]
+    elif shown is not None and shown in outcome.values:
+        text = short_text(outcome.values[shown])
+    else:
+        text = ", ".join(f"{token} {short_text(value)}" for token, value in outcome.values.items())
+    return Tile(place, label, text, False, thumbnail)
 
 
-def _told(outcome: Outcome, shown: str | None) -> str:
-    """Return what is said of the token that is shown; if there is none of it, the values of all sink tokens."""
-    if shown is not None and shown in outcome.texts:
-        return outcome.texts[shown]
-    if shown is not None and shown in outcome.values:
-        return said(outcome.values[shown])
-    return ", ".join(f"{token} {said(value)}" for token, value in outcome.values.items())
-
-
-# -- which token ----------------------------------------------------------------------------------------------------
+def short_text(value: Any) -> str:
+    """Return a value in at most 30 characters."""
+    return sketch(value, Look()).shown.text
 
 
 def _pictured(cg: CompGraph, outcomes: Sequence[Outcome]) -> str | None:
@@ -266,27 +241,26 @@ def _pictured(cg: CompGraph, outcomes: Sequence[Outcome]) -> str | None:
 
 def shown_tokens(cg: CompGraph, outcomes: Iterable[Outcome]) -> tuple[str, ...]:
     """Return the tokens of which a sheet can be made, in the order of the graph: with pictures, texts or numbers."""
-    found = frozenset[str]().union(*(_shown_tokens(outcome) for outcome in outcomes))
+    found: set[str] = set()
+    for outcome in outcomes:
+        # A text among the values may stand for an image of which no picture was asked for.
+        numbers = (token for token, value in outcome.values.items() if not isinstance(value, str))
+        found.update(outcome.thumbnails, outcome.texts, numbers)
     return tuple(token for token in cg.tokens if token in found)
-
-
-def _shown_tokens(outcome: Outcome) -> frozenset[str]:
-    # A text among the values may stand for an image of which no picture was asked for.
-    numbers = (token for token, value in outcome.values.items() if not isinstance(value, str))
-    return frozenset((*outcome.thumbnails, *outcome.texts, *numbers))
 
 
 def _require_shown(cg: CompGraph, outcomes: Sequence[Outcome], token: str) -> str:
     cg.require_token(token)
-    complete = [outcome for outcome in outcomes if outcome.error_info is None]
-    if token in shown_tokens(cg, outcomes) or not complete:
+    if token in shown_tokens(cg, outcomes) or all(outcome.has_failed for outcome in outcomes):
         return token
     pictured = dict.fromkeys(name for outcome in outcomes for name in outcome.thumbnails)
     there_are = f"There are pictures of {', '.join(pictured)}." if pictured else "There are none of any token."
     raise ScaleError(f"No pictures of {token!r} were kept. {there_are} Sweep again with show=({token!r},).")
 
 
-# So many tiles at most; fewer if their texts are long.
+# -- the page ---------------------------------------------------------------------------------------------------
+
+# The number of tiles at most; fewer if their texts are long.
 _MOST_TILES: Final = (120, 80, 50, 25, 10, 3)
 # What a smaller picture shows is hardly seen.
 _LEAST_BYTES: Final = 400
@@ -295,9 +269,9 @@ _LABEL_ROOM: Final = 64
 _MESSAGE_ROOM: Final = 96
 _TITLE_ROOM: Final = 160
 _SIDE_PX: Final = 128
-# Where there are many, so that they are compared at a glance; and what of their files is left is as sharp.
-_SMALL_PX: Final = 80
+# Of more pictures than this each is smaller, so that they are compared at a glance, and their smaller files as sharp.
 _MANY: Final = 40
+_SMALL_PX: Final = 80
 
 # Text has the colour of the page, lines and tints are mixed from it: readable on any ground.
 _STYLE: Final = (
@@ -323,16 +297,8 @@ _STYLE: Final = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class _Look:
-    """How many bytes a picture has at most, and which outcome is marked."""
-
-    most_bytes: int
-    chosen: int | None
-
-
-def page_of(sheet: Sheet, chosen: int | None = None) -> str:
-    """Return a contact sheet for a page, within the size of other pictures; ``chosen`` is the place that is marked."""
+def sheet_page(sheet: Sheet, chosen: int | None = None) -> str:
+    """Return a contact sheet as HTML, within the size of other pictures; ``chosen`` is the place that is marked."""
     page = ""
     for most in _MOST_TILES:
         page = _page(sheet, sheet.first(most), chosen)
@@ -345,75 +311,62 @@ def _page(sheet: Sheet, shown: Sheet, chosen: int | None) -> str:
     tiles, total = shown.tiles, len(sheet.tiles)
     pictures = sum(tile.thumbnail is not None for tile in tiles)
     most_bytes = (THUMBNAIL_CHARACTERS // max(pictures, 1) - _ELEMENT_CHARACTERS) * 3 // 4
-    look = _Look(most_bytes, chosen)
-    blocks = "".join(_paint_block(shown, block, look) for block in shown.blocks)
-    more = f"<p>{_left_out(total - len(tiles))}</p>" if len(tiles) < total else ""
-    side_px = _SIDE_PX if pictures <= _MANY else _SMALL_PX
-    # Where there are but texts, tiles are no higher than these.
-    sizes = f"--side:{side_px}px;--tall:{side_px + 8 if pictures else 0}px"
-    return f'<div class="epypes-contact" style="{sizes}">{_heading(sheet)}{blocks}{more}{_STYLE}</div>'
-
-
-def _left_out(number: int) -> str:
-    return (
-        f"and {number:,} more, for which there is no room here: to_frame() lists all, sheet(rows=..., columns=...) "
-        "lays them out otherwise, pick(result) of epypes_widgets shows more."
-    )
-
-
-def _heading(sheet: Sheet) -> str:
     failed = sum(tile.has_failed for tile in sheet.tiles)
     token = f"{content(fitted(sheet.token, _LABEL_ROOM))}: " if sheet.token else ""
     failures = f", <b>{failed:,} failed</b>" if failed else ""
-    return f"<p>{token}{counted(len(sheet.tiles), 'outcome')}{failures}</p>"
+    parts = [f"<p>{token}{counted(total, 'outcome')}{failures}</p>"]
+    parts += [_paint_block(shown, block, most_bytes, chosen) for block in shown.blocks]
+    if len(tiles) < total:
+        parts.append(
+            f"<p>and {total - len(tiles):,} more, for which there is no room here: to_frame() lists all, "
+            "sheet(rows=..., columns=...) lays them out otherwise, pick(result) of epypes_widgets shows more.</p>"
+        )
+    side_px = _SIDE_PX if pictures <= _MANY else _SMALL_PX
+    # Tiles without pictures are no higher than their texts.
+    sizes = f"--side:{side_px}px;--tall:{side_px + 8 if pictures else 0}px"
+    return f'<div class="epypes-contact" style="{sizes}">{"".join(parts)}{_STYLE}</div>'
 
 
-def _paint_block(sheet: Sheet, block: Block, look: _Look) -> str:
+def _paint_block(sheet: Sheet, block: Block, most_bytes: int, chosen: int | None) -> str:
     title = content(fitted(block.title, _TITLE_ROOM))
+
+    def cells(tag: str, row: Iterable[Cell]) -> str:
+        return "".join(_paint_cell(tag, cell, most_bytes, chosen) for cell in row)
+
+    def heads(labels: Iterable[str], scope: str) -> str:
+        return "".join(f'<th scope="{scope}">{content(fitted(label, _LABEL_ROOM))}</th>' for label in labels)
+
     if sheet.rows is sheet.columns is None:
-        tiles = "".join(_paint_cell("div", cell, look) for row in block.rows for cell in row)
-        return (f"<h4>{title}</h4>" if title else "") + tiles
-    rows = "".join(
-        f"<tr>{_head(label, 'row') if sheet.rows else ''}{''.join(_paint_cell('td', cell, look) for cell in row)}</tr>"
-        for label, row in zip(sheet.row_labels or [""], block.rows, strict=False)
-    )
+        return (f"<h4>{title}</h4>" if title else "") + "".join(cells("div", row) for row in block.rows)
+    # The name of the columns stands above their labels, that of the rows beside these.
+    row_name, lines = heads([sheet.rows] if sheet.rows else [], "col"), []
+    if sheet.columns:
+        name = content(fitted(sheet.columns, _LABEL_ROOM))
+        above = f'<th colspan="{len(sheet.column_labels)}" scope="colgroup">{name}</th>'
+        lines.append(f"{'<td></td>' if sheet.rows else ''}{above}")
+        lines.append(row_name + heads(sheet.column_labels, "col"))
+    else:
+        lines.append(f"{row_name}<td></td>")
+    for number, row in enumerate(block.rows):
+        lines.append(heads(sheet.row_labels[number : number + 1], "row") + cells("td", row))
     caption = f"<caption>{title}</caption>" if title else ""
-    return f"<table>{caption}{_heads(sheet)}{rows}</table>"
+    return f"<table>{caption}{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
 
 
-def _heads(sheet: Sheet) -> str:
-    """Paint the labels of the columns, below their name; that of the rows stands beside it."""
-    if not sheet.columns:
-        return f"<tr>{_head(sheet.rows or '', 'col')}<td></td></tr>"
-    name = content(fitted(sheet.columns, _LABEL_ROOM))
-    above = f'<th colspan="{len(sheet.column_labels)}" scope="colgroup">{name}</th>'
-    labels = "".join(_head(label, "col") for label in sheet.column_labels)
-    if not sheet.rows:
-        return f"<tr>{above}</tr><tr>{labels}</tr>"
-    return f"<tr><td></td>{above}</tr><tr>{_head(sheet.rows, 'col')}{labels}</tr>"
-
-
-def _head(label: str, scope: str) -> str:
-    return f'<th scope="{scope}">{content(fitted(label, _LABEL_ROOM))}</th>'
-
-
-def _paint_cell(tag: str, tiles: tuple[Tile, ...], look: _Look) -> str:
-    state = " failed" if any(tile.has_failed for tile in tiles) else ""
-    state += " chosen" if any(tile.place == look.chosen for tile in tiles) else ""
-    return f'<{tag} class="cell{state}">{"".join(_paint_tile(tile, look) for tile in tiles)}</{tag}>'
-
-
-def _paint_tile(tile: Tile, look: _Look) -> str:
-    words = "✓ chosen " * (tile.place == look.chosen) + tile.label
-    label = f"<span>{content(fitted(words, _LABEL_ROOM))}</span>" if words else ""
-    if tile.has_failed:
-        return f"{label}<span><b>failed</b> {content(fitted(tile.text, _MESSAGE_ROOM))}</span>"
-    picture = None if tile.thumbnail is None else smaller(tile.thumbnail, look.most_bytes)
-    if picture is None:
-        return f"{label}<span>{content(fitted(tile.text, _MESSAGE_ROOM))}</span>"
-    data = base64.b64encode(picture.data).decode()
-    alt = escape(fitted(tile.text, _LABEL_ROOM))
-    return f'<img src="data:{picture.media_type};base64,{data}" alt="{alt}" title="{alt}">{label}'
+def _paint_cell(tag: str, tiles: Cell, most_bytes: int, chosen: int | None) -> str:
+    state = " failed" * any(tile.has_failed for tile in tiles) + " chosen" * any(tile.place == chosen for tile in tiles)
+    painted = ""
+    for tile in tiles:
+        above = "✓ chosen " * (tile.place == chosen) + tile.label
+        label = f"<span>{content(fitted(above, _LABEL_ROOM))}</span>" if above else ""
+        picture = None if tile.thumbnail is None or tile.has_failed else smaller(tile.thumbnail, most_bytes)
+        if picture is None:
+            mark = "<b>failed</b> " * tile.has_failed
+            painted += f"{label}<span>{mark}{content(fitted(tile.text, _MESSAGE_ROOM))}</span>"
+        else:
+            alt = escape(fitted(tile.text, _LABEL_ROOM))
+            painted += f'<img src="{data_uri(picture)}" alt="{alt}" title="{alt}">{label}'
+    return f'<{tag} class="cell{state}">{painted}</{tag}>'
 
 
 def smaller(thumbnail: Thumbnail, most_bytes: int) -> Thumbnail | None:

@@ -1,13 +1,17 @@
-"""Executor backends: this thread, threads, processes or a cluster run the jobs."""
+"""Executor backends: this thread, threads, processes or a cluster run the jobs.
+
+This thread and threads run the graph itself, on runners of their own. Any other executor gets a package of it.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import queue
 import threading
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -21,7 +25,7 @@ from dataclasses import replace
 from typing import Any, Final, Protocol
 
 from epypes.batch.items import Item, payload_of
-from epypes.batch.job import Job, do
+from epypes.batch.job import Job, run_job
 from epypes.batch.packaged_graph import (
     PackagedGraph,
     known_package,
@@ -31,18 +35,20 @@ from epypes.batch.packaged_graph import (
     unpacked_outcomes,
 )
 from epypes.batch.results import ErrorInfo, Outcome
-from epypes.batch.worker_side import PackagedJob, Refusal, lighter, work
+from epypes.batch.worker_side import PackagedJob, WorkerRefusal, run_packaged_job
 from epypes.bundle.clone import clone_runner
 from epypes.errors import EpypesError, ExecutorBroken, ScaleError
 from epypes.run import CompGraphRunner
 from epypes.wording import counted, ended
 
-# How soon a stop that somebody asks for is seen while nothing comes, and a Ctrl+C that another thread was given, which
-# does not wake a main thread that waits on a lock.
+# How soon a stop is noticed while nothing comes, and a Ctrl+C that another thread was given, which does not wake a main
+# thread that waits on a lock.
 _LOOK_S: Final = 0.05
 _JOBS_PER_WORKER: Final = 2
-# How long it is waited, once it was stopped, for what is at work.
+# How long a stop waits for the jobs that have begun.
 _GRACE_S: Final = 2.0
+# A larger package is sent to workers that ask for it, and not with every job.
+_MOST_SENT_BYTES: Final = 64_000
 
 
 def run_jobs(
@@ -53,7 +59,7 @@ def run_jobs(
     ahead: int | None = None,
     stop: threading.Event | None = None,
 ) -> Iterator[list[Outcome]]:
-    """Give the outcomes of jobs, as they come.
+    """Yield the outcomes of jobs, as they come.
 
     Parameters
     ----------
@@ -62,105 +68,147 @@ def run_jobs(
     jobs
         Taken one by one, when there is room for another.
     executor
-        None: this thread does them. A ThreadPoolExecutor runs the graph itself; any other one a bundle of it.
+        None: this thread runs them. A ThreadPoolExecutor runs the graph itself; any other executor a bundle of it.
         Functions that keep something from one item to the next give other results on threads, which share it and take
-        items in any order: a bundle's promotion refuses such functions, threads can't know them.
+        items in any order: a bundle's promotion refuses such functions, threads can't notice them.
     ahead
-        How many jobs are at work or waiting at most; twice as many as there are workers without.
+        How many jobs are in flight at most; twice as many as there are workers without.
     stop
         Ends it in bounded time, once it is set; what was done until then is given.
 
     Raises
     ------
     ExecutorBroken
-        The executor can't do them any more.
+        The executor can't run them any more.
     ScaleError, PromotionRefused
         The graph can't travel to another process.
     """
     if ahead is not None and (type(ahead) is not int or ahead < 1):
         raise ValueError(f"ahead is how many jobs are at work or waiting, 1 or more, not {ahead!r}.")
     if executor is None:
-        return _done_here(runner, jobs, stop)
+        return _run_here(runner, jobs, stop)
     if not isinstance(executor, Executor):
         raise TypeError(f"executor must be a concurrent.futures.Executor, not {type(executor).__name__!r}.")
     over = threading.Event()
     on_threads = isinstance(executor, ThreadPoolExecutor)
-    hands = Threads(runner, executor, over, stop) if on_threads else Bundles(runner, executor)
-    return _handed_out(hands, jobs, ahead or _JOBS_PER_WORKER * worker_count(executor), over, stop)
+    backend = _Threads(runner, executor, over, stop) if on_threads else _Processes(runner, executor)
+    return _run_in_flight(backend, jobs, ahead or _JOBS_PER_WORKER * worker_count(executor), over, stop)
 
 
-def _done_here(runner: CompGraphRunner, jobs: Iterable[Job], stop: threading.Event | None) -> Iterator[list[Outcome]]:
+def _run_here(runner: CompGraphRunner, jobs: Iterable[Job], stop: threading.Event | None) -> Iterator[list[Outcome]]:
     own = clone_runner(runner)
     for job in jobs:
         if stop is not None and stop.is_set():
             return
-        yield do(own, job, stop)
+        yield run_job(own, job, stop)
 
 
-# -- executors --------------------------------------------------------------------------------------------------
+# -- jobs in flight -------------------------------------------------------------------------------------------------
 
 
-def _handed_out(
-    hands: Hands, jobs: Iterable[Job], most: int, over: threading.Event, stop: threading.Event | None
+class _Backend(Protocol):
+    """How an executor runs a job."""
+
+    def submit(self, job: Job, *, with_files: bool = False) -> Future[Any]:
+        """Give a job to the executor; ``with_files``: with all that a worker process needs."""
+
+    def outcomes_of(self, future: Future[Any], job: Job) -> list[Outcome]:
+        """Return the outcomes of a job that is done."""
+
+
+class _SubmitRefused(Exception):
+    """The executor takes no jobs any more: it was shut down, or its client closed."""
+
+
+class _FilesMissing(Exception):
+    """The worker process that got a job has not unpacked the package yet."""
+
+
+class _WorkersKilled(Exception):
+    """Every worker process that ran a job died, and the cluster has given it up."""
+
+
+def _run_in_flight(
+    backend: _Backend, jobs: Iterable[Job], most: int, over: threading.Event, stop: threading.Event | None
 ) -> Iterator[list[Outcome]]:
-    """Keep so many jobs at work; give what comes; leave none behind, however it ends."""
-    at_work: dict[Future[Any], Job] = {}
+    """Keep so many jobs in flight; yield what comes; leave none behind, however it ends."""
+    in_flight: dict[Future[Any], Job] = {}
+    # Items whose workers were killed run again one at a time: then only the one that kills them is blamed.
+    isolated: deque[Job] = deque()
+    alone: Job | None = None
     source, done = iter(jobs), 0
     try:
         while stop is None or not stop.is_set():
-            # One at a time, so that what has come decides about what is taken next.
-            while len(at_work) < most and (job := next(source, None)) is not None:
-                at_work[hands.submit(job)] = job
+            # One at a time, since the outcomes that have come decide about the size of the next job.
+            while len(in_flight) < most and (job := next(source, None)) is not None:
+                in_flight[backend.submit(job)] = job
                 del job
-            if not at_work:
-                if (job := hands.suspect()) is None:
+            if not in_flight:
+                if not isolated:
                     return
-                at_work[hands.submit(job)] = job
-            ready, _ = wait(at_work, _LOOK_S, FIRST_COMPLETED)
+                alone = isolated.popleft()
+                in_flight[backend.submit(alone)] = alone
+            ready, _ = wait(in_flight, _LOOK_S, FIRST_COMPLETED)
             for future in ready:
-                outcomes, again = hands.read(future, at_work.pop(future))
-                at_work |= again
+                job = in_flight.pop(future)
+                try:
+                    outcomes = backend.outcomes_of(future, job)
+                except _FilesMissing:
+                    in_flight[backend.submit(job, with_files=True)] = job
+                    continue
+                except _WorkersKilled:
+                    if job is not alone:
+                        isolated.extend(replace(job, items=(item,)) for item in job.items)
+                        continue
+                    outcomes = _killed(job)
                 done += len(outcomes)
                 yield outcomes
         over.set()
-        yield from _last(hands, at_work)
-    except (BrokenExecutor, CancelledError, NotTaken) as error:
-        raise ExecutorBroken(done, _why(done, error)) from error
+        yield from _last_outcomes(backend, in_flight)
+    except (BrokenExecutor, CancelledError, _SubmitRefused) as error:
+        raise ExecutorBroken(done, _broken_text(done, error)) from error
     finally:
         over.set()
-        for future in at_work:
+        for future in in_flight:
             future.cancel()
 
 
-def _last(hands: Hands, at_work: dict[Future[Any], Job]) -> Iterator[list[Outcome]]:
-    """Give what is still being done; what waits is not begun any more."""
-    begun = {future for future in at_work if not future.cancel()}
-    ready, _ = wait(begun, _GRACE_S)
+def _last_outcomes(backend: _Backend, in_flight: dict[Future[Any], Job]) -> Iterator[list[Outcome]]:
+    """Yield the outcomes of jobs that have begun; no other begins any more."""
+    ready, _ = wait({future for future in in_flight if not future.cancel()}, _GRACE_S)
     for future in ready:
-        outcomes, again = hands.read(future, at_work.pop(future))
-        at_work |= again
-        yield outcomes
+        with contextlib.suppress(_FilesMissing, _WorkersKilled):
+            yield backend.outcomes_of(future, in_flight.pop(future))
 
 
-def _why(done: int, error: BaseException) -> str:
-    if isinstance(error, NotTaken):
-        return _closed(done, str(error))
+def _killed(job: Job) -> list[Outcome]:
+    info = ErrorInfo("", "KilledWorker", "every worker that ran it died")
+    return [Outcome(item.number, item.name, setting, error_info=info) for item in job.items for setting in job.settings]
+
+
+def _broken_text(done: int, error: BaseException) -> str:
+    if isinstance(error, _SubmitRefused):
+        return _closed_text(done, str(error))
     return (
         f"The executor broke after {counted(done, 'outcome')}, most likely since one of its processes died "
-        f"({said(error)}). Make a new one and run again: with store= what was done is taken from there. "
+        f"({_error_text(error)}). Make a new one and run again: with store= what was done is taken from there. "
         "A Dask cluster goes on by itself."
     )
 
 
-def _closed(done: int, why: str) -> str:
+def _closed_text(done: int, reason: str) -> str:
     return (
-        f"The executor takes no jobs after {counted(done, 'outcome')}: it was shut down, or its client closed ({why}). "
-        "Make a new one and run again: with store= what was done is taken from there."
+        f"The executor takes no jobs after {counted(done, 'outcome')}: it was shut down, or its client closed "
+        f"({reason}). Make a new one and run again: with store= what was done is taken from there."
     )
 
 
+def _error_text(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error!s:.500}" if str(error) else type(error).__name__
+
+
 def worker_count(executor: Executor) -> int:
-    """Return how many jobs an executor does at once, as far as that can be known.
+    """Return how many jobs an executor runs at once, as far as that can be known.
 
     Raises
     ------
@@ -177,48 +225,22 @@ def worker_count(executor: Executor) -> int:
     try:
         return max(int(sum(cores().values())), 1)
     except Exception as error:  # a client without a scheduler raises whatever comes first
-        raise ExecutorBroken(0, _closed(0, said(error))) from error
+        raise ExecutorBroken(0, _closed_text(0, _error_text(error))) from error
 
 
-# A larger bundle is sent to whom asks for it, and not with every job.
-_LIGHT: Final = 64_000
-
-Again = Mapping["Future[Any]", Job]
-_NONE: Final[Again] = {}
-
-
-class Hands(Protocol):
-    """Whoever does jobs."""
-
-    def submit(self, job: Job) -> Future[Any]:
-        """Give a job to the executor."""
-
-    def read(self, future: Future[Any], job: Job) -> tuple[list[Outcome], Again]:
-        """Return the outcomes of a job that is done, and what was submitted again in place of it."""
-
-    def suspect(self) -> Job | None:
-        """Return a job that is to be done again while no other one is; None if there is none."""
-
-
-class NotTaken(Exception):
-    """An executor that takes no jobs any more: it was shut down, or its client closed."""
-
-
-def _given(executor: Executor, call: Callable[..., Any], argument: object) -> Future[Any]:
+def _submitted(executor: Executor, call: Callable[..., Any], argument: object) -> Future[Any]:
     try:
         return executor.submit(call, argument)
     except BrokenExecutor:
         raise
     except Exception as error:  # Python's pools raise RuntimeError, others what they like
-        raise NotTaken(said(error)) from error
+        raise _SubmitRefused(_error_text(error)) from error
 
 
-def said(error: BaseException) -> str:
-    """Return what an error says, behind its kind."""
-    return f"{type(error).__name__}: {error!s:.500}" if str(error) else type(error).__name__
+# -- backends -------------------------------------------------------------------------------------------------------
 
 
-class Threads:
+class _Threads:
     """Threads of this process: each job on a runner that no other thread uses meanwhile.
 
     Parameters
@@ -239,11 +261,11 @@ class Threads:
         self._runner, self._executor, self._over, self._stop = clone_runner(runner), executor, over, stop
         self._idle: queue.SimpleQueue[CompGraphRunner] = queue.SimpleQueue()
 
-    def submit(self, job: Job) -> Future[Any]:
+    def submit(self, job: Job, *, with_files: bool = False) -> Future[Any]:
         """Give a job to a thread."""
-        return _given(self._executor, self._do, job)
+        return _submitted(self._executor, self._run, job)
 
-    def _do(self, job: Job) -> list[Outcome]:
+    def _run(self, job: Job) -> list[Outcome]:
         if self._stop is not None and self._stop.is_set():
             return []
         try:
@@ -251,52 +273,50 @@ class Threads:
         except queue.Empty:
             own = clone_runner(self._runner)
         try:
-            return do(own, job, self._over)
+            return run_job(own, job, self._over)
         finally:
             self._idle.put(own)
 
-    def read(self, future: Future[Any], job: Job) -> tuple[list[Outcome], Again]:
+    def outcomes_of(self, future: Future[Any], job: Job) -> list[Outcome]:
         """Return the outcomes of a job."""
-        return future.result(), _NONE
-
-    def suspect(self) -> Job | None:
-        """Return None: a thread that dies takes this process with it."""
-        return None
+        outcomes: list[Outcome] = future.result()
+        return outcomes
 
 
-class Bundles:
-    """Other processes, on this machine or others: what travels is a bundle, made of the first item that can be run.
+class _Processes:
+    """Other processes, on this machine or others, which get a package of the graph.
+
+    Until an item could be run, whose values prove the package, jobs run in this thread.
 
     Parameters
     ----------
     runner
         Its graph and hyperparameters are used.
     executor
-        Whatever has the jobs done.
+        Any executor whose workers are processes.
     """
 
     def __init__(self, runner: CompGraphRunner, executor: Executor) -> None:
         self._runner, self._executor = clone_runner(runner), executor
-        self._hyperparameters = packed_values(runner.hyperparameters, "Hyperparameter")
-        self._parcel: PackagedGraph | None = None
-        self._sent: dict[Future[Any], PackagedJob] = {}
-        self._suspects: deque[Job] = deque()
-        self._alone: Job | None = None
+        self._hyperparameters = packed_values(self._runner.hyperparameters, "Hyperparameter")
+        self._package: PackagedGraph | None = None
 
-    def submit(self, job: Job) -> Future[Any]:
-        """Send a job; do it here as long as nothing could be run that proves the bundle."""
-        if self._parcel is None:
-            self._parcel = known_package(self._runner) or self._proven(job)
-        if self._parcel is None:
+    def submit(self, job: Job, *, with_files: bool = False) -> Future[Any]:
+        """Send a job to a worker process."""
+        package = self._package = self._package or known_package(self._runner) or self._proven(job)
+        if package is None:
             here: Future[Any] = Future()
-            here.set_result(do(clone_runner(self._runner), job))
+            here.set_result(run_job(clone_runner(self._runner), job))
             return here
+        if package.size > _MOST_SENT_BYTES and not with_files:
+            package = replace(package, files=None)
         runner = self._runner
-        ways = runner.workers, runner.guard, runner.check_mutation
-        sent = PackagedJob("", self._parcel, self._hyperparameters, packed_job(job), *ways)
-        return self._send(sent if self._parcel.size <= _LIGHT else lighter(sent))
+        options = runner.workers, runner.guard, runner.check_mutation
+        packaged = PackagedJob(uuid.uuid4().hex, package, self._hyperparameters, packed_job(job), *options)
+        return _submitted(self._executor, run_packaged_job, packaged)
 
     def _proven(self, job: Job) -> PackagedGraph | None:
+        """Return the package that the first item proves which can be run; None if none can."""
         for item in job.items:
             own = clone_runner(self._runner)
             try:
@@ -306,64 +326,43 @@ class Bundles:
             return package_of(own)
         return None
 
-    def _send(self, sent: PackagedJob) -> Future[Any]:
-        sent = replace(sent, id=uuid.uuid4().hex)
-        future = _given(self._executor, work, sent)
-        self._sent[future] = sent
-        return future
-
-    def read(self, future: Future[Any], job: Job) -> tuple[list[Outcome], Again]:
-        """Return the outcomes of a job that came back; send it again if the bundle's files are asked for."""
-        sent = self._sent.pop(future, None)
-        if sent is None:
-            return future.result(), _NONE
+    def outcomes_of(self, future: Future[Any], job: Job) -> list[Outcome]:
+        """Return the outcomes of a job that came back."""
         try:
             found = future.result()
         except (BrokenExecutor, CancelledError):
             raise
         except Exception as error:
+            # By its name, since this module does not import Dask.
             if type(error).__name__ == "KilledWorker":
-                return self._after_deaths(job), _NONE
-            raise _unable(error) from error
-        if not isinstance(found, Refusal):
-            return unpacked_outcomes(found, job), _NONE
-        if found.is_missing:
-            return [], {self._send(replace(sent, parcel=self._parcel or sent.parcel)): job}
-        raise ScaleError(found.text)
-
-    def suspect(self) -> Job | None:
-        """Return an item whose workers died, which is to be tried while nobody else could be the one who kills them."""
-        self._alone = self._suspects.popleft() if self._suspects else None
-        return self._alone
-
-    def _after_deaths(self, job: Job) -> list[Outcome]:
-        if job is not self._alone:
-            self._suspects.extend(replace(job, items=(item,)) for item in job.items)
-            return []
-        error_info = ErrorInfo("", "KilledWorker", "every worker that ran it died")
-        return [
-            Outcome(item.number, item.name, setting, error_info=error_info)
-            for item in job.items
-            for setting in job.settings
-        ]
+                raise _WorkersKilled from error
+            raise _job_error(error) from error
+        if not isinstance(found, WorkerRefusal):
+            return unpacked_outcomes(found, job)
+        if found.needs_files:
+            raise _FilesMissing
+        raise ScaleError(found.reason)
 
 
-def _unable(error: Exception) -> EpypesError:
+def _job_error(error: Exception) -> EpypesError:
     if isinstance(error, EpypesError):
         return error
     needed = "Workers need epypes, of the same version, and what the graph imports."
-    return ScaleError(f"A worker could not do its job: {ended(said(error))} {needed}")
+    return ScaleError(f"A worker could not do its job: {ended(_error_text(error))} {needed}")
 
 
-# As long a job takes, about: long beside the millisecond of its way, short beside a person's patience and the last
-# job's, for which all others wait.
+# -- sizes of jobs --------------------------------------------------------------------------------------------------
+
+
+# The duration of a job, about: long beside the millisecond that its transfer takes, and short, since at the end all
+# workers wait for the last job.
 _JOB_NS: Final = 50_000_000
 _MOST_ITEMS: Final = 64
 # What is left is divided into so many groups per worker.
 _LAST_JOBS: Final = 3
-# Of arrays that wait in memory, in one job.
+# Of arrays in one job, which wait in memory.
 _MOST_BYTES: Final = 4_000_000
-# One more outcome changes what is expected by so much.
+# The weight of one more outcome in the expected duration.
 _SHARE: Final = 0.2
 
 
@@ -385,14 +384,14 @@ class JobSizes:
         self._item_ns, self._taken = 0.0, 0
 
     def learn(self, outcomes: Iterable[Outcome]) -> None:
-        """Take note of how long items took; those that could not be read tell nothing."""
+        """Take note of how long items took, but of those that could not be read."""
         for took_ns in (outcome.total_ns for outcome in outcomes if outcome.total_ns):
             self._item_ns = self._item_ns + _SHARE * (took_ns - self._item_ns) if self._item_ns else took_ns
 
     def __iter__(self) -> Iterator[tuple[Item, ...]]:
         while batch := self._next():
             yield tuple(batch)
-            # The items are in memory as long as somebody holds them.
+            # The items are in memory as long as a variable has them.
             del batch
 
     def _next(self) -> list[Item]:

@@ -44,23 +44,14 @@ _READS_NAME: Final = frozenset({"LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_G
 _BY_TEXT: Final = frozenset({"eval", "exec", "globals", "__import__"})
 _ATTRIBUTES_BY_TEXT: Final = frozenset({"getattr", "vars", "__dict__"})
 _LEAVES: Final = (type(None), bool, float, complex, type(...), type(NotImplemented))
-# Their objects are told by what pickle says of them.
+# Objects of these have all their content in what pickle writes of them.
 _DATA_MODULES: Final = frozenset({"builtins", "collections", "datetime", "decimal", "fractions", "numpy", "uuid"})
 # What these have is no data, whatever it is that has them.
 _CODE: Final = (types.FunctionType, type, types.ModuleType)
 # Entries of a class that say where it stands, or that Python makes from the others, some when an object is pickled.
 _NO_BEHAVIOUR: Final = frozenset(
-    [
-        "__annotations_cache__",
-        "__dict__",
-        "__doc__",
-        "__firstlineno__",
-        "__module__",
-        "__slotnames__",
-        "__static_attributes__",
-        "__weakref__",
-        "_abc_impl",
-    ]
+    {"__annotations_cache__", "__dict__", "__doc__", "__firstlineno__", "__module__", "__slotnames__"}
+    | {"__static_attributes__", "__weakref__", "_abc_impl"}
 )
 # Attributes that an object fills when it is used: caches and counters.
 _DERIVED: Final = {
@@ -108,7 +99,7 @@ class Digester:
     ----------
     of_data
         Whether objects of installed packages are unknown unless they are plain data or a message can carry them: what
-        pickle says of a file, a shared memory or a stored array is its name, and not what is in it.
+        pickle writes of a shared memory or a stored array is its name, and not its content.
     path
         Names on the way to the value, for `unknown`.
 
@@ -120,7 +111,7 @@ class Digester:
     modules
         The names of the modules that were met.
     unknown
-        The first object that pickle can't describe, in words; "" if there is none.
+        The first object that pickle can't describe, as text; "" if there is none.
     """
 
     def __init__(self, *, of_data: bool = False, path: list[str] | None = None) -> None:
@@ -523,20 +514,18 @@ def _content_of(file: str) -> bytes:
 
 
 def _spec(name: str) -> ModuleSpec | None:
-    """Return where a module is, without importing it: what is computed is the same before and after."""
-    path: Any = None
-    spec = None
-    parts = name.split(".")
-    for end in range(1, len(parts) + 1):
-        full = ".".join(parts[:end])
-        try:
-            spec = getattr(sys.modules.get(full), "__spec__", None) or PathFinder.find_spec(full, path)
-        except (ImportError, KeyError, ValueError):  # of a folder without __init__.py that is not imported yet
-            return None
-        if spec is None:
-            return None
-        path = spec.submodule_search_locations
-    return spec
+    """Return where a module is, without importing it or its packages; None if it is no module."""
+    spec = getattr(sys.modules.get(name), "__spec__", None)
+    if spec is not None:
+        return spec  # type: ignore[no-any-return]
+    package = name.rpartition(".")[0]
+    within = _spec(package) if package else None
+    if package and (within is None or within.submodule_search_locations is None):
+        return None
+    try:
+        return PathFinder.find_spec(name, None if within is None else within.submodule_search_locations)
+    except (ImportError, KeyError, ValueError):  # of a folder without __init__.py that is not imported yet
+        return None
 
 
 @lru_cache(512)

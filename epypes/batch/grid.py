@@ -1,4 +1,7 @@
-"""Grids of hyperparameter values: the settings that they stand for, and the order in which they run."""
+"""Grids of hyperparameter values: the settings that they stand for, and the order in which they run.
+
+Settings are counted before any is written out, so that a grid which is too large costs nothing.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from dataclasses import dataclass
 from itertools import islice, pairwise, product
 from typing import Any, Final, Literal, get_args
 
-from epypes.batch.ranges import drawn_by, kept_below, shares, span_of, token_below, values_of
+from epypes.batch.ranges import axis_of, bounded, shares
 from epypes.bundle.hyperparameters import range_of
 from epypes.errors import ScaleError, UnknownName
 from epypes.graph import CompGraph, as_switch
@@ -130,7 +133,7 @@ def _values(runner: CompGraphRunner, name: str, given: Any) -> Sequence[Any]:
     """Return the values of one hyperparameter, sized, and not copied if they are."""
     if given is None or isinstance(given, Param):
         param = _hint(runner, name) if given is None else given
-        return values_of(name, param, runner.hyperparameters[name], MOST_OUTCOMES)
+        return axis_of(runner, name, param).values(MOST_OUTCOMES)
     if isinstance(given, tuple):
         listed = f"[{', '.join(map(repr, given[:4]))}{', ...' * (len(given) > 4)}]"
         raise ScaleError(
@@ -159,7 +162,9 @@ def _hint(runner: CompGraphRunner, name: str) -> Param:
     found = range_of(runner.cg, name, runner.hyperparameters[name])
     if isinstance(found, Param):
         return found
-    raise ScaleError(f"Nothing says which values {name!r} may take. Give a list of values, or a range, as (low, high).")
+    raise ScaleError(
+        f"No hint gives the values that {name!r} may take. Give a list of values, or a range, as (low, high)."
+    )
 
 
 def _product(runner: CompGraphRunner, values: Mapping[str, Sequence[Any]]) -> Grid:
@@ -174,9 +179,10 @@ def _product(runner: CompGraphRunner, values: Mapping[str, Sequence[Any]]) -> Gr
 def _zipped(runner: CompGraphRunner, values: Mapping[str, Sequence[Any]]) -> Grid:
     lengths = {name: len(given) for name, given in values.items()}
     if len(set(lengths.values())) > 1:
-        told = ", ".join(f"{name} has {length}" for name, length in lengths.items())
+        counts = ", ".join(f"{name} has {length}" for name, length in lengths.items())
         raise ScaleError(
-            f"how='zip' takes the first values together, then the second, and so on, but {told}. Give as many of each."
+            f"how='zip' takes the first values together, then the second, and so on, but {counts}. "
+            "Give as many of each."
         )
     names = tuple(values)
 
@@ -206,29 +212,19 @@ def _require_branches(runner: CompGraphRunner, name: str, values: Iterable[Any])
 # -- drawn by chance ------------------------------------------------------------------------------------------------
 
 
-def _drawn(runner: CompGraphRunner, axes: Mapping[str, Any], how: str, n: int, seed: int) -> Grid:
-    params = {name: _hint(runner, name) if given is None else _as_range(name, given) for name, given in axes.items()}
-    draws = {name: _draw(runner, name, param) for name, param in params.items()}
-    bounds, present = _bounds(runner, params), runner.hyperparameters
+def _drawn(runner: CompGraphRunner, grid: Mapping[str, Any], how: str, n: int, seed: int) -> Grid:
+    params = {name: _hint(runner, name) if given is None else _as_range(name, given) for name, given in grid.items()}
+    for name, param in params.items():
+        _require_branches(runner, name, param.choices or ())
+    axes = [axis_of(runner, name, param) for name, param in params.items()]
+    present = runner.hyperparameters
 
     def settings() -> tuple[Setting, ...]:
-        rows = shares(how, n, len(draws), seed)
-        drawn = ({name: draws[name](share) for name, share in zip(draws, row, strict=True)} for row in rows)
-        return tuple(kept_below(setting, bounds, present) for setting in drawn)
+        rows = shares(how, n, len(axes), seed)
+        drawn = ({axis.token: axis.at(share) for axis, share in zip(axes, row, strict=True)} for row in rows)
+        return tuple(bounded(axes, setting, present) for setting in drawn)
 
-    return Grid(tuple(draws), n, settings)
-
-
-def _draw(runner: CompGraphRunner, name: str, param: Param) -> Callable[[float], Any]:
-    _require_branches(runner, name, param.choices or ())
-    return drawn_by(name, param, runner.hyperparameters[name])
-
-
-def _bounds(runner: CompGraphRunner, params: Mapping[str, Param]) -> dict[str, tuple[str, Callable[[float], Any]]]:
-    """Return what each hyperparameter never exceeds that has something, and its largest value up to a number."""
-    found = {name: token_below(runner, name, param.below) for name, param in params.items()}
-    present = runner.hyperparameters
-    return {name: (above, span_of(name, params[name], present[name]).at_most) for name, above in found.items() if above}
+    return Grid(tuple(params), n, settings)
 
 
 def _as_range(name: str, given: Any) -> Param:

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, Final
 
-from epypes.acquisition.files import read_image
-from epypes.acquisition.pictures import IMAGE_ENDINGS, image_files, natural_order
+from epypes.acquisition.files import IMAGE_ENDINGS, image_files, natural_order, read_image
 from epypes.bundle.clone import clone_runner
 from epypes.errors import ScaleError
 from epypes.graph import CompGraph, colour_order
@@ -46,7 +45,7 @@ class Item:
 
 
 def items_of(images: Any, runner: CompGraphRunner, *, is_copied: bool = True) -> Iterator[Item]:
-    """Give the inputs of an image set, each when it is asked for.
+    """Yield the inputs of an image set, each when the caller wants the next one.
 
     Parameters
     ----------
@@ -58,7 +57,7 @@ def items_of(images: Any, runner: CompGraphRunner, *, is_copied: bool = True) ->
         Its free source tokens are what an item has to give.
     is_copied
         Whether what a generator gives is copied, since it may be one array that is filled again each time. False if
-        each item is done with before the next one is asked for.
+        the caller needs no item any more when it takes the next one.
 
     Raises
     ------
@@ -73,7 +72,7 @@ def items_of(images: Any, runner: CompGraphRunner, *, is_copied: bool = True) ->
 
 
 def payload_of(item: Item, cg: CompGraph) -> dict[str, Any]:
-    """Return the payload with its files read: BGR, or RGB where the graph says that the token is.
+    """Return the payload with its files read: BGR, or RGB where the graph has the token marked so.
 
     Raises
     ------
@@ -163,7 +162,7 @@ def _of_values(images: Iterable[Any], kind: str, free: tuple[str, ...]) -> Itera
     number = -1
     for number, value in enumerate(images):
         item = _item(number, value, free)
-        # Whoever waits for the next one must not keep this one alive.
+        # This generator waits for its caller, and must not keep the value alive meanwhile.
         del value
         yield item
         del item
@@ -185,7 +184,7 @@ def _item(number: int, value: Any, free: tuple[str, ...]) -> Item:
         given = {_only(free, f"item #{number} is one value"): Path(value) if isinstance(value, str) else value}
     given = {token: _file_or_value(value) for token, value in given.items()}
     files = [file for file in given.values() if isinstance(file, Path)]
-    # Whoever reads it may stand in another folder.
+    # The process that reads it may have another working folder.
     payload = {token: file.absolute() if isinstance(file, Path) else file for token, file in given.items()}
     return Item(number, ", ".join(map(str, files)) or f"#{number}", payload)
 
@@ -210,7 +209,7 @@ ARRAYS: Final = frozenset({".npy", ".npz"})
 
 
 def is_file(value: Any) -> bool:
-    """Whether something stands for what is in a file: a path, or a text that ends like the name of one."""
+    """Whether a value names a file: a path, or a text with the ending of an image or an array."""
     if isinstance(value, os.PathLike):
         return True
     return isinstance(value, str) and PurePath(value).suffix.lower() in IMAGE_ENDINGS | ARRAYS
@@ -225,7 +224,7 @@ def read_value(value: Any, cg: CompGraph, token: str) -> Any:
         A value, or the path of an image, of ``.npy`` or of ``.npz``: an archive of one array is that array, of several
         a dict.
     cg, token
-        Whose value it is: this says the order of an image's colours.
+        The graph and the token that has the value: they give the order of an image's colours.
 
     Raises
     ------
@@ -252,8 +251,8 @@ def _arrays(path: Path) -> Any:
         with found:
             arrays = {name: found[name] for name in found.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        said = error.strerror if isinstance(error, OSError) and error.strerror else str(error).partition("\n")[0]
-        raise ScaleError(f"{str(path)!r} can't be read as an array: {said}. Check the path.") from error
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error).partition("\n")[0]
+        raise ScaleError(f"{str(path)!r} can't be read as an array: {reason}. Check the path.") from error
     return next(iter(arrays.values())) if len(arrays) == 1 else arrays
 
 
@@ -276,19 +275,19 @@ def holds_its_arrays(values: Any) -> bool:
 
 
 def each_copied(values: Iterable[Any]) -> Iterator[Any]:
-    """Give what an iterable gives, copied when it is taken if it does not hold its arrays itself."""
+    """Yield the values of an iterable, copied unless it holds its arrays itself."""
     if holds_its_arrays(values):
         yield from values
         return
     for value in values:
         copied = defensive_copy(dict(value) if isinstance(value, Mapping) else value)
-        # Whoever waits for the next one must not keep this one alive.
+        # This generator waits for its caller, and must not keep the value alive meanwhile.
         del value
         yield copied
         del copied
 
 
 def detached_runner(runner: CompGraphRunner) -> CompGraphRunner:
-    """Return a runner of one's own, which no longer changes when somebody sets, or writes into, hyperparameters."""
+    """Return another runner, which keeps its values when the given runner's hyperparameters are set or written into."""
     own = {token: defensive_copy(value) for token, value in runner.hyperparameters.items()}
     return clone_runner(runner, own)

@@ -19,7 +19,7 @@ from epypes.run import CompGraphRunner, Failure, Run
 from epypes.run.branch import branched
 
 Setting = Mapping[str, Any]
-# One object, since an outcome is known by the very setting that it has.
+# One object, since settings are compared by identity.
 NO_SETTING: Final[Setting] = {}
 
 
@@ -36,9 +36,9 @@ class Job:
     keep
         Tokens whose values are kept.
     show
-        Tokens of which thumbnails are made; None: of every token that has a picture. What has none is told as text.
+        Tokens of which thumbnails are made; None: of every token that has a picture. Of others a text is kept.
     start
-        What jobs with the same one item have in common; None for what travels to another process.
+        The first run of the item, which several jobs share in this process; None for one of its own.
     targets
         Tokens; only what they need is run, branches that are not chosen too. Everything without.
     """
@@ -51,13 +51,13 @@ class Job:
     targets: tuple[str, ...] = ()
 
 
-def do(runner: CompGraphRunner, job: Job, stop: threading.Event | None = None) -> list[Outcome]:
+def run_job(runner: CompGraphRunner, job: Job, stop: threading.Event | None = None) -> list[Outcome]:
     """Return the outcomes of a job: item by item, setting by setting.
 
     Parameters
     ----------
     runner
-        One that nobody else uses; it has its hyperparameters again afterwards.
+        One that no other thread uses; it has its hyperparameters again afterwards.
     job
         The items and settings. Of the second setting on only what depends on what changed is run.
     stop
@@ -104,12 +104,12 @@ def _of_item(runner: CompGraphRunner, item: Item, job: Job, varied: Setting) -> 
             begun.append(outcome_of(runner, payload))
         return None if runner.last is before else runner
 
-    own = begin() if job.start is None else job.start.go_on(begin)
+    own = begin() if job.start is None else job.start.branch(begin)
     yield from begun
     while own is not None and waiting:
         yield outcome_of(own, None)
     if own is not None and job.start is not None:
-        job.start.leave(own)
+        job.start.move_to(own)
 
 
 def _run(
@@ -138,19 +138,19 @@ def _outcome(item: Item, setting: Setting, job: Job, run: Run, album: Album) -> 
         {token: _value(run[token]) for token in run.cg.sink_tokens if tokens.is_readable(token)},
         report.durations_ns,
         report.total_ns,
-        None if run.failure is None else _trouble(run.failure),
+        None if run.failure is None else _error_info(run.failure),
         thumbnails,
         {token: run[token] for token in job.keep if tokens.is_readable(token)},
         texts,
     )
 
 
-def _trouble(failure: Failure) -> ErrorInfo:
+def _error_info(failure: Failure) -> ErrorInfo:
     return ErrorInfo(failure.function, failure.kind, failure.message)
 
 
 def _value(value: Any) -> Any:
-    """Return what a table shows of a value."""
+    """Return a value as a table shows it."""
     if type(value) is int and is_endless(value):
         return long_number(value)
     if value is None or type(value) in (bool, int, float, str):
@@ -162,9 +162,9 @@ def _value(value: Any) -> Any:
 
 
 class SharedStart:
-    """What several jobs of one process begin with: parts of a grid on one and the same item.
+    """The first run of an item, shared by several jobs of one process: parts of a grid on that item.
 
-    The job that comes first runs the item; the others, on whatever thread, wait for that and go on from there.
+    The first job runs the item; the others, on whatever thread, wait for it and branch from its run.
 
     Attributes
     ----------
@@ -177,11 +177,11 @@ class SharedStart:
         self._lock = threading.Lock()
         self._runner: CompGraphRunner | None = None
 
-    def go_on(self, begin: Callable[[], CompGraphRunner | None]) -> CompGraphRunner | None:
+    def branch(self, begin: Callable[[], CompGraphRunner | None]) -> CompGraphRunner | None:
         """Return a runner that has run the item.
 
-        For who comes first that is what ``begin`` returns, which is called meanwhile: a runner that has run the item,
-        or None if that can't be; who comes next is then the first one. All others get one of their own.
+        The first job gets what ``begin`` returns: a runner that has run the item, or None if it can't be run; then the
+        next job is the first one. All others get a runner of their own, with that run as its last one.
         """
         with self._lock:
             if self._runner is not None:
@@ -190,7 +190,7 @@ class SharedStart:
             self._runner = None if begun is None else branched(begun)
             return begun
 
-    def leave(self, runner: CompGraphRunner) -> None:
-        """Let the next one begin where this runner stands."""
+    def move_to(self, runner: CompGraphRunner) -> None:
+        """Let the next job branch from this runner's last run."""
         with self._lock:
             self._runner = branched(runner)

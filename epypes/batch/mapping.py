@@ -94,9 +94,9 @@ def map_images(
         their turn comes, so that they may be more than fit into memory. A generator may fill one array again and again.
         In a dict a text stands for itself, unless it has the ending of an image and there is such a file.
     executor
-        Who does it: this thread without. A ThreadPoolExecutor runs the graph as it is; any other executor, of
+        None: this thread runs the images. A ThreadPoolExecutor runs the graph as it is; any other executor, of
         processes or a Dask cluster (``client.get_executor()``), a bundle that is made of it. The results are the
-        same, unless a function keeps something from one item to the next: a bundle refuses it, threads can't know.
+        same, unless a function keeps something from one item to the next: a bundle refuses it, threads can't notice it.
         Functions of a module that is not installed, such as a file next to the notebook, can't go to other processes.
     keep
         Tokens whose values are kept, in ``outcome.kept``; nothing else but numbers and texts is.
@@ -109,16 +109,16 @@ def map_images(
         What the series in the store is called; without, a digest of the graph, its hyperparameters and all that its
         functions use: code, globals, attributes, modules. A graph that can't be written as text needs a name. Under
         a name that is taken, other code or other hyperparameters are refused. Every item is run again if lists, dicts,
-        arrays or objects that functions use have changed, or if the content of one can't be told.
+        arrays or objects that functions use have changed, or if the content of one can't be digested.
     progress
         Whether there is a bar; without, in a terminal and in a notebook.
     ahead
-        How many jobs are at work or waiting at most; twice as many as there are workers without.
+        How many jobs are in flight at most; twice as many as there are workers without.
 
     Returns
     -------
     MapResult
-        One outcome per image, in order. An image that can't be read or on which a function fails is one that says so.
+        One outcome per image, in order. An image that can't be read or on which a function fails is one with its error.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""How near is a value to what it should be, as one number?
+"""Metrics: how near a value is to what it should be, as one number.
 
 Each metric takes the value of a token, and most of them what was expected; ``METRICS`` has them by name. What can't be
-compared (another shape, another kind of value) is a ``ValueError`` that says why, never a number.
+compared (another shape, another kind of value) is a ``ValueError`` with the reason, never a number.
 """
 
 from __future__ import annotations
@@ -10,123 +10,13 @@ import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
 from epypes.optional import optional_import
 
-if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-    Array = npt.NDArray[np.generic]
-
-
 BoxForm = Literal["xywh", "xyxy"]
-
 # Each label of one side is compared with each of the other; so many pairs take 0.2 GB.
 _MOST_PAIRS: Final = 25_000_000
-
-
-def paired_iou(pairs: Any) -> float:
-    """Return the mean IoU of objects paired one with one so that it is largest, where those left over count 0.
-
-    Parameters
-    ----------
-    pairs
-        The IoU of each object of one side with each of the other: an array (n, m).
-
-    Raises
-    ------
-    MissingPackage
-        scipy is missing.
-    """
-    most = max(pairs.shape)
-    if not most:
-        return 1.0
-    if not pairs.size:
-        return 0.0
-    with optional_import():
-        from scipy.optimize import linear_sum_assignment
-    rows, columns = linear_sum_assignment(pairs, maximize=True)
-    return float(pairs[rows, columns].sum() / most)
-
-
-# -- boxes ------------------------------------------------------------------------------------------------------
-
-
-def is_boxes(value: Any) -> bool:
-    """Whether these are four numbers each, and no mask that is four pixels wide."""
-    if hasattr(value, "dtype") and hasattr(value, "shape") and not hasattr(value, "columns"):
-        return value.dtype not in ("bool", "uint8") and (
-            (value.ndim == 2 and value.shape[1] == 4) or value.shape in ((4,), (0,))
-        )
-    return isinstance(value, list | tuple) and (
-        all(hasattr(box, "__len__") and len(box) == 4 for box in value) or _is_one_box(value)
-    )
-
-
-def _is_one_box(value: Sequence[Any]) -> bool:
-    return len(value) == 4 and all(isinstance(number, int | float) for number in value)
-
-
-def boxes_iou(value: Any, expected: Any, form: BoxForm) -> float:
-    """Return the IoU of boxes, paired one with one."""
-    import numpy as np
-
-    got, wanted = _corners(value, form), _corners(expected, form)
-    first = np.maximum(got[:, None, :2], wanted[None, :, :2])
-    last = np.minimum(got[:, None, 2:], wanted[None, :, 2:])
-    inside = np.prod(np.clip(last - first, 0, None), axis=2)
-    areas = [np.prod(np.clip(boxes[:, 2:] - boxes[:, :2], 0, None), axis=1) for boxes in (got, wanted)]
-    union = areas[0][:, None] + areas[1][None, :] - inside
-    return paired_iou(np.divide(inside, union, out=np.zeros_like(inside), where=union > 0))
-
-
-def _corners(value: Any, form: BoxForm) -> Any:
-    """Return boxes as float64 (n, 4): x and y of the first corner, x and y of the second."""
-    import numpy as np
-
-    boxes = np.asarray(value, np.float64).reshape(-1, 4)
-    if form == "xywh":
-        boxes = np.concatenate([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], axis=1)
-    return boxes
-
-
-# -- labels -----------------------------------------------------------------------------------------------------
-
-
-def is_label_image(array: Any) -> bool:
-    """Whether an array tells objects from each other: integers, of which more than one is not zero."""
-    import numpy as np
-
-    if array.dtype.kind not in "iu":
-        return False
-    found = array[array != 0]
-    return bool(found.size) and bool(np.any(found != found.flat[0]))
-
-
-def labels_iou(got: Any, wanted: Any) -> float:
-    """Return the IoU of the objects in two label images of one shape, paired one with one; a mask is one object.
-
-    Raises
-    ------
-    ValueError
-        There are too many labels to compare each with each.
-    """
-    import numpy as np
-
-    (labels, ours), (other_labels, theirs) = (np.unique(array, return_inverse=True) for array in (got, wanted))
-    rows, columns = len(labels), len(other_labels)
-    if rows * columns > _MOST_PAIRS:
-        raise ValueError(f"The value has {rows} labels, what was expected {columns}: too many to be label images.")
-    codes = ours.ravel() * columns + theirs.ravel()
-    inside = np.bincount(codes, minlength=rows * columns).reshape(rows, columns).astype(np.float64)
-    union = inside.sum(axis=1, keepdims=True) + inside.sum(axis=0, keepdims=True) - inside
-    # The background is no object.
-    return paired_iou((inside / union)[np.ix_(labels != 0, other_labels != 0)])
-
-
-Better = Literal["greater", "less"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +37,7 @@ class Metric:
 
     function: Callable[..., float]
     compares: bool = True
-    better: Better | None = "greater"
+    better: Literal["greater", "less"] | None = "greater"
     least: float | None = None
 
     @property
@@ -227,11 +117,11 @@ def iou(value: Any, expected: Any, *, boxes: BoxForm = "xywh") -> float:
 
     if boxes not in ("xywh", "xyxy"):
         raise ValueError(f"boxes is {boxes!r}, not 'xywh' or 'xyxy'.")
-    if is_boxes(value) and is_boxes(expected):
-        return boxes_iou(value, expected, boxes)
+    if _is_boxes(value) and _is_boxes(expected):
+        return _boxes_iou(value, expected, boxes)
     got, wanted = _same_shape(value, expected)
-    if is_label_image(got) or is_label_image(wanted):
-        return labels_iou(got, wanted)
+    if _is_label_image(got) or _is_label_image(wanted):
+        return _labels_iou(got, wanted)
     inside, outside = np.count_nonzero((got != 0) & (wanted != 0)), np.count_nonzero((got != 0) | (wanted != 0))
     return float(inside / outside) if outside else 1.0
 
@@ -246,7 +136,7 @@ def count(value: Any, *, of: Literal["items", "nonzero", "labels"] | None = None
     of
         ``"items"``: what ``len`` counts, rows of an array; ``"nonzero"``: pixels that are not zero; ``"labels"``:
         different numbers in a label image but 0. Without: the items, of a mask (bool) the pixels that are True. Other
-        arrays of integers with two axes may be either, so there it must be said.
+        arrays of integers with two axes may be either, so there it must be given.
 
     Raises
     ------
@@ -349,6 +239,90 @@ METRICS: Final[Mapping[str, Metric]] = {
 }
 
 
+# -- overlaps ---------------------------------------------------------------------------------------------------
+
+
+def _paired_iou(pairs: Any) -> float:
+    """Return the mean IoU of objects, paired one with one by the Hungarian method; those left over count 0.
+
+    Parameters
+    ----------
+    pairs
+        The IoU of each object of one side with each of the other: an array (n, m).
+
+    Raises
+    ------
+    MissingPackage
+        scipy is missing.
+    """
+    most = max(pairs.shape)
+    if not most:
+        return 1.0
+    if not pairs.size:
+        return 0.0
+    with optional_import():
+        from scipy.optimize import linear_sum_assignment
+    rows, columns = linear_sum_assignment(pairs, maximize=True)
+    return float(pairs[rows, columns].sum() / most)
+
+
+def _is_boxes(value: Any) -> bool:
+    """Whether these are four numbers each, and no mask that is four pixels wide."""
+    if _is_array(value):
+        is_shaped = (value.ndim == 2 and value.shape[1] == 4) or value.shape in ((4,), (0,))
+        return is_shaped and value.dtype not in ("bool", "uint8")
+    if not isinstance(value, list | tuple):
+        return False
+    is_one = len(value) == 4 and all(isinstance(number, int | float) for number in value)
+    return is_one or all(hasattr(box, "__len__") and len(box) == 4 for box in value)
+
+
+def _boxes_iou(value: Any, expected: Any, form: BoxForm) -> float:
+    """Return the IoU of boxes, paired one with one."""
+    import numpy as np
+
+    got, wanted = (np.asarray(boxes, np.float64).reshape(-1, 4) for boxes in (value, expected))
+    if form == "xywh":
+        got, wanted = (np.hstack([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]]) for boxes in (got, wanted))
+    first = np.maximum(got[:, None, :2], wanted[None, :, :2])
+    last = np.minimum(got[:, None, 2:], wanted[None, :, 2:])
+    inside = np.prod(np.clip(last - first, 0, None), axis=2)
+    ours, theirs = (np.prod(np.clip(boxes[:, 2:] - boxes[:, :2], 0, None), axis=1) for boxes in (got, wanted))
+    union = ours[:, None] + theirs[None, :] - inside
+    return _paired_iou(np.divide(inside, union, out=np.zeros_like(inside), where=union > 0))
+
+
+def _is_label_image(array: Any) -> bool:
+    """Whether an array is a label image: integers with more than one value besides 0."""
+    import numpy as np
+
+    if array.dtype.kind not in "iu":
+        return False
+    found = array[array != 0]
+    return bool(found.size) and bool(np.any(found != found.flat[0]))
+
+
+def _labels_iou(got: Any, wanted: Any) -> float:
+    """Return the IoU of the objects in two label images of one shape, paired one with one; a mask is one object.
+
+    Raises
+    ------
+    ValueError
+        There are too many labels to compare each with each.
+    """
+    import numpy as np
+
+    (labels, ours), (other_labels, theirs) = (np.unique(array, return_inverse=True) for array in (got, wanted))
+    rows, columns = len(labels), len(other_labels)
+    if rows * columns > _MOST_PAIRS:
+        raise ValueError(f"The value has {rows} labels, what was expected {columns}: too many to be label images.")
+    codes = ours.ravel() * columns + theirs.ravel()
+    inside = np.bincount(codes, minlength=rows * columns).reshape(rows, columns).astype(np.float64)
+    union = inside.sum(axis=1, keepdims=True) + inside.sum(axis=0, keepdims=True) - inside
+    # The background is no object.
+    return _paired_iou((inside / union)[np.ix_(labels != 0, other_labels != 0)])
+
+
 # -- values -----------------------------------------------------------------------------------------------------
 
 
@@ -386,15 +360,12 @@ def _same_shape(value: Any, expected: Any) -> tuple[Any, Any]:
 def _numbers(value: Any, expected: Any) -> tuple[Any, Any]:
     import numpy as np
 
-    found = []
     for array in map(_array, (value, expected)):
         if array.dtype.kind not in "biufc":
             raise ValueError(f"{_kind(array)} are no numbers.")
-        found.append(array.astype(np.complex128 if array.dtype.kind == "c" else np.float64))
-    got, wanted = found
-    if got.shape != wanted.shape:
-        raise ValueError(f"The shapes differ: the value is {_kind(value)}, what was expected {_kind(expected)}.")
-    return got, wanted
+    got, wanted = _same_shape(value, expected)
+    dtype = np.result_type(got.dtype, wanted.dtype, np.float64)
+    return got.astype(dtype), wanted.astype(dtype)
 
 
 def _array(value: Any) -> Any:

@@ -14,14 +14,14 @@ from epypes.batch.cache import (
     function_digest,
     graph_fingerprint,
     payload_digest,
+    source_of,
     value_digest,
 )
 from epypes.batch.cases import Case
 from epypes.batch.items import Item
 from epypes.batch.ranges import Axis, ChoiceAxis
 from epypes.batch.results import Outcome
-from epypes.bundle import to_source
-from epypes.errors import EpypesError, PlaceholderNeeded, ScaleError, SourceRefused
+from epypes.errors import EpypesError, ScaleError
 from epypes.graph import CompGraph
 from epypes.run import CompGraphRunner
 
@@ -138,7 +138,7 @@ class Objective:
 
 def code_digests(runner: CompGraphRunner, objective: Objective, *, is_named: bool) -> dict[str, str]:
     """Return the digests of the graph and of the metric; see ``search_digests``."""
-    return _digests({"graph": lambda: _graph_digest(runner, is_named), "metric": objective.digest}, is_named=is_named)
+    return _digests({"graph": lambda: _graph_digest(runner.cg), "metric": objective.digest}, is_named=is_named)
 
 
 def search_digests(
@@ -166,7 +166,7 @@ def search_digests(
     """
     varied = {axis.token for axis in axes}
     fixed = {token: value for token, value in runner.hyperparameters.items() if token not in varied}
-    choices = {axis.token: axis.values for axis in axes if isinstance(axis, ChoiceAxis)}
+    choices = {axis.token: axis.choices for axis in axes if isinstance(axis, ChoiceAxis)}
     labels = [(case.name, dict(case.expected or {}), dict(case.hyperparameters or {})) for case in objective.cases]
     data = {
         "hyperparameters": lambda: value_digest(fixed),
@@ -197,14 +197,8 @@ def _digests(ways: Mapping[str, Callable[[], str]], *, is_named: bool) -> dict[s
     return found
 
 
-def _graph_digest(runner: CompGraphRunner, is_named: bool) -> str:
-    try:
-        source = to_source(runner.cg)
-    except (SourceRefused, PlaceholderNeeded):
-        if not is_named:
-            raise
-        source = None
-    found = graph_fingerprint(runner.cg, source)
+def _graph_digest(cg: CompGraph) -> str:
+    found = graph_fingerprint(cg, source_of(cg))
     if found.unknown:
         raise NoDigest(found.unknown)
     return combined_digest("graph", found.code, found.state).hex()

@@ -1,10 +1,13 @@
-"""A graph as a bundle that travels to other processes, and the serialization of values beside it."""
+"""A graph as a bundle that travels to other processes, and the serialization of the values beside it.
+
+The graph is promoted once, which proves that it computes there what it computes here, and the bundle's files travel.
+Numbers, texts, paths and plain arrays travel as they are; any other value by wire's codecs, which know what pickle does
+not, such as OpenCV's keypoints. Nothing of the notebook is ever pickled.
+"""
 
 from __future__ import annotations
 
 import functools
-import hashlib
-import json
 import re
 import tempfile
 import threading
@@ -14,21 +17,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PosixPath, WindowsPath
 from typing import Any, Final
 
+from epypes.batch.cache import combined_digest, source_of
 from epypes.batch.job import Job
 from epypes.batch.results import Outcome
-from epypes.bundle import promote, to_source
+from epypes.bundle import promote
 from epypes.bundle.hyperparameters import Unwritable, members_in, read, written
 from epypes.bundle.load import SAMPLES
-from epypes.errors import BundleError, MessageError, PlaceholderNeeded, PromotionRefused, ScaleError, SourceRefused
+from epypes.errors import BundleError, MessageError, PromotionRefused, ScaleError
 from epypes.run import CompGraphRunner
 from epypes.run.guard import is_plain_array
 from epypes.wire import Envelope, decode, encode
 
 _NAME: Final = "graph"
-# What stands in the reasons in place of the temporary folder.
+# Stands in the reasons in place of the temporary folder.
 _BUNDLE: Final = "the graph's bundle"
 _MISSING: Final = re.compile(r"ModuleNotFoundError: No module named '([^']+)'")
-_MOST_PROVEN: Final = 16
+_MOST_PACKAGES: Final = 16
 _NOTE: Final = (
     "To be run by other processes or a cluster, a graph is promoted to a bundle first. "
     "A ThreadPoolExecutor runs it as it is. If a function keeps something from one item to the next, "
@@ -43,11 +47,11 @@ class PackagedGraph:
     Attributes
     ----------
     digest
-        Of its files; who has unpacked it knows it by that.
+        Of its files; a worker process knows by it what it has unpacked.
     files
-        Their contents by path, without samples; None where it is left out.
+        Their contents by path, without samples; None where they are left out.
     requirements
-        What is to be installed where it is unpacked.
+        The packages that a worker process needs.
     """
 
     digest: str
@@ -60,99 +64,75 @@ class PackagedGraph:
         return sum(map(len, (self.files or {}).values()))
 
 
-class _Proven:
-    """The parcels that were made in this process, by what they compute; those used last are kept."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._by_source: OrderedDict[str, PackagedGraph] = OrderedDict()
-
-    def find(self, source: str) -> PackagedGraph | None:
-        """Return the parcel of this source, if there is one."""
-        with self._lock:
-            parcel = self._by_source.get(source)
-            if parcel is not None:
-                self._by_source.move_to_end(source)
-            return parcel
-
-    def add(self, source: str, parcel: PackagedGraph) -> None:
-        """Keep a parcel."""
-        with self._lock:
-            self._by_source[source] = parcel
-            while len(self._by_source) > _MOST_PROVEN:
-                self._by_source.popitem(last=False)
-
-
-_PROVEN: Final = _Proven()
+# The packages that this process has made, by what they compute; the oldest ones go.
+_PACKAGES: Final[OrderedDict[str, PackagedGraph]] = OrderedDict()
+_LOCK: Final = threading.Lock()
 
 
 def known_package(runner: CompGraphRunner) -> PackagedGraph | None:
-    """Return the parcel of a runner's graph if this process has made it before."""
-    source = _source_of(runner)
-    return None if source is None else _PROVEN.find(source)
+    """Return the package of a runner's graph if this process has made it before."""
+    key = _key_of(runner)
+    with _LOCK:
+        return None if key is None else _PACKAGES.get(key)
 
 
 def package_of(runner: CompGraphRunner) -> PackagedGraph:
-    """Make a parcel of a runner's graph; its last run is what proves it.
+    """Package a runner's graph; its last run is the sample that proves the bundle.
 
     Raises
     ------
     PromotionRefused
-        With every reason why it can't be a bundle.
+        With every reason why the graph can't become a bundle.
     """
-    with tempfile.TemporaryDirectory(prefix="epypes-parcel-") as folder:
+    with tempfile.TemporaryDirectory(prefix="epypes-package-") as folder:
         try:
             bundle = promote(runner, Path(folder) / _NAME)
         except PromotionRefused as error:
-            refused = PromotionRefused(_BUNDLE, _told(error.reasons, Path(folder) / _NAME))
+            refused = PromotionRefused(_BUNDLE, _reasons(error.reasons, Path(folder) / _NAME))
             refused.add_note(_NOTE)
             raise refused from error
         except BundleError as error:
             error.add_note(_NOTE)
             raise
-        files = {str(file.relative_to(bundle.path)): file.read_bytes() for file in _files(bundle.path)}
-    digest = hashlib.sha256()
-    for name, content in sorted(files.items()):
-        digest.update(f"{name}\0{len(content)}\0".encode() + content)
-    parcel = PackagedGraph(digest.hexdigest(), files, files.get("requirements.txt", b"").decode())
-    source = _source_of(runner)
-    if source is not None:
-        _PROVEN.add(source, parcel)
-    return parcel
+        paths = sorted(file for file in bundle.path.rglob("*") if file.is_file() and SAMPLES not in file.parts)
+        files = {str(file.relative_to(bundle.path)): file.read_bytes() for file in paths}
+    digest = combined_digest(*(part for file in files.items() for part in file)).hex()
+    package = PackagedGraph(digest, files, files.get("requirements.txt", b"").decode())
+    if (key := _key_of(runner)) is not None:
+        with _LOCK:
+            _PACKAGES[key] = package
+            while len(_PACKAGES) > _MOST_PACKAGES:
+                _PACKAGES.popitem(last=False)
+    return package
 
 
-def _told(reasons: Sequence[str], folder: Path) -> list[str]:
-    """Return the reasons without a folder that nobody has named and that is gone; first which modules are missing."""
+def _reasons(reasons: Sequence[str], folder: Path) -> list[str]:
+    """Return the reasons without the temporary folder, which the user has not named; missing modules come first."""
     places = sorted({str(folder), str(folder.resolve())}, key=len, reverse=True)
-    said = [functools.reduce(lambda text, place: text.replace(place, _BUNDLE), places, reason) for reason in reasons]
-    missing = dict.fromkeys(name for reason in said for name in _MISSING.findall(reason))
+    texts = [functools.reduce(lambda text, place: text.replace(place, _BUNDLE), places, reason) for reason in reasons]
+    missing = dict.fromkeys(name for reason in texts for name in _MISSING.findall(reason))
     first = [
         f"Module {name!r} is not installed, so no other process can import it: install it as a package, or take a "
         "ThreadPoolExecutor, or no executor, which run the graph as it is."
         for name in missing
     ]
-    return [*first, *said]
+    return [*first, *texts]
 
 
-def _files(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.rglob("*") if file.is_file() and SAMPLES not in file.parts)
+def _key_of(runner: CompGraphRunner) -> str | None:
+    """Return a text that differs for graphs that compute something else; None if the graph can't be written as text.
 
-
-def _source_of(runner: CompGraphRunner) -> str | None:
-    """Return what tells a graph from others that compute something else; None if that can't be written as text.
-
-    Values of hyperparameters are not in it: they travel beside the parcel.
+    Values of hyperparameters are not in it: they travel beside the package.
     """
-    try:
-        source = to_source(runner.cg)
-    except (SourceRefused, PlaceholderNeeded):
-        return None
-    kinds = {
+    source, cg = source_of(runner.cg), runner.cg
+    types = {
         token: f"{type(value).__module__}.{type(value).__qualname__}" for token, value in runner.hyperparameters.items()
     }
-    io = {name: [runner.cg.func_inputs(name), runner.cg.func_outputs(name)] for name in runner.cg.functions}
-    return json.dumps([source, io, kinds, list(runner.free_source_tokens)])
+    io = {name: (cg.func_inputs(name), cg.func_outputs(name)) for name in cg.functions}
+    return None if source is None else repr((source, io, types, runner.free_source_tokens))
 
+
+# -- serialization --------------------------------------------------------------------------------------------------
 
 _AS_THEY_ARE: Final = frozenset({bool, int, float, complex, str, bytes, type(None), Path, PosixPath, WindowsPath})
 _PART: Final = "value"
@@ -209,7 +189,7 @@ def unpacked_values(values: Mapping[str, Any], enums: Mapping[str, Any] | None =
 
 
 def packed_job(job: Job) -> Job:
-    """Return a job as it travels: where it starts, with a lock and a runner, is of this process alone."""
+    """Return a job as it travels: without where it starts, since that has a lock and a runner of this process."""
     items = tuple(replace(item, payload=packed_values(item.payload, "Input")) for item in job.items)
     settings = tuple(packed_values(setting, "Hyperparameter") for setting in job.settings)
     return replace(job, items=items, settings=settings, start=None)
@@ -222,22 +202,17 @@ def unpacked_job(job: Job, enums: Mapping[str, Any]) -> Job:
 
 
 def packed_outcomes(outcomes: list[Outcome]) -> list[Outcome]:
-    """Return outcomes as they travel back: without their settings, which whoever sent the job knows."""
+    """Return outcomes as they travel back: without their settings, which the process that sent the job has."""
     return [replace(outcome, setting={}, kept=packed_values(outcome.kept, "Token")) for outcome in outcomes]
 
 
 def unpacked_outcomes(outcomes: list[Outcome], job: Job) -> list[Outcome]:
-    """Return the outcomes of a job that came back."""
-    settings = len(job.settings)
-    return [
-        replace(outcome, setting=job.settings[place % settings], kept=_locked(unpacked_values(outcome.kept)))
-        for place, outcome in enumerate(outcomes)
-    ]
-
-
-def _locked(values: dict[str, Any]) -> dict[str, Any]:
-    """Make arrays read-only, as those of a run are."""
-    for value in values.values():
-        if is_plain_array(value):
-            value.flags.writeable = False
-    return values
+    """Return the outcomes of a job that came back; their arrays are read-only, as those of a run are."""
+    unpacked: list[Outcome] = []
+    for place, outcome in enumerate(outcomes):
+        kept = unpacked_values(outcome.kept)
+        for value in kept.values():
+            if is_plain_array(value):
+                value.flags.writeable = False
+        unpacked.append(replace(outcome, setting=job.settings[place % len(job.settings)], kept=kept))
+    return unpacked

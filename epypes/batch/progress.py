@@ -1,4 +1,4 @@
-"""How far is it?"""
+"""Progress bars, on standard error or as text below a cell."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def progress_bar(progress: bool | None, total: int | None, what: str, *, unit: s
     Parameters
     ----------
     progress
-        Whether there is one; None: where somebody sees it, in a terminal or a notebook, if tqdm is installed.
+        Whether there is one; None: in a terminal or a notebook, if tqdm is installed.
     total
         How many there will be; None if that is not known.
     what
@@ -30,7 +30,7 @@ def progress_bar(progress: bool | None, total: int | None, what: str, *, unit: s
         What is counted.
     """
     if progress is False or (progress is None and not _is_seen()):
-        yield _tell_nobody
+        yield _show_nothing
         return
     try:
         with optional_import():
@@ -38,7 +38,7 @@ def progress_bar(progress: bool | None, total: int | None, what: str, *, unit: s
     except MissingPackage:
         if progress:
             raise
-        yield _tell_nobody
+        yield _show_nothing
         return
     failed = 0
     with tqdm(total=total, desc=what, unit=unit, file=_Cell() if _is_in_notebook() else sys.stderr) as bar:
@@ -81,8 +81,8 @@ class _Cell:
         """Do nothing: each line is shown at once."""
 
 
-def _tell_nobody(count: int, failures: int) -> None:
-    """Take how far it is, where nobody wants to know."""
+def _show_nothing(count: int, failures: int) -> None:
+    """Take the numbers, where there is no bar."""
 
 
 def _is_seen() -> bool:

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, Final
 from epypes.bundle.hyperparameters import plain, range_of
 from epypes.catalog import parameter_names
 from epypes.errors import ScaleError, UnknownName
-from epypes.graph import CompGraph
 from epypes.hints import Param, Roi, as_param, odd_step, param_from_value
 from epypes.optional import optional_import
 from epypes.run import CompGraphRunner
@@ -95,126 +94,8 @@ class Span:
         return self.value(min(max(place, 0), self.size - 1))
 
 
-def kept_below(
-    values: Mapping[str, Any],
-    bounds: Mapping[str, tuple[str, Callable[[float], Any]]],
-    present: Mapping[str, Any],
-) -> dict[str, Any]:
-    """Return values of which none exceeds the one that it is to stay below.
-
-    Parameters
-    ----------
-    values
-        Of what varies, by token.
-    bounds
-        By token that has one: the token that it never exceeds, and the function that gives the largest value up to a
-        number.
-    present
-        The values of what does not vary.
-    """
-    kept = dict(values)
-    for _ in bounds:  # a bound may have one itself
-        for token, (above, at_most) in bounds.items():
-            bound = kept.get(above, present.get(above))
-            if isinstance(bound, numbers.Real) and kept[token] > bound:
-                kept[token] = at_most(float(bound))
-    return kept
-
-
 def _written(number: float) -> Decimal:
     return Decimal(int(number)) if isinstance(number, numbers.Integral) else Decimal(repr(float(number)))
-
-
-# -- the values of a sweep --------------------------------------------------------------------------------------
-
-
-def values_of(name: str, param: Param, present: Any, most: int) -> Sequence[Any]:
-    """Return all values that a hyperparameter may take; of more than ``most`` only a range of that length.
-
-    Raises
-    ------
-    ScaleError
-        They can't be counted.
-    """
-    if param.choices is not None:
-        return param.choices
-    span = span_of(name, param, present)
-    if span.step is None:
-        raise ScaleError(
-            f"Between {span.low:g} and {span.high:g} there is no end of values for {name!r}. Give a list, as "
-            f"{name}=[...], a step, as ep.Param({span.low:g}, {span.high:g}, step=...), or how='random' with n=..."
-        )
-    return tuple(map(span.value, range(span.size))) if span.size <= most else range(span.size)
-
-
-def drawn_by(name: str, param: Param, present: Any) -> Callable[[float], Any]:
-    """Return the function that gives the value for a share from 0 to below 1, all values being equally likely.
-
-    Raises
-    ------
-    ScaleError
-        The range is open.
-    """
-    if param.choices is not None:
-        choices = param.choices
-        return lambda share: choices[min(int(share * len(choices)), len(choices) - 1)]
-    return span_of(name, param, present).at
-
-
-def shares(how: str, n: int, dimensions: int, seed: int) -> Sequence[Sequence[float]]:
-    """Return n rows of shares from 0 to below 1: random ones, or Latin hypercubes, with each n-th part once."""
-    import numpy as np
-
-    generator = np.random.default_rng(seed)
-    if how == "random":
-        rows: Sequence[Sequence[float]] = generator.random((n, dimensions)).tolist()
-        return rows
-    with optional_import():
-        from scipy.stats import qmc
-    drawn: Sequence[Sequence[float]] = qmc.LatinHypercube(dimensions, seed=generator).random(n).tolist()
-    return drawn
-
-
-def span_of(name: str, param: Param, present: Any) -> Span:
-    """Return the range of a hyperparameter that is ``present`` now; its soft part, if it has one.
-
-    Raises
-    ------
-    ScaleError
-        An end is open.
-    """
-    low, high = _ends(param)
-    if not (_is_number(low) and _is_number(high)):
-        raise ScaleError(f"The range of {name!r} is open. Give both ends, as {name}=(low, high), or a list of values.")
-    given = (low, high, 1 if param.step is None else param.step)
-    is_whole = all(isinstance(end, numbers.Integral) for end in given) and (
-        isinstance(present, numbers.Integral) or not isinstance(present, numbers.Real)
-    )
-    return _span(name, param, low, high, is_whole)
-
-
-def _span(name: str, param: Param, low: float, high: float, is_whole: bool) -> Span:
-    """Return a span whose ends are on its steps."""
-    step = param.step
-    if param.odd:
-        low, high, step = math.ceil(low) | 1, math.floor(high), odd_step(step)
-    elif is_whole:
-        low, high, step = math.ceil(low), math.floor(high), max(1, round(step or 1))
-    if low > high:
-        raise ScaleError(f"There is no {'odd' if param.odd else 'whole'} number in the range of {name!r}. Widen it.")
-    span = Span(low, high, step, param.log)
-    return span if step is None else replace(span, high=span.value(span.size - 1))
-
-
-def _ends(param: Param) -> tuple[Any, Any]:
-    return param.soft or (param.low, param.high)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
-
-
-# -- the axes of a search ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,6 +105,26 @@ class NumberAxis:
     token: str
     span: Span
     below: str = ""
+
+    def values(self, most: int) -> Sequence[Any]:
+        """Return all values; of more than ``most`` only a range of that length.
+
+        Raises
+        ------
+        ScaleError
+            They can't be counted.
+        """
+        span, token = self.span, self.token
+        if span.step is None:
+            raise ScaleError(
+                f"Between {span.low:g} and {span.high:g} there is no end of values for {token!r}. Give a list, as "
+                f"{token}=[...], a step, as ep.Param({span.low:g}, {span.high:g}, step=...), or how='random' with n=..."
+            )
+        return tuple(map(span.value, range(span.size))) if span.size <= most else range(span.size)
+
+    def at(self, share: float) -> Any:
+        """Return the value at a share from 0 to below 1."""
+        return self.span.at(share)
 
     def value(self, suggested: Any) -> Any:
         """Return the value for what the sampler has suggested."""
@@ -250,16 +151,24 @@ class ChoiceAxis:
     """A hyperparameter that takes one of some values; each has a label of its own, for the database."""
 
     token: str
-    values: tuple[Any, ...]
+    choices: tuple[Any, ...]
     labels: tuple[str, ...]
+
+    def values(self, most: int) -> Sequence[Any]:
+        """Return all values."""
+        return self.choices
+
+    def at(self, share: float) -> Any:
+        """Return the value at a share from 0 to below 1."""
+        return self.choices[min(int(share * len(self.choices)), len(self.choices) - 1)]
 
     def value(self, suggested: Any) -> Any:
         """Return the value of a label."""
-        return self.values[self.labels.index(suggested)]
+        return self.choices[self.labels.index(suggested)]
 
     def suggestion(self, value: Any) -> str:
         """Return the label of a value; the first label if the value is none of them."""
-        same = (label for label, known in zip(self.labels, self.values, strict=True) if _is_one(known, value))
+        same = (label for label, known in zip(self.labels, self.choices, strict=True) if _is_one(known, value))
         return next(same, self.labels[0])
 
     @property
@@ -273,6 +182,90 @@ class ChoiceAxis:
 Axis = NumberAxis | ChoiceAxis
 
 
+def axis_of(runner: CompGraphRunner, token: str, param: Param) -> Axis:
+    """Return the values that a hyperparameter may take; of a range its soft part, if it has one.
+
+    They are integers if the range is one of odd numbers, or if its ends and step are integers and the present value is
+    one, or no number: 1.0 is a float on purpose, and so is what it ranges over.
+
+    Raises
+    ------
+    ScaleError
+        An end is open, or there is no such number.
+    """
+    if param.choices is not None:
+        names = (one.name if isinstance(one, enum.Enum) else f"{one!r:.80}" for one in param.choices)
+        labels = tuple(param.labels or names)
+        if len(set(labels)) < len(labels):  # texts that are alike are numbered
+            labels = tuple(f"{text} #{number}" for number, text in enumerate(labels))
+        return ChoiceAxis(token, param.choices, labels)
+    low, high = _ends(param)
+    if not (_is_number(low) and _is_number(high)):
+        raise ScaleError(f"The range of {token!r} is open. Give both ends, as (low, high), or a list of values.")
+    step, present = param.step, plain(runner.hyperparameters[token])
+    given = (low, high, 1 if step is None else step)
+    is_whole = isinstance(present, numbers.Integral) or not isinstance(present, numbers.Real)
+    if param.odd:
+        low, high, step = math.ceil(low) | 1, math.floor(high), odd_step(step)
+        if low > high:
+            raise ScaleError(f"There is no odd number in the range of {token!r}. Widen it.")
+    elif is_whole and all(isinstance(number, numbers.Integral) for number in given):
+        low, high, step = int(low), int(high), int(step or 1)
+    else:
+        low, high, step = float(low), float(high), None if step is None else float(step)
+    span = Span(low, high, step, param.log)
+    if step is not None:
+        span = replace(span, high=span.value(span.size - 1))
+    return NumberAxis(token, span, _token_below(runner, token, param.below))
+
+
+def _ends(param: Param) -> tuple[Any, Any]:
+    return param.soft or (param.low, param.high)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def bounded(axes: Sequence[Axis], values: Mapping[str, Any], present: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values of which none exceeds the one that it is to stay below.
+
+    Parameters
+    ----------
+    axes
+        What varies.
+    values
+        Of what varies, by token.
+    present
+        The values of the other hyperparameters.
+    """
+    kept = dict(values)
+    bounds = [axis for axis in axes if isinstance(axis, NumberAxis) and axis.below]
+    for _ in bounds:  # a bound may have one itself
+        for axis in bounds:
+            bound = kept.get(axis.below, present.get(axis.below))
+            if isinstance(bound, numbers.Real) and kept[axis.token] > bound:
+                kept[axis.token] = axis.span.at_most(float(bound))
+    return kept
+
+
+def shares(how: str, n: int, dimensions: int, seed: int) -> Sequence[Sequence[float]]:
+    """Return n rows of shares from 0 to below 1: random ones, or Latin hypercubes, with each n-th part once."""
+    import numpy as np
+
+    generator = np.random.default_rng(seed)
+    if how == "random":
+        rows: Sequence[Sequence[float]] = generator.random((n, dimensions)).tolist()
+        return rows
+    with optional_import():
+        from scipy.stats import qmc
+    drawn: Sequence[Sequence[float]] = qmc.LatinHypercube(dimensions, seed=generator).random(n).tolist()
+    return drawn
+
+
+# -- the axes of a search ---------------------------------------------------------------------------------------
+
+
 def axes_of(runner: CompGraphRunner, ranges: Mapping[str, Any] | None = None) -> tuple[Axis, ...]:
     """Return what is searched, in graph order.
 
@@ -284,7 +277,6 @@ def axes_of(runner: CompGraphRunner, ranges: Mapping[str, Any] | None = None) ->
         By hyperparameter: an ``ep.Param``, a tuple as a range (low, high[, step]), or a list of choices; only these
         vary. Without, all those vary for which an annotation, a switch, or the tables of OpenCV and scikit-image give
         choices or both ends of a range, hard or usual. A range that is usual is widened to hold the present value.
-        Values are whole numbers where the present one is.
 
     Raises
     ------
@@ -305,26 +297,7 @@ def axes_of(runner: CompGraphRunner, ranges: Mapping[str, Any] | None = None) ->
     if not ranges:
         raise ScaleError('ranges is empty, so nothing would vary. Name hyperparameters: ranges={"name": (low, high)}.')
     order = [token for token in runner.cg.source_tokens if token in ranges]
-    return tuple(_axis(runner, token, _given(token, ranges[token], present[token])) for token in order)
-
-
-def setting_of(axes: Sequence[Axis], suggested: Mapping[str, Any], present: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of the hyperparameters that a sampler has suggested, by token.
-
-    Parameters
-    ----------
-    axes
-        What varies.
-    suggested
-        By token: a number, or a label.
-    present
-        The values of the other hyperparameters.
-    """
-    values = {axis.token: axis.value(suggested[axis.token]) for axis in axes}
-    bounds = {
-        axis.token: (axis.below, axis.span.at_most) for axis in axes if isinstance(axis, NumberAxis) and axis.below
-    }
-    return kept_below(values, bounds, present)
+    return tuple(axis_of(runner, token, _given(token, ranges[token], present[token])) for token in order)
 
 
 def _hinted(runner: CompGraphRunner) -> Iterator[Axis]:
@@ -337,8 +310,11 @@ def _hinted(runner: CompGraphRunner) -> Iterator[Axis]:
             param = param_from_value(value)
         if not isinstance(param, Param):
             continue
+        if param.soft is not None:
+            low, high = param.soft
+            param = replace(param, low=min(low, plain(value)), high=max(high, plain(value)), soft=None)
         if param.choices is not None or all(map(_is_number, _ends(param))):
-            yield _axis(runner, token, param, holds_present=param.soft is not None)
+            yield axis_of(runner, token, param)
 
 
 def _given(token: str, hint: Any, value: Any) -> Param:
@@ -350,45 +326,23 @@ def _given(token: str, hint: Any, value: Any) -> Param:
     if param is None or isinstance(param, Roi):
         text = f"ranges[{token!r}] is {hint!r:.60}. Give an ep.Param, a tuple (low, high), or a list of choices."
         raise ScaleError(text)
-    if param.choices is None and not all(map(_is_number, _ends(param))):
-        raise ScaleError(f"The range of {token!r} has an open end. Give both: ranges={{{token!r}: (low, high)}}.")
     if param.choices is None and not _is_number(plain(value)):
         text = f"{token!r} is {value!r:.60}, so it has no range of numbers."
         raise ScaleError(f"{text} Give a list of choices: ranges={{{token!r}: [...]}}.")
     return param
 
 
-def _axis(runner: CompGraphRunner, token: str, param: Param, *, holds_present: bool = False) -> Axis:
-    if param.choices is not None:
-        names = (one.name if isinstance(one, enum.Enum) else f"{one!r:.80}" for one in param.choices)
-        labels = tuple(param.labels or names)
-        if len(set(labels)) < len(labels):  # texts that are alike are numbered
-            labels = tuple(f"{text} #{number}" for number, text in enumerate(labels))
-        return ChoiceAxis(token, param.choices, labels)
-    value = plain(runner.hyperparameters[token])
-    low, high = _ends(param)
-    if holds_present:
-        low, high = min(low, value), max(high, value)
-    # 1.0 is a float on purpose, and so is what it ranges over, unless that is odd.
-    is_whole = isinstance(value, numbers.Integral)
-    span = _span(token, param, low, high, is_whole)
-    if not (is_whole or param.odd):
-        span = Span(float(span.low), float(span.high), span.step and float(span.step), span.log)
-    return NumberAxis(token, span, token_below(runner, token, param.below))
-
-
-def token_below(runner: CompGraphRunner, token: str, name: str) -> str:
+def _token_below(runner: CompGraphRunner, token: str, name: str) -> str:
     """Return the hyperparameter that a hint calls by its own name or by that of a function's parameter."""
     if not name or name in runner.hyperparameters:
         return name
-    return next((found for found in _called(runner.cg, token, name) if found in runner.hyperparameters), "")
-
-
-def _called(cg: CompGraph, token: str, name: str) -> Iterator[str]:
+    cg = runner.cg
     for function in cg.digraph.consumers.get(token, ()):
-        inputs = cg.func_inputs(function)
-        names = parameter_names(cg.functions[function])
-        yield from (given for given, called in zip(inputs, names, strict=False) if called == name)
+        parameters = parameter_names(cg.functions[function])
+        for given, parameter in zip(cg.func_inputs(function), parameters, strict=False):
+            if parameter == name and given in runner.hyperparameters:
+                return given
+    return ""
 
 
 def _is_one(known: Any, value: Any) -> bool:

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
+from epypes.batch.items import Item
 from epypes.display.durations import duration_text
 from epypes.display.markup import content, escape
 from epypes.display.previews.short import float_text
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 # What reading a file raises.
 _UNREADABLE: Final = frozenset({ImageFileError.__name__, ScaleError.__name__})
-# Python can be told to refuse numbers of more than 640 digits.
+# Python can be configured to refuse numbers of more than 640 digits.
 _MOST_BITS: Final = 2_126
 
 
@@ -35,7 +36,7 @@ class ErrorInfo:
     kind
         Name of the exception's class.
     message
-        What the exception says.
+        The exception's text.
     """
 
     function: str
@@ -73,7 +74,7 @@ class Thumbnail:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What is left of one item under one setting.
+    """The result of one item under one setting.
 
     Attributes
     ----------
@@ -87,14 +88,14 @@ class Outcome:
         Nanoseconds by function that ran; what was reused from the setting before is not among them.
     total_ns
         Nanoseconds of the run, without reading files.
-    trouble
+    error_info
         What failed; None if nothing did.
     thumbnails
         By token, if they were asked for.
     kept
         Whole values by token, if they were asked for.
     texts
-        Of tokens whose pictures were asked for and that have none: what is said of them instead.
+        Of tokens whose thumbnails were asked for and that have no picture: a text instead.
     """
 
     number: int
@@ -114,74 +115,62 @@ class Outcome:
         return self.error_info is not None
 
     def to_json(self) -> dict[str, Any]:
-        """Return what JSON can hold of it: all but ``kept``."""
+        """Return all but ``kept`` as JSON can hold it."""
+        thumbnails = {
+            token: {**asdict(shown), "data": base64.b64encode(shown.data).decode()}
+            for token, shown in self.thumbnails.items()
+        }
         return {
             "number": self.number,
             "name": self.name,
-            "setting": {token: _plain(value) for token, value in self.setting.items()},
+            "setting": {token: _json_value(value) for token, value in self.setting.items()},
             "values": dict(self.values),
             "times_ns": dict(self.times_ns),
             "total_ns": self.total_ns,
             "error_info": None if self.error_info is None else asdict(self.error_info),
-            "thumbnails": {
-                token: {
-                    "media_type": shown.media_type,
-                    "data": base64.b64encode(shown.data).decode(),
-                    "caption": shown.caption,
-                }
-                for token, shown in self.thumbnails.items()
-            },
+            "thumbnails": thumbnails,
             "texts": dict(self.texts),
         }
 
     @staticmethod
-    def from_json(data: Mapping[str, Any]) -> Outcome:
-        """Return the outcome that ``to_json`` wrote."""
-        error_info = data["error_info"]
+    def from_json(data: Mapping[str, Any], item: Item, setting: Mapping[str, Any]) -> Outcome:
+        """Return the outcome that ``to_json`` wrote, for the item and the setting that it was looked up for."""
+        info = data["error_info"]
         return Outcome(
-            data["number"],
-            data["name"],
-            {token: _read(value) for token, value in data["setting"].items()},
+            item.number,
+            item.name,
+            setting,
             dict(data["values"]),
             dict(data["times_ns"]),
             data["total_ns"],
-            None if error_info is None else ErrorInfo(**error_info),
+            None if info is None else ErrorInfo(**info),
             {
-                token: Thumbnail(shown["media_type"], base64.b64decode(shown["data"]), shown["caption"])
+                token: Thumbnail(**{**shown, "data": base64.b64decode(shown["data"])})
                 for token, shown in data["thumbnails"].items()
             },
-            texts=dict(data.get("texts", {})),
+            texts=dict(data["texts"]),
         )
 
 
-def _plain(value: Any) -> Any:
-    """Return a hyperparameter's value as JSON can hold it; a tuple is told from a list."""
+def _json_value(value: Any) -> Any:
+    """Return a hyperparameter's value as JSON can hold it, for people and tables: it is not read back."""
     if isinstance(value, int) and is_endless(value):
-        return {"text": long_number(value)}
+        return long_number(value)
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, tuple | list):
-        items = [_plain(item) for item in value]
-        return {"tuple": items} if isinstance(value, tuple) else items
+        return [_json_value(item) for item in value]
     number = plain_number(value)
-    return {"text": str(value)} if number is None else number
-
-
-def _read(data: Any) -> Any:
-    if isinstance(data, list):
-        return [_read(item) for item in data]
-    if not isinstance(data, Mapping):
-        return data
-    return tuple(_read(item) for item in data["tuple"]) if "tuple" in data else data["text"]
+    return str(value) if number is None else number
 
 
 def is_endless(value: int) -> bool:
-    """Whether a number has more digits than can be read from a text, whatever Python is told to refuse."""
+    """Whether a number has more digits than Python may be configured to convert."""
     return value.bit_length() > _MOST_BITS
 
 
 def long_number(value: int) -> str:
-    """Return what a table says of a number that nobody reads."""
+    """Return the text that a table shows in place of a very long number."""
     return f"int of {value.bit_length():,} bits"
 
 
@@ -282,7 +271,7 @@ def outcomes_html(outcomes: Sequence[Outcome], cg: CompGraph, caption: str) -> s
     """Return a table as HTML: the failed and the first others, in order, with the thumbnails there is room for."""
     chosen = _chosen(outcomes)
     shown = [token for token in cg.tokens if any(token in outcome.thumbnails for outcome in chosen)]
-    # A sink token with a picture says the rest in the picture's title.
+    # A sink token with a picture is described in the picture's title.
     sinks = [token for token in cg.sink_tokens if token not in shown]
     head = _row("th", ["name", *shown, *sinks, "time"])
     room, rows = _THUMBNAIL_CHARACTERS, []
@@ -309,9 +298,9 @@ def _outcome_row(outcome: Outcome, pictures: list[str], sinks: Sequence[str]) ->
     if outcome.error_info is None:
         values = [content(value_text(outcome.values[token])) if token in outcome.values else "" for token in sinks]
         return _row("td", [name, *pictures, *values, duration_text(outcome.total_ns)])
-    said = " ".join(str(outcome.error_info).split())
-    cut = said if len(said) <= _MESSAGE_CHARACTERS else f"{said[:_MESSAGE_CHARACTERS]}..."
-    style = f'style="text-align:left;color:{_ERROR}" title="{escape(said)}"'
+    message = " ".join(str(outcome.error_info).split())
+    cut = message if len(message) <= _MESSAGE_CHARACTERS else f"{message[:_MESSAGE_CHARACTERS]}..."
+    style = f'style="text-align:left;color:{_ERROR}" title="{escape(message)}"'
     failure = f'<td colspan="{len(sinks) + 1}" {style}>\u2717 {content(cut)}</td>'
     cells = "".join(f"<td{_LEFT}>{cell}</td>" for cell in (name, *pictures))
     return f"<tr>{cells}{failure}</tr>"

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 _WIDTH: Final = 560
 _HEIGHT: Final = 200
-_LEFT, _RIGHT, _TOP, _BOTTOM = 64, 14, 14, 34
+_LEFT, _RIGHT, _TOP, _BOTTOM = 76, 14, 14, 34
 # More dots than this can't be told apart; the line of the best has all trials.
 _MOST_DOTS: Final = 1_000
 _MOST_ROWS: Final = 30

@@ -86,7 +86,7 @@ class SweepResult:
         Parameters
         ----------
         token
-            Any that was shown: what has no picture is told as text. None: the last sink token that has pictures, else
+            Any that was shown, as a picture or as text. None: the last sink token that has pictures, else
             the last token that has some.
         rows, columns
             Hyperparameters by which the pictures are laid out; None: the first two that vary. What else varies, and
@@ -152,7 +152,7 @@ def sweep(
     keep
         Tokens whose values are kept in ``outcome.kept``; of all others only thumbnails, numbers and texts are.
     show
-        Tokens of which thumbnails are made; None: all that have a picture. What has none is told as text.
+        Tokens of which thumbnails are made; None: all that have a picture. Of others a text is kept.
     store, name
         As for ``map``: settings that are stored already are not run again.
     progress
@@ -166,7 +166,7 @@ def sweep(
     Raises
     ------
     ScaleError
-        The grid says nothing, or is too large to hold; there is no image; a package is missing.
+        The grid is empty, or too large to hold; there is no image; a package is missing.
     UnknownName
         A name is none of a hyperparameter or token.
     PayloadError

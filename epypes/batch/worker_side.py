@@ -9,11 +9,11 @@ import tempfile
 import threading
 from collections import OrderedDict
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from epypes.batch.job import Job, do
+from epypes.batch.job import Job, run_job
 from epypes.batch.packaged_graph import PackagedGraph, packed_outcomes, unpacked_job, unpacked_values
 from epypes.batch.results import Outcome
 from epypes.bundle.load import Bundle, read_bundle
@@ -26,24 +26,24 @@ _MOST_LOADED: Final = 8
 
 @dataclass(frozen=True, slots=True)
 class PackagedJob:
-    """A job that travels.
+    """A job as it travels to a worker process.
 
     Attributes
     ----------
     id
-        Another one each time, since a cluster takes what is equal for the same.
-    parcel
+        Another one each time, since a Dask cluster takes equal calls for one.
+    package
         The graph.
     hyperparameters
-        The runner's, as they travel.
+        The runner's, packed.
     job
-        What is to be done, as it travels.
+        The job, packed.
     workers, guard, check_mutation
-        As the runner has them.
+        Options of the runner.
     """
 
     id: str
-    parcel: PackagedGraph
+    package: PackagedGraph
     hyperparameters: Mapping[str, Any]
     job: Job
     workers: int = 1
@@ -55,68 +55,63 @@ class PackagedJob:
 
 
 @dataclass(frozen=True, slots=True)
-class Refusal:
-    """What comes back in place of outcomes: why the job can't be done here; ``is_missing``: the parcel's files are."""
+class WorkerRefusal:
+    """Why a worker process can't run a job; ``needs_files``: it has not unpacked the package yet."""
 
-    text: str
-    is_missing: bool = False
+    reason: str
+    needs_files: bool = False
 
 
-class _Loaded:
-    """A bundle that was unpacked in this process, and the runners that are idle."""
+class _LoadedGraph:
+    """A bundle that was unpacked in this process, and the runners of it that are idle."""
 
     def __init__(self, bundle: Bundle) -> None:
         self._bundle = bundle
         self._idle: queue.SimpleQueue[CompGraphRunner] = queue.SimpleQueue()
 
-    def do(self, sent: PackagedJob) -> list[Outcome]:
-        """Do a job, on a runner that no other thread uses meanwhile."""
+    def run(self, packaged: PackagedJob) -> list[Outcome]:
+        """Run a job, on a runner that no other thread uses meanwhile."""
         enums = self._bundle.enums
-        hyperparameters = unpacked_values(sent.hyperparameters, enums)
+        hyperparameters = unpacked_values(packaged.hyperparameters, enums)
         try:
             own = self._idle.get_nowait()
         except queue.Empty:
-            own = CompGraphRunner(
-                self._bundle.cg,
-                hyperparameters,
-                workers=sent.workers,
-                guard=sent.guard,
-                check_mutation=sent.check_mutation,
-            )
+            options = {name: getattr(packaged, name) for name in ("workers", "guard", "check_mutation")}
+            own = CompGraphRunner(self._bundle.cg, hyperparameters, **options)
         try:
             own.set(**hyperparameters)
-            return do(own, unpacked_job(sent.job, enums))
+            return run_job(own, unpacked_job(packaged.job, enums))
         finally:
             self._idle.put(own)
 
 
-_LOADED: Final[OrderedDict[tuple[str, int, bool, bool], _Loaded]] = OrderedDict()
+_LOADED: Final[OrderedDict[tuple[str, int, bool, bool], _LoadedGraph]] = OrderedDict()
 _LOCK: Final = threading.Lock()
 
 
-def work(sent: PackagedJob) -> list[Outcome] | Refusal:
-    """Do a job in this process; called by whatever executor there is."""
-    key = sent.parcel.digest, sent.workers, sent.guard, sent.check_mutation
+def run_packaged_job(packaged: PackagedJob) -> list[Outcome] | WorkerRefusal:
+    """Run a job in this worker process; the executor calls it."""
+    key = packaged.package.digest, packaged.workers, packaged.guard, packaged.check_mutation
     with _LOCK:
         loaded = _LOADED.get(key)
         if loaded is None:
-            if sent.parcel.files is None:
-                return Refusal("the files of the bundle are missing", is_missing=True)
+            if packaged.package.files is None:
+                return WorkerRefusal("the files of the bundle are missing", needs_files=True)
             try:
-                loaded = _Loaded(_unpacked(sent.parcel.files))
+                loaded = _LoadedGraph(_unpacked(packaged.package.files))
             except (Exception, SystemExit) as error:  # whatever the module of a bundle does when it is imported
-                return Refusal(_why_not(sent.parcel, error))
+                return WorkerRefusal(_load_error(packaged.package, error))
             _LOADED[key] = loaded
             while len(_LOADED) > _MOST_LOADED:
                 _LOADED.popitem(last=False)
     try:
-        return packed_outcomes(loaded.do(sent))
+        return packed_outcomes(loaded.run(packaged))
     except ScaleError as error:
-        return Refusal(str(error))
+        return WorkerRefusal(str(error))
 
 
 def _unpacked(files: Mapping[str, bytes]) -> Bundle:
-    with tempfile.TemporaryDirectory(prefix="epypes-parcel-") as folder:
+    with tempfile.TemporaryDirectory(prefix="epypes-package-") as folder:
         for name, content in files.items():
             file = Path(folder) / "graph" / name
             file.parent.mkdir(parents=True, exist_ok=True)
@@ -125,14 +120,9 @@ def _unpacked(files: Mapping[str, bytes]) -> Bundle:
         return read_bundle(Path(folder) / "graph", sealed=False)
 
 
-def _why_not(parcel: PackagedGraph, error: BaseException) -> str:
+def _load_error(package: PackagedGraph, error: BaseException) -> str:
     where = f"Worker process {os.getpid()} on {socket.gethostname()}"
-    needs = ", ".join(line for line in parcel.requirements.splitlines() if line and not line.startswith("#"))
+    needs = ", ".join(line for line in package.requirements.splitlines() if line and not line.startswith("#"))
     way_out = f"Install there what the graph needs: {needs}" if needs else "Look at what its modules do there"
-    said = ended(f"{type(error).__name__}: {error}")
-    return f"{where} can't load the graph: {said} {way_out}; or use an executor of this machine."
-
-
-def lighter(sent: PackagedJob) -> PackagedJob:
-    """Return what is sent without the files of its parcel, for who may have them."""
-    return replace(sent, parcel=replace(sent.parcel, files=None))
+    reason = ended(f"{type(error).__name__}: {error}")
+    return f"{where} can't load the graph: {reason} {way_out}; or use an executor of this machine."

@@ -93,6 +93,8 @@ class Arrays:
 
 def write_arrays(folder: Path, arrays: Mapping[str, Any]) -> None:
     """Write arrays into a bundle, each in the order of its elements, to the last bit."""
+    if not arrays:
+        return
     import numpy as np
 
     for name, array in arrays.items():

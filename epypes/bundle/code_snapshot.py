@@ -1,4 +1,4 @@
-"""A snapshot of the mutable objects that code reaches: names, closures, defaults, attributes, classes and caches.
+"""A snapshot of the mutable objects that code refers to: names, closures, defaults, attributes, classes and caches.
 
 What code can change is read off its instructions: bindings of names and attributes are only compared where some of the
 code can set them, and locked arrays only where some of it can unlock them.
@@ -42,7 +42,7 @@ _OF_PYTHON: Final = frozenset(
 
 
 class CodeSnapshot(Snapshot):
-    """The mutable objects that functions reach, through names, closures, defaults, attributes, classes and caches.
+    """The mutable objects that functions refer to, through names, closures, defaults, attributes, classes and caches.
 
     Parameters
     ----------
@@ -69,18 +69,18 @@ class CodeSnapshot(Snapshot):
         self.arrays: dict[int, object] = {}
         self._settlers: list[Callable[[], None]] = []
         self._checks: list[CacheCheck] = []
-        self._words: set[str] = set()
+        self._instructions: set[str] = set()
         self._imported: set[str] = set()
         # What is only recorded if some of the code can change it.
         self._bound: list[_Bindings] = []
         self._set: list[_Bindings] = []
         self._locked: list[tuple[str, Any]] = []
         super().__init__(functions)
-        if self._words & _BINDS or "STORE_GLOBAL" in self._words:
+        if self._instructions & _BINDS or "STORE_GLOBAL" in self._instructions:
             self.records += self._bound
-        if self._words & _SETS or "STORE_ATTR" in self._words:
+        if self._instructions & _SETS or "STORE_ATTR" in self._instructions:
             self.records += self._set
-        if self._words & _UNLOCKS:
+        if self._instructions & _UNLOCKS:
             for name, value in self._locked:
                 self.records.append(array_record(name, value))
 
@@ -180,12 +180,12 @@ class CodeSnapshot(Snapshot):
             if instruction.opname in ("STORE_DEREF", "DELETE_DEREF"):
                 stored.add(instruction.argval)
             elif instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
-                self._words.add("STORE_GLOBAL")
+                self._instructions.add("STORE_GLOBAL")
             elif instruction.opname == "IMPORT_NAME":
                 self._imported.add(instruction.argval)
             elif instruction.opname in ("STORE_ATTR", "DELETE_ATTR"):
-                self._words |= {"STORE_ATTR", f"={instruction.argval}"}
-        self._words.update(code.co_names)
+                self._instructions |= {"STORE_ATTR", f"={instruction.argval}"}
+        self._instructions.update(code.co_names)
         for constant in code.co_consts:
             if isinstance(constant, types.CodeType):
                 inner, inner_stored = self._read(constant)

@@ -49,7 +49,7 @@ _MEANING: Final = (
     f"{counted(RUNS, 'more run')} in the notebook gave other last digits: a replay may differ by {SAFETY:g} times as",
     "much, and each number by no more than the relative part of its own magnitude.",
 )
-Told = Callable[[str], None]
+OnProgress = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,11 @@ class Learnt:
 
 
 def learn(
-    cg: CompGraph, hyperparameters: Mapping[str, Any], samples: Sequence[Run], outputs: Sequence[str], told: Told
+    cg: CompGraph,
+    hyperparameters: Mapping[str, Any],
+    samples: Sequence[Run],
+    outputs: Sequence[str],
+    on_progress: OnProgress,
 ) -> Learnt:
     """Run the payload of each sample again, RUNS times, and compare every token with what the sample has.
 
@@ -81,8 +85,8 @@ def learn(
         Completed runs, with all tokens.
     outputs
         The tokens that are compared when the bundle is replayed.
-    told
-        Is told before each run which one begins.
+    on_progress
+        Called before each run with which one begins.
 
     Raises
     ------
@@ -93,30 +97,30 @@ def learn(
     runner = CompGraphRunner(with_defaults(clone_graph(cg), {}), hyperparameters, check_mutation=True)
     tolerances: dict[str, Tolerance] = {}
     reasons: list[str] = []
-    held = {name: CodeSnapshot({name: function}, lock=False) for name, function in cg.functions.items()}
+    snapshots = {name: CodeSnapshot({name: function}, lock=False) for name, function in cg.functions.items()}
     for number, sample in enumerate(samples, 1):
         of = f" of sample {number} of {len(samples)}" if len(samples) > 1 else ""
-        seen = _Seen(runner, sample, lambda text, of=of: told(text + of))  # type: ignore[misc]
+        seen = _Seen(runner, sample, lambda text, of=of: on_progress(text + of))  # type: ignore[misc]
         for token, found in seen.unlike.items():
             if token in outputs and _is_noise(found) and token not in seen.growing():
                 tolerances[token] = _widened(tolerances.get(token), found)
         reason = seen.reason(outputs)
         reasons += [reason] if reason and reason not in reasons else []
-    changed = {name: snapshot.changed() for name, snapshot in held.items()}
-    kept = [
+    changed = {name: snapshot.changed() for name, snapshot in snapshots.items()}
+    changes = [
         f"Function {name!r} changes {known!r} from run to run, which outlives the call: the next event would find it "
         "different. Copy it first, or make it a token."
         for name, known in changed.items()
         if known is not None
     ]
-    return Learnt(tolerances, tuple(reasons or kept))
+    return Learnt(tolerances, tuple(reasons or changes))
 
 
 class _Seen:
     """What runs of one sample have shown: by token every place where a run differs from the sample."""
 
-    def __init__(self, runner: CompGraphRunner, sample: Run, told: Told) -> None:
-        self._runner, self._sample, self._told = runner, sample, told
+    def __init__(self, runner: CompGraphRunner, sample: Run, on_progress: OnProgress) -> None:
+        self._runner, self._sample, self._on_progress = runner, sample, on_progress
         self._first: Run | None = None
         self.unlike: dict[str, list[Unlike]] = {}
         # How far each run is from the first of them, by token.
@@ -131,7 +135,7 @@ class _Seen:
             self._run(number + 1, _RUNS_OF_SUSPECTS)
 
     def _run(self, number: int, of: int) -> None:
-        self._told(f"running the functions again to learn what they repeat: {number} of {of}")
+        self._on_progress(f"running the functions again to learn what they repeat: {number} of {of}")
         sample = self._sample
         try:
             run = self._runner.run(**{token: sample[token] for token in self._runner.free_source_tokens})
@@ -190,7 +194,7 @@ def run_failed_in(error: BaseException) -> str:
 
 
 def _distance(found: Sequence[Unlike]) -> float:
-    """Return how far apart two values are; 0.0 where that can't be told."""
+    """Return how far apart two values are; 0.0 for what is no number."""
     return max((unlike.largest or 0.0 for unlike in found), default=0.0)
 
 

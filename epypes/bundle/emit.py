@@ -18,7 +18,7 @@ from epypes.bundle.expressions import noted_refusals
 from epypes.bundle.formatting import LINE, one_per_line
 from epypes.bundle.graphs import Graphs, GraphText
 from epypes.bundle.hyperparameters import members_in
-from epypes.bundle.literal import literal, quoted
+from epypes.bundle.literal import quoted
 from epypes.bundle.load import MAKER
 from epypes.bundle.order import ordered
 from epypes.bundle.resolve import Refused
@@ -140,7 +140,7 @@ def emit_module(
     text = written if isinstance(written, GraphText) else GraphText(written)
     tail = [*blocks, text.functions("func_dict"), text.io("func_io", cg)]
     if cg.groups:
-        items = [(f"{quoted(name)}: ", literal(list(functions))) for name, functions in cg.groups.items()]
+        items = [(f"{quoted(name)}: ", f"[{', '.join(map(quoted, part))}]") for name, part in cg.groups.items()]
         tail.append(["# Drawn as one box each.", *one_per_line("func_groups = {", items, "}")])
     return module_text([_docstring(settings)], needed, [_spaced(["\n".join(block) for block in [*tail, *own]])])
 
@@ -163,7 +163,10 @@ def module_text(head: Sequence[str], needed: Slice, tail: Sequence[str]) -> str:
     sections = ["\n\n".join([*head, *imports, *([] if reader else constants)])]
     if reader:
         sections += [reader, *constants]
-    sections += [texts[name] for name in ordered(texts, positions, needed.reads)]
+    names = ordered(texts, positions, needed.reads)
+    for are_constants, group in itertools.groupby(names, needed.constants.__contains__):
+        found = [texts[name] for name in group]
+        sections += ["\n".join(found)] if are_constants else found
     return "\n\n\n".join([*filter(None, sections), *tail]) + "\n"
 
 

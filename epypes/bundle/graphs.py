@@ -10,7 +10,7 @@ from epypes.bundle.expressions import expression_or_none, noted_refusals
 from epypes.bundle.formatting import Item, laid_out, one_per_line
 from epypes.bundle.identifiers import identifier_of
 from epypes.bundle.instances import arguments_of, by_position
-from epypes.bundle.literal import literal, quoted
+from epypes.bundle.literal import quoted
 from epypes.bundle.slice import Slice, slice_functions
 from epypes.graph import CompGraph, Switch, as_switch, is_placeholder
 from epypes.pipeline import Node, Pipeline
@@ -52,9 +52,14 @@ class GraphText:
             if name in self.switches and type(given) is tuple and isinstance(made, str):
                 items.append(("", f"**{self.switches[name]}.func_io"))
             else:
-                sides = [tuple(side) if isinstance(side, list) else side for side in (given, made)]
-                items.append((f"{quoted(name)}: ", literal(tuple(sides))))
+                items.append((f"{quoted(name)}: ", f"({_side(given)}, {_side(made)})"))
         return one_per_line(f"{variable} = {{", items, "}")
+
+
+def _side(tokens: str | tuple[str, ...] | list[str] | None) -> str:
+    if tokens is None or isinstance(tokens, str):
+        return "None" if tokens is None else quoted(tokens)
+    return f"({', '.join(map(quoted, tokens))}{',' if len(tokens) == 1 else ''})"
 
 
 class Graphs:
@@ -186,7 +191,7 @@ class Graphs:
         epypes = self._epypes(what)
         source = f"{epypes}.CompGraph({functions}, {io}{'' if cg.types else ', types=False'})"
         for name, members in cg.groups.items():
-            source = f"{epypes}.group({source}, {quoted(name)}, functions={literal(list(members))})"
+            source = f"{epypes}.group({source}, {quoted(name)}, functions=[{', '.join(map(quoted, members))}])"
         return source, lines
 
     def _epypes(self, what: str) -> str:

@@ -3,6 +3,8 @@
 What TOML has stands there as it is. Anything else is a table with its ``kind``: beside the value where the whole value
 is meant, as an inline table where it is inside a list or a table. Every entry is ready for JSON too.
 
+An array of more than MOST_NUMBERS numbers, as a calibrated map, is a file of the bundle, whose name stands in TOML.
+
 The range of a hyperparameter is what an annotation says, the branches of a switch, or what is usual for the functions
 that take it. What is usual is a ``soft`` range and forbids nothing.
 """
@@ -11,9 +13,11 @@ from __future__ import annotations
 
 import enum
 import numbers
+import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Final
 
 from epypes.catalog import entry_of, parameter_names, uses, usual
@@ -23,6 +27,7 @@ from epypes.run.guard import is_plain_array
 
 # What a person still reads, and a line of a diff still shows.
 MOST_NUMBERS: Final = 400
+ARRAYS_OF_HYPERPARAMETERS: Final = "hyperparameters"
 _KIND: Final = "kind"
 _SMALL: Final = range(-(2**63), 2**63)
 _DEEPEST: Final = 20
@@ -42,6 +47,53 @@ class Member:
 
     enum: str
     name: str
+
+
+@dataclass(frozen=True, slots=True)
+class StoredArray:
+    """An array that is a file of the bundle, known by its name alone where the files are not read."""
+
+    file: str
+
+
+def store_arrays(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return values with a StoredArray in the place of each array that is too large for text, and the arrays by file.
+
+    Parameters
+    ----------
+    values
+        Hyperparameters by token.
+    """
+    after, arrays = dict(values), {}
+    for token, value in values.items():
+        if is_plain_array(value) and value.dtype.kind in "biufc" and value.size > MOST_NUMBERS:
+            file = f"{ARRAYS_OF_HYPERPARAMETERS}/{re.sub(r'[^0-9A-Za-z_]', '_', token)}.npy"
+            while file in arrays:
+                file = f"{file.removesuffix('.npy')}_.npy"
+            after[token], arrays[file] = StoredArray(file), value
+    return after, arrays
+
+
+def write_stored_arrays(folder: Path, arrays: Mapping[str, Any]) -> None:
+    """Write the arrays into a bundle, to the last bit."""
+    for file, array in arrays.items():
+        import numpy as np
+
+        (folder / file).parent.mkdir(exist_ok=True)
+        np.save(folder / file, array, allow_pickle=False)
+
+
+def read_stored_arrays(folder: Path, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the array, which can't be written to, of each value that is a StoredArray, by token."""
+    return {token: _stored(folder, value) for token, value in values.items() if type(value) is StoredArray}
+
+
+def _stored(folder: Path, value: StoredArray) -> Any:
+    import numpy as np
+
+    array = np.load(folder / value.file, allow_pickle=False)
+    array.flags.writeable = False
+    return array
 
 
 def plain(value: Any) -> Any:
@@ -92,6 +144,8 @@ def _written(value: Any, depth: int) -> dict[str, Any]:
         return {"value": _of_number(value), _KIND: "numpy", "dtype": value.dtype.name}
     if isinstance(value, enum.Enum) and value.name in type(value).__members__:
         return {"value": value.name, _KIND: "enum", "enum": type(value).__qualname__}
+    if isinstance(value, StoredArray):
+        return {"value": value.file, _KIND: "file"}
     if isinstance(value, Member):
         return {"value": value.name, _KIND: "enum", "enum": value.enum}
     raise Unwritable(f"a {type(value).__name__}")
@@ -120,6 +174,11 @@ def read(entry: Mapping[str, Any], enums: Mapping[str, Any] | None = None) -> An
         What :func:`written` returned; other keys are passed over.
     enums
         The enumerations by name. Members of others are read as :class:`Member`.
+
+    Returns
+    -------
+    Any
+        The value; a :class:`StoredArray` for an array that is a file.
 
     Raises
     ------
@@ -259,6 +318,13 @@ def _read_member(entry: Mapping[str, Any], enums: Mapping[str, Any]) -> Any:
     return enums[name][member] if name in enums else Member(name, member)
 
 
+def _read_stored(entry: Mapping[str, Any], enums: Mapping[str, Any]) -> StoredArray:
+    file = entry["value"]
+    if not isinstance(file, str) or not re.fullmatch(rf"{ARRAYS_OF_HYPERPARAMETERS}/\w+\.npy", file):
+        raise TypeError(f"{file!r} is no file of {ARRAYS_OF_HYPERPARAMETERS}/")
+    return StoredArray(file)
+
+
 _WRITERS: Final[Mapping[type, Callable[[Any, int], dict[str, Any]]]] = {
     type(None): lambda value, depth: {_KIND: "none"},
     bool: _as_it_is,
@@ -285,6 +351,7 @@ _READERS: Final[Mapping[str, Callable[[Mapping[str, Any], Mapping[str, Any]], An
     "frozenset": lambda entry, enums: frozenset(_whole(entry["value"], enums)),
     "dict": lambda entry, enums: {_whole(key, enums): _whole(item, enums) for key, item in entry["value"]},
     "array": _read_array,
+    "file": _read_stored,
     "numpy": _read_number,
     "enum": _read_member,
 }

@@ -1,15 +1,16 @@
-"""How does a bundle become a runner or a pipeline again?"""
+"""Loading: a bundle becomes a runner or a pipeline again."""
 
 from __future__ import annotations
 
 import sys
 import types
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 from epypes.bundle.adapters import answer_with, payload_of
+from epypes.bundle.hyperparameters import read_stored_arrays
 from epypes.bundle.manifest import check_files, check_manifest
 from epypes.bundle.mutable_state import MutableState, lock_cached_values
 from epypes.bundle.settings import Settings, read_settings
@@ -80,6 +81,7 @@ def read_bundle(path: str | Path, *, sealed: bool = True) -> Bundle:
                 check_files(folder)
             digest = check_manifest(folder) if sealed else ""
             settings, source = read_settings(folder / SETTINGS), (folder / MODULE).read_bytes()
+            stored = read_stored_arrays(folder, settings.hyperparameters)
         except (BundleError, OSError):
             if _identity(folder) == before:
                 raise
@@ -91,6 +93,7 @@ def read_bundle(path: str | Path, *, sealed: bool = True) -> Bundle:
     try:
         enums = getattr(module, "enums", {}) if settings.has_members else {}
         settings = settings.with_enums(enums)
+        settings = replace(settings, hyperparameters={**settings.hyperparameters, **stored})
         own = {name: getattr(module, name) for name in settings.own}
         lock_cached_values(vars(module))
         ports = {name: port for name, port in own.items() if name != MAKER}

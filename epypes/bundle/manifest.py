@@ -47,7 +47,7 @@ def write_manifest(folder: Path, environment: Mapping[str, str] | None = None) -
     folder
         The bundle.
     environment
-        What its samples have been recorded on; without, what the manifest said before is kept.
+        What its samples have been recorded on; without, those of the manifest before stay.
     """
     names = _files(folder)
     facts = _facts(folder) if environment is None else {**environment, **_recorded(folder, names)}
@@ -104,7 +104,7 @@ def check_files(folder: Path) -> None:
 def why_no_bundle(folder: Path) -> str:
     """Return as a sentence why a folder is not a bundle and nothing else; "" if it is.
 
-    A file that was changed or removed since is no reason; one that the manifest does not name is somebody's own.
+    A file that was changed or removed since is no reason; one that the manifest does not name is the user's own.
     """
     no_bundle = f"{folder} exists and is not a bundle."
     try:
@@ -155,7 +155,7 @@ def _sums(path: Path) -> str:
 
 
 def _changed_line(folder: Path, name: str, facts: Mapping[str, str]) -> str:
-    """Return where a text was changed first, as ``" at line 3: ..."``; "" if that can't be told."""
+    """Return where a text was changed first, as ``" at line 3: ..."``; "" if that is not known."""
     if f"{_LINES}{name}" not in facts:
         return ""
     path = folder / name
@@ -279,8 +279,8 @@ def _hash(path: Path) -> str:
 
 
 _CPU_INFO: Final = Path("/proc/cpuinfo")
-# What is told of each difference, by the name of what differs.
-_TOLD: Final = {
+# How each difference is named, by the name of what differs.
+_DIFFERENCES: Final = {
     "python": "another Python",
     "platform": "another platform",
     "processor": "another processor",
@@ -319,6 +319,6 @@ def environment_differences(recorded: Mapping[str, str], now: Mapping[str, str])
     """Return as sentences what is not as it was when the samples were recorded."""
     return [
         f"It was recorded on {what}: {recorded[name]}, here it is {now[name]}."
-        for name, what in _TOLD.items()
+        for name, what in _DIFFERENCES.items()
         if name in recorded and name in now and recorded[name] != now[name]
     ]

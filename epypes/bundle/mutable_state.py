@@ -1,9 +1,9 @@
-"""Mutable state that a bundle's functions reach: locked where it is an array, else compared after each call.
+"""Mutable state that a bundle's functions refer to: locked where it is an array, else compared after each call.
 
 No answer may depend on an earlier event. Promotion refuses functions that plainly write to what outlives their call;
-syntax can't show all of it. So each function of a loaded bundle that reaches a mutable object is wrapped: after its
+syntax can't show all of it. So each function of a loaded bundle that refers to a mutable object is wrapped: after its
 call, a snapshot of these objects is compared; if one has changed, it is put back and the call raises StateChanged.
-Functions that reach only constants, which are most, are not wrapped.
+Functions that refer only to constants, which are most, are not wrapped.
 
 Calls in several threads share the objects. Where a call finds a change and other calls ran meanwhile, any of them may
 have made it, or have read it: each of them is called again, alone, on objects that have been put back.

@@ -1,4 +1,4 @@
-"""How is a notebook file executed fresh, and its graph promoted in its own kernel?"""
+"""Promotion of a notebook file: it is executed in a new kernel, and its graph is promoted there."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner
 
 Progress = Callable[[int, int], None]
-Told = Callable[[str], None]
+OnText = Callable[[str], None]
 
 
 def promote_notebook(
@@ -28,7 +28,7 @@ def promote_notebook(
     to: str | Path,
     outputs: Sequence[str] | None = None,
     on_cell: Progress = lambda done, total: None,
-    told: Told = lambda text: None,
+    on_progress: OnText = lambda text: None,
     samples: Sequence[str] = (),
 ) -> None:
     """Execute every cell of a notebook in a new kernel of this Python, then promote one of its objects there.
@@ -43,7 +43,7 @@ def promote_notebook(
         As for ``promote``.
     on_cell
         Called with the number of code cells done and their total.
-    told
+    on_progress
         Called on a thread of its own with what the promotion in the kernel is doing.
     samples
         The variables that hold further payloads, as ``promote`` takes them, or lists of such.
@@ -61,10 +61,10 @@ def promote_notebook(
         code = (
             "from epypes.bundle.notebook import promote_here as _promote_here\n"
             f"_promote_here({name!r}, {str(Path(to).resolve())!r}, "
-            f"{None if outputs is None else list(outputs)!r}, {str(outcome)!r}, {str(Path(scratch) / 'told')!r}, "
+            f"{None if outputs is None else list(outputs)!r}, {str(outcome)!r}, {str(Path(scratch) / 'progress')!r}, "
             f"{list(samples)!r})"
         )
-        with _lines_of(Path(scratch) / "told", told):
+        with _lines_of(Path(scratch) / "progress", on_progress):
             _execute(path, code, on_cell, Path(scratch))
         ended = json.loads(outcome.read_text(encoding="utf-8"))
     if ended["reasons"]:
@@ -72,8 +72,8 @@ def promote_notebook(
 
 
 @contextmanager
-def _lines_of(pipe: Path, told: Told) -> Iterator[None]:
-    """While the block runs, tell every line that is written into a named pipe."""
+def _lines_of(pipe: Path, on_line: OnText) -> Iterator[None]:
+    """While the block runs, pass on every line that is written into a named pipe."""
     os.mkfifo(pipe)
     # Opened for both, it opens at once, and does not end when the kernel closes its side.
     descriptor = os.open(pipe, os.O_RDWR)
@@ -81,9 +81,9 @@ def _lines_of(pipe: Path, told: Told) -> Iterator[None]:
     def read() -> None:
         with os.fdopen(descriptor, encoding="utf-8", closefd=False) as lines:
             for line in iter(lines.readline, "\n"):
-                told(line.rstrip("\n"))
+                on_line(line.rstrip("\n"))
 
-    reader = threading.Thread(target=read, name="epypes-promotion-told", daemon=True)
+    reader = threading.Thread(target=read, name="epypes-promotion-progress", daemon=True)
     reader.start()
     try:
         yield
@@ -105,8 +105,8 @@ def _execute(path: Path, last_cell: str, on_cell: Progress, scratch: Path) -> No
     except OSError as error:
         raise BundleError(path, f"Notebook {path} can't be read: {error.strerror or error}.") from error
     except Exception as error:  # nbformat raises its own and json's errors for what is no notebook
-        said = f"{type(error).__name__}: {error}".replace("\n", " ")[:120]
-        raise BundleError(path, f"{path} is not a notebook that Jupyter opens: {said}") from error
+        reason = f"{type(error).__name__}: {error}".replace("\n", " ")[:120]
+        raise BundleError(path, f"{path} is not a notebook that Jupyter opens: {reason}") from error
     total = sum(cell.cell_type == "code" for cell in document.cells)
     document.cells.append(nbformat.v4.new_code_cell(last_cell))
     done = 0
@@ -149,7 +149,7 @@ def promote_here(
 ) -> None:
     """Promote a variable of the notebook that this kernel runs; write the reasons against it, if any, as JSON."""
 
-    def told(text: str) -> None:
+    def on_progress(text: str) -> None:
         with open(pipe, "w", encoding="utf-8") as file:
             file.write(" ".join(text.split()) + "\n")
 
@@ -158,7 +158,7 @@ def promote_here(
         if name not in names:
             known = [key for key, value in names.items() if isinstance(value, CompGraphRunner | Pipeline)]
             raise UnknownName("variable", name, known, "that holds a runner or pipeline in the notebook")
-        promote(names[name], to, outputs, samples=_payloads(names, samples), told=told)
+        promote(names[name], to, outputs, samples=_payloads(names, samples), on_progress=on_progress)
     except PromotionRefused as refused:
         reasons = list(refused.reasons)
     except EpypesError as error:

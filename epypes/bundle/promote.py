@@ -1,4 +1,4 @@
-"""How does a notebook's graph become a bundle?
+"""Promotion: a notebook's graph becomes a bundle.
 
 Resolve every function, slice what it needs, emit the module, record the sample, replay it in a fresh isolated
 process, pin what that imported, seal. Each step may refuse with a reason and a way out; none guesses; and only a
@@ -15,9 +15,9 @@ from typing import Any
 
 from epypes.bundle.adapters import ANSWERS, record_answer
 from epypes.bundle.arrays import write_arrays
-from epypes.bundle.compare import Tolerance
 from epypes.bundle.determinism import learn
 from epypes.bundle.emit import write_module
+from epypes.bundle.hyperparameters import store_arrays, write_stored_arrays
 from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
 from epypes.bundle.manifest import MANIFEST, why_no_bundle
 from epypes.bundle.proof import prove, swap_folders
@@ -30,8 +30,8 @@ from epypes.pipeline import Pipeline
 from epypes.run import CompGraphRunner, Run
 
 
-def _tell_nobody(text: str) -> None:
-    """Take what is told, where nobody wants to hear it."""
+def _ignore(text: str) -> None:
+    """Take the progress of a promotion that shows none."""
 
 
 def promote(
@@ -42,7 +42,7 @@ def promote(
     f_out: Callable[[Any], Any] | None = None,
     *,
     samples: Iterable[Any] = (),
-    told: Callable[[str], None] = _tell_nobody,
+    on_progress: Callable[[str], None] = _ignore,
 ) -> Bundle:
     """Write a bundle: a folder of text that computes what the runner's last run computed, and proves it.
 
@@ -60,9 +60,9 @@ def promote(
     samples
         Further payloads that are run and recorded, besides that of the last run: values of the one free source token,
         or mappings by token.
-    told
-        Is told what is being done: the functions are run three times more, to learn which tokens they repeat to the
-        last bit and how far noise puts the others apart.
+    on_progress
+        Called with what is being done: the functions are run three times more, to learn which tokens they repeat to
+        the last bit and how far noise puts the others apart.
 
     Raises
     ------
@@ -84,10 +84,10 @@ def promote(
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{target.name[:40]}-", dir=target.parent) as scratch:
             draft = Path(scratch) / target.name
-            _write(draft, target, subject, outputs, samples, told)
-            told("replaying in a fresh process")
+            _write(draft, target, subject, outputs, samples, on_progress)
+            on_progress("replaying in a fresh process")
             for note in prove(draft, target).notes:
-                told(note)
+                on_progress(note)
             _replace(draft, target)
     except (OSError, UnicodeError) as error:
         if isinstance(error, EpypesError):
@@ -98,7 +98,7 @@ def promote(
 
 def _check_place(target: Path) -> None:
     """Refuse to write over what is not a bundle, or into one."""
-    why = _why_kept(target)
+    why = _why_not_replaced(target)
     if why:
         raise PromotionRefused(target, [why])
     around = next((parent for parent in target.parents if (parent / MANIFEST).is_file()), None)
@@ -108,7 +108,7 @@ def _check_place(target: Path) -> None:
         )
 
 
-def _why_kept(target: Path) -> str:
+def _why_not_replaced(target: Path) -> str:
     """Return why what is at a place may not be replaced; "" if it is a bundle, an empty folder, or nothing."""
     if not target.exists() or (target.is_dir() and not any(target.iterdir())):
         return ""
@@ -124,16 +124,17 @@ def _write(
     subject: Subject,
     outputs: Sequence[str] | None,
     samples: Iterable[Any],
-    told: Callable[[str], None],
+    on_progress: Callable[[str], None],
 ) -> None:
     """Write all that can be written without running anything new; raise every reason against it at once."""
     runner, cg = subject.runner, subject.cg
     wanted = cg.sink_tokens if outputs is None else tuple(outputs)
     for token in wanted:
         cg.require_token(token)
-    reasons = [*_unready(runner, wanted), *unwritable(runner.hyperparameters)]
+    hyperparameters, stored = store_arrays(runner.hyperparameters)
+    reasons = [*_unready(runner, wanted), *unwritable(hyperparameters)]
     reasons += unwritable(subject.attributes, "Attribute")
-    hyperparameters, free = runner.hyperparameters, runner.free_source_tokens
+    free = runner.free_source_tokens
     rgb = tuple(token for token in dict.fromkeys((*free, *wanted)) if colour_order(cg, token) == "rgb")
     settings = Settings(
         target.name, free, wanted, hyperparameters, rgb, writable_defaults(cg, hyperparameters), cg.types,
@@ -143,16 +144,20 @@ def _write(
     if reasons or refusals:
         raise PromotionRefused(target, [*reasons, *refusals])
     runs = [*_runs(target, subject, samples)]
-    settings = replace(settings, tolerances=_learnt(target, subject, runs, wanted, told))
+    try:
+        learnt = learn(cg, runner.hyperparameters, runs, wanted, on_progress)
+    except BundleError as error:
+        raise PromotionRefused(target, [str(error)]) from error
+    if learnt.reasons:
+        raise PromotionRefused(target, learnt.reasons)
+    settings = replace(settings, tolerances=learnt.tolerances)
     (draft / SAMPLES).mkdir(parents=True)
     (draft / MODULE).write_text(module, encoding="utf-8")
     write_settings(draft / SETTINGS, settings, cg)
     write_arrays(draft, arrays)
+    write_stored_arrays(draft, stored)
     for number, run in enumerate(runs):
-        _record(draft / SAMPLES / f"{number:03}.npz", target, run, settings)
-        # An answer is compared to the last bit, which noise would change.
-        if "f_out" in subject.ports and not settings.tolerances:
-            _record_answer(draft / ANSWERS / f"{number:03}.npz", subject, run, settings)
+        _record(draft, f"{number:03}.npz", target, subject, run, settings)
 
 
 def _runs(target: Path, subject: Subject, samples: Iterable[Any]) -> Iterator[Run]:
@@ -170,26 +175,6 @@ def _runs(target: Path, subject: Subject, samples: Iterable[Any]) -> Iterator[Ru
         yield run
 
 
-def _learnt(
-    target: Path, subject: Subject, runs: Sequence[Run], outputs: Sequence[str], told: Callable[[str], None]
-) -> Mapping[str, Tolerance]:
-    """Return the tolerances of the outputs; refuse outputs that are something else at every run."""
-    try:
-        learnt = learn(subject.cg, subject.runner.hyperparameters, runs, outputs, told)
-    except BundleError as error:
-        raise PromotionRefused(target, [str(error)]) from error
-    if learnt.reasons:
-        raise PromotionRefused(target, learnt.reasons)
-    return learnt.tolerances
-
-
-def _record_answer(path: Path, subject: Subject, run: Run, settings: Settings) -> None:
-    """Record what f_out makes of a run where that is no accident: another run of the same payload tells."""
-    payload = {token: run[token] for token in settings.inputs}
-    again = subject.fresh_runner().run_on(payload)
-    record_answer(path, subject.ports["f_out"], settings.name, (run, again), settings.attributes)
-
-
 def _unready(runner: CompGraphRunner, outputs: Sequence[str]) -> list[str]:
     """Return why the last run can't serve as a sample."""
     call = run_call(runner.free_source_tokens)
@@ -204,14 +189,19 @@ def _unready(runner: CompGraphRunner, outputs: Sequence[str]) -> list[str]:
     return []
 
 
-def _record(path: Path, target: Path, run: Run, settings: Settings) -> None:
+def _record(draft: Path, name: str, target: Path, subject: Subject, run: Run, settings: Settings) -> None:
+    """Record a run as a sample, and the answer of the user's own f_out if another run gives the same."""
     from epypes.wire.samples import save_sample
 
     try:
         inputs, outputs = ({token: run[token] for token in side} for side in (settings.inputs, settings.outputs))
-        save_sample(path, inputs, outputs, rgb=settings.rgb)
+        save_sample(draft / SAMPLES / name, inputs, outputs, rgb=settings.rgb)
     except MessageError as error:
         raise PromotionRefused(target, [str(error)]) from error
+    # An answer is compared to the last bit, which noise would change.
+    if "f_out" in subject.ports and not settings.tolerances:
+        runs = run, subject.fresh_runner().run_on(inputs)
+        record_answer(draft / ANSWERS / name, subject.ports["f_out"], settings.name, runs, settings.attributes)
 
 
 def _replace(draft: Path, target: Path) -> None:
@@ -222,7 +212,7 @@ def _replace(draft: Path, target: Path) -> None:
         return
     # The old one is then in the scratch folder, and goes with it; unless it is no bundle any more.
     swap_folders(draft, target)
-    why = _why_kept(draft)
+    why = _why_not_replaced(draft)
     if why:
         swap_folders(draft, target)
         raise PromotionRefused(target, [why.replace(str(draft), str(target))])

@@ -284,11 +284,11 @@ def _outcome_of(folder: Path, work: Callable[[Path], dict[str, Any]]) -> dict[st
     except EpypesError as error:
         return {"error": str(error)}
     except BaseException as error:
-        return {"error": _told(error, folder)}
+        return {"error": _describe(error, folder)}
 
 
-def _told(error: BaseException, folder: Path) -> str:
-    """Tell what failed in the bundle's own code, with its last line there."""
+def _describe(error: BaseException, folder: Path) -> str:
+    """Describe what failed in the bundle's own code, with its last line there."""
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.startswith(str(folder))]
     where = f" at {Path(frames[-1].filename).name}, line {frames[-1].lineno}: {frames[-1].line}" if frames else ""
     notes = "; ".join(getattr(error, "__notes__", ()))

@@ -1,4 +1,4 @@
-"""What stands in pipeline.toml, and how is it read back?"""
+"""The settings of a bundle, written to pipeline.toml and read back."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Settings:
     defaults
         The graph's defaults of hyperparameters by token: what they are where the graph is used without these settings.
     types
-        Whether the graph compares annotations, as CompGraph does unless told otherwise.
+        Whether the graph compares annotations, as CompGraph does by default.
     tolerances
         How far outputs may be from what was recorded, by token; those of all others not at all.
     own
@@ -112,8 +112,8 @@ def unwritable(values: Mapping[str, Any], what: str = "Hyperparameter") -> list[
         except LargeArray as found:
             reasons.append(
                 f"{what} {token!r} is or holds {found}; {MOST_NUMBERS} are the most that pipeline.toml holds, where "
-                "people read them. Let the function read it from a variable of the notebook, outside of it: the bundle "
-                "keeps that as a file. Or make it in a function; or unfreeze it and pass it to run()."
+                "people read them. Make each array a hyperparameter of its own, which the bundle keeps as a file; or "
+                "make it in a function; or unfreeze it and pass it to run()."
             )
         except Unwritable as found:
             way_out = "or unfreeze it and pass it to run()" if what == "Hyperparameter" else "or leave it out"

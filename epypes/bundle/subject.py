@@ -1,4 +1,4 @@
-"""What of a runner or pipeline goes into a bundle?"""
+"""The subject of a promotion: what of a runner or pipeline goes into the bundle."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Subject:
     pipeline
         The pipeline; None if a runner is promoted.
     ports
-        f_in and f_out, as far as they are not those that a bundle has without being told.
+        f_in and f_out, as far as they are not the usual ones of a bundle.
     attributes
         Those of the pipeline.
     """

@@ -9,6 +9,6 @@ Nothing here imports these libraries: a caller that uses their functions has imp
 
 from epypes.catalog.calls import Use, parameter_names, uses
 from epypes.catalog.lookup import entry_of, usual
-from epypes.catalog.table import Entry, table
+from epypes.catalog.table import CatalogEntry, table
 
-__all__ = ["Entry", "Use", "entry_of", "parameter_names", "table", "uses", "usual"]
+__all__ = ["CatalogEntry", "Use", "entry_of", "parameter_names", "table", "uses", "usual"]

@@ -20,7 +20,7 @@ from types import FunctionType, ModuleType
 from typing import Any, Final
 
 from epypes.catalog.lookup import entry_of
-from epypes.catalog.table import Entry
+from epypes.catalog.table import CatalogEntry
 from epypes.graph.redefined import unwrapped
 
 _CONVERSIONS: Final = ("int", "float", "round", "bool")
@@ -44,7 +44,7 @@ class Use:
         The function's parameter with whose values it is compared; empty if there is none.
     """
 
-    entry: Entry | None
+    entry: CatalogEntry | None
     cuts: str = ""
 
 

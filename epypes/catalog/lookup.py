@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import cache, partial
 from typing import Any, Final
 
-from epypes.catalog.table import FILES, Entry, entries_of, param_of, read_toml, table
+from epypes.catalog.table import FILES, CatalogEntry, entries_of, param_of, read_toml, table
 from epypes.hints import Param
 
 _CREATE: Final = "_create"
@@ -17,7 +17,7 @@ _CREATE: Final = "_create"
 _SHORTEST: Final = 3
 
 
-def entry_of(function: Any, parameter: str) -> Entry | None:
+def entry_of(function: Any, parameter: str) -> CatalogEntry | None:
     """Return the entry of a parameter of a library's function, found by object; None if there is none.
 
     A library that is not imported yet is not imported.
@@ -39,9 +39,9 @@ def entry_of(function: Any, parameter: str) -> Entry | None:
 
 
 @cache
-def _by_function(library: str) -> Mapping[str, Mapping[str, Mapping[str, Entry]]]:
+def _by_function(library: str) -> Mapping[str, Mapping[str, Mapping[str, CatalogEntry]]]:
     """Return the entries of a library by the function's last name, its full name, and the parameter."""
-    found: dict[str, dict[str, dict[str, Entry]]] = {}
+    found: dict[str, dict[str, dict[str, CatalogEntry]]] = {}
     for entry in entries_of(library):
         functions = found.setdefault(entry.function.rpartition(".")[2], {})
         functions.setdefault(entry.function, {})[entry.parameter] = entry
@@ -81,13 +81,13 @@ def usual(name: str, value: float | str) -> Param | None:
 
 
 @cache
-def _by_name() -> tuple[Mapping[str, tuple[Param, ...]], Mapping[str, tuple[Entry, ...]]]:
+def _by_name() -> tuple[Mapping[str, tuple[Param, ...]], Mapping[str, tuple[CatalogEntry, ...]]]:
     """Return the ranges of common names, and the entries by the parameter's name."""
     content = read_toml("names.toml")
     common: dict[str, tuple[Param, ...]] = {}
     for group in content["usual"]:
         common |= dict.fromkeys(group["names"], tuple(map(param_of, group["ranges"])))
-    by_parameter: dict[str, tuple[Entry, ...]] = {}
+    by_parameter: dict[str, tuple[CatalogEntry, ...]] = {}
     for entry in table():
         name = entry.parameter.replace("_", "").lower()
         if len(name) >= _SHORTEST and name not in content["vague"]:
@@ -103,7 +103,7 @@ def _bare_names(name: str) -> list[str]:
     return list(dict.fromkeys(("".join(words), "".join(words[-2:]), "".join(words[-1:]))))
 
 
-def _agreed(entries: Iterable[Entry]) -> tuple[Param, ...]:
+def _agreed(entries: Iterable[CatalogEntry]) -> tuple[Param, ...]:
     """Return the range that all entries of a name have; none if they differ."""
     params = [entry.resolved() for entry in entries]
     plain = {repr(param and replace(param, about="", unit="")) for param in params}

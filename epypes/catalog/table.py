@@ -20,7 +20,7 @@ FILES: Final = {"cv2": "opencv.toml", "skimage": "skimage.toml"}
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class CatalogEntry:
     """The values of one parameter of a library's function.
 
     Attributes
@@ -58,13 +58,13 @@ class Entry:
         return replace(self.param, choices=tuple(existing.values()), labels=tuple(existing))
 
 
-def table() -> tuple[Entry, ...]:
+def table() -> tuple[CatalogEntry, ...]:
     """Return all entries, OpenCV's first, in the files' order."""
     return tuple(entry for library in FILES for entry in entries_of(library))
 
 
 @cache
-def entries_of(library: str) -> tuple[Entry, ...]:
+def entries_of(library: str) -> tuple[CatalogEntry, ...]:
     """Return the entries of one library's functions, in the file's order."""
     content = read_toml(FILES[library])
     shared = content.pop("shared")
@@ -73,7 +73,7 @@ def entries_of(library: str) -> tuple[Entry, ...]:
         for parameter, value in parameters.items():
             fields = dict(shared[value] if isinstance(value, str) else value)
             constants, cuts = tuple(fields.pop("constants", ())), fields.pop("cuts", "")
-            found.append(Entry(library, function, parameter, param_of(fields), constants, cuts))
+            found.append(CatalogEntry(library, function, parameter, param_of(fields), constants, cuts))
     return tuple(found)
 
 

@@ -72,7 +72,7 @@ def _parse_camera(text: str) -> str | int:
 
 def _print_results(results: Results) -> None:
     """Print the summary of the times, then the requests that failed with their reasons."""
-    from epypes.experiment.fits import summary
+    from epypes.experiment.results import summary
 
     rows = summary(results.table)[list(_COLUMNS.values())].map(lambda value: "" if value != value else f"{value:.3f}")
     columns: dict[str, dict[str, Any]] = {"time": {}, **{name: {"justify": "right"} for name in _COLUMNS}}

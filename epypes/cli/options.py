@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -21,10 +22,19 @@ any_source_argument: Final = click.argument(
 )
 
 
+def refuse_nan(context: click.Context, option: click.Parameter, value: float | None) -> float | None:
+    """Refuse NaN, which is in every range of click."""
+    if value is not None and math.isnan(value):
+        raise click.BadParameter("nan is not a number.", context, option)
+    return value
+
+
 def seconds_option(name: str, default: float, text: str, least: float = 0.0) -> Callable[[Command], Command]:
     """Return an option for a duration in seconds, whose parameter ends in ``_s``."""
     parameter = f"{name.removeprefix('--').replace('-', '_')}_s"
-    return click.option(name, parameter, type=click.FloatRange(least), default=default, help=f"{text}, in seconds.")
+    range_ = click.FloatRange(least)
+    help_ = f"{text}, in seconds."
+    return click.option(name, parameter, type=range_, default=default, callback=refuse_nan, help=help_)
 
 
 json_option: Final = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")

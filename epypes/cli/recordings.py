@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import click
 
-from epypes.cli.options import PATH, allow_option, insecure_option, keys_option
+from epypes.cli.options import PATH, allow_option, insecure_option, keys_option, refuse_nan
 from epypes.errors import RecordingError
 from epypes.wording import counted
 
@@ -18,13 +18,14 @@ from epypes.wording import counted
 _JOIN_S: Final = 0.5
 # A slow disk has this time to write what waits; the rest is dropped, and counted.
 _STOP_S: Final = 30.0
+_SPEED: Final = click.FloatRange(0.0)
 
 
 @click.command()
 @click.argument("address", help="Address of the publisher; bind:ADDRESS binds.")
 @click.argument("file", type=PATH, help="MCAP file to write.")
 @click.option("--topic", default="", show_default=False, help="Record only this topic and those below it.")
-@click.option("--seconds", type=click.FloatRange(0.0), help="Stop after this time.")
+@click.option("--seconds", type=click.FloatRange(0.0), callback=refuse_nan, help="Stop after this time.")
 @click.option("--messages", type=click.IntRange(1), help="Stop after this number of messages.")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 @insecure_option
@@ -59,8 +60,12 @@ def record(
 
 @click.command()
 @click.argument("file", type=PATH, help="MCAP file that epypes record wrote.")
-@click.argument("address", default="tcp://127.0.0.1:*", help="Address to bind; connect:ADDRESS connects.")
-@click.option("--speed", type=click.FloatRange(0.0), default=1.0, help="2 is twice as fast; 0 is as fast as possible.")
+@click.argument(
+    "address", default="tcp://127.0.0.1:*", help="Address to bind (default: any port); connect:ADDRESS connects."
+)
+@click.option(
+    "--speed", type=_SPEED, default=1.0, callback=refuse_nan, help="2 is twice as fast; 0 as fast as possible."
+)
 @click.option("--loop", type=click.IntRange(0), default=1, help="Number of times; 0 is until Ctrl+C.")
 @click.option("--wait/--no-wait", default=True, help="Wait for a subscriber before the first message.")
 @click.option("--info", "only_info", is_flag=True, help="Print the content of the file; send nothing.")

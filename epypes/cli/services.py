@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 _ANY_PORT: Final = "tcp://127.0.0.1:*"
 _DIGITS: Final = 12
+# The kernel takes a C int.
+_MAX_POLL_MS: Final = 2**31 - 1
 
 _http_option: Final = click.option(
     "--http", default="", show_default=False, help="URL of the service, as http://127.0.0.1:8642."
@@ -228,7 +230,7 @@ def _terminate(source: str, state: ServiceState, opened: ExitStack) -> int | Non
 def _wait_for_end(process: int, timeout_s: float) -> bool:
     poll = select.poll()
     poll.register(process, select.POLLIN)
-    return bool(poll.poll(timeout_s * 1000))
+    return bool(poll.poll(min(timeout_s * 1000, _MAX_POLL_MS)))
 
 
 @click.command("set")

@@ -17,13 +17,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Results", "orb_graph", "orb_hyperparameters", "run_experiment", "stereo_pair"]
 
-_HOME = {
-    "Results": "results",
-    "orb_graph": "graph",
-    "orb_hyperparameters": "graph",
-    "run_experiment": "run",
-    "stereo_pair": "graph",
-}
+_HOME = {"Results": "results", "run_experiment": "run"} | dict.fromkeys(
+    ("orb_graph", "orb_hyperparameters", "stereo_pair"), "graph"
+)
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""Which two pipelines answer a request? Acquisition, which finds the images, and vision, which finds the keypoints.
+"""The two pipelines that answer a request: acquisition finds the images, vision finds the keypoints.
 
 They are the same in every layout, and know nothing of sockets.
 """
@@ -11,29 +11,22 @@ from typing import Any, Final
 
 from epypes.acquisition import ImageAcquisition, camera
 from epypes.experiment.graph import orb_graph, orb_hyperparameters, stereo_pair
-from epypes.experiment.messages import T_VREQ, Request, StereoPair, contents_of, read_request
+from epypes.experiment.messages import T_VREQ, Request, StereoPair, encode_keypoints
 from epypes.graph import CompGraph
 from epypes.pipeline import EventView, FullPipeline
-from epypes.pipeline.reactive import FIn
 from epypes.run import Failure
 from epypes.wire import JustBytes, add_attribute
 
-ROWS: Final = 20
+_ROWS: Final = 20
 _NS: Final = 1_000_000_000
 # An older frame than this is no answer, unless a camera is as slow: so many of its frames may be missing.
 _MAX_AGE_S: Final = 1.0
-_MOST_MISSED: Final = 3
-# What a component writes into its answers; the last two when f_out has returned.
-_TIMES: Final = ("t_react", "t_fin_start", "t_fin_end", "t_p", "o_cg", "t_fout_start", "t_fout_end", "t_pub")
-
-Pack = Callable[[EventView], Any]
-AddAttribute = Callable[[Any, str, float], None]
-SetAttribute = Callable[[Any, int, str, float], None]
+_MAX_MISSED: Final = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What the nodes are made with.
+    """The options of the nodes.
 
     Attributes
     ----------
@@ -49,7 +42,7 @@ class Settings:
     keys
         The .key_secret file of the pair that all nodes have in common; empty for none.
     allow
-        The .key files, or folders of them, of who else may connect.
+        The .key files, or folders of them, of further peers that may connect.
     """
 
     cameras: tuple[str | int, ...] = ()
@@ -64,60 +57,48 @@ class Component(FullPipeline):
     """A FullPipeline that writes its times into its answers, as attributes under its name.
 
     These are ``t_react``, ``t_fin_start``, ``t_fin_end``, ``t_fout_start``, ``t_fout_end`` and ``t_pub`` (Unix time),
-    ``t_p`` (how long the pipeline's graph took) and ``o_cg`` (how much of that was in none of its functions), all of
-    them in seconds.
-
-    Parameters
-    ----------
-    pack
-        Makes an answer from the event's view; it is f_out but for the times.
-    add
-        Adds an attribute to an answer.
-    set_last
-        Sets one that has been added: given the answer, its place from the end (-1 is the last), its key and the value.
+    ``t_p`` (duration of the pipeline's graph) and ``o_cg`` (the part of it in none of its functions), all of them in
+    seconds. A subclass makes an answer of the event's view in `pack`, and adds attributes to it in `add`.
     """
 
     def __init__(
-        self,
-        name: str,
-        cg: CompGraph,
-        q_in: Any,
-        q_out: Any,
-        f_in: FIn,
-        pack: Pack,
-        add: AddAttribute,
-        set_last: SetAttribute,
-        hparams: Mapping[str, Any] | None = None,
-        *,
-        workers: int = 1,
+        self, name: str, cg: CompGraph, q_in: Any, q_out: Any, hparams: Any = None, *, workers: int = 1
     ) -> None:
-        super().__init__(name, cg, q_in, q_out, f_in, self._answer, hparams, workers=workers)
-        self.pack, self.add, self.set_last = pack, add, set_last
-        *self._keys, self._t_fout_end, self._t_pub = (f"{name}.{time}" for time in _TIMES)
+        super().__init__(name, cg, q_in, q_out, self.payload, self.answer, hparams, workers=workers)
 
-    def _answer(self, view: EventView) -> Any:
-        answer = self.pack(view)
-        stamps = view.stamps
+    def payload(self, event: Any) -> Mapping[str, Any]:
+        """Return the payload of an event: the f_in."""
+        raise NotImplementedError
+
+    def pack(self, view: EventView) -> Any:
+        """Return the answer without its times."""
+        raise NotImplementedError
+
+    def add(self, answer: Any, key: str, value: float) -> None:
+        """Add an attribute to an answer."""
+        raise NotImplementedError
+
+    def answer(self, view: EventView) -> Any:
+        """Return the answer with the times so far: the f_out."""
+        answer, stamps = self.pack(view), view.stamps
         # t_p and o_cg are the paper's: the pipeline's own time as a node, and what its nodes' times leave of it.
-        times = (
-            stamps.react_ns / _NS,
-            stamps.f_in_start_ns / _NS,
-            stamps.f_in_end_ns / _NS,
-            self.time,
-            self.compute_overhead(),
-            stamps.f_out_start_ns / _NS,
-        )
-        for key, time in zip(self._keys, times, strict=True):
-            self.add(answer, key, time)
-        # Their values are not known yet; to set them takes less of the time that they are about than to add them.
-        self.add(answer, self._t_fout_end, 0.0)
-        self.add(answer, self._t_pub, 0.0)
+        times = {
+            "t_react": stamps.react_ns / _NS,
+            "t_fin_start": stamps.f_in_start_ns / _NS,
+            "t_fin_end": stamps.f_in_end_ns / _NS,
+            "t_p": self.time,
+            "o_cg": self.compute_overhead(),
+            "t_fout_start": stamps.f_out_start_ns / _NS,
+        }
+        for key, value in times.items():
+            self.add(answer, f"{self.name}.{key}", value)
         return answer
 
     def put(self, answer: Any, view: EventView) -> None:
-        """Write the end of f_out and the time of publishing into an answer, then put it on q_out."""
-        self.set_last(answer, -2, self._t_fout_end, view.stamps.f_out_end_ns / _NS)
-        self.set_last(answer, -1, self._t_pub, view.stamps.now_ns() / _NS)
+        """Add the end of f_out and the time of publishing to an answer, then put it on q_out."""
+        t_pub = view.stamps.now_ns() / _NS
+        self.add(answer, f"{self.name}.t_fout_end", view.stamps.f_out_end_ns / _NS)
+        self.add(answer, f"{self.name}.t_pub", t_pub)
         super().put(answer, view)
 
     def wait_until_ready(self, timeout_s: float) -> bool:
@@ -129,15 +110,25 @@ class Acquisition(Component):
     """The component whose graph finds the frames nearest to a time; its cameras run while it listens."""
 
     def __init__(self, q_in: Any, q_out: Any, settings: Settings) -> None:
-        sources = settings.cameras or stereo_pair()
         self.cameras = ImageAcquisition(
-            *(camera(source, fps=settings.fps) for source in sources),
+            *(camera(source, fps=settings.fps) for source in settings.cameras or stereo_pair()),
             # Of slow cameras the newest frame is older.
-            max_age_s=max(_MAX_AGE_S, _MOST_MISSED / settings.fps),
+            max_age_s=max(_MAX_AGE_S, _MAX_MISSED / settings.fps),
             on_error=self._report_camera,
         )
-        cg = acquisition_graph(self.cameras)
-        super().__init__("acquisition", cg, q_in, q_out, payload_of_request, pack_pair, add_to_pair, set_in_pair)
+        super().__init__("acquisition", acquisition_graph(self.cameras), q_in, q_out)
+
+    def payload(self, event: Request) -> Mapping[str, Any]:
+        """Return the time that a request asks for."""
+        return {T_VREQ: event.t_vreq}
+
+    def pack(self, view: EventView) -> StereoPair:
+        """Return the images, with the id and the time of the request."""
+        return StereoPair(view["pair"], view.event.id, {T_VREQ: view[T_VREQ]})
+
+    def add(self, answer: StereoPair, key: str, value: float) -> None:
+        """Add an attribute to a pair."""
+        answer.attributes[key] = value
 
     def listen(self, timeout_s: float = 0.5) -> None:
         """Start the cameras and the event loop."""
@@ -151,13 +142,13 @@ class Acquisition(Component):
         finally:
             self.cameras.stop(timeout_s)
 
-    def _report_camera(self, index: int, exception: BaseException) -> None:
-        if self.on_error is not None:
-            self.on_error(Failure(f"camera {index}", (), {}, exception, source=self.name))
-
     def wait_until_ready(self, timeout_s: float) -> bool:
         """Return whether every camera has given a frame within ``timeout_s`` seconds."""
         return self.cameras.wait_for_frames(timeout_s)
+
+    def _report_camera(self, index: int, exception: BaseException) -> None:
+        if self.on_error is not None:
+            self.on_error(Failure(f"camera {index}", (), {}, exception, source=self.name))
 
 
 def acquisition_graph(cameras: ImageAcquisition) -> CompGraph:
@@ -169,70 +160,32 @@ def acquisition_graph(cameras: ImageAcquisition) -> CompGraph:
     return CompGraph({"nearest": nearest}, {"nearest": (T_VREQ, "pair")})
 
 
-def payload_of_request(event: Request) -> dict[str, Any]:
-    """Return the payload of the acquisition's graph: the f_in for an Event's bytes."""
-    return {T_VREQ: read_request(event)}
+class Vision(Component):
+    """The component that runs the ORB graph on pairs."""
 
+    def __init__(self, q_in: Any, q_out: Any, settings: Settings) -> None:
+        self.unsafe_pickle = settings.unsafe_pickle
+        super().__init__("vision", orb_graph(), q_in, q_out, orb_hyperparameters(), workers=settings.workers)
 
-def pack_pair(view: EventView) -> StereoPair:
-    """Return the images, with the id and the time of the request."""
-    return StereoPair(view["pair"], view.event.id, {T_VREQ: view[T_VREQ]})
+    def payload(self, event: StereoPair) -> Mapping[str, Any]:
+        """Return the two images of a pair."""
+        image_1, image_2 = event
+        return {"image_1": image_1, "image_2": image_2}
 
+    def pack(self, view: EventView) -> JustBytes:
+        """Return the first 20 rows of the matched keypoints, with the attributes of the pair."""
+        contents = encode_keypoints(view["keypoints_paired"][:_ROWS], unsafe_pickle=self.unsafe_pickle)
+        answer = JustBytes(contents=contents, id=view.event.id)
+        for key, value in view.event.attributes.items():
+            add_attribute(answer, key, value)
+        return answer
 
-def add_to_pair(pair: StereoPair, key: str, value: float) -> None:
-    """Add an attribute to a pair."""
-    pair.attributes[key] = value
-
-
-def set_in_pair(pair: StereoPair, _place: int, key: str, value: float) -> None:
-    """Set an attribute of a pair."""
-    pair.attributes[key] = value
-
-
-def vision(q_in: Any, q_out: Any, settings: Settings) -> Component:
-    """Return the component that runs the ORB graph on pairs."""
-    pack = pack_pickled if settings.unsafe_pickle else pack_keypoints
-    cg, hparams = orb_graph(), orb_hyperparameters()
-    return Component(
-        "vision",
-        cg,
-        q_in,
-        q_out,
-        payload_of_pair,
-        pack,
-        add_attribute,
-        set_in_answer,
-        hparams,
-        workers=settings.workers,
-    )
-
-
-def payload_of_pair(pair: StereoPair) -> dict[str, Any]:
-    """Return the payload of the ORB graph: the f_in for a pair."""
-    image_1, image_2 = pair
-    return {"image_1": image_1, "image_2": image_2}
-
-
-def set_in_answer(answer: JustBytes, place: int, _key: str, value: float) -> None:
-    """Set an attribute that has been added to an answer."""
-    answer.attributes.entries[place].double_val = value
-
-
-def pack_keypoints(view: EventView) -> JustBytes:
-    """Return the first 20 rows of the matched keypoints, with what is known of the request so far."""
-    return _answer(view, contents_of(view["keypoints_paired"][:ROWS]))
-
-
-def pack_pickled(view: EventView) -> JustBytes:
-    """Return the same for a peer of 2019, which expects a pickle."""
-    return _answer(view, contents_of(view["keypoints_paired"][:ROWS], unsafe_pickle=True))
-
-
-def _answer(view: EventView, contents: bytes) -> JustBytes:
-    answer = JustBytes(contents=contents, id=view.event.id)
-    for key, value in view.event.attributes.items():
+    def add(self, answer: JustBytes, key: str, value: float) -> None:
+        """Add an attribute to an answer."""
         add_attribute(answer, key, value)
-    return answer
 
 
-NODES: Final[Mapping[str, Callable[[Any, Any, Settings], Component]]] = {"acquisition": Acquisition, "vision": vision}
+COMPONENTS: Final[Mapping[str, Callable[[Any, Any, Settings], Component]]] = {
+    "acquisition": Acquisition,
+    "vision": Vision,
+}

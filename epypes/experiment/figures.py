@@ -1,30 +1,54 @@
-"""How are the times of the paper's experiment drawn as its Figures 14, 15 and 16?
+"""Figures 14, 15 and 16 of the paper, drawn from the times of an experiment.
 
-Semeniuta and Falkman 2019, PeerJ Computer Science 5:e176.
+Semeniuta and Falkman 2019, PeerJ Computer Science 5:e176. They are Matplotlib's, made without pyplot, so nothing is
+shown twice and no figure stays open. Colours are Okabe and Ito's, which people with any colour vision tell apart. The
+ground is white, so that text is readable in a dark notebook and on any page.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final
 
+import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from epypes.experiment.drawing import BLUE, GREEN, INK, ORANGE, RED, blank, finished, in_style, told
-from epypes.experiment.fits import PAPER, LogNormal, answered, lognormal_fit
+from epypes.experiment.results import PAPER, LogNormal, answered, lognormal_fit
 from epypes.wording import counted
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.axes import Axes
 
+_BLUE: Final = "#0072b2"
+_ORANGE: Final = "#e69f00"
+_GREEN: Final = "#009e73"
+_RED: Final = "#c44e00"
+_INK: Final = "#1f2328"
+_GREY: Final = "#525a64"
+
+# All else is Matplotlib's default, whatever users have set for figures of their own.
+_STYLE: Final[Any] = MappingProxyType(
+    dict.fromkeys(("axes.edgecolor", "axes.titlecolor", "xtick.color", "ytick.color"), _GREY)
+    | dict.fromkeys(
+        ("axes.labelcolor", "legend.labelcolor", "text.color", "xtick.labelcolor", "ytick.labelcolor"), _INK
+    )
+    | {"axes.linewidth": 0.8, "axes.spines.right": False, "axes.spines.top": False}
+    # With a fixed salt, the same figure has the same names inside its SVG.
+    | {"legend.fontsize": 9, "legend.frameon": False, "svg.hashsalt": "epypes"}
+)
 _MS, _US = 1e3, 1e6
 _SHOWN_REQUESTS: Final = 100
 _PARTS: Final = {
-    "acquisition.t_rp": ("acquisition", BLUE),
-    "vision.t_rp": ("vision", ORANGE),
-    "o_network": ("network", GREEN),
+    "acquisition.t_rp": ("acquisition", _BLUE),
+    "vision.t_rp": ("vision", _ORANGE),
+    "o_network": ("network", _GREEN),
 }
 # Of a curve, by as many sigmas from mu as there is something to see: a narrow peak on a wide axis has them all.
 _POINTS: Final = 160
@@ -34,11 +58,61 @@ _SIGMAS_LEFT: Final = 2.5
 _BINS: Final = 60
 # What is beside the outermost mark, as a factor.
 _MARGIN: Final = 1.5
+_NO_CURVE: Final = "no curve, since there are no values that differ"
 # On more decades there is no room for numbers at 2 and 5.
 _FEW_DECADES: Final = 3.6
 
 
-@in_style()
+@contextmanager
+def _in_style() -> Iterator[None]:
+    """Draw in the style of these figures, whatever the user's own is."""
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(_STYLE)
+        yield
+
+
+class Drawing(Figure):
+    """A figure of Matplotlib that shows itself in a notebook, whether pyplot has been imported or not."""
+
+    def savefig(self, fname: Any, **options: Any) -> None:
+        """Save the figure as Matplotlib does, in its own style."""
+        with _in_style():
+            super().savefig(fname, **options)
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, Any]:
+        # The PNG is for pages that show no SVG, such as that of a notebook which is not trusted.
+        svg, png = self._saved("svg", metadata={"Date": None}), self._saved("png")
+        return {"text/plain": repr(self), "image/svg+xml": svg.decode(), "image/png": png}
+
+    def _saved(self, kind: str, **options: Any) -> bytes:
+        file = BytesIO()
+        self.savefig(file, format=kind, **options)
+        return file.getvalue()
+
+
+def _blank(title: str) -> tuple[Drawing, Axes]:
+    """Return a figure with a title and nothing in it, and its axes."""
+    figure = Drawing(figsize=(8, 4.2), dpi=100, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.06))
+    figure.suptitle(title, x=0.015, ha="left", fontsize=11, fontweight="bold")
+    return figure, figure.add_subplot()
+
+
+def _with_message(figure: Drawing, axes: Axes, text: str) -> Drawing:
+    """Return the figure with a sentence instead of axes, where there is nothing to draw."""
+    axes.set_axis_off()
+    axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes)
+    return figure
+
+
+def _with_notes(figure: Drawing, axes: Axes, *notes: str, columns: int = 3) -> Drawing:
+    """Return the figure with notes above its axes, and with its legend in so many columns below them."""
+    axes.set_title("; ".join(filter(None, notes)), loc="left", fontsize=9)
+    figure.legend(loc="outside lower left", ncols=columns, handlelength=1.6, columnspacing=1.4)
+    return figure
+
+
+@_in_style()
 def figure_14(table: pd.DataFrame) -> Figure:
     """Draw 100 requests as stacked bars: what acquisition, vision and the network took of each trip.
 
@@ -59,26 +133,26 @@ def figure_14(table: pd.DataFrame) -> Figure:
         It is no table of an experiment.
     """
     has_times = answered(table, *_PARTS)[:_SHOWN_REQUESTS]
-    figure, axes = blank("Figure 14: where the time of each request goes")
+    figure, axes = _blank("Figure 14: where the time of each request goes")
     if not has_times.any():
-        return told(figure, axes, _why_nothing(has_times))
+        return _without_data(figure, axes, has_times)
     shown = table[:_SHOWN_REQUESTS]
     negative = _stack(axes, np.flatnonzero(has_times), shown[has_times])
     failed = np.flatnonzero(~has_times)
     if len(failed):
-        axes.plot(failed, np.zeros(len(failed)), "x", color=INK, label="failed", clip_on=False, zorder=3)
+        axes.plot(failed, np.zeros(len(failed)), "x", color=_INK, label="failed", clip_on=False, zorder=3)
     axes.set(xlabel="request", ylabel="time, ms", xlim=(-1, len(shown)))
-    return finished(
+    return _with_notes(
         figure,
         axes,
         _of_experiments(len(shown), "request", shown["experiment"].nunique()),
-        f"{counted(negative, 'negative time')} not drawn" * bool(negative),
-        _failures(has_times),
+        _note(negative, "negative time", "not drawn"),
+        _note(np.sum(~has_times), "request", "failed"),
         columns=4,
     )
 
 
-@in_style()
+@_in_style()
 def figure_15(table: pd.DataFrame, *, side_by_side: bool = False) -> Figure:
     """Draw how the graph overhead of the vision component is distributed, beside the paper's.
 
@@ -105,7 +179,7 @@ def figure_15(table: pd.DataFrame, *, side_by_side: bool = False) -> Figure:
     return _densities(table, "vision.o_cg", "Figure 15: graph overhead", f"o_cg: pipeline time less {less}, µs")
 
 
-@in_style()
+@_in_style()
 def figure_16(table: pd.DataFrame) -> Figure:
     """Draw how the overhead of the vision component's reactive pipeline is distributed, beside the paper's.
 
@@ -129,26 +203,29 @@ def _stack(axes: Axes, places: np.ndarray, rows: pd.DataFrame) -> int:
 
 def _densities(table: pd.DataFrame, column: str, title: str, meaning: str) -> Figure:
     has_times = answered(table, column)
-    figure, axes = blank(title)
+    figure, axes = _blank(title)
     if not has_times.any():
-        return told(figure, axes, _why_nothing(has_times))
+        return _without_data(figure, axes, has_times)
     rows = table[has_times]
     whole = lognormal_fit(rows[column])
     if not whole.count:
-        return told(figure, axes, f"Of {counted(len(rows), 'value')} none is positive, so there is nothing to fit.")
+        return _with_message(
+            figure, axes, f"Of {counted(len(rows), 'value')} none is positive, so there is nothing to fit."
+        )
     experiments = [lognormal_fit(values) for _, values in rows.groupby("experiment")[column]]
+    flat = sum(not fitted.has_curve for fitted in experiments)
     positive = rows.loc[rows[column] > 0, column]
     _axis(axes, positive, whole, PAPER[column])
     axes.set_xlabel(meaning)
     _histogram(axes, positive)
     _curves(axes, whole, experiments)
-    return finished(
+    return _with_notes(
         figure,
         axes,
         _of_experiments(whole.count, "value", len(experiments)),
-        f"{counted(whole.left_out, 'value')} not positive, left out" * bool(whole.left_out),
-        _without_curve(whole, experiments),
-        _failures(has_times),
+        _note(whole.left_out, "value", "not positive, left out"),
+        _note(flat, "experiment", "without a curve") if whole.has_curve else _NO_CURVE,
+        _note(np.sum(~has_times), "request", "failed"),
     )
 
 
@@ -157,9 +234,11 @@ def _axis(axes: Axes, times: pd.Series[float], whole: LogNormal, paper: float) -
     least, most, mode, paper = (_US * time for time in (times.min(), times.max(), whole.mode, paper))
     measured = f"measured: {_number(least)} to {_number(most)} µs" if least < most else f"measured: {_number(least)} µs"
     for time, label in ((least, measured), (most, None)):
-        axes.axvline(time, color=INK, linewidth=3, label=label, ymax=0.25)
-    axes.axvline(mode, color=INK, linewidth=0.9, label=f"mode: {_number(mode)} µs")
-    axes.axvline(paper, color=RED, linewidth=1.6, linestyle=(0, (4, 2)), label=f"the paper's mode: {_number(paper)} µs")
+        axes.axvline(time, color=_INK, linewidth=3, label=label, ymax=0.25)
+    axes.axvline(mode, color=_INK, linewidth=0.9, label=f"mode: {_number(mode)} µs")
+    axes.axvline(
+        paper, color=_RED, linewidth=1.6, linestyle=(0, (4, 2)), label=f"the paper's mode: {_number(paper)} µs"
+    )
     # To the left a fit may reach further than what was measured.
     low = min(least, mode, paper, _US * float(np.exp(whole.mu - _SIGMAS_LEFT * whole.sigma))) / _MARGIN
     high = max(most, mode, paper) * _MARGIN
@@ -174,7 +253,7 @@ def _histogram(axes: Axes, times: pd.Series[float]) -> None:
     """Draw how dense the measured values are, in bins that are equally wide on the axis."""
     if times.nunique() > 1:
         bins = np.geomspace(_US * times.min(), _US * times.max(), _BINS).tolist()
-        axes.hist(_US * times, bins=bins, density=True, color=INK, alpha=0.16, label="histogram", zorder=0)
+        axes.hist(_US * times, bins=bins, density=True, color=_INK, alpha=0.16, label="histogram", zorder=0)
 
 
 def _curves(axes: Axes, whole: LogNormal, experiments: list[LogNormal]) -> None:
@@ -185,9 +264,9 @@ def _curves(axes: Axes, whole: LogNormal, experiments: list[LogNormal]) -> None:
     label = "each experiment"
     for fitted in experiments:
         if fitted.has_curve:
-            axes.fill_between(*_density(fitted, low, high), color=BLUE, alpha=0.2, linewidth=0, label=label)
+            axes.fill_between(*_density(fitted, low, high), color=_BLUE, alpha=0.2, linewidth=0, label=label)
             label = ""
-    axes.plot(*_density(whole, low, high), color=BLUE, linewidth=2.8, label="all data")
+    axes.plot(*_density(whole, low, high), color=_BLUE, linewidth=2.8, label="all data")
     axes.set_ylabel("probability density, per µs")
     axes.set_ylim(bottom=0)
 
@@ -199,27 +278,18 @@ def _density(fitted: LogNormal, low: float, high: float) -> tuple[np.ndarray, np
     return times, fitted.pdf(times / _US) / _US
 
 
-def _why_nothing(has_times: np.ndarray) -> str:
-    requests = len(has_times)
-    if not requests:
-        return "There is no request."
-    return "The only request failed." if requests == 1 else f"All {requests} requests failed."
+def _without_data(figure: Drawing, axes: Axes, has_times: np.ndarray) -> Drawing:
+    texts = {0: "There is no request.", 1: "The only request failed."}
+    return _with_message(figure, axes, texts.get(len(has_times), f"All {len(has_times)} requests failed."))
 
 
 def _of_experiments(count: int, noun: str, experiments: int) -> str:
     return f"{count:,} {noun}{'s' * (count != 1)} of {counted(experiments, 'experiment')}"
 
 
-def _failures(has_times: np.ndarray) -> str:
-    failed = int(np.sum(~has_times))
-    return f"{counted(failed, 'request')} failed" * bool(failed)
-
-
-def _without_curve(whole: LogNormal, experiments: list[LogNormal]) -> str:
-    if not whole.has_curve:
-        return "no curve, since there are no values that differ"
-    flat = sum(not fitted.has_curve for fitted in experiments)
-    return f"{counted(flat, 'experiment')} without a curve" * bool(flat)
+def _note(count: int, noun: str, text: str) -> str:
+    """Return a note on how many there are; empty if there is none."""
+    return f"{counted(int(count), noun)} {text}" if count else ""
 
 
 def _number(time: float) -> str:

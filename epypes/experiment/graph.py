@@ -1,4 +1,4 @@
-"""Which graph does the paper's experiment run? Keypoints that two images have in common, by ORB (Figure 13)."""
+"""The graph of the paper's Figure 13: keypoints that two images have in common, by ORB."""
 
 # ruff: noqa: N803  hyperparameters are called as in OpenCV
 
@@ -16,14 +16,8 @@ if TYPE_CHECKING:
 
 # The hyperparameters that both images share, in the order in which the function takes them.
 OPTIONS: Final = (
-    "nfeatures",
-    "scaleFactor",
-    "nlevels",
-    "edgeThreshold",
-    "WTA_K",
-    "scoreType",
-    "patchSize",
-    "fastThreshold",
+    *("nfeatures", "scaleFactor", "nlevels", "edgeThreshold"),
+    *("WTA_K", "scoreType", "patchSize", "fastThreshold"),
 )
 
 

@@ -1,7 +1,6 @@
-"""How are the three nodes spread over processes?
+"""Layouts: how the three nodes are spread over processes.
 
-A layout says nothing else: nodes, functions, graphs, f_in and f_out are the same in all of them. The robot is in the
-calling process.
+Nodes, functions, graphs, f_in and f_out are the same in all of them. The robot is in the calling process.
 """
 
 from __future__ import annotations
@@ -15,8 +14,14 @@ from typing import Any, Final
 
 from epypes.errors import ExperimentError
 from epypes.experiment.components import Settings
-from epypes.experiment.process import ChildStation
-from epypes.experiment.station import KEPT, START_TIMEOUT_S, Station, address_for, guard_of
+from epypes.experiment.stations import (
+    QUEUE_SIZE,
+    START_TIMEOUT_S,
+    ChildStation,
+    Station,
+    curve_options,
+    new_address,
+)
 from epypes.pipeline import Mailbox
 from epypes.transport import ZMQPublisher, ZMQSubscriber
 
@@ -37,11 +42,6 @@ class Layout:
     processes: tuple[tuple[str, ...], ...]
     in_children: bool
 
-    @property
-    def scheme(self) -> str:
-        """Of the sockets' addresses."""
-        return "tcp" if self.in_children else "inproc"
-
 
 LAYOUTS: Final[Mapping[str, Layout]] = MappingProxyType(
     {
@@ -54,7 +54,7 @@ LAYOUTS: Final[Mapping[str, Layout]] = MappingProxyType(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class System:
-    """The two queues that the robot stands between, while everything runs.
+    """A running layout, with the two queues of the robot.
 
     Attributes
     ----------
@@ -70,10 +70,6 @@ class System:
     inbox: Any
     stations: tuple[Station | ChildStation, ...]
 
-    def described(self) -> dict[str, Mapping[str, Any]]:
-        """Return what the nodes compute, by name."""
-        return {name: node for station in self.stations for name, node in station.described().items()}
-
 
 @contextmanager
 def running(layout: Layout, settings: Settings) -> Iterator[System]:
@@ -84,28 +80,24 @@ def running(layout: Layout, settings: Settings) -> Iterator[System]:
     ExperimentError
         A process or a node does not start.
     """
-    requests = Mailbox("drop_oldest", KEPT)
+    requests = Mailbox("drop_oldest", QUEUE_SIZE)
     inbox: Any = queue.SimpleQueue()
+    scheme = "tcp" if layout.in_children else "inproc"
+    stations: list[Station | ChildStation] = []
     with ExitStack() as stack:
-        guard = guard_of(settings, bind=True)
-        publisher = stack.enter_context(ZMQPublisher(address_for(layout.scheme), requests, **guard))
-        stations: list[Station | ChildStation] = []
+        publisher = ZMQPublisher(new_address(scheme), requests, **curve_options(settings, bind=True))
+        stack.enter_context(publisher)
         for names in layout.processes:
-            station = (
-                ChildStation(names, settings, inbox.put)
-                if layout.in_children
-                else Station(names, settings, layout.scheme)
-            )
-            stack.callback(station.stop)
-            stations.append(station)
-        source = publisher.address
-        heard = []
+            in_child = layout.in_children
+            stations.append(ChildStation(names, settings, inbox.put) if in_child else Station(names, settings, scheme))
+            stack.callback(stations[-1].stop)
+        source, failures = publisher.address, []
         for station in stations:
             addresses = station.start(source)
             source = addresses["answers"]
-            heard.append(addresses["failures"])
-        for address in (source, *heard):
-            subscriber = stack.enter_context(ZMQSubscriber(address, inbox, **guard_of(settings, bind=False)))
+            failures.append(addresses["failures"])
+        for address in (source, *failures):
+            subscriber = stack.enter_context(ZMQSubscriber(address, inbox, **curve_options(settings, bind=False)))
             if not subscriber.wait_joined(START_TIMEOUT_S):
-                raise ExperimentError("robot", f"Nobody publishes at {address}.")
+                raise ExperimentError("robot", f"Nothing is published at {address}.")
         yield System(requests, inbox, tuple(stations))

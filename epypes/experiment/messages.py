@@ -1,4 +1,4 @@
-"""What travels between the three nodes? Requests, pairs of images, answers.
+"""The messages between the three nodes: requests, pairs of images, answers.
 
 Requests and answers are messages of 2019: an Event, a JustBytes. A pair is a tuple of two arrays in a process, and an
 Envelope between processes. Attributes are doubles, in seconds.
@@ -6,10 +6,10 @@ Envelope between processes. Attributes are doubles, in seconds.
 
 from __future__ import annotations
 
-import functools
 import io
 import pickle
 from collections.abc import Iterable, Mapping
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from epypes.errors import MessageError
@@ -27,9 +27,9 @@ _NPY: Final = b"\x93NUMPY"
 
 
 class Request(bytes):
-    """The bytes of an Event, which are parsed once, when they are asked for something."""
+    """The bytes of an Event, parsed when it is first read."""
 
-    @functools.cached_property
+    @cached_property
     def message(self) -> Event:
         """The Event; MessageError is raised if these bytes are none."""
         return parsed(Event, self)
@@ -42,9 +42,23 @@ class Request(bytes):
         except MessageError:
             return ""
 
+    @property
+    def t_vreq(self) -> float:
+        """The time whose images are wanted: Unix time in seconds.
+
+        Raises
+        ------
+        MessageError
+            These are no Event's bytes, or it has no attribute ``t_vreq``.
+        """
+        found = attributes(self.message).get(T_VREQ)
+        if not isinstance(found, float):
+            raise MessageError("no time", f"A request needs the attribute {T_VREQ!r}: Unix time in seconds, a double.")
+        return found
+
 
 class StereoPair(tuple[Any, ...]):
-    """A tuple of two images, with the id of the request that it answers and attributes, which may be added to."""
+    """A tuple of two images, with the id of the request that it answers, and attributes, which may be added to."""
 
     id: str
     attributes: dict[str, float]
@@ -63,74 +77,50 @@ class StereoPair(tuple[Any, ...]):
         pair.id, pair.attributes = request_id, dict(attributes)
         return pair
 
+    @classmethod
+    def from_envelope(cls, envelope: Any) -> Self:
+        """Return the pair that another process has sent.
+
+        Raises
+        ------
+        MessageError
+            Of reason ``"no pair"`` if it is something else.
+        """
+        is_envelope = isinstance(envelope, Envelope)
+        if not is_envelope or envelope.type != PAIR or any(name not in envelope.parts for name in _IMAGES):
+            what = repr(envelope) if is_envelope else f"a {type(envelope).__name__}"
+            raise MessageError("no pair", f"Vision takes pairs of images, not {what}.")
+        return cls((envelope.parts[name] for name in _IMAGES), envelope.id, envelope.attributes)
+
+    def to_envelope(self) -> Envelope:
+        """Return the message that carries the pair to another process."""
+        parts = dict(zip(_IMAGES, self, strict=True))
+        return Envelope(type=PAIR, parts=parts, id=self.id, source="acquisition", attributes=self.attributes)
+
     def __repr__(self) -> str:
         return f"<StereoPair {self.id:.40}: {len(self.attributes)} attributes>"
 
 
-def envelope_of(pair: StereoPair) -> Envelope:
-    """Return a pair as it travels between processes."""
-    parts = dict(zip(_IMAGES, pair, strict=True))
-    return Envelope(type=PAIR, parts=parts, id=pair.id, source="acquisition", attributes=pair.attributes)
-
-
-def pair_of(envelope: Any) -> StereoPair:
-    """Return the pair that has come from another process.
-
-    Raises
-    ------
-    MessageError
-        Of reason ``"no pair"`` if it is something else.
-    """
-    is_envelope = isinstance(envelope, Envelope)
-    if not is_envelope or envelope.type != PAIR or any(name not in envelope.parts for name in _IMAGES):
-        what = repr(envelope) if is_envelope else f"a {type(envelope).__name__}"
-        raise MessageError("no pair", f"Vision takes pairs of images, not {what}.")
-    return StereoPair((envelope.parts[name] for name in _IMAGES), envelope.id, envelope.attributes)
-
-
-def read_request(event: Request) -> float:
-    """Return the time that a request asks for: Unix time in seconds.
-
-    Raises
-    ------
-    MessageError
-        These are no Event's bytes, or it has no attribute ``t_vreq``.
-    """
-    found = attributes(event.message).get(T_VREQ)
-    if not isinstance(found, float):
-        raise MessageError("no time", f"A request needs the attribute {T_VREQ!r}: Unix time in seconds, a double.")
-    return found
-
-
-def contents_of(keypoints: Array, *, unsafe_pickle: bool = False) -> bytes:
+def encode_keypoints(keypoints: Array, *, unsafe_pickle: bool = False) -> bytes:
     """Return an array as the contents of an answer: as numpy.save writes it, or pickled for a peer of 2019."""
     import numpy as np
 
     if unsafe_pickle:
         # Protocol 2, and the module's name of that time: NumPy 2 has moved it, and can still read both.
         return pickle.dumps(keypoints, 2).replace(b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n", 1)
-    rows = np.ascontiguousarray(keypoints)
-    return _npy_header(rows.shape, rows.dtype.str) + rows.tobytes()
-
-
-@functools.lru_cache
-def _npy_header(shape: tuple[int, ...], dtype: str) -> bytes:
-    # Kept, since writing it takes numpy ten times as long as the rest.
-    import numpy as np
-
     buffer = io.BytesIO()
-    np.lib.format.write_array_header_1_0(buffer, {"descr": dtype, "fortran_order": False, "shape": shape})
+    np.save(buffer, keypoints, allow_pickle=False)
     return buffer.getvalue()
 
 
-def keypoints_of(contents: bytes, *, unsafe_pickle: bool = False) -> Array:
+def decode_keypoints(contents: bytes, *, unsafe_pickle: bool = False) -> Array:
     """Return the array in the contents of an answer.
 
     Parameters
     ----------
     unsafe_pickle
-        Whether contents that are a pickle, as a peer of 2019 sends them, are read. Whoever sends one can run any code
-        in this process.
+        Whether to read contents that are a pickle, as a peer of 2019 sends them. The sender of a pickle can run any
+        code in this process.
 
     Raises
     ------

@@ -1,29 +1,38 @@
-"""What is known of each request of an experiment? A row of durations."""
+"""The results of an experiment: durations by request, their summary, and the log-normal distributions that fit them.
+
+Semeniuta and Falkman 2019, PeerJ Computer Science 5:e176.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, cast
 
-from epypes.experiment.robot import Answer
 from epypes.optional import optional_import
 
 if TYPE_CHECKING:
+    import numpy as np
     import pandas as pd
 
-COMPONENTS: Final = ("vision", "acquisition")
+    from epypes.experiment.run import Answer
+
+# Seconds, by column of the table: where the curves over all data of the paper's figures 15 and 16 are highest.
+PAPER: Final[Mapping[str, float]] = MappingProxyType({"vision.o_cg": 0.3e-3, "vision.o_epypes": 0.02e-3})
+_COMPONENTS: Final = ("vision", "acquisition")
 _TIMES: Final = ("t_p", "o_cg", "t_fin", "t_fout", "o_epypes")
-_WHO: Final = ("experiment", "request", "id")
-_NUMBERS: Final = (
+_DURATIONS: Final = (
     "t_trip",
     "acquisition.t_rp",
     "vision.t_rp",
     "o_network",
-    *(f"{name}.{time}" for name in COMPONENTS for time in _TIMES),
+    *(f"{name}.{time}" for name in _COMPONENTS for time in _TIMES),
 )
-COLUMNS: Final = (*_WHO, *_NUMBERS, "failure")
+COLUMNS: Final = ("experiment", "request", "id", *_DURATIONS, "failure")
+_MS: Final = 1e3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,25 +67,22 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     with optional_import("experiment"):
         import pandas as pd
 
-    return pd.DataFrame(list(rows), columns=list(COLUMNS)).astype(dict.fromkeys(_NUMBERS, float))
+    return pd.DataFrame(list(rows), columns=list(COLUMNS)).astype(dict.fromkeys(_DURATIONS, float))
 
 
 def row_of(answer: Answer, experiment: int, request: int) -> dict[str, Any]:
-    """Return the row of an answer. Only durations of one clock are combined.
-
-    An answer that lacks a time, as that of another component may, is a failure.
-    """
+    """Return the row of an answer. An answer that lacks a time, as that of another component may, is a failure."""
     row: dict[str, Any] = {"experiment": experiment, "request": request, "id": answer.id, "failure": answer.failure}
     if not answer.failure:
         try:
             row |= durations_of(answer.t_trip, answer.attributes)
         except KeyError as error:
             row["failure"] = f"robot: the answer has no attribute {error}"
-    return dict.fromkeys(_NUMBERS, float("nan")) | row
+    return dict.fromkeys(_DURATIONS, math.nan) | row
 
 
 def durations_of(t_trip: float, times: Mapping[str, Any]) -> dict[str, float]:
-    """Return the durations of a request by column.
+    """Return the durations of a request by column. Only times of one clock are combined.
 
     Parameters
     ----------
@@ -86,13 +92,129 @@ def durations_of(t_trip: float, times: Mapping[str, Any]) -> dict[str, float]:
         The attributes of the answer: time stamps and durations of each component, by its own clock.
     """
     durations = {"t_trip": t_trip}
-    for name in COMPONENTS:
-        own = {key: times[f"{name}.{key}"] for key in ("t_react", "t_pub", "t_p", "o_cg")}
-        t_rp = own["t_pub"] - own["t_react"]
-        t_fin = times[f"{name}.t_fin_end"] - times[f"{name}.t_fin_start"]
-        t_fout = times[f"{name}.t_fout_end"] - times[f"{name}.t_fout_start"]
-        values = (own["t_p"], own["o_cg"], t_fin, t_fout, t_rp - (own["t_p"] + t_fin + t_fout))
+    for name in _COMPONENTS:
+
+        def between(start: str, end: str, name: str = name) -> float:
+            return float(times[f"{name}.{end}"] - times[f"{name}.{start}"])
+
+        t_p, t_rp = times[f"{name}.t_p"], between("t_react", "t_pub")
+        t_fin, t_fout = between("t_fin_start", "t_fin_end"), between("t_fout_start", "t_fout_end")
+        values = (t_p, times[f"{name}.o_cg"], t_fin, t_fout, t_rp - (t_p + t_fin + t_fout))
         durations[f"{name}.t_rp"] = t_rp
         durations |= {f"{name}.{time}": value for time, value in zip(_TIMES, values, strict=True)}
-    durations["o_network"] = t_trip - sum(durations[f"{name}.t_rp"] for name in COMPONENTS)
+    durations["o_network"] = t_trip - sum(durations[f"{name}.t_rp"] for name in _COMPONENTS)
     return durations
+
+
+def answered(table: pd.DataFrame, *columns: str) -> np.ndarray:
+    """Return whether each request was answered, a bool per row; those that failed have no times.
+
+    Raises
+    ------
+    ValueError
+        It is no table of an experiment, or lacks some of the columns that are needed.
+    """
+    with optional_import("experiment"):
+        import pandas as pd
+
+    if not isinstance(table, pd.DataFrame):
+        kind = type(table).__name__
+        raise ValueError(f"A table of an experiment is needed, as run_experiment(...).table, not {kind!r}.")
+    missing = [column for column in ("experiment", "failure", *columns) if column not in table]
+    if missing and len(table):
+        names = ", ".join(map(repr, missing))
+        raise ValueError(
+            f"The table has no column {names}. It must be that of an experiment: run_experiment(...).table."
+        )
+    # An empty text is missing once the table has been read from a file.
+    failures = table["failure"].fillna("") if len(table) else pd.Series(dtype=str)
+    return (failures == "").to_numpy(dtype=bool)
+
+
+def summary(table: pd.DataFrame) -> pd.DataFrame:
+    """Summarize the times of an experiment beside the paper's own.
+
+    Parameters
+    ----------
+    table
+        A row per request, as ``Results.table``.
+
+    Returns
+    -------
+    DataFrame
+        A row per time, in milliseconds: ``requests`` that were answered, ``not_positive`` values among them,
+        ``median_ms``, ``mode_ms`` of the log-normal distribution, the range from ``least_ms`` to ``most_ms``, and
+        ``paper_mode_ms``, nan where the paper names none.
+    """
+    with optional_import("experiment"):
+        import pandas as pd
+
+    rows = table[answered(table)]
+    found = {}
+    for time in rows.select_dtypes("number").columns.difference(["experiment", "request"], sort=False):
+        values = rows[time].dropna()
+        fitted = lognormal_fit(values)
+        in_s = (values.median(), fitted.mode, values.min(), values.max(), PAPER.get(time, math.nan))
+        found[time] = [len(values), fitted.left_out, *(_MS * value for value in in_s)]
+    columns = ["requests", "not_positive", "median_ms", "mode_ms", "least_ms", "most_ms", "paper_mode_ms"]
+    return pd.DataFrame.from_dict(found, orient="index", columns=columns)
+
+
+@dataclass(frozen=True, slots=True)
+class LogNormal:
+    """The log-normal distribution that fits some times best; does not change.
+
+    Attributes
+    ----------
+    mu, sigma
+        The mean and the population standard deviation of the times' logarithms, in seconds; nan if there is no time.
+    count
+        How many times were fitted.
+    left_out
+        How many more there were that no log-normal distribution has: zero, negative, infinite or missing.
+    """
+
+    mu: float
+    sigma: float
+    count: int
+    left_out: int
+
+    @property
+    def mode(self) -> float:
+        """The most likely time, in seconds; nan if nothing was fitted."""
+        return math.exp(self.mu - self.sigma**2)
+
+    @property
+    def has_curve(self) -> bool:
+        """Whether there is a density to draw: times that differ."""
+        return self.count > 1 and self.sigma > 0
+
+    def pdf(self, times: np.ndarray) -> np.ndarray:
+        """Return the probability density at positive times in seconds, per second; nan where there is no curve."""
+        with optional_import("experiment"):
+            from scipy import stats
+
+        return cast("np.ndarray", stats.lognorm.pdf(times, self.sigma or math.nan, scale=math.exp(self.mu)))
+
+
+def lognormal_fit(values: Iterable[float]) -> LogNormal:
+    """Fit a log-normal distribution to times by maximum likelihood.
+
+    Values that aren't positive numbers are counted, not fitted. Where all times are equal, ``sigma`` is 0.
+
+    Examples
+    --------
+    >>> fitted = lognormal_fit([1e-3, 4e-3, 0.0])
+    >>> round(math.exp(fitted.mu), 6), round(fitted.mode, 6), fitted.count, fitted.left_out
+    (0.002, 0.001237, 2, 1)
+    """
+    import numpy as np
+
+    given = np.fromiter(values, float)
+    times = given[np.isfinite(given) & (given > 0)]
+    if not len(times):
+        return LogNormal(math.nan, math.nan, 0, len(given))
+    logs = np.log(times)
+    # The mean of equal logarithms can be off by its last bit, which would look like a spread.
+    sigma = 0.0 if np.ptp(times) == 0 else float(np.std(logs))
+    return LogNormal(float(np.mean(logs)), sigma, len(times), len(given) - len(times))

@@ -1,29 +1,152 @@
-"""How is the paper's experiment run? Layout by layout, request by request."""
+"""Running the paper's experiment: the robot, which announces requests and takes the times of their answers."""
 
 from __future__ import annotations
 
 import math
+import queue
 import threading
+import time
+import uuid
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 from epypes.acquisition.cameras import LAST_DEVICE
-from epypes.errors import ExperimentError, KeysError
+from epypes.errors import ExperimentError, KeysError, MessageError
 from epypes.experiment.components import Settings
 from epypes.experiment.layouts import LAYOUTS, running
+from epypes.experiment.messages import REQUEST, T_VREQ, decode_keypoints
 from epypes.experiment.results import Results, row_of, table_of
-from epypes.experiment.robot import Robot
 from epypes.transport import read_keys
 from epypes.transport.zeromq.curve import public_keys
+from epypes.wire import Envelope, Event, JustBytes, add_attribute, attributes, parsed
 
+_NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
 # Requests that come first and are not counted: they fill caches, and from its fourth run on a graph is compiled.
 _WARM_UP: Final = 5
-# So many requests without any answer in a row mean that there will be none.
-_MOST_MISSING: Final = 3
+# After so many requests in a row without an answer, none is expected any more.
+_MAX_MISSING: Final = 3
 
-Progress = Callable[[int, int], None]
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """The outcome of one request.
+
+    Attributes
+    ----------
+    id
+        Of the request.
+    t_trip
+        From the request to its answer, in seconds, by the robot's clock; nan if there was none.
+    attributes
+        Of the answer: the time of the request, and the times of both components.
+    contents
+        The bytes of the answer.
+    keypoints
+        The matched coordinates in them, float32, (at most 20, 4); None if there was no answer.
+    failure
+        What failed; empty if nothing did.
+    is_missing
+        Whether neither an answer nor a failure came within the time-out.
+    """
+
+    id: str
+    t_trip: float = math.nan
+    attributes: Mapping[str, Any] = field(default_factory=lambda: _NOTHING, repr=False)
+    contents: bytes = field(default=b"", repr=False)
+    keypoints: Any = field(default=None, repr=False)
+    failure: str = ""
+    is_missing: bool = False
+
+
+class Robot:
+    """Announces requests one by one, and waits for the answer of each.
+
+    Parameters
+    ----------
+    requests
+        The queue that takes Events.
+    inbox
+        The queue that gives answers (bytes), failures (Envelopes) and errors that end the experiment.
+    timeout_s
+        Longest wait for one answer, in seconds.
+    unsafe_pickle
+        Whether contents that are a pickle are read; see `decode_keypoints`.
+
+    Attributes
+    ----------
+    counts
+        What came besides the answers that were waited for: late ones of earlier requests, messages that are no
+        answers, failures of no request. They are ignored, but counted.
+    """
+
+    def __init__(self, requests: Any, inbox: Any, *, timeout_s: float = 5.0, unsafe_pickle: bool = False) -> None:
+        self.requests, self.inbox, self.timeout_s, self.unsafe_pickle = requests, inbox, timeout_s, unsafe_pickle
+        self.counts: Counter[str] = Counter()
+
+    def ask(self, at: float | None = None) -> Answer:
+        """Announce a request, and return its outcome within the time-out.
+
+        Parameters
+        ----------
+        at
+            The time whose images are wanted: Unix time in seconds; default: now.
+
+        Raises
+        ------
+        ExperimentError
+            A process has ended.
+        """
+        request_id = uuid.uuid4().hex
+        start = time.perf_counter()
+        event = Event(type=REQUEST, id=request_id)
+        add_attribute(event, T_VREQ, time.time() if at is None else float(at))
+        self.requests.put(event)
+        deadline = start + self.timeout_s
+        while True:
+            try:
+                item = self.inbox.get(timeout=max(0.0, deadline - time.perf_counter()))
+            except queue.Empty:
+                return Answer(request_id, failure=f"no answer within {self.timeout_s:g} s", is_missing=True)
+            end = time.perf_counter()
+            answer = self._read(item, request_id, end - start)
+            if answer is not None:
+                return answer
+
+    def _read(self, item: Any, request_id: str, t_trip: float) -> Answer | None:
+        """Return the outcome if the item is that of the request; else count the item."""
+        if isinstance(item, ExperimentError):
+            raise item
+        if isinstance(item, Envelope):
+            text = _describe_failure(item)
+            if item.correlation_id == request_id:
+                return Answer(request_id, failure=text)
+            self.counts["late failure" if item.correlation_id else text] += 1
+            return None
+        try:
+            message = parsed(JustBytes, item)
+        except MessageError as error:
+            self.counts[f"message that is no answer ({error.reason})"] += 1
+            return None
+        if message.id != request_id:
+            self.counts["late answer"] += 1
+            return None
+        try:
+            keypoints = decode_keypoints(message.contents, unsafe_pickle=self.unsafe_pickle)
+            return Answer(request_id, t_trip, attributes(message), message.contents, keypoints)
+        except MessageError as error:
+            return Answer(request_id, failure=f"robot: {error}")
+
+
+def _describe_failure(event: Envelope) -> str:
+    """Return the text of a failure event, on one line."""
+    failure = event.failure
+    if failure is None:
+        return f"{event.source}: an event of type {event.type!r} came for an answer"
+    return " ".join(f"{event.source}, {failure.function}: {failure.exception}: {failure.message}".split())
 
 
 def run_experiment(
@@ -34,7 +157,7 @@ def run_experiment(
     workers: int = 1,
     fps: float = 5.0,
     unsafe_pickle: bool = False,
-    progress: Progress | None = None,
+    progress: Callable[[int, int], None] | None = None,
     cameras: Sequence[str | Path | int] = (),
     timeout_s: float = 5.0,
     keys: str | Path | None = None,
@@ -56,7 +179,7 @@ def run_experiment(
     fps
         Frames per second of cameras that are files.
     unsafe_pickle
-        Whether the contents of answers are pickled, as in 2019, and read. Whoever can send an answer could then run
+        Whether the contents of answers are pickled, as in 2019, and read. The sender of an answer could then run
         code here.
     progress
         Called with the requests made so far and those of all experiments, between two requests.
@@ -66,9 +189,10 @@ def run_experiment(
     timeout_s
         Longest wait for one answer.
     keys
-        The .key_secret file of the pair that all nodes have in common; anybody on this machine may connect without.
+        The .key_secret file of the pair that all nodes have in common; without, every program on this machine may
+        connect.
     allow
-        With keys: the .key files, or folders of them, of who else may connect to look on.
+        With keys: the .key files, or folders of them, of further peers that may connect to look on.
 
     Returns
     -------
@@ -88,53 +212,34 @@ def run_experiment(
     """
     import pandas as pd  # noqa: F401 - missing here, rather than after the last experiment
 
-    _check(layout, requests=requests, experiments=experiments, workers=workers)
+    if layout not in list(LAYOUTS):
+        raise ExperimentError("layout", f"There is no layout {layout!r}. There are: {', '.join(LAYOUTS)}.")
+    for name, count in {"requests": requests, "experiments": experiments, "workers": workers}.items():
+        if type(count) is not int or count < 1:
+            raise ExperimentError(name, f"{name} must be a whole number from 1, not {count!r}.")
     _check_number("fps", fps)
     _check_number("timeout_s", timeout_s, threading.TIMEOUT_MAX)
     guarded = _checked_keys(keys, allow)
     settings = Settings(_checked_cameras(cameras), float(fps), workers, bool(unsafe_pickle), *guarded)
     rows: list[dict[str, Any]] = []
     counts: Counter[str] = Counter()
-
-    def on_request() -> None:
-        if progress is not None:
-            progress(len(rows), requests * experiments)
-
     for experiment in range(experiments):
         with running(LAYOUTS[layout], settings) as system:
             robot = Robot(system.requests, system.inbox, timeout_s=timeout_s, unsafe_pickle=settings.unsafe_pickle)
-            ask = _patient(robot)
-            for _ in range(_WARM_UP):
-                ask()
-            for request in range(requests):
-                rows.append(row_of(ask(), experiment, request))
-                on_request()
+            missing = 0
+            for request in range(-_WARM_UP, requests):
+                answer = robot.ask()
+                missing = missing + 1 if answer.is_missing else 0
+                if missing >= _MAX_MISSING:
+                    text = f"None of {missing} requests in a row was answered within {timeout_s:g} s each."
+                    raise ExperimentError("robot", text)
+                if request < 0:
+                    continue
+                rows.append(row_of(answer, experiment, request))
+                if progress is not None:
+                    progress(len(rows), requests * experiments)
         counts += robot.counts
     return Results(layout, table_of(rows), counts)
-
-
-def _patient(robot: Robot) -> Callable[[], Any]:
-    """Return the robot's ask, which gives up when nobody has answered several times in a row."""
-    missing = 0
-
-    def ask() -> Any:
-        nonlocal missing
-        answer = robot.ask()
-        missing = missing + 1 if answer.is_missing else 0
-        if missing >= _MOST_MISSING:
-            text = f"Nobody answered {missing} requests in a row within {robot.timeout_s:g} s each."
-            raise ExperimentError("robot", text)
-        return answer
-
-    return ask
-
-
-def _check(layout: str, **counts: int) -> None:
-    if layout not in list(LAYOUTS):
-        raise ExperimentError("layout", f"There is no layout {layout!r}. There are: {', '.join(LAYOUTS)}.")
-    for name, count in counts.items():
-        if type(count) is not int or count < 1:
-            raise ExperimentError(name, f"{name} must be a whole number from 1, not {count!r}.")
 
 
 def _check_number(name: str, number: float, most: float = math.inf) -> None:
@@ -145,7 +250,7 @@ def _check_number(name: str, number: float, most: float = math.inf) -> None:
 
 
 def _checked_keys(keys: str | Path | None, allow: Sequence[str | Path] | None) -> tuple[str, tuple[str, ...]]:
-    """Return the files of keys as they can be told to another process."""
+    """Return the files of keys as absolute paths, for other processes."""
     if keys is None:
         if allow:
             raise KeysError("", "allow= was given, but no keys. Give keys= as well: epypes keys makes them.")
@@ -156,7 +261,7 @@ def _checked_keys(keys: str | Path | None, allow: Sequence[str | Path] | None) -
 
 
 def _checked_cameras(cameras: Sequence[str | Path | int]) -> tuple[str | int, ...]:
-    """Return the sources as they can be told to another process."""
+    """Return the sources, paths as absolute ones, for other processes."""
     given = [cameras] if isinstance(cameras, str | Path | int) else list(cameras)
     if len(given) not in (0, 2) or any(not isinstance(source, str | Path | int) for source in given):
         raise ExperimentError("cameras", f"cameras must be two, each a path or the number of a device, not {given!r}.")

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from epypes.errors import MailboxOverflow, MessageError, ServiceError
 from epypes.run import Failure
 from epypes.service.failures.record import FAILURE_TOPIC, FailedEvent
-from epypes.store.later import SeriesWriter
+from epypes.store.writer import SeriesWriter
 from epypes.transport.channel import Confirmed
 from epypes.transport.throttle import Throttle
 from epypes.wire import EncodedEnvelope, failure_event

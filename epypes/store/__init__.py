@@ -1,8 +1,13 @@
-"""Results and history in a database: a SQLite file, or any other that SQLAlchemy speaks to."""
+"""Results and history in a database: a SQLite file, or any other that SQLAlchemy supports.
+
+- ``store``: a database of series, and series of rows
+- ``database``: transactions, statements, and errors in plain words; the only module that imports SQLAlchemy at its top
+- ``place``: the URL of a database
+- ``writer``: writing on a background thread, so that no caller waits for a disk or a database
+"""
 
 from __future__ import annotations
 
-from epypes.store.series import Series
-from epypes.store.store import Store, as_store, opened_store
+from epypes.store.store import Series, Store, opened_store
 
-__all__ = ["Series", "Store", "as_store", "opened_store"]
+__all__ = ["Series", "Store", "opened_store"]

@@ -1,116 +1,252 @@
-"""Who writes, so that whoever has something to keep waits for no disk and no database?
-
-One thread, which begins with the first thing that waits and ends when nothing does. What waits, and when it is due, is
-decided by what is handed in: failures of a service by cause, rows of a series in a line.
-"""
+"""Writing on a background thread, so that no caller waits for a disk or a database."""
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Mapping
+from itertools import islice
+from pathlib import Path
 from time import monotonic
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, Final, Generic, TypeVar
+
+from epypes.errors import StoreError
+from epypes.optional import optional_import
+from epypes.store.store import Series, Store
 
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
 
-# While somebody waits for it, what failed is tried again so often.
-_FLUSHING_S: Final = 0.1
+# A write that failed is tried again after the first pause, then after twice as long, up to the longest; while a caller
+# waits in flush(), after the short one.
+_FIRST_PAUSE_S: Final = 0.5
+_LONGEST_PAUSE_S: Final = 30.0
+_FLUSHING_PAUSE_S: Final = 0.1
+
+# Waiting rows are in memory; a row of an event has about 1 KB.
+_MAX_ROWS: Final = 10_000
+_ROWS_AT_A_TIME: Final = 200
 
 
-class Waiting(Protocol):
-    """What waits to be written. Not for threads: the writer holds its lock. Times are in seconds."""
-
-    def __len__(self) -> int: ...
-
-    def take(self, now_s: float, *, at_once: bool = False) -> Any:
-        """Return what is to be written now, None if nothing is; ``at_once`` does not wait until it is due."""
-
-    def due_in_s(self, now_s: float) -> float | None:
-        """Return in how many seconds the next is to be written; None if nothing waits."""
-
-
-class Writer:
-    """Writes what waits on a thread of its own.
+class BackgroundWriter(Generic[_T]):
+    """Writes items in order on a daemon thread, which begins with the first item and ends when none waits.
 
     Parameters
     ----------
     name
-        Of the thread.
-    waiting
-        What waits.
+        The thread's name.
     write
-        Called on the thread with what was taken. What it raises is logged, and the next is written.
-    begin
-        Called on the thread when it begins.
+        Called on the thread with the next items. If it returns False, they stay and are tried again later, with pauses
+        that grow to 30 seconds. If it raises, that is logged and they are dropped.
+    most
+        How many items may wait.
+    at_a_time
+        How many items are written at a time.
     """
 
     def __init__(
-        self, name: str, waiting: Waiting, write: Callable[[Any], object], begin: Callable[[], object] = lambda: None
+        self,
+        name: str,
+        write: Callable[[list[_T]], bool],
+        *,
+        most: int,
+        at_a_time: int = 1,
     ) -> None:
-        self._name, self._waiting, self._write, self._begin = name, waiting, write, begin
-        self._turn = threading.Condition()
-        self._is_writing, self._is_flushing = False, 0
+        self._name, self._write = name, write
+        self._most, self._at_a_time = most, at_a_time
+        self._items: deque[_T] = deque()
+        self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
+        self._flushing = 0
+        self._failed_s, self._pause_s = 0.0, 0.0
 
-    def put(self, change: Callable[[float], _T]) -> _T:
-        """Change what waits, and have it written; return at once what the change returns.
+    def __len__(self) -> int:
+        """How many items wait, or are being written."""
+        return len(self._items)
 
-        Parameters
-        ----------
-        change
-            Called with the time, while no other changes it.
-        """
-        with self._turn:
-            found = change(monotonic())
+    def put(self, item: _T) -> bool:
+        """Have an item written; return at once, and whether there was room for it."""
+        with self._changed:
+            fits = len(self._items) < self._most
+            if fits:
+                self._items.append(item)
             self._start()
-            self._turn.notify_all()
-        return found
-
-    def _start(self) -> None:
-        if self._thread is None and self._waiting:
-            thread = threading.Thread(target=self._write_all, name=self._name, daemon=True)
-            try:
-                thread.start()
-            except RuntimeError:
-                # No more threads, or the interpreter ends: it waits for the next that is put.
-                return
-            self._thread = thread
+        return fits
 
     def flush(self, timeout_s: float = 5.0) -> bool:
-        """Have all that waits written now; return whether that was done in time."""
-        with self._turn:
-            self._is_flushing += 1
+        """Write all that waits now; return whether that was done in time."""
+        with self._changed:
+            self._flushing += 1
             self._start()
-            self._turn.notify_all()
             try:
-                return self._turn.wait_for(lambda: not self._waiting and not self._is_writing, timeout_s)
+                return self._changed.wait_for(lambda: not self._items, timeout_s)
             finally:
-                self._is_flushing -= 1
+                self._flushing -= 1
 
-    def _write_all(self) -> None:
-        self._begin()
-        while (found := self._next()) is not None:
+    def _start(self) -> None:
+        if self._thread is None and self._items:
+            thread = threading.Thread(target=self._run, name=self._name, daemon=True)
             try:
-                self._write(found)
-            except Exception:  # the next must be written, whatever was wrong with this one
+                thread.start()
+            except RuntimeError:  # no more threads, or the interpreter ends: the next put tries again
+                return
+            self._thread = thread
+        self._changed.notify_all()
+
+    def _run(self) -> None:
+        while items := self._next():
+            try:
+                is_done = self._write(items)
+            except Exception:  # the next items must be written, whatever is wrong with these
                 _log.exception("%s could not write", self._name)
-            finally:
-                # So that its memory is given back while the next is waited for.
-                found = None
-                with self._turn:
-                    self._is_writing = False
-                    self._turn.notify_all()
+                is_done = True
+            with self._changed:
+                if is_done:
+                    for _ in items:
+                        self._items.popleft()
+                    self._pause_s = 0.0
+                else:
+                    self._failed_s = monotonic()
+                    self._pause_s = min(max(2 * self._pause_s, _FIRST_PAUSE_S), _LONGEST_PAUSE_S)
+                self._changed.notify_all()
+            del items  # their memory is given back while the next ones are waited for
 
-    def _next(self) -> Any:
-        """Return what is to be written, once it is due; None if nothing waits any more."""
-        with self._turn:
-            while (due_in_s := self._waiting.due_in_s(monotonic())) is not None:
-                found = self._waiting.take(monotonic(), at_once=self._is_flushing > 0)
-                if found is not None:
-                    self._is_writing = True
-                    return found
-                self._turn.wait(min(due_in_s, _FLUSHING_S) if self._is_flushing else due_in_s)
+    def _next(self) -> list[_T]:
+        """Return the next items, once they are due; none if none wait."""
+        with self._changed:
+            while self._items:
+                pause_s = min(self._pause_s, _FLUSHING_PAUSE_S) if self._flushing else self._pause_s
+                due_in_s = self._failed_s + pause_s - monotonic()
+                if due_in_s <= 0:
+                    return list(islice(self._items, self._at_a_time))
+                self._changed.wait(due_in_s)
             self._thread = None
-            return None
+            return []
+
+
+class SeriesWriter:
+    """Writes rows to a series on a background thread; while the database is away, they wait.
+
+    Parameters
+    ----------
+    store
+        A path, a URL or a Store. It is opened on the thread too, so that it may be away for now.
+    kind, name, about
+        As for `Store.series`.
+    most
+        How many rows may wait.
+    report
+        Called on the thread with a sentence on what goes wrong; without, it goes to the log.
+
+    Raises
+    ------
+    StoreError
+        There can be no such database, or there is no driver for it.
+
+    Notes
+    -----
+    Any thread may use it. Close it, so that all rows are written.
+    """
+
+    def __init__(
+        self,
+        store: str | Path | Store,
+        kind: str,
+        name: str,
+        *,
+        about: Mapping[str, Any] | None = None,
+        most: int = _MAX_ROWS,
+        report: Callable[[str], object] = _log.warning,
+    ) -> None:
+        self._kind, self._name, self._about = kind, name, about
+        self._store = store if isinstance(store, Store) else None
+        # Of a store that is opened here, and closed here too.
+        self._place = None if isinstance(store, Store) else store
+        if self._place is not None:
+            with optional_import():
+                from epypes.store.database import check_place
+            check_place(self._place)
+        self._series: Series | None = None
+        self._on_problem = report
+        self._is_away = False
+        self._counts = {"written": 0, "skipped": 0, "unwritten": 0}
+        self._lock = threading.Lock()
+        self._writer = BackgroundWriter(f"epypes {kind}", self._write, most=most, at_a_time=_ROWS_AT_A_TIME)
+
+    def append(self, key: str, data: Mapping[str, Any]) -> bool:
+        """Have a row written; return at once, and whether there was room for it. ``data`` must not change any more."""
+        fits = self._writer.put((key, data))
+        with self._lock:
+            self._counts["skipped"] += not fits
+        return fits
+
+    def counts(self) -> dict[str, int]:
+        """Return how many rows were written, were skipped (no room), are no JSON (unwritten), and wait."""
+        with self._lock:
+            return {**self._counts, "waiting": len(self._writer)}
+
+    def flush(self, timeout_s: float = 5.0) -> bool:
+        """Write all rows that wait now; return whether that was done in time."""
+        return self._writer.flush(timeout_s)
+
+    def close(self, timeout_s: float = 5.0) -> bool:
+        """Write all rows that wait, and close a store that was opened for it; return whether that was done in time."""
+        is_done = self.flush(timeout_s)
+        if is_done and self._place is not None and self._store is not None:
+            self._store.close()
+            # A later row opens it again.
+            self._store = self._series = None
+        return is_done
+
+    # on the thread, to the end of the class
+
+    def _write(self, rows: list[tuple[str, Mapping[str, Any]]]) -> bool:
+        try:
+            written = self._put(rows)
+        except StoreError as error:
+            is_first, self._is_away = not self._is_away, True
+            if is_first:
+                self._report(f"{error} Rows of {self._kind} {self._name!r} wait for it.")
+            return False
+        with self._lock:
+            self._counts["written"] += written
+            self._counts["unwritten"] += len(rows) - written
+        if self._is_away:
+            _log.info("Rows of %s %r are written again.", self._kind, self._name)
+        self._is_away = False
+        return True
+
+    def _put(self, rows: list[tuple[str, Mapping[str, Any]]]) -> int:
+        """Write rows; return how many, since a row that is no JSON can never be written."""
+        series = self._opened()
+        try:
+            series.append_all(rows)
+        except StoreError:
+            raise
+        except Exception:  # one row is no JSON, or fails in another way; the others are written
+            return sum(self._is_put(series, row) for row in rows)
+        return len(rows)
+
+    def _is_put(self, series: Series, row: tuple[str, Mapping[str, Any]]) -> bool:
+        try:
+            series.append(*row)
+        except StoreError:
+            raise
+        except Exception as error:
+            self._report(str(error) or repr(error))
+            return False
+        return True
+
+    def _report(self, text: str) -> None:
+        try:
+            self._on_problem(text)
+        except Exception:  # the rows must be written, whatever is wrong with the caller's function
+            _log.exception("the function that gets reports of %s %r failed", self._kind, self._name)
+
+    def _opened(self) -> Series:
+        if self._series is None:
+            if self._store is None:
+                self._store = Store(self._place or "")
+            self._series = self._store.series(self._kind, self._name, about=self._about)
+        return self._series

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from epypes.acquisition import read_image, write_image
-from epypes.acquisition.quiet import quiet
+from epypes.acquisition.files import quiet_opencv
 from epypes.errors import ImageFileError
 
 
@@ -63,8 +63,8 @@ def test_opencv_stays_quiet_until_the_last_reader_has_done():
     # Up to OpenCV 4.12 the functions are in cv2 itself.
     logging = getattr(cv2.utils, "logging", cv2)
     before = logging.getLogLevel()
-    with quiet():
-        with quiet():
+    with quiet_opencv():
+        with quiet_opencv():
             pass
         assert logging.getLogLevel() == 0
     assert logging.getLogLevel() == before

@@ -1,4 +1,4 @@
-"""How many items make one job?"""
+"""The number of items in one job."""
 
 from __future__ import annotations
 

@@ -262,7 +262,7 @@ def test_results_that_another_process_has_stored_are_taken_if_nothing_was_edited
     assert len(first) == len(FORMS)
 
 
-def test_a_graph_that_uses_what_nobody_can_see_through_is_run_again_each_time(tmp_path: Path) -> None:
+def test_a_graph_with_an_object_that_has_no_digest_is_run_again_each_time(tmp_path: Path) -> None:
     orb = [cv2.ORB_create(5)]
     calls: list[int] = []
     logger = log_to(calls.append)
@@ -471,12 +471,12 @@ class Near:
         np.frompyfunc(lambda tokens, case: 1, 2, 1),
     ],
 )
-def test_what_nobody_can_see_through_is_refused(metric: Any) -> None:
+def test_a_function_with_an_object_that_has_no_digest_is_refused(metric: Any) -> None:
     with pytest.raises(NoDigest):
         function_digest(metric)
 
 
-def test_objects_are_told_by_what_is_in_them() -> None:
+def test_objects_are_compared_by_class_and_state() -> None:
     assert function_digest(Near(1)) == function_digest(Near(1)) != function_digest(Near(2))
 
 
@@ -570,7 +570,7 @@ def test_what_differs_has_another_digest_and_another_text(values):
 
 
 @pytest.mark.parametrize("level", [1, 7])
-def test_an_array_in_a_file_is_told_by_what_is_in_it(tmp_path, level):
+def test_an_array_in_a_file_is_compared_by_content(tmp_path, level):
     found = []
     for number, content in enumerate((image(level), image(level), image(level + 1))):
         mapped = np.memmap(tmp_path / f"{number}.dat", np.uint8, "w+", shape=(100, 100))
@@ -590,7 +590,7 @@ def test_what_a_person_can_read_stays_readable():
     assert value_label(image(1)).startswith("uint8 (100, 100) ")
 
 
-def test_data_whose_content_can_not_be_told_has_no_digest() -> None:
+def test_data_whose_content_pickle_does_not_have_has_no_digest() -> None:
     memory = shared_memory.SharedMemory(create=True, size=8)
     try:
         for value in (threading.local(), [cv2.ORB_create()], {"a": (memory,)}, (n for n in ())):
@@ -613,7 +613,7 @@ def test_a_file_of_a_payload_counts_by_its_content_and_how_it_is_read(tmp_path: 
             payload_digest({"image": tmp_path / name})
 
 
-def test_a_path_that_is_a_value_is_told_by_its_name_and_its_file(tmp_path):
+def test_a_path_that_is_a_value_counts_by_its_name_and_its_file(tmp_path):
     assert value_digest(Path("a.txt")) != value_digest(Path("b.txt"))
     before = value_digest(tmp_path / "a.txt")
     (tmp_path / "a.txt").write_text("x")

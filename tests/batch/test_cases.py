@@ -1,4 +1,4 @@
-"""What is a case, and which words are there for it?"""
+"""Cases of a labelled set, in Python and in CASES.toml: their checks, and what is refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Does a labelled set say which cases pass, and why the others do not?"""
+"""The check of a labelled set: which cases pass, the reasons of the others, and what is shown."""
 
 from __future__ import annotations
 

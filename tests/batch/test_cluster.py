@@ -1,4 +1,4 @@
-"""Does a Dask cluster give the same results, also when its workers die?"""
+"""A Dask cluster gives the same results, also when its workers die."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from distributed import Client, LocalCluster
 import epypes as ep
 from epypes.batch.executors import worker_count
 from epypes.errors import ExecutorBroken
-from tests.batch.test_spreading import mixed, mortal_runner, without_times
+from tests.batch.test_executors import mixed, mortal_runner, without_times
 from tests.bundle.cells import cell
 
 pytestmark = pytest.mark.slow
@@ -57,7 +57,7 @@ def until(condition, what):
         threading.Event().wait(0.005)
 
 
-def test_a_client_that_was_closed_is_told_with_the_way_out(client, runner, crops):
+def test_a_client_that_was_closed_raises_with_the_way_out(client, runner, crops):
     with Client(client.scheduler.address) as other:
         executor = other.get_executor()
         assert worker_count(executor) == 2

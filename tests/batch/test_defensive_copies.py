@@ -79,7 +79,7 @@ def test_arrays_of_a_list_are_not_copied():
 
 
 @pytest.mark.parametrize("threads", [0, 2])
-def test_who_changes_the_runner_meanwhile_changes_nothing_that_is_computed_or_stored(threads, tmp_path):
+def test_a_change_of_the_runner_meanwhile_changes_nothing_that_is_computed_or_stored(threads, tmp_path):
     table = np.ones(3)
     runner = runner_of(lambda image, gain, tables: float(gain + tables[0].sum()), "image", "gain", "tables")
     runner.freeze(gain=1, tables=(table,))
@@ -102,7 +102,7 @@ def test_who_changes_the_runner_meanwhile_changes_nothing_that_is_computed_or_st
     ] * 3
 
 
-def test_who_changes_the_runner_during_a_sweep_or_a_check_changes_nothing():
+def test_a_change_of_the_runner_during_a_sweep_or_a_check_changes_nothing():
     runner = runner_of(lambda image, gain, table: float(gain + table.sum()), "image", "gain", "table")
 
     def frames():

@@ -93,6 +93,8 @@ STEPPED = [
     (ep.Param(0.1, 0.3, step=0.1), 0.3, [0.1, 0.2, 0.3]),
     (ep.Param(-0.3, 0.6, step=0.3), 0.0, [-0.3, 0.0, 0.3, 0.6]),
     (ep.Param(0.0, 2.0, step=2 / 3), 0.0, [0.0, 0.6666666666666666, 1.3333333333333333, 2.0]),
+    (ep.Param(0, 4, step=2), 0.0, [0.0, 2.0, 4.0]),
+    (ep.Param(0.0, 0.5, step=0.25), 0, [0.0, 0.25, 0.5]),
     (ep.Param(1 / 3, 0.7, step=0.1), 1 / 3, [1 / 3, 0.4333333333333333, 0.5333333333333333, 0.6333333333333333]),
 ]
 
@@ -148,7 +150,7 @@ def test_a_logarithmic_range_is_drawn_as_often_below_its_geometric_mean_as_above
         ({"offset": np.int64(5)}, {"how": "zip"}, r"no list of values"),
         ({"offset": np.array(5)}, {"how": "random", "n": 3}, "offset=5 is neither a range"),
         ({"method": "near"}, {}, r"Write method=\['near'"),
-        ({"method": None}, {}, "Nothing says which values 'method' may take"),
+        ({"method": None}, {}, "No hint gives the values that 'method' may take"),
         ({"scale": None}, {}, "no end of values for 'scale'"),
         ({"offset": (0, 4)}, {"how": "random"}, "Say how many"),
         ({"offset": [1]}, {"n": 5}, "goes with how='random'"),

@@ -1,4 +1,4 @@
-"""Which inputs does an image set give, under which names?"""
+"""The inputs of image sets, and their names."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_files_are_found_from_another_folder_too(folder, runner, monkeypatch):
     assert all(payload_of(item, runner.cg)["image"].shape == (100, 150, 3) for item in items)
 
 
-def test_a_text_by_token_stays_a_text_and_a_missing_file_is_told_when_it_is_opened(runner):
+def test_a_text_by_token_stays_a_text_and_a_missing_file_raises_when_it_is_read(runner):
     text = Item(0, "#0", {"image": "no path"})
     assert payload_of(text, runner.cg) == {"image": "no path"}
     (missing,) = items_of(["nowhere.png"], runner)

@@ -1,4 +1,4 @@
-"""What does a map give, in which order, and what does it keep?"""
+"""Maps: their values, their order, and what is kept and stored of them."""
 
 from __future__ import annotations
 
@@ -208,7 +208,7 @@ def test_other_hyperparameters_are_another_series(noted, calls, tmp_path):
     assert values(ep.map(noted, levels(1), store=tmp_path / "r.sqlite", name="b"), "out") == [3.0]
 
 
-def test_a_series_that_somebody_has_looked_for_is_not_of_another_computation(noted, calls, tmp_path):
+def test_a_series_that_was_looked_for_before_is_not_of_another_computation(noted, calls, tmp_path):
     with ep.Store(tmp_path / "r.sqlite") as store:
         assert store.series("map", "a").to_frame().empty
         ep.map(noted, levels(1), store=store, name="a")
@@ -239,7 +239,7 @@ def test_a_graph_that_no_text_tells_from_others_wants_a_name(tmp_path):
         ep.map(runner, levels(1), store=tmp_path / "r.sqlite")
 
 
-def test_arrays_are_told_apart_by_what_is_in_them(noted, calls, tmp_path):
+def test_arrays_are_compared_by_content(noted, calls, tmp_path):
     ep.map(noted, levels(1, 2), store=tmp_path / "r.sqlite", name="a")
     result = ep.map(noted, levels(2, 5), store=tmp_path / "r.sqlite", name="a")
     assert values(result, "out") == [4.0, 10.0]

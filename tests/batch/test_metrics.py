@@ -1,4 +1,4 @@
-"""Is each metric the number that it is said to be?"""
+"""Each built-in metric has the value of its definition."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Does every outcome stand where it belongs on a contact sheet, and is the sheet small enough for a notebook?"""
+"""The contact sheet of a sweep: where each outcome stands, and the size of its page."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 import epypes as ep
-from epypes.batch.contact_sheet import Tile, said
+from epypes.batch.contact_sheet import Tile, short_text
 from epypes.batch.results import Thumbnail
 from epypes.display.limits import CHARACTERS, THUMBNAIL_CHARACTERS
 from epypes.errors import ScaleError, UnknownName
@@ -125,7 +125,7 @@ def test_a_token_without_pictures_is_shown_as_text() -> None:
     result = ep.sweep(runner, {"power": [1, 2]})
     assert [tile.text for tile in result.sheet("level").tiles] == ["4.0", "16.0"]
     assert [tile.text for tile in result.sheet("half").tiles] == ["2.0", "8.0"]
-    assert [tile.text for tile in result.sheet("table").tiles] == [said(table_of(4.0))] * 2
+    assert [tile.text for tile in result.sheet("table").tiles] == [short_text(table_of(4.0))] * 2
     assert "16.0" in html_of(result.sheet("level"))
     assert "power" not in result[0].texts
     only = ep.sweep(runner, {"power": [1, 2]}, show=())

@@ -123,7 +123,7 @@ def test_a_folder_that_was_moved_or_copied_goes_on(folder, tmp_path, store):
     ],
     ids=["list", "tuple", "masked", "of nobody knows what"],
 )
-def test_values_that_are_no_plain_arrays_are_told_by_what_is_in_them(given, store):
+def test_values_that_are_no_plain_arrays_are_compared_by_content(given, store):
     runner = runner_of(total, "image")
     for level in (10, 200):
         image = np.zeros((100, 100), np.uint8)
@@ -131,7 +131,7 @@ def test_values_that_are_no_plain_arrays_are_told_by_what_is_in_them(given, stor
         assert stored(runner, [given(image)], store)
 
 
-def test_keypoints_are_told_by_what_they_say(store):
+def test_keypoints_are_compared_by_content(store):
     runner = runner_of(strength, "keypoints")
     for _ in range(2):
         for response in range(10):
@@ -140,7 +140,7 @@ def test_keypoints_are_told_by_what_they_say(store):
     assert rows(store) == 10
 
 
-def test_what_nobody_can_look_into_is_run_each_time_and_not_written(store):
+def test_an_item_without_a_digest_is_run_each_time_and_not_written(store):
     class Frame(threading.local):
         def __init__(self, level):
             self.level = level
@@ -151,7 +151,7 @@ def test_what_nobody_can_look_into_is_run_each_time_and_not_written(store):
     assert rows(store) == 0
 
 
-def test_hyperparameters_in_tuples_are_told_by_what_is_in_them(store):
+def test_hyperparameters_in_tuples_are_compared_by_content(store):
     image = np.zeros((2, 2))
     table = np.zeros(5000)
     runner = runner_of(lambda image, tables: float(tables[0].sum()), "image", "tables", tables=(table.copy(),))
@@ -161,13 +161,13 @@ def test_hyperparameters_in_tuples_are_told_by_what_is_in_them(store):
     assert stored(runner, [image], store) == [7.0]
 
 
-def test_a_hyperparameter_that_nobody_can_look_into_is_refused_by_name(store):
+def test_a_hyperparameter_without_a_digest_is_refused_by_name(store):
     runner = runner_of(lambda image, model: 1, "image", "model", model=cv2.ORB_create())
     with pytest.raises(ScaleError, match=r"Hyperparameter 'model' is or holds a 'ORB'"):
         ep.map(runner, [np.zeros((2, 2))], store=store, name="n")
 
 
-def test_settings_with_arrays_are_told_by_what_is_in_them(store):
+def test_settings_with_arrays_are_compared_by_content(store):
     runner = runner_of(lambda image, table: float(table[0].sum()), "image", "table", table=(np.zeros(1),))
     for level in (1.0, 2.0):
         table = np.zeros(5000)

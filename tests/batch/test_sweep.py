@@ -1,4 +1,4 @@
-"""Does a sweep run what it must, once, and leave everything else as it was?"""
+"""A sweep runs what it must, once, and leaves everything else as it was."""
 
 from __future__ import annotations
 
@@ -331,7 +331,7 @@ def corners(gradient, quality):
 
 
 @pytest.mark.slow
-def test_the_same_value_has_the_same_picture_whoever_makes_it_and_in_whatever_order(
+def test_the_same_value_has_the_same_picture_on_every_executor_and_in_every_order(
     processes: Any, crops: list[Any]
 ) -> None:
     made = cell(SIGNED)

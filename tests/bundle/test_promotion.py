@@ -222,7 +222,7 @@ def test_a_token_without_codec_refuses_promotion_by_name(tmp_path):
 
 def test_a_hyperparameter_that_toml_cannot_hold_is_refused_by_name(tmp_path):
     cg = ep.CompGraph({"add": np.add}, {"add": (("x", "k"), "y")})
-    runner = ep.CompGraphRunner(cg, {"k": np.ones(999)})
+    runner = ep.CompGraphRunner(cg, {"k": [np.ones(999)]})
     runner.run(x=np.zeros(999))
     with pytest.raises(
         PromotionRefused, match=r"'k' is or holds an array of 999 numbers; 400 are the most that pipeline\.toml holds"
@@ -347,7 +347,7 @@ def test_what_is_put_there_while_the_promotion_runs_is_kept(when, was_there, bun
     if when == "exchanging" and not was_there:
         bundle.path.mkdir()
     with pytest.raises(PromotionRefused, match=re.escape(str(bundle.path))):
-        ep.promote(runner, bundle.path, told=lambda text: put() if when in text else None)
+        ep.promote(runner, bundle.path, on_progress=lambda text: put() if when in text else None)
     assert mine.read_text() == "important"
     assert [path.name for path in bundle.path.parent.iterdir()] == [bundle.path.name]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import functools
 import linecache
 import re
@@ -48,7 +49,7 @@ def promoted(source: str, function: str = "f", arity: int = 1):
 
 def executed(text: str) -> types.SimpleNamespace:
     names: dict = {"__name__": "bundle"}
-    exec(compile(text, "bundle", "exec"), names)
+    exec(compile(text, "bundle", "exec", dont_inherit=True), names)
     return types.SimpleNamespace(**names)
 
 
@@ -338,3 +339,73 @@ def test_an_array_keeps_its_layout(made):
 def test_an_array_that_is_part_of_another_is_refused_with_the_way_out(made):
     _, refusals = promoted(f"M = np.arange(6.0).reshape(2, 3)\nK = {made}\ndef f(x):\n    return K\n")
     assert "Make it a whole one in the notebook: np.ascontiguousarray(" in refusals[0]
+
+
+CONSTANTS = {
+    "several lines with comments": ("K = (1,  # low\n     'two')  # in mm\n", "K = (1,  # low\n     'two')  # in mm\n"),
+    "a text over lines": ('K = """a\n    b"""\n', 'K = """a\n    b"""\n'),
+    "inside of a block": ("if True:\n    # why\n    K = [1,\n         2]\n", "# why\nK = [1,\n         2]\n"),
+    "two on one line": ("K = 1.50; L = 2  # both\n", "K = 1.50\n"),
+    "with an annotation": ("K: int = 0x10  # bits\n", "K = 16  # bits\n"),
+    "in brackets over lines": ("K = (1 +\n     2)\n", "K = (1 +\n     2)\n"),
+    "computed from another": ("L = 2\nK = L * 3\n", "K = 6  # L * 3 in the notebook\n"),
+    "changed since": ("K = [1]  # one\nK.append(2)\n", "K = [1, 2]\n"),
+    "given by a call": ("K = dict(a='x')\n", 'K = {"a": "x"}  # dict(a=\'x\') in the notebook\n'),
+    "too long for a line": (
+        "K = tuple(f'number {i}' for i in range(8))\n",
+        '# tuple((f\'number {i}\' for i in range(8))) in the notebook\nK = (\n    "number 0",\n    "number 1",\n',
+    ),
+    "a call too long for a line": (
+        "K = np.arange(16.0).reshape(2, 8) / 3 + 100\n",
+        "# np.arange(16.0).reshape(2, 8) / 3 + 100 in the notebook\nK = np.array(\n    [\n        [\n            100.0,\n",
+    ),
+}
+
+
+@pytest.mark.parametrize(("source", "written"), CONSTANTS.values(), ids=CONSTANTS)
+def test_a_constant_stands_as_the_notebook_has_it_or_with_how_it_was_computed(source, written):
+    source += "def f(x):\n    return repr(K)\n"
+    text, refusals = promoted(source)
+    assert refusals == []
+    assert f"\n{written}" in text
+    assert executed(text).func_dict["f"](0) == notebook(source)["f"](0)
+
+
+class Token(enum.StrEnum):
+    INPUT = "the image"
+    MASK = "mask"
+
+
+def test_members_of_an_enumeration_as_names_are_written_as_their_text():
+    names = notebook("def f(*numbers):\n    return sum(numbers)\n")
+    cg = ep.CompGraph({Token.MASK: names["f"]}, {Token.MASK: ([Token.INPUT, Token.MASK], "sum")})
+    cg = ep.group(cg, Token.INPUT, [Token.MASK])
+    needed, references = slice_graph(cg.functions)
+    module = executed(emit_module(SETTINGS, cg, needed, references))
+    assert repr(module.func_io) == "{'mask': (('the image', 'mask'), 'sum')}"
+    assert repr(module.func_groups) == "{'the image': ['mask']}"
+
+
+RECORD = "from dataclasses import dataclass\n@dataclass(frozen=True)\nclass Cfg:\n    k: int = 3\n"
+ORDERED = {
+    "a class that reads records": f"def f(x):\n    return D.z + x\n{RECORD}A, B = Cfg(1), Cfg(2)\nclass D:\n    z = A.k + B.k\n",
+    "a decorator that reads a record when it decorates": (
+        f"{RECORD}def deco(g):\n    by = CFG.k\n    @functools.wraps(g)\n    def w(x):\n        return g(x) + by\n    return w\n"
+        "CFG = Cfg(5)\n@deco\ndef f(x):\n    return x\n"
+    ),
+    "a factory that reads a table at once": (
+        "def make():\n    by = T['a']\n    def inner(x):\n        return x + by(x)\n    return inner\n"
+        "def twice(x):\n    return 2 * x\nT = {'a': twice}\nf = make()\n"
+    ),
+    "classes that make each other": (
+        "class A:\n    n = 1\n    def other(self):\n        return B()\nclass B(A):\n    n = 2\n    def back(self):\n        return A().n\n"
+        "def f(x):\n    return A().other().n + B().back() + x\n"
+    ),
+}
+
+
+@pytest.mark.parametrize("source", ORDERED.values(), ids=ORDERED)
+def test_what_importing_a_definition_reads_stands_before_it(source):
+    text, refusals = promoted(source)
+    assert refusals == []
+    assert executed(text).func_dict["f"](3) == notebook(source)["f"](3)

@@ -10,7 +10,7 @@ import numpy as np
 import skimage
 from skimage import exposure, feature, filters, measure, morphology, restoration, segmentation, transform  # noqa: F401
 
-from epypes.catalog import Entry, parameter_names
+from epypes.catalog import CatalogEntry, parameter_names
 
 GRAY: Final = np.zeros((40, 48), np.uint8)
 GRAY[8:20, 10:30] = 200
@@ -167,7 +167,7 @@ _NUMBERS: Final = frozenset(
 )
 
 
-def function_of(entry: Entry) -> Any:
+def function_of(entry: CatalogEntry) -> Any:
     """Return the function of an entry; None if this version of the library has none."""
     found: Any = {"cv2": cv2, "skimage": skimage}[entry.library]
     for part in entry.function.split("."):
@@ -183,7 +183,7 @@ def names_of(function: Any) -> tuple[str, ...]:
         return parameter_names(function)
 
 
-def called(entry: Entry, value: Any) -> Any:
+def called(entry: CatalogEntry, value: Any) -> Any:
     """Call the function of an entry with this value, and use what it makes."""
     is_side = entry.parameter in _SIDES and entry.function not in _NUMBERS
     given = dict(_GIVEN.get(entry.function, {} if entry.library == "cv2" else _PLAIN))

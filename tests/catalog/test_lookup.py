@@ -15,12 +15,12 @@ from cv2 import GaussianBlur as soften
 from skimage import filters
 from skimage.feature import canny as find_edges
 
-from epypes.catalog import Entry, entry_of, parameter_names, table, uses, usual
+from epypes.catalog import CatalogEntry, entry_of, parameter_names, table, uses, usual
 
 BLUR = "GaussianBlur"
 
 
-def entry(function: str, parameter: str) -> Entry:
+def entry(function: str, parameter: str) -> CatalogEntry:
     return next(entry for entry in table() if (entry.function, entry.parameter) == (function, parameter))
 
 

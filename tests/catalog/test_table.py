@@ -10,7 +10,7 @@ from typing import Any, Final
 import cv2
 import pytest
 
-from epypes.catalog import Entry, entry_of, parameter_names, table
+from epypes.catalog import CatalogEntry, entry_of, parameter_names, table
 from tests.catalog.calls import called, function_of, names_of
 
 # Just outside of what is allowed, the library refuses these too.
@@ -94,11 +94,11 @@ _GONE: Final = ("AKAZE_create", "KAZE_create", "BRISK_create")
 _ERRORS: Final = (cv2.error, ValueError, TypeError, LookupError, NameError, ArithmeticError, MemoryError)
 
 
-def named(entry: Entry) -> str:
+def named(entry: CatalogEntry) -> str:
     return f"{entry.library}.{entry.function}-{entry.parameter}"
 
 
-def is_there(entry: Entry) -> bool:
+def is_there(entry: CatalogEntry) -> bool:
     """Whether this version of the library has the function; one that is missing unexpectedly is tested, and fails."""
     return function_of(entry) is not None or entry.function not in _GONE
 
@@ -106,7 +106,7 @@ def is_there(entry: Entry) -> bool:
 PRESENT: Final = tuple(filter(is_there, table()))
 
 
-def ends(entry: Entry) -> list[Any]:
+def ends(entry: CatalogEntry) -> list[Any]:
     """Return the choices, or both ends of what is usual and of what is allowed."""
     param = entry.resolved()
     assert param is not None
@@ -120,7 +120,7 @@ def ends(entry: Entry) -> list[Any]:
     return [end for end in dict.fromkeys(inward) if (entry.function, entry.parameter, end) not in _SLOW]
 
 
-def default(entry: Entry) -> Any:
+def default(entry: CatalogEntry) -> Any:
     try:
         return inspect.signature(function_of(entry)).parameters[entry.parameter].default
     except ValueError:  # OpenCV's signatures don't say
@@ -130,7 +130,7 @@ def default(entry: Entry) -> Any:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Parameter:FutureWarning", "ignore:No inliers found:UserWarning")
 @pytest.mark.parametrize("entry", PRESENT, ids=named)
-def test_the_library_takes_what_the_table_allows(entry: Entry) -> None:
+def test_the_library_takes_what_the_table_allows(entry: CatalogEntry) -> None:
     assert entry.parameter in names_of(function_of(entry))
     assert entry_of(function_of(entry), entry.parameter) is entry
     assert not entry.cuts or entry.cuts in parameter_names(function_of(entry))
@@ -147,7 +147,7 @@ def test_the_library_takes_what_the_table_allows(entry: Entry) -> None:
 
 
 @pytest.mark.parametrize("entry", [entry for entry in PRESENT if entry.constants], ids=named)
-def test_all_constants_are_there(entry: Entry) -> None:
+def test_all_constants_are_there(entry: CatalogEntry) -> None:
     param = entry.resolved()
     assert param is not None
     missing = set(entry.constants) - set(param.labels or ())
@@ -157,7 +157,7 @@ def test_all_constants_are_there(entry: Entry) -> None:
 @pytest.mark.parametrize(
     "entry", [entry for entry in table() if entry.parameter in _REFUSED.get(entry.function, ())], ids=named
 )
-def test_what_the_library_refuses_is_outside_of_the_table(entry: Entry) -> None:
+def test_what_the_library_refuses_is_outside_of_the_table(entry: CatalogEntry) -> None:
     param = entry.resolved()
     assert param is not None
     for value in _REFUSED[entry.function][entry.parameter]:

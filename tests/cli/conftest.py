@@ -1,4 +1,4 @@
-"""Where do the commands that the tests run keep what they write?"""
+"""Folders for what the tested commands write."""
 
 from __future__ import annotations
 

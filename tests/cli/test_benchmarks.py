@@ -1,4 +1,4 @@
-"""Do the benchmarks run, compare equals and keep every row? No speed is asserted."""
+"""The benchmarks run, compare equals and keep every row. No speed is asserted."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rich.console import Console
 
 from epypes.experiment.components import Settings
 from epypes.experiment.layouts import LAYOUTS, running
-from epypes.experiment.robot import Robot
+from epypes.experiment.run import Robot
 from epypes.wire import attributes
 from tests.apart import apart
 from tests.benchmarks import brokers, case, engine, pipeline, tuning

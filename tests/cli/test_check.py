@@ -1,4 +1,4 @@
-"""Does ``epypes check`` tell continuous integration what it must know?"""
+"""``epypes check`` reports each case, by its output, its exit status and JUnit XML."""
 
 from __future__ import annotations
 

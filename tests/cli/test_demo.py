@@ -1,4 +1,4 @@
-"""Does the demo do the main job, and does it fail when it should?"""
+"""``epypes demo`` does the main job, and fails if a step fails."""
 
 from __future__ import annotations
 

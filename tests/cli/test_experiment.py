@@ -1,4 +1,4 @@
-"""Is the paper's experiment one command?"""
+"""``epypes experiment`` runs the paper's experiment, and leaves its table and figures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Does every command that fails exit non-zero with one actionable line?
+"""Every command that fails exits non-zero with one actionable line.
 
 Each command has a row here: a new one without a row fails the first test.
 """
@@ -102,7 +102,6 @@ ROWS = {
 # By command: what does not fail before it is looked for what an extra brings.
 FIRST = {
     "promote": ["{text}", "--to", "{folder}/b"],
-    "demo": ["{text}", "--to", "{folder}/demo"],
     "lab": ["{folder}"],
     "serve": ["{bundle}"],
 }
@@ -163,13 +162,30 @@ def test_an_option_that_there_is_not_exits_with_2(command, epypes):
     assert "No such option" in done.stderr
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "record tcp://127.0.0.1:5555 {folder}/a.mcap --seconds nan",
+        "record tcp://127.0.0.1:5555 {folder}/a.mcap --seconds -1",
+        "play {folder}/none.mcap --speed nan",
+        "stop {bundle} --timeout nan",
+        "serve {bundle} --job-timeout nan",
+        "serve {bundle} --threads 65",
+        "experiment --requests 1.5",
+    ],
+)
+def test_a_number_out_of_range_exits_with_2(words, places, epypes):
+    done = epypes(*words.format(**places).split())
+    assert done.returncode == 2
+    assert "Error: Invalid value for '--" in done.stderr
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "module", "package", "extra"),
     [
         ("promote", "nbclient", "nbclient", "service"),
         ("promote", "nbformat", "nbformat", "service"),
-        ("demo", "nbclient", "nbclient", "service"),
         ("lab", "jupyterlab", "jupyterlab", "notebook"),
         ("serve", "zmq", "pyzmq", "serve"),
     ],

@@ -1,4 +1,4 @@
-"""Do ``epypes failures`` and ``epypes replay`` tell what failed, and whether it fails again?"""
+"""``epypes failures`` and ``epypes replay`` report what failed, and whether it fails again."""
 
 from __future__ import annotations
 

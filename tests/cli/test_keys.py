@@ -1,4 +1,4 @@
-"""Do ``epypes keys`` and the options --keys and --allow let in whom they should, and nobody else?"""
+"""``epypes keys`` and the options --keys and --allow admit known peers alone."""
 
 from __future__ import annotations
 

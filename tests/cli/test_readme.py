@@ -1,4 +1,4 @@
-"""Do the README's commands and code do what it says?"""
+"""The README's commands and code do what it says."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Is a running service looked at, set and stopped from a terminal?"""
+"""A running service is inspected, set, exchanged and stopped from a terminal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which table of an experiment do tests of figures and fits share?"""
+"""The table and the images that tests of the experiment share."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Do acquisition and vision answer, with their times, whatever comes?"""
+"""Acquisition and vision answer, with their times, whatever comes."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from epypes.experiment.components import NODES, Settings, vision
-from epypes.experiment.messages import Request, StereoPair, keypoints_of
+from epypes.experiment.components import COMPONENTS, Settings, Vision
+from epypes.experiment.messages import Request, StereoPair, decode_keypoints
 from epypes.run import Failure
 from epypes.wire import Event, add_attribute, attributes
 
@@ -31,7 +31,7 @@ def queues():
 
 @pytest.fixture
 def acquisition(images, queues):
-    node = NODES["acquisition"](*queues, Settings(images, fps=50.0))
+    node = COMPONENTS["acquisition"](*queues, Settings(images, fps=50.0))
     failures = queue.SimpleQueue()
     node.on_error = failures.put
     node.failures = failures
@@ -75,7 +75,7 @@ def test_a_request_older_than_the_ring_is_a_failure_with_its_id(acquisition, que
 def test_a_slow_camera_is_no_dead_one(images, queues, fps, is_answered):
     q_in, _ = queues
     said = queue.SimpleQueue()
-    node = NODES["acquisition"](q_in, said, Settings(images, fps=fps))
+    node = COMPONENTS["acquisition"](q_in, said, Settings(images, fps=fps))
     node.on_error = said.put
     with node:
         assert node.wait_until_ready(TIMEOUT_S)
@@ -101,7 +101,7 @@ def test_a_camera_that_fails_while_it_runs_is_reported(acquisition):
 def test_vision_answers_a_pair_with_its_keypoints_and_the_times_of_both(pictures, queues):
     q_in, q_out = queues
     times = {"t_vreq": 1.5, "acquisition.t_pub": 2.5}
-    with vision(q_in, q_out, Settings()):
+    with Vision(q_in, q_out, Settings()):
         q_in.put(StereoPair(pictures, "abc", times))
         answer = q_out.get(timeout=TIMEOUT_S)
     said = attributes(answer)
@@ -109,7 +109,7 @@ def test_vision_answers_a_pair_with_its_keypoints_and_the_times_of_both(pictures
     assert times.items() <= said.items()
     assert set(said) == {*times, *(f"vision.{key}" for key in (*TIMES, "t_p", "o_cg"))}
     assert ordered(said, "vision")
-    keypoints = keypoints_of(answer.contents)
+    keypoints = decode_keypoints(answer.contents)
     assert keypoints.shape == (20, 4)
     assert np.allclose(keypoints[:, :2], keypoints[:, 2:]), "of two equal images"
 
@@ -117,7 +117,7 @@ def test_vision_answers_a_pair_with_its_keypoints_and_the_times_of_both(pictures
 def test_vision_fails_with_the_id_of_its_pair(queues):
     q_in, q_out = queues
     failures = queue.SimpleQueue()
-    node = vision(q_in, q_out, Settings())
+    node = Vision(q_in, q_out, Settings())
     node.on_error = failures.put
     with node:
         q_in.put(StereoPair((np.zeros((9, 9), complex),) * 2, "abc", {}))
@@ -129,10 +129,10 @@ def test_vision_fails_with_the_id_of_its_pair(queues):
 
 def test_contents_are_pickled_when_a_peer_of_2019_wants_them(pictures, queues):
     q_in, q_out = queues
-    with vision(q_in, q_out, Settings(unsafe_pickle=True)):
+    with Vision(q_in, q_out, Settings(unsafe_pickle=True)):
         q_in.put(StereoPair(pictures, "abc", {}))
         contents = q_out.get(timeout=TIMEOUT_S).contents
-    assert keypoints_of(contents, unsafe_pickle=True).shape == (20, 4)
+    assert decode_keypoints(contents, unsafe_pickle=True).shape == (20, 4)
     assert contents.startswith(b"\x80")
 
 
@@ -140,7 +140,7 @@ def test_functions_side_by_side_find_the_same(pictures, queues):
     q_in, q_out = queues
     found = []
     for workers in (1, 2):
-        with vision(q_in, q_out, Settings(workers=workers)):
+        with Vision(q_in, q_out, Settings(workers=workers)):
             q_in.put(StereoPair(pictures, "abc", {}))
             found.append(q_out.get(timeout=TIMEOUT_S).contents)
     assert found[0] == found[1]

@@ -1,4 +1,4 @@
-"""Are the log-normal distributions those of maximum likelihood, and is the summary that of the table?"""
+"""The log-normal distributions are those of maximum likelihood, and the summary is that of the table."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from epypes.experiment.fits import PAPER, lognormal_fit, summary
+from epypes.experiment.results import PAPER, lognormal_fit, summary
 
 
 def test_it_finds_the_distribution_that_the_values_were_drawn_from():

@@ -1,4 +1,4 @@
-"""Is the graph that of Figure 13?"""
+"""The graph is that of the paper's Figure 13."""
 
 from __future__ import annotations
 

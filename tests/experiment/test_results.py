@@ -1,4 +1,4 @@
-"""Are the durations of a row those of the paper?"""
+"""The durations of a row are those of the paper."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from epypes.experiment.results import COLUMNS, Results, durations_of, row_of, table_of
-from epypes.experiment.robot import Answer
+from epypes.experiment.run import Answer
 
 # Clocks of three machines that know nothing of each other.
 ACQUISITION_S, VISION_S = 1_000.0, 5_000_000.0

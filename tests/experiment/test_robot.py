@@ -1,4 +1,4 @@
-"""Does the robot take the right answer, and never wait for ever?"""
+"""The robot takes the right answer, and never waits for ever."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from epypes.errors import ExperimentError
-from epypes.experiment.messages import contents_of
-from epypes.experiment.robot import Robot
+from epypes.experiment.messages import encode_keypoints
+from epypes.experiment.run import Robot
 from epypes.run import Failure
 from epypes.wire import Envelope, JustBytes, add_attribute, attributes, failure_event
 
@@ -46,7 +46,7 @@ def robot_with():
 
 
 def answer(event, contents=None, **times) -> bytes:
-    message = JustBytes(contents=contents_of(KEYPOINTS) if contents is None else contents, id=event.id)
+    message = JustBytes(contents=encode_keypoints(KEYPOINTS) if contents is None else contents, id=event.id)
     for key, value in times.items():
         add_attribute(message, key, value)
     return message.SerializeToString()

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import anywidget
 
-from epypes.batch.contact_sheet import Block, Sheet, Tile, page_of, shown_tokens
+from epypes.batch.contact_sheet import Block, Sheet, Tile, sheet_page, shown_tokens
 from epypes.batch.grid import identity
 from epypes.batch.sweeping import SweepResult
 from epypes.display.markup import cut
@@ -82,7 +82,7 @@ class Picker:
         self._text = ""
         self._is_seen = False
         self._worker = Worker(self._compute, self._failed, "epypes-pick")
-        self._still = Still(lambda: page_of(self._sheet, self.chosen))
+        self._still = Still(lambda: sheet_page(self._sheet, self.chosen))
         self._view = SheetView()
         self._view.on_msg(self._answer)
         listen_beside_cells(self._view)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 from weakref import WeakKeyDictionary
 
 from epypes.store import Store, opened_store
-from epypes.store.later import SeriesWriter
+from epypes.store.writer import SeriesWriter
 from epypes_widgets.history import Entry, History, changed
 from epypes_widgets.places import Tunable
 from epypes_widgets.plain import plain
@@ -52,7 +52,7 @@ class StoredHistory:
         self._told: Callable[[str], object] = _log.warning
         self._writer: SeriesWriter | None = None
         if store is not None:
-            self._writer = SeriesWriter(store, KIND, self._name, told=lambda text: self._told(text))
+            self._writer = SeriesWriter(store, KIND, self._name, report=lambda text: self._told(text))
         self._lock = threading.Lock()
         self._last: Entry | None = None
         self._forget: Callable[[], None] | None = None

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields, replace
 from time import time_ns
 from typing import Any, Final
 
-from epypes.bundle.hyperparameters import read
+from epypes.bundle.hyperparameters import StoredArray, read
 
 # The topic of the events that publish failures.
 FAILURE_TOPIC: Final = "failure"
@@ -165,6 +165,8 @@ def values_of(
         except (LookupError, TypeError, ValueError):
             gone.append(token)
             continue
+        if isinstance(value, StoredArray):
+            continue  # the bundle has it
         if token in known:
             values[token] = value
         else:

@@ -13,16 +13,16 @@ import json
 import logging
 import os
 import threading
-from collections import Counter, OrderedDict, deque
-from collections.abc import Hashable, Iterator, Mapping
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from time import time
+from time import monotonic, time
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.errors import EpypesError, FailureNotKept, MessageError, UnknownName
 from epypes.service.failures.record import ID, FailedEvent, read_record, with_id
-from epypes.store.writer import Writer
+from epypes.store.writer import BackgroundWriter
 from epypes.transport.throttle import Throttle
 
 if TYPE_CHECKING:
@@ -61,42 +61,28 @@ def failures_folder(bundle: str | Path) -> Path:
 # -- the pace ---------------------------------------------------------------------------------------------------------
 
 
-class _FailureQueue:
-    """The failures that wait to be written: of each cause some at once, then one each second (a token bucket).
+class _CauseBudgets:
+    """How many failures of each cause may be written: some at once, then one each second (a token bucket).
 
     A camera with black frames fails thirty times a second, always alike: to write down each failure would take the disk
-    from other processes, and push out the one failure that is different. `Writer` holds its lock around all methods,
-    and gives the time in seconds on a monotonic clock.
+    from other processes, and push out the one failure that is different.
     """
 
     def __init__(self, burst: int) -> None:
         self._burst = burst
-        self._waiting: deque[Any] = deque()
         # By cause: how many may be written now, and when that was computed.
         self._budgets: OrderedDict[Hashable, tuple[float, float]] = OrderedDict()
 
-    def __len__(self) -> int:
-        return len(self._waiting)
-
-    def add(self, cause: Hashable, item: Any, now_s: float) -> bool:
-        """Add a failure, unless there are too many; return whether it was added."""
+    def spend(self, cause: Hashable, put: Callable[[], bool]) -> bool:
+        """Put a failure if its cause has a budget; return whether it was put. Not for several threads at once."""
+        now_s = monotonic()
         left, at_s = self._budgets.pop(cause, (self._burst, now_s))
         left = min(left + (now_s - at_s) * _PER_S, self._burst)
-        is_added = left >= 1 and len(self._waiting) < _MAX_WAITING
-        self._budgets[cause] = left - is_added, now_s
+        is_put = left >= 1 and put()
+        self._budgets[cause] = left - is_put, now_s
         if len(self._budgets) > _MAX_CAUSES:
             self._budgets.popitem(last=False)
-        if is_added:
-            self._waiting.append(item)
-        return is_added
-
-    def take(self, now_s: float, *, at_once: bool = False) -> Any:
-        """Return what is to be written next; None if nothing is."""
-        return self._waiting.popleft() if self._waiting else None
-
-    def due_in_s(self, now_s: float) -> float | None:
-        """Return 0; None if nothing waits."""
-        return 0.0 if self._waiting else None
+        return is_put
 
 
 # -- the store --------------------------------------------------------------------------------------------------------
@@ -126,8 +112,8 @@ class FailureStore:
     ) -> None:
         self.folder = Path(folder)
         self._most, self._most_bytes = most, most_bytes
-        self._queue = _FailureQueue(burst)
-        self._writer = Writer("epypes failures", self._queue, lambda item: self._write(*item), self._sweep)
+        self._budgets = _CauseBudgets(burst)
+        self._writer = BackgroundWriter("epypes failures", self._write_next, most=_MAX_WAITING)
         self._lock = threading.Lock()
         self._counts = Counter(dict.fromkeys(_COUNTED, 0))
         self._causes: dict[str, object] = {}
@@ -141,8 +127,9 @@ class FailureStore:
         Returns at once and raises nothing. The event's arrays must not change any more.
         """
         record = with_id(record)
-        is_added = self._writer.put(lambda now_s: self._queue.add(record.cause, (record, event), now_s))
-        self._count("skipped", not is_added)
+        with self._lock:
+            is_put = self._budgets.spend(record.cause, lambda: self._writer.put((record, event)))
+            self._counts["skipped"] += not is_put
         return record
 
     def flush(self, timeout_s: float = 5.0) -> bool:
@@ -163,6 +150,12 @@ class FailureStore:
             self._counts[what] += count
 
     # on the writer's thread, to the end of this section
+
+    def _write_next(self, items: list[tuple[FailedEvent, Any]]) -> bool:
+        self._sweep()
+        for record, event in items:
+            self._write(record, event)
+        return True
 
     def _write(self, record: FailedEvent, event: Any) -> None:
         packed, no_event = self._packed(event)

@@ -18,7 +18,7 @@ from time import perf_counter_ns
 from typing import Any, Final
 
 import epypes
-from epypes.bundle.hyperparameters import Member, read
+from epypes.bundle.hyperparameters import Member, StoredArray, read
 from epypes.bundle.load import Bundle, pipeline_of
 from epypes.errors import MessageError
 from epypes.pipeline import FullPipeline, Pipeline
@@ -351,6 +351,8 @@ def _values(entries: Mapping[str, Any], enums: Mapping[str, Any]) -> tuple[dict[
         except Exception as error:  # an entry of a kind may fail in the making of a value of that kind
             problems[token] = f"This value can't be read: {_text_of(error)}."
             continue
+        if isinstance(values[token], StoredArray):
+            problems[token] = "It is a file of the bundle. Promote it anew."
         if isinstance(values[token], Member):
             problems[token] = f"The bundle has no enumeration {values[token].enum!r}."
     return values, problems

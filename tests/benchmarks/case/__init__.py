@@ -43,7 +43,7 @@ def _times(contenders: Mapping[str, Contender], column: str) -> Times:
 
 
 def _mode_row(column: str, contenders: Mapping[str, Contender], most_ns: float, note: str) -> Row:
-    from epypes.experiment.fits import lognormal_fit
+    from epypes.experiment.results import lognormal_fit
 
     modes = {name: lognormal_fit(list(found.durations[column].values())).mode for name, found in contenders.items()}
     return Row(f"{_PAPER}: {column}, mode", modes, goal=Goal("total", most_ns), note=note)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from epypes.experiment.components import Settings
 from epypes.experiment.layouts import LAYOUTS, running
 from epypes.experiment.results import durations_of
-from epypes.experiment.robot import Robot
+from epypes.experiment.run import Robot
 from epypes.wire import attributes
 from tests.benchmarks.case.by_hand import ByHand
 from tests.benchmarks.timing import Effort

@@ -1,4 +1,4 @@
-"""Who does the jobs, and what if they can't?"""
+"""Jobs on threads, processes and a pool that breaks: the same results, and bounded ends."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def forked():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("who", ["threads", "processes", "forked"])
-def test_results_are_the_same_whoever_does_the_jobs(who, runner, crops, folder, request):
+def test_results_are_the_same_on_every_executor(who, runner, crops, folder, request):
     expected = ep.map(runner, mixed(crops, folder), keep=["edges", "keypoints"])
     if who == "threads":
         with ThreadPoolExecutor(3) as pool:
@@ -68,7 +68,7 @@ def test_results_are_the_same_whoever_does_the_jobs(who, runner, crops, folder, 
         assert all(not value.flags.writeable for token, value in one.kept.items() if token == "edges")
 
 
-def test_settings_are_the_same_whoever_does_the_jobs(runner, crops, processes):
+def test_settings_are_the_same_in_this_thread_and_in_processes(runner, crops, processes):
     settings = tuple({"canny_lo": low} for low in (10, 60, 120))
     jobs = [Job((item,), settings) for item in items_of(crops[:3], runner)]
     expected = [outcome for outcomes in run_jobs(runner, jobs) for outcome in outcomes]
@@ -156,7 +156,7 @@ def test_no_function_of_the_notebook_is_ever_pickled(runner, crops, processes):
 
 
 @pytest.mark.slow
-def test_a_large_bundle_is_sent_to_whom_asks_for_it(processes):
+def test_a_large_bundle_is_sent_only_to_workers_that_ask_for_it(processes):
     made = cell(
         "import numpy as np\nTABLE = np.arange(40_000.0)\n\ndef look_up(image):\n    return float(TABLE[image].sum())"
     )
@@ -188,7 +188,9 @@ def test_a_graph_that_can_not_be_promoted_is_refused_with_the_reasons(crops, pro
 
 
 @pytest.mark.slow
-def test_a_module_next_to_the_notebook_is_named_first_with_who_can_run_it(processes, tmp_path, monkeypatch):
+def test_a_module_next_to_the_notebook_is_named_first_with_the_executors_that_can_run_it(
+    processes, tmp_path, monkeypatch
+):
     (tmp_path / "beside_the_notebook.py").write_text("def half(image):\n    return image // 2\n")
     monkeypatch.syspath_prepend(tmp_path)
     half = importlib.import_module("beside_the_notebook").half
@@ -199,11 +201,11 @@ def test_a_module_next_to_the_notebook_is_named_first_with_who_can_run_it(proces
     assert first.startswith("Module 'beside_the_notebook' is not installed")
     assert "a ThreadPoolExecutor, or no executor" in first
     assert second.startswith("The replay of the graph's bundle failed at pipeline.py")
-    assert "epypes-parcel" not in str(refused.value)
+    assert "epypes-package" not in str(refused.value)
 
 
 @pytest.mark.slow
-def test_a_function_that_keeps_something_is_refused_and_told_to_be_run_without_an_executor(crops, processes):
+def test_a_function_that_keeps_something_is_refused_with_the_way_out(crops, processes):
     apply = cv2.createBackgroundSubtractorMOG2().apply
     runner = ep.CompGraphRunner(ep.CompGraph({"apply": apply}, {"apply": ("image", "mask")}))
     with pytest.raises(PromotionRefused, match="is a method of an object of class") as refused:
@@ -231,7 +233,7 @@ def have_no_place():
 
 
 @pytest.mark.slow
-def test_a_worker_that_lacks_what_the_graph_imports_is_told_with_the_way_out(runner, crops):
+def test_a_worker_that_lacks_a_package_raises_with_the_way_out(runner, crops):
     with (
         ProcessPoolExecutor(1, mp_context=spawn(), initializer=have_no_opencv) as pool,
         pytest.raises(
@@ -243,7 +245,7 @@ def test_a_worker_that_lacks_what_the_graph_imports_is_told_with_the_way_out(run
 
 
 @pytest.mark.slow
-def test_a_worker_that_can_not_unpack_the_bundle_is_told(runner, crops):
+def test_a_worker_that_can_not_unpack_the_bundle_raises(runner, crops):
     with (
         ProcessPoolExecutor(1, mp_context=spawn(), initializer=have_no_place) as pool,
         pytest.raises(ScaleError, match=r"can't load the graph: FileNotFoundError"),
@@ -295,7 +297,7 @@ def test_a_pool_whose_worker_dies_says_how_many_were_done_and_a_store_lets_it_go
 
 
 @pytest.mark.parametrize("kind", [ThreadPoolExecutor, ProcessPoolExecutor])
-def test_a_pool_that_was_shut_down_is_told_with_the_way_out(kind, runner, crops):
+def test_a_pool_that_was_shut_down_raises_with_the_way_out(kind, runner, crops):
     pool = kind(1)
     pool.shutdown()
     with pytest.raises(ExecutorBroken, match=r"takes no jobs after 0 outcomes: it was shut down.*Make a new") as told:
@@ -372,7 +374,7 @@ def test_a_stop_in_this_thread_ends_after_the_item():
     assert [outcome.values["out"] for outcome in outcomes] == [0, 1, 2]
 
 
-def test_whoever_does_not_want_more_leaves_nothing_queued():
+def test_closing_the_outcomes_leaves_nothing_queued():
     gate = Gate()
     runner = gate.runner()
     with ThreadPoolExecutor(2) as pool:
@@ -410,7 +412,7 @@ def test_an_interruption_leaves_nothing_queued():
     assert gate.calls <= 40
 
 
-def test_no_more_jobs_are_at_work_than_may_be():
+def test_no_more_jobs_are_in_flight_than_may_be():
     taken = []
 
     def jobs(runner):

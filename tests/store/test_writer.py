@@ -1,16 +1,18 @@
-"""Are rows written without anybody waiting for the database, and is none lost while it is away for a while?"""
+"""Rows are written without a caller waiting for the database, and none is lost while it is away for a while."""
 
 from __future__ import annotations
 
+import itertools
 import logging
 import sqlite3
+import threading
 from time import monotonic
 
 import pytest
 
 from epypes.errors import StoreError
 from epypes.store import Store
-from epypes.store.later import Line, SeriesWriter
+from epypes.store.writer import BackgroundWriter, SeriesWriter
 from tests.store.postgres import server
 
 
@@ -55,7 +57,7 @@ def test_what_can_not_be_written_at_all_holds_nothing_else_up(store, caplog):
 
 
 @pytest.mark.slow
-def test_who_hands_over_rows_waits_for_nobody_and_what_does_not_fit_is_counted(tmp_path, monkeypatch):
+def test_a_caller_does_not_wait_for_the_database_and_rows_that_do_not_fit_are_counted(tmp_path, monkeypatch):
     path = tmp_path / "results.sqlite"
     with Store(path) as store:
         series = store.series("events", "edges")
@@ -106,23 +108,61 @@ def test_a_place_that_can_never_be_is_refused_at_once(tmp_path):
         SeriesWriter("nosuch://host/db", "events", "edges")
 
 
-def test_a_database_that_fails_is_tried_less_and_less_often():
-    line = Line()
-    line.add(("a", {}))
-    assert line.due_in_s(0.0) == 0.0
-    pauses, now_s = [], 0.0
-    for count in range(10):
-        assert line.failed(now_s) is (count == 0)
-        pauses.append(line.due_in_s(now_s))
-        assert line.take(now_s + 0.05, at_once=True) is None, "not at once again, even if somebody waits"
-        assert line.take(now_s + 0.11, at_once=True) is not None
-        assert line.take(now_s + pauses[-1] - 0.01) is None
-        now_s += pauses[-1]
-        assert line.take(now_s) is not None
-    assert pauses[:4] == [0.5, 1.0, 2.0, 4.0]
-    assert max(pauses) == 30.0
-    assert line.done(1)
-    assert line.due_in_s(now_s) is None
-    line.add(("b", {}))
-    assert line.due_in_s(now_s) == 0.0
-    assert line.failed(now_s), "it is told anew"
+@pytest.mark.slow
+def test_rows_wait_for_a_database_also_if_the_report_of_it_fails(tmp_path, caplog):
+    folder = tmp_path / "results"
+    folder.mkdir()
+
+    def report(text):
+        raise RuntimeError("no such panel")
+
+    writer = SeriesWriter(folder / "results.sqlite", "events", "edges", report=report)
+    folder.rmdir()
+    writer.append("a", {"n": 1})
+    writer.append("bad", {"n": object()})
+    assert not writer.flush(0.5)
+    folder.mkdir()
+    assert writer.close(60)
+    assert writer.counts() == {"written": 1, "skipped": 0, "unwritten": 1, "waiting": 0}
+    assert "no such panel" in caplog.text
+
+
+@pytest.mark.slow
+def test_what_can_not_be_written_now_is_tried_less_and_less_often_and_at_once_while_a_caller_waits(monkeypatch):
+    monkeypatch.setattr("epypes.store.writer._FIRST_PAUSE_S", 0.05)
+    monkeypatch.setattr("epypes.store.writer._LONGEST_PAUSE_S", 0.2)
+    monkeypatch.setattr("epypes.store.writer._FLUSHING_PAUSE_S", 0.01)
+    tried_s, tried, enough = [], [], threading.Event()
+
+    def write(items):
+        tried_s.append(monotonic())
+        tried.append(list(items))
+        if len(tried) == 6:
+            enough.set()
+        return len(tried) > 6
+
+    writer = BackgroundWriter("a test", write, most=3, at_a_time=2)
+    assert [writer.put(number) for number in range(4)] == [True, True, True, False]
+    assert enough.wait(60)
+    pauses = [later - earlier for earlier, later in itertools.pairwise(tried_s)]
+    assert all(pause >= least for pause, least in zip(pauses, (0.05, 0.1, 0.2, 0.2, 0.2), strict=False))
+    assert writer.flush(60)
+    assert [item for items in tried[6:] for item in items] == [0, 1, 2], "in order, and each once"
+    assert len(writer) == 0
+
+
+def test_what_can_not_be_written_at_all_is_logged_and_the_next_is_written(caplog):
+    written = []
+
+    def write(items):
+        if items == ["bad"]:
+            raise ValueError("no such thing")
+        written.extend(items)
+        return True
+
+    writer = BackgroundWriter("a test", write, most=10)
+    for item in ("a", "bad", "b"):
+        writer.put(item)
+    assert writer.flush(60)
+    assert written == ["a", "b"]
+    assert "a test could not write" in caplog.text
