@@ -303,15 +303,18 @@ def _check_layer(decorator: ast.expr, wrapper: Any, names: dict[str, Any], what:
         if unrepeatable(ast.Expression(argument), names) is not None:
             text = f"{what} its argument {ast.unparse(argument)!r} may be something else in a service"
             raise Refused(f"{text}. Compute it above under a name of its own.")
-    if not isinstance(wrapper, types.FunctionType) or _is_of_library(wrapper):
-        return
-    _, node = definition_of(wrapper.__code__)
+    made_by = evaluated(decorator.func if isinstance(decorator, ast.Call) else decorator, names)
+    is_own = made_by is None or importable(made_by) is None
+    if is_own and not isinstance(made_by, types.FunctionType):
+        kind = "no name of a function" if made_by is None else f"an object of class {type(made_by).__name__!r}"
+        raise Refused(f"{what} it is {kind}. Write the decorator as a function (def).")
+    code = wrapper.__code__ if isinstance(wrapper, types.FunctionType) and not _is_of_library(wrapper) else None
+    _, node = definition_of(code) if code is not None else ([], None)
     if node is not None:
         check_state(wrapper, node, f"{what} {wrapper.__code__.co_name!r}")
-    made_by = evaluated(decorator.func if isinstance(decorator, ast.Call) else decorator, names)
-    if isinstance(made_by, types.FunctionType) and importable(made_by) is None:
+    if is_own:
         _, factory = definition_of(made_by.__code__)
-        part = unrepeatable(factory, made_by.__globals__, wrapper.__code__) if factory is not None else None
+        part = unrepeatable(factory, made_by.__globals__, code) if factory is not None else None
         if part is not None:
             place = place_in(made_by.__code__.co_filename, part.lineno)
             text = f"{what} it calls {ast.unparse(part)!r} ({place}), which may give something else in a service"

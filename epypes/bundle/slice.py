@@ -342,7 +342,7 @@ class Slice:
         """Add a closure as a call of the function that made it."""
         arguments = [self._argument(value, what) for value in made.positional]
         arguments += [f"{word}={self._argument(value, what)}" for word, value in made.named.items()]
-        inner = f"Function {made.factory.__name__!r}, which makes {what[0].lower()}{what[1:]},"
+        inner = f"Function {made.factory.__name__!r}, which makes {what[0].lower()}{what[1:]}".rstrip(",") + ","
         factory = self._callable(made.factory, inner, "")
         position = self._places.of_name(name) or self._places.of_definition(found)
         self._write(name, f"{name} = {factory}({', '.join(arguments)})\n", position)
