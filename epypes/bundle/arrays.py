@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from epypes.bundle.identifiers import identifier_of
-from epypes.bundle.source import Refused
+from epypes.bundle.resolve import Refused
 
 if TYPE_CHECKING:
-    from epypes.bundle.slicer import Slice
+    from epypes.bundle.slice import Slice
 
 ARRAYS: Final = "arrays"
 READER: Final = "stored_array"

@@ -1,7 +1,7 @@
-"""What does a class of the notebook need to stand in a module of its own?
+"""The definition of a class of the notebook, which stands in the module as it is written.
 
-Like functions, classes are looked up by object, and nothing is believed: a text is taken only if its methods compile to
-the code that the class has, and its attributes are what the text gives them.
+Like functions, classes are looked up by object. Whether the class statement makes what the notebook has by now is found
+out by the comparison with the module's objects.
 """
 
 from __future__ import annotations
@@ -16,11 +16,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from epypes.bundle.cells import place_in
 from epypes.bundle.literal import is_same_data
-from epypes.bundle.side_effects import unrepeatable
-from epypes.bundle.source import Refused
-from epypes.bundle.text import (
+from epypes.bundle.notebook_source import (
     class_code,
     lines_in,
     names_from_outside,
@@ -28,8 +25,11 @@ from epypes.bundle.text import (
     own_parts,
     own_text,
     parsed,
+    place_in,
     same_methods,
 )
+from epypes.bundle.resolve import Refused
+from epypes.bundle.side_effects import unrepeatable
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class ClassDefinition:
     node
         Its syntax tree.
     place
-        Cell and line, for people.
+        Cell and line, as reasons give them.
     code
         What that text compiles to, as a module.
     names
@@ -69,7 +69,7 @@ class ClassDefinition:
         return self.node.lineno
 
     def place_of(self, name: str) -> str:
-        """Return where it uses a name, for people."""
+        """Return the cell and line where it uses a name."""
         uses = (node.lineno for node in ast.walk(self.node) if isinstance(node, ast.Name) and node.id == name)
         return place_in(self.file, next(uses, self.line))
 

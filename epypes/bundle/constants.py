@@ -8,12 +8,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from epypes.bundle.cells import Statement, statements_of
-from epypes.bundle.evaluate import UNKNOWN, value_of
 from epypes.bundle.formatting import LINE, laid_out
-from epypes.bundle.literal import is_data, is_same_data
+from epypes.bundle.literal import UNKNOWN, is_data, is_same_data, literal_value
+from epypes.bundle.notebook_source import Statement, is_comment, statements_of
 from epypes.bundle.order import Position
-from epypes.bundle.text import is_comment
 from epypes.run.guard import is_plain_array
 
 
@@ -72,7 +70,7 @@ def remark_on(name: str, value: Any, source: str, names: Mapping[str, Any], file
         given = getattr(statement.node, "value", None)
         if not isinstance(given, ast.expr):
             continue
-        written = value_of(given, {}) if _is_assignment_to(name, statement.node) else UNKNOWN
+        written = literal_value(given) if _is_assignment_to(name, statement.node) else UNKNOWN
         if written is UNKNOWN or is_same_data(written, value):
             return _remark(name, value, source, given, statement, written is not UNKNOWN)
     return None

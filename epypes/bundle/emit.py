@@ -21,9 +21,9 @@ from epypes.bundle.hyperparameters import members_in
 from epypes.bundle.literal import quoted
 from epypes.bundle.load import MAKER
 from epypes.bundle.order import ordered
+from epypes.bundle.resolve import Refused
 from epypes.bundle.settings import Settings
-from epypes.bundle.slicer import Slice
-from epypes.bundle.source import Refused
+from epypes.bundle.slice import Slice
 from epypes.bundle.subject import Subject, own_lines
 from epypes.errors import run_call
 from epypes.graph import CompGraph

@@ -19,6 +19,7 @@ import enum
 import functools
 import linecache
 import reprlib
+import sys
 import tempfile
 import traceback
 import types
@@ -30,16 +31,22 @@ from pathlib import Path
 from typing import Any, Final
 
 from epypes.bundle.arrays import write_arrays
-from epypes.bundle.cells import place_in, place_of
 from epypes.bundle.classes import statements_of_class
-from epypes.bundle.decorators import layers
+from epypes.bundle.definitions import annotated_names
 from epypes.bundle.instances import is_set_elsewhere
-from epypes.bundle.lambdas import lambdas_of
 from epypes.bundle.literal import is_data, is_same_data
 from epypes.bundle.load import MODULE, execute
-from epypes.bundle.source import importable
-from epypes.bundle.text import computes_the_same, definition_of, names_from_outside, nested_codes, spelled_tree
-from epypes.bundle.uses import annotated_names
+from epypes.bundle.notebook_source import (
+    computes_the_same,
+    definition_of,
+    lambdas_of,
+    names_from_outside,
+    nested_codes,
+    place_in,
+    place_of,
+    spelled_tree,
+)
+from epypes.bundle.resolve import layers
 from epypes.graph import CompGraph, Switch
 from epypes.pipeline import Node, Pipeline
 from epypes.run.guard import as_written, is_plain_array, is_unguarded
@@ -69,7 +76,7 @@ _WAY_OUT: Final = (
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Path:
-    """The way to an object, for people: a function of the graph, the nearest function or class, and its part."""
+    """The way to an object, for a reason: a function of the graph, the nearest function or class, and its part."""
 
     root: str
     owner: str
@@ -171,12 +178,12 @@ class _Walk:
         while self.waiting:
             path, ours, theirs = self.waiting.popleft()
             ours, theirs = _bare(ours), _bare(theirs)
-            if ours is theirs:
-                continue
+            if id(ours) in self._called:
+                path = dataclasses.replace(path, closure=id(ours))
             if type(ours) not in _PLAIN and self._partners.setdefault(id(ours), theirs) is not theirs:
                 text = f"{path.name} is one object in the notebook and several in the module, and a function uses 'is'."
                 self._divided = self._divided or _Different(path, text)
-            if (id(ours), id(theirs)) not in self._seen:
+            if ours is not theirs and (id(ours), id(theirs)) not in self._seen:
                 self._seen[id(ours), id(theirs)] = ours, theirs
                 self._compare(path, ours, theirs)
         if self._divided is not None and self._asks_for_identity:
@@ -194,13 +201,15 @@ class _Walk:
             self._compare_functions(path, ours, theirs)
             return
         if kind is not type(theirs):
-            if importable(kind) is not None or kind.__name__ != type(theirs).__name__:
+            if not _is_of_notebook(kind) or kind.__name__ != type(theirs).__name__:
                 raise _unlike(path, ours, theirs)
             self._add(path.to(" class"), kind, type(theirs))
         if is_data(ours) and is_same_data(ours, theirs):
             return
         if is_plain_array(ours) and not ours.dtype.hasobject:
-            if _bits(ours) != _bits(theirs):
+            # A view with gaps is whole in the file that the module reads it from.
+            is_whole = ours.flags.c_contiguous or ours.flags.f_contiguous
+            if _bits(ours, is_whole) != _bits(theirs, is_whole):
                 raise _unlike(path, ours, theirs)
             return
         if kind in _PLAIN and kind not in (set, frozenset):
@@ -226,11 +235,10 @@ class _Walk:
             self._add(path.to(part), value, others[part])
 
     def _compare_functions(self, path: _Path, ours: types.FunctionType, theirs: types.FunctionType) -> None:
-        closure = id(ours) if id(ours) in self._called else path.closure
         if ours.__code__ is not theirs.__code__:
             node = _node(ours.__code__)
             owner = _placed(f"Function {ours.__name__!r}", ours) if path.part else path.owner
-            path = _Path(path.root, owner, closure=closure)
+            path = _Path(path.root, owner, closure=path.closure)
             if not _is_same_text(ours.__code__, theirs.__code__, node):
                 raise _Different(path, "the notebook has it with another text than the cells have now.")
             self._asks_for_identity |= node is not None and any(map(_asks_for_identity, ast.walk(node)))
@@ -247,7 +255,7 @@ class _Walk:
             self._add(path.to(f" {name!r}"), _meaning(ours, name), _meaning(theirs, name))
 
     def _compare_classes(self, path: _Path, ours: type, theirs: type) -> None:
-        if importable(ours) is not None or ours.__name__ != theirs.__name__:
+        if not _is_of_notebook(ours) or ours.__name__ != theirs.__name__:
             raise _unlike(path, ours, theirs)
         path = _Path(path.root, _placed(f"Class {ours.__name__!r}", ours), closure=path.closure)
         self._add(path.to(" metaclass"), type(ours), type(theirs))
@@ -274,6 +282,11 @@ def _placed(what: str, value: Any) -> str:
     statements = statements_of_class(value) if isinstance(value, type) else iter(())
     found = next((pair for pair in statements if _DRAFT not in pair[0]), None)
     return f"{what} ({place_in(found[0], found[1].lineno)})" if found else what
+
+
+def _is_of_notebook(kind: type) -> bool:
+    """Whether a class was defined in the notebook, or in a module that is no imported one, as that of a bundle."""
+    return kind.__module__ == "__main__" or kind.__module__ not in sys.modules
 
 
 def _side(is_notebook: bool) -> str:
@@ -344,9 +357,10 @@ def _defaults(function: types.FunctionType) -> dict[str, Any]:
 
 
 def _marks(function: Any) -> dict[str, Any]:
-    """Return the attributes of a function but for the marks of EPypes."""
+    """Return the attributes of a function but for the marks of EPypes and what functools.wraps copies."""
     found = {name: value for name, value in vars(function).items() if not name.startswith("__epypes_")}
-    return {f" attribute {name!r}": found[name] for name in sorted(found)}
+    names = sorted(found.keys() - set(functools.WRAPPER_ASSIGNMENTS))
+    return {f" attribute {name!r}": found[name] for name in names}
 
 
 def _names(ours: types.FunctionType, theirs: types.FunctionType) -> Iterator[str]:
@@ -390,8 +404,8 @@ def _options(kind: type) -> str:
     return repr(vars(kind).get("__dataclass_params__", ""))
 
 
-def _bits(array: Any) -> tuple[object, ...]:
-    return array.dtype, array.shape, array.strides if array.size else (), array.tobytes()
+def _bits(array: Any, with_layout: bool) -> tuple[object, ...]:
+    return array.dtype, array.shape, array.strides if with_layout and array.size else (), array.tobytes()
 
 
 def _parts(value: Any) -> dict[str, Any]:
@@ -402,11 +416,12 @@ def _parts(value: Any) -> dict[str, Any]:
     TypeError
         It can't be seen through.
     """
-    for kind, names in _PARTS:
-        if isinstance(value, kind):
-            return {f" {name}": getattr(value, name) for name in names}
+    if type(value) is functools.partial:
+        return {" function": value.func, " arguments": value.args, " keywords": value.keywords, **_marks(value)}
+    if type(value) in _PARTS:
+        return {f" {name}": getattr(value, name) for name in _PARTS[type(value)]}
     if isinstance(value, functools._lru_cache_wrapper):
-        return {" parameters": value.cache_parameters(), " function": value.__wrapped__}
+        return {" parameters": value.cache_parameters(), " function": value.__wrapped__, **_marks(value)}
     if isinstance(value, weakref.WeakKeyDictionary | weakref.WeakValueDictionary):
         return {}  # a cache, as of functools.singledispatch
     if type(value) in (set, frozenset):
@@ -421,7 +436,7 @@ def _parts(value: Any) -> dict[str, Any]:
         return {" name": value.name, " value": value.value, **_own(value)}
     if isinstance(value, Node):
         return _of_node(value)
-    if importable(type(value)) is None:
+    if _is_of_notebook(type(value)):
         return {**_own(value), **_content(value)}
     return _of_library(value)
 
@@ -480,12 +495,12 @@ def _of_library(value: Any) -> dict[str, Any]:
     return found | {" items": [*(items or ())], " entries": [*(pairs or ())]}
 
 
-_PARTS: Final[tuple[tuple[Any, tuple[str, ...]], ...]] = (
-    (functools.partial, ("func", "args", "keywords", "__dict__")),
-    (types.MethodType, ("__func__", "__self__")),
-    (property, ("fget", "fset", "fdel")),
-    ((staticmethod, classmethod), ("__func__",)),
-    (functools.cached_property, ("func", "attrname")),
-    (dataclasses.Field, _OF_FIELDS),
-    (Switch, ("branches",)),
-)
+_PARTS: Final[Mapping[type, tuple[str, ...]]] = {
+    types.MethodType: ("__func__", "__self__"),
+    property: ("fget", "fset", "fdel"),
+    staticmethod: ("__func__",),
+    classmethod: ("__func__",),
+    functools.cached_property: ("func", "attrname"),
+    dataclasses.Field: _OF_FIELDS,
+    Switch: ("branches",),
+}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
 import pathlib
 import re
 import sys
@@ -16,14 +17,13 @@ from operator import attrgetter, itemgetter, methodcaller
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin
 
 from epypes.bundle.literal import literal_source
-from epypes.bundle.records import made_again
-from epypes.bundle.source import Importable, Refused, importable
+from epypes.bundle.resolve import Importable, Refused, importable
 from epypes.hints import Param
 from epypes.images import Image
 from epypes.run.guard import is_plain_array
 
 if TYPE_CHECKING:
-    from epypes.bundle.slicer import Slice
+    from epypes.bundle.slice import Slice
 
 FunctionWriter = Callable[[Any], str]
 # Their objects know the call that makes them.
@@ -124,17 +124,33 @@ class _Writer:
         gathered, what = self.gathered, self.what
         if is_plain_array(value):
             return gathered.arrays.written(gathered, value, what, self._array(value))
-        made = self._mark(value) or made_again(
-            value,
-            lambda part: expression(gathered, part, what),
-            lambda kind: gathered.add_class(kind, None, f"Class {kind.__name__!r} of {what[0].lower()}{what[1:]}"),
-        )
+        made = self._mark(value) or self._record(value)
         if made:
             return made
         home = importable(value)
         if home is None and self.function is not None and callable(value) and not isinstance(value, type):
             return self.function(value)
         return gathered.reference(home, what) if home else ""
+
+    def _record(self, value: Any) -> str:
+        """Return the expression of a member of an enumeration, a dataclass's object or a named tuple; "" for others.
+
+        A class may do more with its arguments than keep them. The comparison with the module's objects finds that out.
+        """
+        kind, what = type(value), f"Class {type(value).__name__!r} of {self.what[0].lower()}{self.what[1:]}"
+        if isinstance(value, enum.Enum):
+            is_member = value.name in kind.__members__
+            return f"{self.gathered.add_class(kind, None, what)}.{value.name}" if is_member else ""
+        if dataclasses.is_dataclass(kind):
+            names = [field.name for field in dataclasses.fields(kind) if field.init]
+            is_record = len(names) == len(dataclasses.fields(kind))
+        else:
+            names, is_record = [*getattr(kind, "_fields", ())], isinstance(value, tuple) and hasattr(kind, "_fields")
+        parts = [(name, expression(self.gathered, getattr(value, name), self.what)) for name in names if is_record]
+        if not is_record or not all(source for _, source in parts):
+            return ""
+        given = ", ".join(f"{name}={source}" for name, source in parts)
+        return f"{self.gathered.add_class(kind, None, what)}({given})"
 
     def _array(self, array: Any) -> str:
         """Return a small array of numbers as source that makes it again, to the last bit; "" for any other."""

@@ -11,7 +11,7 @@ from epypes.bundle.formatting import Item, laid_out, one_per_line
 from epypes.bundle.identifiers import identifier_of
 from epypes.bundle.instances import arguments_of, by_position
 from epypes.bundle.literal import quoted
-from epypes.bundle.slicer import Slice, slice_functions
+from epypes.bundle.slice import Slice, slice_functions
 from epypes.graph import CompGraph, Switch, as_switch, is_placeholder
 from epypes.pipeline import Node, Pipeline
 from epypes.run.guard import as_written

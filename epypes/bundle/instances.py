@@ -13,8 +13,8 @@ from typing import Any, Final
 
 from epypes.bundle.classes import functions_of
 from epypes.bundle.literal import is_data, is_same_data
-from epypes.bundle.source import Refused
-from epypes.bundle.text import nested_codes
+from epypes.bundle.notebook_source import nested_codes
+from epypes.bundle.resolve import Refused
 from epypes.pipeline import Node, Pipeline
 from epypes.run.guard import as_written, is_plain_array
 
@@ -27,7 +27,7 @@ def arguments_of(made: Node, what: str) -> dict[str, Any]:
     Raises
     ------
     Refused
-        An argument is not kept by the object.
+        The object does not hold an argument.
     """
     found: dict[str, Any] = {}
     for parameter in parameters_of(type(made)):

@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 import ast
-from typing import Any
+import operator
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+UNKNOWN: Final = object()
+_OPERATORS: Final[Mapping[type, Callable[[Any, Any], Any]]] = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
+}  # fmt: skip
 
 
 def is_data(value: object) -> bool:
@@ -58,3 +65,15 @@ def is_same_data(written: Any, value: Any) -> bool:
         return type(written) is type(value) and literal(written) == literal(value)
     except (ValueError, RecursionError):
         return False
+
+
+def literal_value(expression: ast.expr) -> Any:
+    """Return the value of a literal or of a sum or product of numbers, UNKNOWN for any other expression."""
+    try:
+        if isinstance(expression, ast.BinOp) and type(expression.op) in _OPERATORS:
+            left, right = literal_value(expression.left), literal_value(expression.right)
+            are_numbers = type(left) in (int, float, complex) and type(right) in (int, float, complex)
+            return _OPERATORS[type(expression.op)](left, right) if are_numbers else UNKNOWN
+        return ast.literal_eval(expression)
+    except (ValueError, TypeError, SyntaxError, ArithmeticError, MemoryError, RecursionError):
+        return UNKNOWN

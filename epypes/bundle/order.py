@@ -7,10 +7,9 @@ import sys
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from epypes.bundle.cells import cell_of, statements_of
 from epypes.bundle.classes import ClassDefinition
-from epypes.bundle.source import Definition
-from epypes.bundle.text import parsed
+from epypes.bundle.definitions import Definition
+from epypes.bundle.notebook_source import cell_of, parsed, statements_of
 
 AnyDefinition = Definition | ClassDefinition
 # The number of the cell, that of the file, the line.

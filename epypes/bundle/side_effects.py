@@ -17,9 +17,16 @@ from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Any, Final
 
-from epypes.bundle.cells import executed_cells, place_in
-from epypes.bundle.source import Importable, Refused, check_nonlocal, evaluated, importable
-from epypes.bundle.text import definition_of, first_line, names_from_outside, nested_codes, parsed
+from epypes.bundle.notebook_source import (
+    definition_of,
+    executed_cells,
+    first_line,
+    names_from_outside,
+    nested_codes,
+    parsed,
+    place_in,
+)
+from epypes.bundle.resolve import Importable, Refused, evaluated, importable
 from epypes.run.guard import is_plain_array
 
 # -- writes to what outlives a call ----------------------------------------------------------------------------------
@@ -161,7 +168,7 @@ def root_of(node: ast.expr) -> str:
 
 _ASKED: Final = {
     "get_ipython": "the notebook itself, as magics and shell escapes do. Write it in Python, or elsewhere",
-    "display": "which shows something in the notebook; a service has nobody to show it to. Return it as a token",
+    "display": "which shows something in the notebook; a service shows nothing. Return it as a token",
     "input": "which asks a person. Make the answer a token",
     "breakpoint": "which waits for a person. Leave it out",
     "exit": "which ends the notebook. Raise an exception",
@@ -203,6 +210,16 @@ def check_state(function: types.FunctionType, node: ast.AST, what: str) -> None:
             place = place_in(code.co_filename, getattr(part, "lineno", code.co_firstlineno))
             text = f"{what} writes into {name!r}, which outlives the call ({place})"
             raise Refused(f"{text}: the next event would find it different. Copy it first, or make it a token.")
+
+
+def check_nonlocal(function: types.FunctionType, node: ast.AST, what: str) -> None:
+    """Refuse a function that keeps something from call to call in the function around it."""
+    code = function.__code__
+    for part in ast.walk(node):
+        kept = [name for name in part.names if name in code.co_freevars] if isinstance(part, ast.Nonlocal) else []
+        if kept and isinstance(part, ast.Nonlocal):
+            text = f"{what} changes {kept[0]!r} of the function around it ({place_in(code.co_filename, part.lineno)})"
+            raise Refused(f"{text}, so that every call finds it different. Make it a token, or return the value.")
 
 
 def line_of(node: ast.AST, name: str, otherwise: int) -> int:

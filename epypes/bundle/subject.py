@@ -13,8 +13,8 @@ from epypes.bundle.graphs import Graphs
 from epypes.bundle.instances import arguments_of, parameters_of
 from epypes.bundle.literal import quoted
 from epypes.bundle.load import MAKER
-from epypes.bundle.slicer import Slice
-from epypes.bundle.source import Refused
+from epypes.bundle.resolve import Refused
+from epypes.bundle.slice import Slice
 from epypes.graph import CompGraph, with_defaults
 from epypes.pipeline import FullPipeline, Pipeline, SinkPipeline, SourcePipeline
 from epypes.run import CompGraphRunner

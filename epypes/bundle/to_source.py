@@ -16,7 +16,7 @@ from epypes.bundle.expressions import expression_or_none
 from epypes.bundle.formatting import LINE, Item, laid_out, one_per_line
 from epypes.bundle.identifiers import identifier_of, identifiers_of, is_identifier
 from epypes.bundle.literal import literal_source, quoted
-from epypes.bundle.slicer import Slice, slice_functions
+from epypes.bundle.slice import Slice, slice_functions
 from epypes.errors import PlaceholderNeeded, SourceRefused
 from epypes.graph import CompGraph, as_switch
 from epypes.pipeline import Pipeline

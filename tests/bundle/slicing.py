@@ -6,7 +6,7 @@ import epypes as ep
 from epypes.bundle.emit import emit_module
 from epypes.bundle.equivalence import refusal
 from epypes.bundle.settings import Settings
-from epypes.bundle.slicer import Slice, slice_functions
+from epypes.bundle.slice import Slice, slice_functions
 
 
 def slice_graph(functions, uncalled=()):

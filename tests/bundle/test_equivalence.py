@@ -65,6 +65,10 @@ PROMOTED: dict[str, tuple[str, ...]] = {
         "def plain(n):\n    def h(a):\n        return a * n\n    return h\none, two, three = make(1), plain(2), plain(3)\n"
         "def f(a):\n    return one(a) + two(a) * three(a)\nGAIN = 5",
     ),
+    "closure that is one of two, with another value by now": (
+        "def make():\n    k = 1\n    def f(a):\n        return a * k\n    def put(v):\n        nonlocal k\n        k = v\n"
+        "    return f, put\nf, put = make()\nput(5)",
+    ),
     "closure with a default": (OWN_DEFAULT,),
     "closure with a default that has another value by now": (OWN_DEFAULT, "G = 5"),
     "default of a name that has another value by now": ("K = 5\ndef f(a, k=K):\n    return a * k\nK = 9",),
@@ -127,6 +131,31 @@ REFUSED: dict[str, tuple[str, str]] = {
     "default of a dataclass that was set later": (
         "import dataclasses\n@dataclasses.dataclass\nclass C:\n    k: int = 2\nC.__init__.__defaults__ = (7,)\ndef f(a):\n    return a * C().k",
         r"Class 'C' \(cell \[1\], line 3\), which function 'f' needs: its .*__init__ default of 'k'.* is 7 in the notebook and 2",
+    ),
+    "iterator of a class that was read from": (
+        "class C:\n    ROWS = iter([1, 2])\nnext(C.ROWS)\ndef f(a):\n    return a, C.ROWS.__length_hint__()",
+        r"Class 'C' .* its 'ROWS' state is 1 in the notebook and 0 in the module",
+    ),
+    "member of an enumeration that was changed": (
+        "import enum\nclass Way(enum.Enum):\n    UP = 1\nWay.UP._value_ = 7\ndef f(a):\n    return a * Way.UP.value",
+        r"Class 'Way' .*'UP'.* value is 7 in the notebook and 1",
+    ),
+    "attribute of a metaclass that was changed": (
+        "class M(type):\n    K = 1\nclass C(metaclass=M):\n    pass\nM.K = 7\ndef f(a):\n    return a * C.K",
+        r"Class 'M' \(cell \[1\], line 1\), .* its 'K' is 7 in the notebook and 1",
+    ),
+    "property that was replaced": (
+        "class C:\n    @property\n    def p(self):\n        return 2\nC.p = property(lambda self: 5)\ndef f(a):\n    return a * C().p",
+        r"\(cell \[1\], line 5\), .* another text",
+    ),
+    "function that was given other names": (
+        "class C:\n    def m(self, a):\n        return a * K\nK, L = 2, 3\nC.m = type(f0 := lambda: 0)(C.m.__code__, {'K': 9})\n"
+        "def f(a):\n    return C().m(a) * K", r"'K' .*has another value elsewhere|its 'K' is 9 in the notebook and 2",
+    ),
+    "decorator that is an object": (
+        "import dataclasses\n@dataclasses.dataclass\nclass D:\n    k: int\n    def __call__(self, g):\n        @functools.wraps(g)\n"
+        "        def w(a):\n            return g(a) * self.k\n        return w\nd = D(2)\n@d\ndef f(a):\n    return a",
+        r"@d \(cell \[1\], line 11\): it is an object of class 'D'\. Write the decorator as a function",
     ),
     "class that reads the environment": (
         "import os\nclass C:\n    K = len(os.environ)\ndef f(a):\n    return a * C.K", r"Class 'C', .* 'os.environ' \(cell \[1\], line 3\)",

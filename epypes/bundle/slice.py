@@ -1,6 +1,6 @@
-"""What does a notebook function need to stand in a module of its own?
+"""The slice of a notebook that some of its functions need to stand in a module of their own.
 
-Imports, constants and other functions of the notebook are followed; everything else is refused by name.
+Imports, constants, classes and other functions of the notebook are followed; everything else is refused by name.
 """
 
 from __future__ import annotations
@@ -16,27 +16,104 @@ from functools import partial
 from typing import Any, Final
 
 from epypes.bundle.arrays import Arrays
-from epypes.bundle.callables import found_definition, holds_functions, is_function, method_of
 from epypes.bundle.classes import class_definition, class_names
-from epypes.bundle.closures import FactoryCall, factory_call
 from epypes.bundle.constants import Remark, imported_as, remark_on
-from epypes.bundle.expressions import expression
-from epypes.bundle.formatting import laid_out
-from epypes.bundle.literal import is_data, is_same_data, literal_source
-from epypes.bundle.names import Names, of_object
-from epypes.bundle.order import AnyDefinition, Position, Positions
-from epypes.bundle.side_effects import check_asked, check_home, check_patches, check_state
-from epypes.bundle.source import Definition, Importable, Refused, evaluated, importable
-from epypes.bundle.text import renamed, with_defaults
-from epypes.bundle.uses import (
+from epypes.bundle.definitions import (
+    Definition,
+    FactoryCall,
     default_values,
     defaults_in,
+    factory_call,
+    found_definition,
     global_names,
+    method_of,
     only_in_annotations,
     replaced,
     submodules,
 )
+from epypes.bundle.expressions import expression
+from epypes.bundle.formatting import laid_out
+from epypes.bundle.identifiers import identifier_of, is_identifier
+from epypes.bundle.literal import is_data, is_same_data, literal_source, literal_value
+from epypes.bundle.notebook_source import names_of, renamed, with_defaults
+from epypes.bundle.order import AnyDefinition, Position, Positions
+from epypes.bundle.resolve import Importable, Refused, evaluated, holds_functions, importable, is_function
+from epypes.bundle.side_effects import check_asked, check_home, check_patches, check_state
 from epypes.run.guard import WATCH
+
+Meaning = tuple[str, object]
+
+
+def of_object(value: object) -> Meaning:
+    """Return the meaning of a name for an object."""
+    return "object", id(value)
+
+
+class Names:
+    """The names of a module.
+
+    Parameters
+    ----------
+    reserved
+        The names that the module keeps for the graph.
+
+    Attributes
+    ----------
+    read
+        What functions read by name: these names are theirs before anything is named freely.
+    """
+
+    def __init__(self, reserved: Collection[str]) -> None:
+        self.reserved = reserved
+        self.read: dict[str, object] = {}
+        self._meanings: dict[str, Meaning] = {}
+
+    def claim(self, name: str, meaning: Meaning, what: str) -> None:
+        """Make a name mean one thing in the module.
+
+        Raises
+        ------
+        Refused
+            It means another.
+        """
+        if name in self.reserved:
+            raise Refused(f"{what} uses the name {name!r}, which the module keeps for the graph. Rename it.")
+        if not self.may_mean(name, meaning):
+            raise Refused(
+                f"{what} uses the name {name!r}, which means something else in another function of the graph. "
+                "Rename one of the two."
+            )
+
+    def may_mean(self, name: str, meaning: Meaning) -> bool:
+        """Whether a name means this, or does from now on because it meant nothing."""
+        return self._meanings.setdefault(name, meaning) == meaning
+
+    def is_taken(self, name: str) -> bool:
+        """Whether a name means something in the module already."""
+        return name in self.reserved or name in self._meanings or name in self.read or hasattr(builtins, name)
+
+    def is_free(self, name: str, value: object) -> bool:
+        """Whether a name can mean an object, and hides nothing."""
+        if name in self.read:
+            return self.read[name] is value
+        if name in self.reserved or self._meanings.get(name, of_object(value)) != of_object(value):
+            return False
+        return not hasattr(builtins, name) and name not in sys.modules
+
+    def name_for(self, function: object, found: Definition, wanted: str) -> str:
+        """Return what a function is called in the module: as in the notebook, if that means nothing else there."""
+        own, bound = "" if found.is_lambda else found.name, names_of(function, found.names)
+        is_known_otherwise = bool(found.captured) or found.names.get(own, function) is not function
+        others = [wanted, own] if is_known_otherwise else [own, wanted]
+        candidates = [*(name for name in bound if name == own), *bound, *others]
+        free = (name for name in candidates if is_identifier(name) and self.is_free(name, function))
+        return next(free, "") or identifier_of(own or wanted or found.name, self.is_taken)
+
+    def alias_for(self, value: object, notebook: Mapping[str, object], own: str) -> str:
+        """Return the name that a notebook has for an object besides its own; "" if it has none that is free."""
+        known = names_of(value, notebook)
+        return "" if own in known else next((name for name in known if self.is_free(name, value)), "")
+
 
 _CONSTANT_CHARACTERS: Final = 400
 RESERVED: Final = frozenset({"func_dict", "func_io"})
@@ -265,7 +342,7 @@ class Slice:
         """Add a closure as a call of the function that made it."""
         arguments = [self._argument(value, what) for value in made.positional]
         arguments += [f"{word}={self._argument(value, what)}" for word, value in made.named.items()]
-        inner = f"Function {made.factory.__name__!r}, which makes {what[0].lower()}{what[1:]},"
+        inner = f"Function {made.factory.__name__!r}, which makes {what[0].lower()}{what[1:]}".rstrip(",") + ","
         factory = self._callable(made.factory, inner, "")
         position = self._places.of_name(name) or self._places.of_definition(found)
         self._write(name, f"{name} = {factory}({', '.join(arguments)})\n", position)
@@ -411,10 +488,7 @@ def _is_kept(parameter: str, default: ast.expr, value: Any, found: Definition) -
         is_own = isinstance(default, ast.Name) and default.id == parameter and found.is_lambda and literal_source(value)
         is_fixed = isinstance(default, ast.Name) or _is_constant(value)
         return is_fixed and not is_own and evaluated(default, {**vars(builtins), **found.names}) is value
-    try:
-        return is_same_data(ast.literal_eval(default), value)
-    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
-        return False
+    return is_same_data(literal_value(default), value)
 
 
 def _is_constant(value: object) -> bool:

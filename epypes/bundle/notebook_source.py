@@ -1,7 +1,8 @@
-"""Which text says what a function computes, and does it still say that?
+"""The text of the notebook: its cells, and the text that some code was compiled from.
 
-A file may have been changed since it was started, and text that is moved to another place may mean something else. So
-nothing is believed: what is found, and what is written, is compiled and compared with the function.
+The cells that were executed are the text; of a script, it is the script. A file may have been changed since it was
+started, and text that is moved to another place may mean something else. So what is found, and what is written, is
+compiled and compared with the function.
 """
 
 from __future__ import annotations
@@ -13,14 +14,169 @@ import io
 import linecache
 import os
 import re
+import sys
 import tokenize
 import types
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import takewhile
-from typing import Final
+from typing import Any, Final
+
+from epypes.bundle.formatting import LINE, laid_out
+
+_CELL_MAGIC: Final = "get_ipython().run_cell_magic("
+_EXECUTING: Final = ("capture", "time", "prun")
+
+
+@dataclass(frozen=True, slots=True)
+class Statement:
+    """A statement that gives names their values.
+
+    Attributes
+    ----------
+    node
+        Its syntax tree.
+    lines
+        The lines of its cell.
+    cell
+        The number of its cell, 0 in a script.
+    """
+
+    node: ast.stmt
+    lines: tuple[str, ...]
+    cell: int
+
+
+def executed_cells(names: Mapping[str, Any]) -> list[tuple[int, str]]:
+    """Return the cells that a notebook has executed, each with its number; none outside of notebooks."""
+    cells = names.get("In")
+    if not isinstance(cells, list):
+        return []
+    texts = ((number, _without_magic(cell)) for number, cell in enumerate(cells) if isinstance(cell, str))
+    return [(number, text) for number, text in texts if text.strip()]
+
+
+@lru_cache(maxsize=512)
+def _without_magic(cell: str) -> str:
+    """Return what a cell magic such as %%capture or %%time has executed of its cell, on the same lines."""
+    tree = parsed(cell) if cell.lstrip().startswith(_CELL_MAGIC) else None
+    call = getattr(tree.body[0], "value", None) if tree and len(tree.body) == 1 else None
+    constants = (part.value for part in getattr(call, "args", ()) if isinstance(part, ast.Constant))
+    texts = [value for value in constants if isinstance(value, str)]
+    return f"\n{texts[2]}" if len(texts) == 3 and texts[0] in _EXECUTING else cell
+
+
+def cell_of(file: str, names: Mapping[str, Any]) -> int:
+    """Return the number of the cell that Python knows as a file, the last one of that text; 0 outside of notebooks."""
+    source = "".join(linecache.getlines(file)).strip()
+    numbers = (number for number, cell in executed_cells(names) if source and cell.strip() == source)
+    return max(numbers, default=0)
+
+
+def place_of(code: types.CodeType) -> str:
+    """Return where code stands: the cell's number, if it is from a notebook, and the line."""
+    return place_in(code.co_filename, code.co_firstlineno)
+
+
+def place_in(file: str, number: int) -> str:
+    """Return a place in a file or cell: the cell's number, if it is from a notebook, and the line."""
+    names = vars(sys.modules["__main__"])
+    cell = cell_of(file, names)
+    # What a cell magic has executed begins on the second line.
+    below = any(known == cell and text.startswith("\n") for known, text in executed_cells(names))
+    return f"cell [{cell}], line {number + below}" if cell else f"{file}, line {number}"
+
+
+def statements_of(name: str, names: Mapping[str, Any], file: str = "") -> Iterator[Statement]:
+    """Return the statements that have given a name its value, the last one first.
+
+    Parameters
+    ----------
+    name
+        A global name.
+    names
+        The notebook's names.
+    file
+        Without a notebook, the text is that of this file.
+    """
+    texts = executed_cells(names)
+    if not texts and file:
+        texts = [(0, "".join(linecache.getlines(file)))]
+    for cell, text in reversed(texts):
+        for node in reversed(_givers(text).get(name, ())):
+            yield Statement(node, tuple(text.split("\n")), cell)
+
+
+@lru_cache(maxsize=512)  # every constant of a graph asks for every cell
+def _givers(text: str) -> dict[str, tuple[ast.stmt, ...]]:
+    """Return the statements of a cell by the global names that they give a value."""
+    found: dict[str, tuple[ast.stmt, ...]] = {}
+    tree = parsed(text)
+    for node in _statements(tree.body) if tree else ():
+        for name in dict.fromkeys(_given(node)):
+            found[name] = (*found.get(name, ()), node)
+    return found
+
+
+def _statements(body: list[ast.stmt]) -> Iterator[ast.stmt]:
+    """Return statements and those inside of them, but not inside of functions and classes."""
+    for node in body:
+        yield node
+        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            for field in ("body", "orelse", "finalbody"):
+                yield from _statements(getattr(node, field, []))
+
+
+def _given(node: ast.stmt) -> Iterator[str]:
+    if isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign):
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+        for target in targets:
+            parts = (part for part in ast.walk(target) if isinstance(part, ast.Name))
+            yield from (part.id for part in parts if isinstance(part.ctx, ast.Store))
+    elif isinstance(node, ast.Import | ast.ImportFrom):
+        yield from (alias.asname or alias.name for alias in node.names)
+
+
+def names_of(value: object, names: Mapping[str, Any]) -> list[str]:
+    """Return the names that a notebook has given to an object, but those that hold what cells have shown."""
+    return [name for name, known in names.items() if known is value and not name.startswith("_")]
+
+
+def place_of_object(value: object, names: Mapping[str, Any], key: str = "") -> str:
+    """Return where the notebook made an object, as far as its text says; "" if it does not.
+
+    Parameters
+    ----------
+    value
+        The object.
+    names
+        The notebook's names.
+    key
+        The name that the object has in a dict, as functions of a graph have.
+    """
+    for name in names_of(value, names):
+        for statement in statements_of(name, names):
+            return f"cell [{statement.cell}], line {statement.node.lineno}"
+    for cell, text in reversed(executed_cells(names)):
+        line = _line_of_key(text, key)
+        if line:
+            return f"cell [{cell}], line {line}"
+    return ""
+
+
+@lru_cache(maxsize=512)
+def _line_of_key(text: str, key: str) -> int:
+    """Return the last line of a cell where a dict has a key; 0 if none has."""
+    tree = parsed(text)
+    lines = [0]
+    for node in ast.walk(tree) if tree and key else ():
+        if isinstance(node, ast.Dict):
+            lines += [part.lineno for part in node.keys if isinstance(part, ast.Constant) and part.value == key]
+    return max(lines)
+
 
 LATE_ANNOTATIONS: Final = __future__.annotations.compiler_flag
 # Above a function these say something about their whole file.
@@ -101,7 +257,7 @@ def compiled(tree: ast.Module, flags: int) -> types.CodeType | None:
 
 @contextmanager
 def _without_warnings() -> Iterator[None]:
-    """Whoever wrote the text was warned when it was run."""
+    """Silence the warnings that the notebook has shown when the text was run."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
@@ -141,7 +297,7 @@ def computes_the_same(one: types.CodeType, other: types.CodeType) -> bool:
 
 
 def _bare(code: types.CodeType) -> types.CodeType:
-    """Return code without what tells where it stands."""
+    """Return code without its file and lines."""
     constants = tuple(_bare(value) if isinstance(value, types.CodeType) else value for value in code.co_consts)
     return code.replace(co_consts=constants, co_filename="", co_firstlineno=1, co_linetable=b"")
 
@@ -303,3 +459,119 @@ def _spelled(value: object) -> object:
 
 def _names_in(code: types.CodeType) -> list[tuple[tuple[str, ...], ...]]:
     return [(part.co_names, part.co_varnames, part.co_freevars, part.co_cellvars) for part in nested_codes(code)]
+
+
+# Until its name is known.
+UNNAMED: Final = "function"
+
+
+def lambdas_of(code: types.CodeType) -> tuple[list[str], list[ast.Lambda]]:
+    """Return the lines that code is from, and the lambdas among them that may be it: one, if Python has its columns."""
+    lines = lines_in(code.co_filename)
+    tree = parsed("".join(lines))
+    if tree is None:
+        return lines, []
+    nodes = [node for node in ast.walk(tree) if isinstance(node, ast.Lambda) and node.lineno == code.co_firstlineno]
+    known = [other for apart in (False, True) for other in _same_lambdas(tree, code, apart)]
+    if not known:
+        return lines, []
+    # The table of lines holds the columns too, unless Python runs with -X no_debug_ranges.
+    exact = [other for other in known if other.co_linetable == code.co_linetable]
+    if not exact:
+        return lines, []
+    around = [node for node in nodes if _holds(node.body, exact[0])]
+    # Of lambdas in one another, the innermost.
+    return lines, [max(around, key=lambda node: _start(node.body))] if around else nodes
+
+
+def _same_lambdas(tree: ast.Module, code: types.CodeType, apart: bool) -> Iterator[types.CodeType]:
+    for other in codes_in(tree, code.co_flags & LATE_ANNOTATIONS, apart):
+        place = (other.co_name, other.co_firstlineno)
+        if place == (code.co_name, code.co_firstlineno) and computes_the_same(other, code):
+            yield other
+
+
+def _holds(body: ast.expr, code: types.CodeType) -> bool:
+    """Whether code, which has something to show, stands inside of a body."""
+    places = [((line, column), (end_line, end_column)) for line, end_line, column, end_column in _shown(code)]
+    return bool(places) and _start(body) <= min(places)[0] and max(end for _, end in places) <= _end(body)
+
+
+def _shown(code: types.CodeType) -> Iterator[tuple[int, int, int, int]]:
+    """Return the positions of code that have a text: some versions of Python put the return at the line's beginning."""
+    for line, end_line, column, end_column in code.co_positions():
+        is_known = line is not None and end_line is not None and column is not None and end_column is not None
+        if is_known and (line, column) != (end_line, end_column):
+            yield line or 0, end_line or 0, column or 0, end_column or 0
+
+
+def _start(node: ast.expr) -> tuple[int, int]:
+    return node.lineno, node.col_offset
+
+
+def _end(node: ast.expr) -> tuple[int, int]:
+    return node.end_lineno or node.lineno, node.end_col_offset or 0
+
+
+def as_function(lines: list[str], node: ast.Lambda) -> tuple[str, ast.FunctionDef]:
+    """Return a lambda as the text of a function, with the comment above or beside it, and as a syntax tree.
+
+    Parameters
+    ----------
+    lines
+        The lines of its cell.
+    node
+        The lambda.
+    """
+    shape = ast.parse(f"def {UNNAMED}(): pass").body[0]
+    if not isinstance(shape, ast.FunctionDef):
+        raise TypeError(type(shape).__name__)
+    vars(shape).update(args=node.args, body=[ast.copy_location(ast.Return(node.body), node.body)])
+    head = f"def {UNNAMED}({', '.join(_parameters(node.args))}):"
+    text = f"{_comment(lines, node)}{head}\n{_returned(''.join(lines), node.body)}\n"
+    return text, ast.copy_location(shape, node)
+
+
+def _returned(source: str, body: ast.expr) -> str:
+    """Return a body as a statement: as it stands, if that is one line which fits."""
+    text = f"    return {ast.get_source_segment(source, body)}"
+    tree = parsed(f"def f():\n{text}\n")
+    returned = getattr(tree.body[0], "body", [])[0] if tree else None
+    value = returned.value if isinstance(returned, ast.Return) else None
+    if value is not None and "\n" not in text and len(text) <= LINE and spelled_tree(value) == spelled_tree(body):
+        return text
+    return "\n".join(laid_out(ast.unparse(body), 1, "return "))
+
+
+def _parameters(arguments: ast.arguments) -> Iterator[str]:
+    """Return the parameters as they stand in a definition."""
+    by_position = [*arguments.posonlyargs, *arguments.args]
+    lone = [None] * (len(by_position) - len(arguments.defaults))
+    for number, (argument, default) in enumerate(zip(by_position, [*lone, *arguments.defaults], strict=True), 1):
+        yield _parameter(argument, default)
+        if number == len(arguments.posonlyargs):
+            yield "/"
+    if arguments.vararg:
+        yield f"*{arguments.vararg.arg}"
+    elif arguments.kwonlyargs:
+        yield "*"
+    for argument, given in zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True):
+        yield _parameter(argument, given)
+    if arguments.kwarg:
+        yield f"**{arguments.kwarg.arg}"
+
+
+def _parameter(argument: ast.arg, default: ast.expr | None) -> str:
+    return f"{argument.arg}={ast.unparse(default)}" if default else argument.arg
+
+
+def _comment(lines: list[str], node: ast.Lambda) -> str:
+    """Return the comment that stands above the line of a lambda, or beside it, and is on it alone."""
+    if lines[node.lineno - 1].count("lambda") > 1:
+        return ""
+    first = number = node.lineno - 1
+    while first and is_comment(lines[first - 1], first):
+        first -= 1
+    above = "".join(f"{line.strip()}\n" for line in lines[first:number])
+    rest = lines[(node.end_lineno or 1) - 1].encode()[node.end_col_offset :].decode().lstrip(" ,)]}")
+    return above or (f"{rest.strip()}\n" if rest.startswith("#") else "")
