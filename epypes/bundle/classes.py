@@ -16,7 +16,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from epypes.bundle.literal import is_same_data
 from epypes.bundle.notebook_source import (
     class_code,
     lines_in,
@@ -30,6 +29,7 @@ from epypes.bundle.notebook_source import (
 )
 from epypes.bundle.resolve import Refused
 from epypes.bundle.side_effects import unrepeatable
+from epypes.bundle.syntax import is_same_data
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,6 @@ from functools import partial
 from inspect import CO_ASYNC_GENERATOR, CO_COROUTINE
 from typing import Any, TypeGuard
 
-from epypes.bundle.literal import literal_source
 from epypes.bundle.notebook_source import (
     LATE_ANNOTATIONS,
     UNNAMED,
@@ -34,6 +33,7 @@ from epypes.bundle.notebook_source import (
 )
 from epypes.bundle.resolve import Importable, Refused, evaluated, importable, layers
 from epypes.bundle.side_effects import CHANGING, check_nonlocal, check_state, unrepeatable
+from epypes.bundle.syntax import literal_source
 from epypes.graph import outputs
 from epypes.run.guard import unguarded
 

@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import ast
 import enum
 import functools
 import itertools
 import json
-import sys
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
-from epypes.bundle.constants import constant_lines
 from epypes.bundle.equivalence import Pair, refusal
 from epypes.bundle.expressions import noted_refusals
-from epypes.bundle.formatting import LINE, one_per_line
 from epypes.bundle.graphs import Graphs, GraphText
 from epypes.bundle.hyperparameters import members_in
-from epypes.bundle.literal import quoted
 from epypes.bundle.load import MAKER
-from epypes.bundle.order import ordered
+from epypes.bundle.module import module_text
 from epypes.bundle.resolve import Refused
 from epypes.bundle.settings import Settings
 from epypes.bundle.slice import Slice
 from epypes.bundle.subject import Subject, own_lines
+from epypes.bundle.syntax import LINE, one_per_line, quoted
 from epypes.errors import run_call
 from epypes.graph import CompGraph
 from epypes.pipeline import FullPipeline
@@ -143,40 +139,6 @@ def emit_module(
         items = [(f"{quoted(name)}: ", f"[{', '.join(map(quoted, part))}]") for name, part in cg.groups.items()]
         tail.append(["# Drawn as one box each.", *one_per_line("func_groups = {", items, "}")])
     return module_text([_docstring(settings)], needed, [_spaced(["\n".join(block) for block in [*tail, *own]])])
-
-
-def module_text(head: Sequence[str], needed: Slice, tail: Sequence[str]) -> str:
-    """Return the text of a module: what stands at its head, what its functions need, and what stands behind that."""
-    texts = {name: found.text.rstrip() for name, found in needed.definitions.items()}
-    positions = {**needed.positions, **{name: remark.position for name, remark in needed.remarks.items()}}
-    early: list[str] = []
-    for name in sorted(needed.constants, key=lambda name: (name not in needed.remarks, positions.get(name, ()))):
-        lines = constant_lines(name, needed.constants[name], needed.remarks.get(name))
-        read = {node.id for node in ast.walk(ast.parse(needed.constants[name])) if isinstance(node, ast.Name)}
-        if read & needed.definitions.keys():
-            texts[name] = "\n".join(lines)
-        else:
-            early += [*[""][: bool(early) and lines[0].startswith("#")], *lines]
-    reader = needed.arrays.reader(needed)
-    imports = [_import_lines(needed.imports.values())] if needed.imports else []
-    constants = ["\n".join(early)] if early else []
-    sections = ["\n\n".join([*head, *imports, *([] if reader else constants)])]
-    if reader:
-        sections += [reader, *constants]
-    names = ordered(texts, positions, needed.reads)
-    for are_constants, group in itertools.groupby(names, needed.constants.__contains__):
-        found = [texts[name] for name in group]
-        sections += ["\n".join(found)] if are_constants else found
-    return "\n\n\n".join([*filter(None, sections), *tail]) + "\n"
-
-
-def _import_lines(statements: Iterable[str]) -> str:
-    """Return imports in order: Python's own first, whole modules before names from modules."""
-    in_order = sorted(dict.fromkeys(statements), key=lambda text: (text.startswith("from"), text.lower(), text))
-    first = [text for text in in_order if text.startswith("from __future__")]
-    others = [text for text in in_order if text.split()[1].partition(".")[0] not in sys.stdlib_module_names]
-    own = [text for text in in_order if text not in first and text not in others]
-    return "\n\n".join("\n".join(part) for part in (first, own, others) if part)
 
 
 def _spaced(blocks: Sequence[str]) -> str:

@@ -30,11 +30,10 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from epypes.bundle.arrays import write_arrays
 from epypes.bundle.classes import statements_of_class
 from epypes.bundle.definitions import annotated_names
+from epypes.bundle.expressions import write_arrays
 from epypes.bundle.instances import is_set_elsewhere
-from epypes.bundle.literal import is_data, is_same_data
 from epypes.bundle.load import MODULE, execute
 from epypes.bundle.notebook_source import (
     computes_the_same,
@@ -47,6 +46,7 @@ from epypes.bundle.notebook_source import (
     spelled_tree,
 )
 from epypes.bundle.resolve import layers
+from epypes.bundle.syntax import is_data, is_same_data
 from epypes.graph import CompGraph, Switch
 from epypes.pipeline import Node, Pipeline
 from epypes.run.guard import as_written, is_plain_array, is_unguarded

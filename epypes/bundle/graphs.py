@@ -7,11 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from epypes.bundle.expressions import expression_or_none, noted_refusals
-from epypes.bundle.formatting import Item, laid_out, one_per_line
-from epypes.bundle.identifiers import identifier_of
 from epypes.bundle.instances import arguments_of, by_position
-from epypes.bundle.literal import quoted
 from epypes.bundle.slice import Slice, slice_functions
+from epypes.bundle.syntax import Item, identifier_of, laid_out, one_per_line, quoted
 from epypes.graph import CompGraph, Switch, as_switch, is_placeholder
 from epypes.pipeline import Node, Pipeline
 from epypes.run.guard import as_written

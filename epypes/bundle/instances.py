@@ -12,9 +12,9 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 from epypes.bundle.classes import functions_of
-from epypes.bundle.literal import is_data, is_same_data
 from epypes.bundle.notebook_source import nested_codes
 from epypes.bundle.resolve import Refused
+from epypes.bundle.syntax import is_data, is_same_data
 from epypes.pipeline import Node, Pipeline
 from epypes.run.guard import as_written, is_plain_array
 

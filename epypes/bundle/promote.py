@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from epypes.bundle.adapters import ANSWERS, record_answer
-from epypes.bundle.arrays import write_arrays
 from epypes.bundle.determinism import learn
 from epypes.bundle.emit import write_module
+from epypes.bundle.expressions import write_arrays
 from epypes.bundle.hyperparameters import store_arrays, write_stored_arrays
 from epypes.bundle.load import MODULE, SAMPLES, SETTINGS, Bundle, read_bundle
 from epypes.bundle.manifest import MANIFEST, why_no_bundle

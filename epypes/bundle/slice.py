@@ -15,9 +15,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
 
-from epypes.bundle.arrays import Arrays
 from epypes.bundle.classes import class_definition, class_names
-from epypes.bundle.constants import Remark, imported_as, remark_on
 from epypes.bundle.definitions import (
     Definition,
     FactoryCall,
@@ -31,14 +29,20 @@ from epypes.bundle.definitions import (
     replaced,
     submodules,
 )
-from epypes.bundle.expressions import expression
-from epypes.bundle.formatting import laid_out
-from epypes.bundle.identifiers import identifier_of, is_identifier
-from epypes.bundle.literal import is_data, is_same_data, literal_source, literal_value
+from epypes.bundle.expressions import Arrays, expression
+from epypes.bundle.module import AnyDefinition, Position, Positions, Remark, imported_as, remark_on
 from epypes.bundle.notebook_source import names_of, renamed, with_defaults
-from epypes.bundle.order import AnyDefinition, Position, Positions
 from epypes.bundle.resolve import Importable, Refused, evaluated, holds_functions, importable, is_function
 from epypes.bundle.side_effects import check_asked, check_home, check_patches, check_state
+from epypes.bundle.syntax import (
+    identifier_of,
+    is_data,
+    is_identifier,
+    is_same_data,
+    laid_out,
+    literal_source,
+    literal_value,
+)
 from epypes.run.guard import WATCH
 
 Meaning = tuple[str, object]

@@ -8,13 +8,12 @@ from typing import Any, Final
 
 from epypes.bundle.adapters import is_usual
 from epypes.bundle.expressions import expression, noted_refusals
-from epypes.bundle.formatting import laid_out
 from epypes.bundle.graphs import Graphs
 from epypes.bundle.instances import arguments_of, parameters_of
-from epypes.bundle.literal import quoted
 from epypes.bundle.load import MAKER
 from epypes.bundle.resolve import Refused
 from epypes.bundle.slice import Slice
+from epypes.bundle.syntax import laid_out, quoted
 from epypes.graph import CompGraph, with_defaults
 from epypes.pipeline import FullPipeline, Pipeline, SinkPipeline, SourcePipeline
 from epypes.run import CompGraphRunner

@@ -10,13 +10,21 @@ from itertools import chain
 from typing import Any, Final
 
 from epypes.bundle.clone import called_by, is_plain_pipeline
-from epypes.bundle.emit import module_text
 from epypes.bundle.equivalence import Pair, refusal
 from epypes.bundle.expressions import expression_or_none
-from epypes.bundle.formatting import LINE, Item, laid_out, one_per_line
-from epypes.bundle.identifiers import identifier_of, identifiers_of, is_identifier
-from epypes.bundle.literal import literal_source, quoted
+from epypes.bundle.module import module_text
 from epypes.bundle.slice import Slice, slice_functions
+from epypes.bundle.syntax import (
+    LINE,
+    Item,
+    identifier_of,
+    identifiers_of,
+    is_identifier,
+    laid_out,
+    literal_source,
+    one_per_line,
+    quoted,
+)
 from epypes.errors import PlaceholderNeeded, SourceRefused
 from epypes.graph import CompGraph, as_switch
 from epypes.pipeline import Pipeline
