@@ -110,6 +110,8 @@ def detached(value: Any) -> Any:
 
 
 ANSWERS: Final = "answers"
+# How a difference of an answer is named, beside those of tokens.
+ANSWER: Final = "the answer of f_out"
 _BYTES: Final = "bytes"
 _Parts = Mapping[str, Any]
 
@@ -153,7 +155,7 @@ def answer_differences(bundle: Bundle, sample: str, run: Run) -> Iterator[Differ
         return
     _, expected = load_sample(path)
     got = _parts(_answer(bundle.own["f_out"], bundle.settings.name, run, bundle.settings.attributes))
-    found = difference(sample, "the answer of f_out", differences(expected, None if got is None else dict(got)))
+    found = difference(sample, ANSWER, differences(expected, None if got is None else dict(got)))
     if found is not None:
         yield found
 

@@ -94,6 +94,10 @@ class Difference:
         How many values of the token differ, of how many.
     largest
         The largest difference of numbers, None for what is none.
+    relative
+        The largest difference of a floating-point number as a part of its magnitude, see Tolerance.
+    is_noise
+        Whether all that differ are floating-point numbers, in less than half of their digits.
     """
 
     sample: str
@@ -105,6 +109,8 @@ class Difference:
     count: int = 0
     size: int = 0
     largest: float | None = None
+    relative: float = 0.0
+    is_noise: bool = False
 
     def __str__(self) -> str:
         return f"sample {self.sample}, token {self.token!r}: {self.text}"
@@ -148,7 +154,15 @@ def difference(sample: str, token: str, found: Iterable[Unlike]) -> Difference |
     count, size = (sum(getattr(place, name) for place in places) for name in ("count", "size"))
     numbers = [place.largest for place in places if place.largest is not None]
     largest = max(numbers, default=None)
-    return Difference(sample, token, text, first.where, first.expected, first.got, count, size, largest)
+    return Difference(
+        sample, token, text, first.where, first.expected, first.got, count, size, largest,
+        max(place.relative for place in places), is_noise(places),
+    )  # fmt: skip
+
+
+def is_noise(found: Iterable[Unlike]) -> bool:
+    """Whether all that differ are floating-point numbers, in less than half of their digits."""
+    return all(unlike.epsilon and unlike.relative <= math.sqrt(unlike.epsilon) for unlike in found)
 
 
 def _named(where: str, expected: str, got: str) -> Unlike:

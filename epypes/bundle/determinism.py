@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from epypes.bundle.clone import clone_graph
 from epypes.bundle.code_snapshot import CodeSnapshot
-from epypes.bundle.compare import Tolerance, Unlike, differences
+from epypes.bundle.compare import Tolerance, Unlike, differences, is_noise
 from epypes.errors import BundleError, InputMutated
 from epypes.graph import CompGraph, with_defaults
 from epypes.optional import optional_import
@@ -45,8 +45,9 @@ _WAYS_OUT: Final = {
     _UNSTEADY: "Pass a seed as a token and make the generator of it, as in np.random.default_rng(seed), or call "
     "cv2.setRNGSeed(seed) inside the function; a time and what is kept are to be tokens, too.",
 }
+LEARNT: Final = f"{counted(RUNS, 'more run')} in the notebook"
 _MEANING: Final = (
-    f"{counted(RUNS, 'more run')} in the notebook gave other last digits: a replay may differ by {SAFETY:g} times as",
+    "{} gave other last digits: a replay may differ by {:g} times as",
     "much, and each number by no more than the relative part of its own magnitude.",
 )
 OnProgress = Callable[[str], None]
@@ -102,8 +103,9 @@ def learn(
         of = f" of sample {number} of {len(samples)}" if len(samples) > 1 else ""
         seen = _Seen(runner, sample, lambda text, of=of: on_progress(text + of))  # type: ignore[misc]
         for token, found in seen.unlike.items():
-            if token in outputs and _is_noise(found) and token not in seen.growing():
-                tolerances[token] = _widened(tolerances.get(token), found)
+            if token in outputs and is_noise(found) and token not in seen.growing():
+                relative = max(unlike.relative for unlike in found)
+                tolerances[token] = widened(tolerances.get(token), _distance(found), relative)
         reason = seen.reason(outputs)
         reasons += [reason] if reason and reason not in reasons else []
     changed = {name: snapshot.changed() for name, snapshot in snapshots.items()}
@@ -166,7 +168,7 @@ class _Seen:
         bad = [
             token
             for token in outputs
-            if token in self.unlike and (token in growing or not _is_noise(self.unlike[token]))
+            if token in self.unlike and (token in growing or not is_noise(self.unlike[token]))
         ]
         if not bad:
             return ""
@@ -176,7 +178,7 @@ class _Seen:
         also = f" So {', '.join(map(repr, bad))} can't be verified." if bad != [token] else ""
         if token in growing:
             cause = _GROWS
-        elif _is_noise(self.unlike[token]):
+        elif is_noise(self.unlike[token]):
             cause = _NOISE
         else:
             cause = _UNSTEADY if token in self._unsteady else _SETTLED
@@ -204,17 +206,10 @@ def _grows(distances: Sequence[float]) -> bool:
     return 0.0 not in later and all(left < right for left, right in itertools.pairwise(later))
 
 
-def _is_noise(found: Sequence[Unlike]) -> bool:
-    """Whether all that differs are floating-point numbers, in less than half of their digits."""
-    return all(unlike.epsilon and unlike.relative <= math.sqrt(unlike.epsilon) for unlike in found)
-
-
-def _widened(known: Tolerance | None, found: Sequence[Unlike]) -> Tolerance:
-    """Return a tolerance that covers what was found, with the factor of safety, and what was known before."""
-    absolute = SAFETY * max(unlike.largest or 0.0 for unlike in found)
-    relative = SAFETY * max(unlike.relative for unlike in found)
+def widened(known: Tolerance | None, absolute: float, relative: float) -> Tolerance:
+    """Return a tolerance that covers what was known before, and differences with the factor of safety."""
     # Two digits are enough, rounded up: the file is read by people, and small changes of the noise don't change it.
-    absolute, relative = _rounded_up(absolute), _rounded_up(relative)
+    absolute, relative = _rounded_up(SAFETY * absolute), _rounded_up(SAFETY * relative)
     if known is None:
         return Tolerance(absolute, relative)
     return Tolerance(max(absolute, known.absolute), max(relative, known.relative))
@@ -227,22 +222,31 @@ def _rounded_up(number: float) -> float:
     return float(f"{math.ceil(number / step) * step:.0e}")
 
 
-def add_tolerances(document: Any, tolerances: Mapping[str, Tolerance]) -> None:
-    """Add the tolerances to the document of pipeline.toml, with a comment of what they mean."""
+def add_tolerances(document: Any, tolerances: Mapping[str, Tolerance], origin: str = LEARNT) -> None:
+    """Add tolerances to the document of pipeline.toml, with a comment of what they mean, in the place of former ones.
+
+    Parameters
+    ----------
+    document
+        The document of tomlkit.
+    tolerances
+        By token.
+    origin
+        What has shown the noise.
+    """
     with optional_import():
         import tomlkit
 
     if not tolerances:
         return
-    entries = tomlkit.table(is_super_table=True)
+    entries = document.setdefault("tolerance", tomlkit.table(is_super_table=True))
     for token, tolerance in tolerances.items():
         entry = tomlkit.table()
         for line in _MEANING:
-            entry.add(tomlkit.comment(line))
+            entry.add(tomlkit.comment(line.format(origin, SAFETY)))
         entry.add("absolute", tolerance.absolute)
         entry.add("relative", tolerance.relative)
-        entries.add(token, entry)
-    document.add("tolerance", entries)
+        entries[token] = entry
 
 
 def read_tolerances(document: Mapping[str, Any]) -> dict[str, Tolerance]:

@@ -11,13 +11,17 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
-from epypes.bundle.compare import Difference
+from epypes.bundle.adapters import ANSWER, ANSWERS
+from epypes.bundle.compare import Difference, Tolerance
 from epypes.bundle.conditions import CALL, PROCESS, Condition, other_conditions, usual_environment
+from epypes.bundle.determinism import add_tolerances, read_tolerances, widened
 from epypes.bundle.file_access import named_here
+from epypes.bundle.load import SETTINGS
 from epypes.bundle.manifest import write_manifest
 from epypes.bundle.replay import REPLAY_TIMEOUT_S, ReplayReport, replay_isolated, run_isolated
 from epypes.bundle.requirements import REQUIREMENTS
 from epypes.errors import BundleError, PromotionRefused
+from epypes.optional import optional_import
 
 # From Linux's fcntl.h and fs.h.
 _AT_FDCWD: Final = -100
@@ -34,7 +38,8 @@ def prove(draft: Path, target: Path, timeout_s: float = REPLAY_TIMEOUT_S) -> Rep
     """Replay a draft in fresh isolated processes, write its requirements, seal it; return what the replay found.
 
     Two processes replay at the same time, each every sample twice and the second time in the opposite order. The
-    second one has another hash seed, working folder, time zone, locale and number of threads.
+    second one has another hash seed, working folder, time zone, locale and number of threads. Where these make floats
+    differ by noise alone, as sums in parallel do, a tolerance for it is written into the draft.
 
     Parameters
     ----------
@@ -55,17 +60,39 @@ def prove(draft: Path, target: Path, timeout_s: float = REPLAY_TIMEOUT_S) -> Rep
         folders = _Folders(Path(scratch))
         jobs = [pool.submit(_replayed, draft, changed, folders, timeout_s) for changed in ((), conditions)]
         usual, other = (job.result() for job in jobs)
+        if _tolerate_noise(draft, usual, other):
+            other = _replayed(draft, conditions, folders, timeout_s)
         if isinstance(usual, ReplayReport) and usual.identical and usual.outside:
             raise PromotionRefused(target, usual.outside)
-        if (
-            isinstance(usual, BundleError)
-            or isinstance(other, BundleError)
-            or not (usual.identical and other.identical)
-        ):
+        if isinstance(usual, BundleError) or not (usual.identical and _is_identical(other)):
             raise PromotionRefused(target, _reasons(draft, target, usual, other, conditions, folders))
     (draft / REQUIREMENTS).write_text("".join(f"{line}\n" for line in usual.requirements), encoding="utf-8")
     write_manifest(draft, usual.environment)
     return usual
+
+
+def _tolerate_noise(draft: Path, usual: ReplayReport | BundleError, other: ReplayReport | BundleError) -> bool:
+    """Write tolerances if all that differs under other conditions is noise; return whether there is any.
+
+    A clock or a counter is none: under usual conditions too it would have another value than in the notebook.
+    """
+    if not (_is_identical(usual) and _differences(other)) or not all(entry.is_noise for entry in _differences(other)):
+        return False
+    with optional_import():
+        import tomlkit
+
+    document = tomlkit.parse((draft / SETTINGS).read_text(encoding="utf-8"))
+    known = read_tolerances(document.unwrap())
+    found: dict[str, Tolerance] = {}
+    for entry in _differences(other):
+        if entry.token != ANSWER:
+            before = found.get(entry.token, known.get(entry.token))
+            found[entry.token] = widened(before, entry.largest or 0.0, entry.relative)
+    add_tolerances(document, found, "Another number of threads, or the like,")
+    (draft / SETTINGS).write_text(tomlkit.dumps(document), encoding="utf-8")
+    # They are compared to the last bit.
+    shutil.rmtree(draft / ANSWERS, ignore_errors=True)
+    return True
 
 
 class _Folders:

@@ -112,7 +112,8 @@ def unwritable(values: Mapping[str, Any], what: str = "Hyperparameter") -> list[
         except LargeArray as found:
             reasons.append(
                 f"{what} {token!r} is or holds {found}; {MOST_NUMBERS} are the most that pipeline.toml holds, where "
-                "people read them. Make each array a hyperparameter of its own, which the bundle keeps as a file; or "
+                "people read them. Make each array a hyperparameter of its own, or let the function read it from "
+                "a variable of the notebook, outside of it: the bundle keeps either as a file. Or "
                 "make it in a function; or unfreeze it and pass it to run()."
             )
         except Unwritable as found:

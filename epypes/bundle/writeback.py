@@ -76,7 +76,8 @@ def write_back(
             shutil.copytree(folder, draft, ignore=shutil.ignore_patterns("__pycache__"))
             (draft / SETTINGS).write_text(changed, encoding="utf-8")
             _record(draft, folder, timeout_s)
-            found = WriteBack(_diff(text, changed), digest(draft))
+            written_text = (draft / SETTINGS).read_text(encoding="utf-8")
+            found = WriteBack(_diff(text, written_text), digest(draft))
             if check_manifest(folder) != before:
                 raise BundleError(folder, f"{folder} was replaced meanwhile. Write the values back again.")
             if not dry_run:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import shutil
 
-import cv2
 import numpy as np
 import pytest
 
@@ -115,12 +114,10 @@ def test_arrays_beyond_what_a_bundle_keeps_are_refused_with_a_way_out(tmp_path):
     assert "Pass it in as a token" in reason
 
 
-@pytest.mark.parametrize("value", [IMAGE[:40, :40], {"coin": IMAGE[:40, :40]}])
-def test_a_large_array_as_hyperparameter_is_refused_and_its_way_out_works(value, tmp_path):
-    cg = ep.CompGraph({"match": cv2.matchTemplate}, {"match": (("image", "template", "method"), "out")})
-    if isinstance(value, dict):
-        use = cell("def use(image, template, method):\n    return image + template['coin'].max()\n")["use"]
-        cg = ep.CompGraph({"match": use}, {"match": (("image", "template", "method"), "out")})
+def test_a_large_array_in_a_hyperparameter_is_refused_and_its_way_out_works(tmp_path):
+    value = {"coin": IMAGE[:40, :40]}
+    use = cell("def use(image, template, method):\n    return image + template['coin'].max()\n")["use"]
+    cg = ep.CompGraph({"match": use}, {"match": (("image", "template", "method"), "out")})
     runner = ep.CompGraphRunner(cg, {"template": value, "method": 5})
     runner.run(image=IMAGE)
     with pytest.raises(PromotionRefused) as caught:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import epypes as ep
+from epypes.bundle import verify
 from epypes.errors import PromotionRefused
 from tests.bundle.cells import cell
 
@@ -32,7 +33,7 @@ DEPENDS = {
     ),
     "the parts of a sum": (
         "import cv2, numpy as np\ndef use(x):\n    parts = np.array_split(x, cv2.getNumThreads() + 1)\n"
-        "    return sum(np.cumsum(part)[-1] for part in parts)",
+        "    return int(1e6 * sum(np.cumsum(part)[-1] for part in parts))",
         "the number of threads (OMP_NUM_THREADS, cv2.setNumThreads)",
     ),
     "two of them": (
@@ -89,3 +90,17 @@ def test_a_function_that_fails_under_a_condition_is_refused_with_it(tmp_path):
 def test_a_function_that_counts_is_refused(tmp_path):
     text = refusal("import itertools\nN = itertools.count()\ndef use(x):\n    return next(N)", tmp_path / "bundle")
     assert "'use'" in text
+
+
+def test_noise_that_the_number_of_threads_makes_is_tolerated_as_such(tmp_path):
+    source = (
+        "import cv2, numpy as np\ndef use(x):\n    parts = np.array_split(x, cv2.getNumThreads() + 1)\n"
+        "    return np.array([sum(np.cumsum(part)[-1] for part in parts)], np.float32)"
+    )
+    runner = ep.CompGraphRunner(ep.CompGraph({"use": cell(source)["use"]}, {"use": ("x", "used")}), {})
+    runner.run(x=X)
+    bundle = ep.promote(runner, tmp_path / "bundle")
+    assert 0 < bundle.settings.tolerances["used"].relative < 1e-4
+    text = (bundle.path / "pipeline.toml").read_text()
+    assert "[tolerance.used]\n# Another number of threads, or the like, gave other last digits: a replay may" in text
+    assert verify(bundle.path).identical

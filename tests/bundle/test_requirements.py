@@ -8,13 +8,14 @@ import json
 import subprocess
 import sys
 from importlib import metadata
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 import epypes as ep
-from epypes.bundle.requirements import _reason, _steps, _wanted, pins
+from epypes.bundle.requirements import fresh_environment, pins
 from epypes.errors import BundleError
 from tests.bundle.test_slicer import notebook
 
@@ -136,39 +137,77 @@ def test_pins_are_read_with_comments_and_markers_passed_over():
     assert pins(lines) == {"numpy": "2.0", "a-b-c": "1+cpu"}
 
 
-def test_a_fresh_environment_gets_the_pins_and_the_epypes_that_runs_now(tmp_path):
-    (tmp_path / "requirements.txt").write_text("# a comment\nnumpy==1.2.3\nepypes==0.0.1\n")
-    wanted = _wanted(tmp_path)
-    assert wanted[0] == "numpy==1.2.3"
-    assert [name for name in wanted if name.startswith("protobuf")]
-    assert "epypes==0.0.1" not in wanted
-    with pytest.raises(BundleError, match="can't be read"):
-        _wanted(tmp_path / "nowhere")
+@pytest.fixture
+def bundle(tmp_path):
+    """A folder of which only the requirements are read."""
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "requirements.txt").write_text("# a comment\nnumpy==1.2.3\nepypes==0.0.1\n")
+    return tmp_path / "b"
 
 
-def test_without_uv_it_is_made_by_venv_and_pip(tmp_path, monkeypatch):
+@pytest.fixture
+def no_uv(tmp_path, monkeypatch):
+    """An empty folder as the PATH of a machine on which Python has no uv."""
     monkeypatch.setitem(sys.modules, "uv", None)
-    monkeypatch.setenv("PATH", str(tmp_path))
-    made, installed = (command for _, command in _steps(tmp_path / "env", ["numpy==1"]))
-    assert made[1:4] == ["-I", "-m", "venv"]
-    assert installed[2:5] == ["-m", "pip", "install"]
+    monkeypatch.setenv("PATH", str(tmp_path / "bin"))
+    (tmp_path / "bin").mkdir()
+    return tmp_path / "bin"
+
+
+def installer(folder, body):
+    """Write a program uv that logs its arguments."""
+    program = folder / "uv"
+    program.write_text(
+        f"#!{sys.executable}\nimport sys\nopen({str(folder / 'log')!r}, 'a').write(' '.join(sys.argv[1:]) + '\\n')\n{body}\n"
+    )
+    program.chmod(0o755)
+    return folder / "log"
+
+
+def test_a_fresh_environment_gets_the_pins_and_the_epypes_that_runs_now(bundle, no_uv):
+    log = installer(no_uv, "")
+    with fresh_environment(bundle) as python:
+        home = Path(python).parent.parent
+    made, installed = (line.split() for line in log.read_text().splitlines())
+    assert (made[0], made[-1]) == ("venv", str(home))
+    assert {"pip", "install", python, "numpy==1.2.3"} <= set(installed)
+    assert [name for name in installed if name.startswith("protobuf")]
+    assert "epypes==0.0.1" not in installed
+    (bundle / "requirements.txt").unlink()
+    with pytest.raises(BundleError, match="can't be read"), fresh_environment(bundle):
+        pass
+
+
+@pytest.mark.slow
+def test_without_uv_it_is_made_by_venv_and_pip(bundle, no_uv, monkeypatch):
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    why = r"What requirements\.txt names can't be installed: "
+    with pytest.raises(BundleError, match=why), fresh_environment(bundle):
+        pass
 
 
 @pytest.mark.parametrize(
-    "said",
+    ("output", "reason"),
     [
-        "error: Failed to fetch: `https://index.example/simple/numpy/` dns error: failed to lookup address",
-        "WARNING: Retrying ... NewConnectionError: Failed to establish a new connection: [Errno 111] Connection refused",
+        (
+            "error: Failed to fetch: `https://index.example/simple/numpy/` dns error: failed to lookup address",
+            "A new environment can't be made: no package index answers. Connect to the network, "
+            "or verify without --fresh-env.",
+        ),
+        (
+            "WARNING: Retrying ... NewConnectionError: [Errno 111] Connection refused",
+            "A new environment can't be made: no package index answers. Connect to the network, "
+            "or verify without --fresh-env.",
+        ),
+        (
+            "error: no numpy==9\n  at https://index.example/simple",
+            "A new environment can't be made: error: no numpy==9 at .... Mend requirements.txt in a new promotion, "
+            "or verify without --fresh-env.",
+        ),
     ],
 )
-def test_no_network_is_one_plain_sentence(said):
-    assert _reason("It can't be installed", said) == (
-        "It can't be installed: no package index answers. Connect to the network, or verify without --fresh-env."
-    )
-
-
-def test_what_an_installer_says_is_told_without_addresses_in_one_line():
-    told = _reason("It can't be installed", "error: no numpy==9\n  at https://index.example/simple\n")
-    assert "no numpy==9 at ..." in told
-    assert "\n" not in told
-    assert "index.example" not in told
+def test_why_there_is_no_environment_is_one_plain_sentence_without_addresses(output, reason, bundle, no_uv):
+    installer(no_uv, f"sys.exit({output!r})")
+    with pytest.raises(BundleError) as caught, fresh_environment(bundle):
+        pass
+    assert str(caught.value) == f"{bundle}: {reason}"

@@ -110,7 +110,7 @@ def test_a_runner_that_has_not_been_run_is_refused(told: Told, tmp_path: Path) -
 
 
 def test_every_reason_is_said(told: Told, tmp_path: Path) -> None:
-    runner = runner_of(lambda x, k, m: x, "x", "k", "m", k=np.ones(1_000), m=len)
+    runner = runner_of(lambda x, k, m: x, "x", "k", "m", k=[np.ones(1_000)], m=len)
     runner.run(x=1)
     outcome = told.promoted(runner, tmp_path / "b")
     assert outcome.state == "refused"
