@@ -65,7 +65,7 @@ class Fingerprint:
     state
         Of what is in lists, dicts, arrays and objects that functions use: a call may change it.
     unknown
-        The first object whose content can't be digested, in words; "" if there is none. A computation with one may be
+        The first object whose content can't be digested, as text; "" if there is none. A computation with one may be
         another one although the digests are the same.
     """
 

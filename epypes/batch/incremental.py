@@ -13,12 +13,12 @@ from epypes.bundle.clone import clone_runner
 from epypes.run import CompGraphRunner, Run
 from epypes.run.stopped import stop_at
 
-# Of what the runners of cases hold between settings; cases beyond are run from their files or arrays each time.
+# Of the values that runners hold between settings; further cases run from their files or arrays each time.
 _MOST_BYTES: Final = 2**30
 
 
 class SearchStopped(Exception):
-    """Somebody has asked to stop, and the function that ran then has returned."""
+    """A stop was requested, and the function that ran then has returned."""
 
 
 class CaseRunners:
@@ -29,13 +29,13 @@ class CaseRunners:
     runner
         Its graph and hyperparameters are used; it is left as it is.
     items
-        What is run.
+        The cases' inputs.
     own
         Hyperparameters of the items that differ from those of the runner.
     keep
         The tokens that are wanted; only what they need is run.
     stop
-        Ends the work after the function that runs when it is set.
+        Once it is set, the function that runs is the last one.
     """
 
     def __init__(
@@ -52,12 +52,12 @@ class CaseRunners:
         self._bytes = 0
 
     def outcomes(self, setting: Mapping[str, Any]) -> Iterator[Outcome]:
-        """Give what the items give with a setting, one after another.
+        """Yield the outcomes of the items under a setting, one after another.
 
         Raises
         ------
-        Stopped
-            As it was asked for.
+        SearchStopped
+            A stop was requested.
         """
         for index, item in enumerate(self._items):
             yield self._outcome(index, item, setting)

@@ -24,6 +24,7 @@ import pytest
 import epypes as ep
 from epypes.batch.cache import NoDigest, function_digest, payload_digest, value_digest, value_label
 from epypes.errors import ScaleError
+from tests.bundle.cells import cell
 from tests.calls import log_to
 
 # -- edited code ----------------------------------------------------------------------------------------------------
@@ -181,18 +182,23 @@ def graph_of(function: Any, outputs: str = "out") -> ep.CompGraph:
     return ep.CompGraph({"f": function}, {"f": ("image", outputs)})
 
 
-def notebook(form: str, factor: int, **names: Any) -> Any:
-    """Run the cells of a notebook in a kernel of their own; return the `f` of it."""
-    namespace = {"__name__": "__main__", **names}
+def notebook(form: str, factor: int) -> Any:
+    """Run the cells of a notebook in a kernel of their own; return the `f` of it, which has no source."""
+    namespace = {"__name__": "__main__"}
     exec(textwrap.dedent(BEFORE), namespace)
     exec(textwrap.dedent(FORMS[form].replace("{}", str(factor))), namespace)
     return namespace["f"]
 
 
-def mapped(function: Any, store: Any) -> ep.Outcome:
-    """Return what a map gives that stores under the name "n"."""
+def cell_of(form: str, factor: int) -> Any:
+    """Return the `f` of a notebook's cell, which has its source."""
+    return cell(textwrap.dedent(BEFORE) + textwrap.dedent(FORMS[form].replace("{}", str(factor))) + "\n")["f"]
+
+
+def mapped(function: Any, store: Any, name: str | None = "n") -> ep.Outcome:
+    """Return the one outcome of a map with a store."""
     runner = ep.CompGraphRunner(ep.CompGraph({"f": function}, {"f": ("image", "out")}))
-    (outcome,) = ep.map(runner, [{"image": np.float64(4)}], store=store, name="n")
+    (outcome,) = ep.map(runner, [{"image": np.float64(4)}], store=store, name=name)
     return outcome
 
 
@@ -214,6 +220,20 @@ def test_failure_72_no_stored_result_of_a_named_map_survives_an_edit_behind(form
         assert edited.values == {"out": 8.0}
     # What was stored of the first computation is of that.
     assert mapped(notebook(form, 1), store) == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", FORMS)
+def test_an_edited_cell_has_other_results_or_its_graph_needs_a_name(form: str, tmp_path: Path) -> None:
+    store = tmp_path / "r.sqlite"
+    try:
+        before = mapped(cell_of(form, 1), store, None)
+    except ScaleError as refused:
+        reason = str(refused)
+        assert reason.endswith("can't be written as text, which would tell it from others. Give name=.")
+        return
+    assert mapped(cell_of(form, 1), store, None) == before
+    assert mapped(cell_of(form, 2), store, None).values == {"out": 8.0}
 
 
 @pytest.mark.parametrize("form", FORMS)
