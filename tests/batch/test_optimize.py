@@ -227,7 +227,7 @@ def test_cases_that_do_not_fit_into_memory_are_run_anew(
     cases, ranges = [np.full((30, 30), 1), np.full((2, 2), 5)], {"k": (0, 9)}
     kept = ep.optimize(runner, "y", cases, 8, ranges=ranges)
     calls["heavy"] = 0
-    monkeypatch.setattr(incremental, "_MOST_BYTES", 1_000)
+    monkeypatch.setattr(incremental, "MOST_BYTES", 1_000)
     anew = ep.optimize(runner, "y", cases, 8, ranges=ranges)
     assert calls["heavy"] == 8 + 1, "the small one is kept"
     assert [trial.value for trial in anew] == [trial.value for trial in kept]
