@@ -307,7 +307,7 @@ def test_a_trial_that_fails_says_why_and_the_others_go_on() -> None:
     def metric(tokens: Mapping[str, Any], _case: ep.Case) -> Any:
         if tokens["y"] == 1:
             raise RuntimeError("no label")
-        return {2: float("nan"), 3: "much"}.get(tokens["y"], tokens["y"])
+        return {2: float("nan"), 3: "much", 4: 10**400}.get(tokens["y"], tokens["y"])
 
     result = ep.optimize(runner_of(f, k=0), metric, [1, 2], 40, ranges={"k": (0, 5)})
     frame = result.to_frame()
@@ -317,6 +317,7 @@ def test_a_trial_that_fails_says_why_and_the_others_go_on() -> None:
         1: "#0: metric raised RuntimeError: no label",
         2: "#0: metric gave nan",
         3: "#0: metric gave a 'str', no number",
+        4: "#0: metric gave a 'int', no number",
     }
     assert (result.best, result.best_value) == ({"k": 5}, 5.0)
     assert set(frame.failure[frame.state == "complete"]) == {None}
