@@ -14,7 +14,7 @@ from epypes.run import CompGraphRunner, Run
 from epypes.run.stopped import stop_at
 
 # Of the values that runners hold between settings; further cases run from their files or arrays each time.
-_MOST_BYTES: Final = 2**30
+MOST_BYTES: Final = 2**30
 
 
 class SearchStopped(Exception):
@@ -103,7 +103,7 @@ class CaseRunners:
     def _remember(self, index: int, runner: CompGraphRunner) -> None:
         """Keep a runner for the next setting, unless its arrays are too large."""
         held = 0 if runner.last is None else _bytes_of(runner.last)
-        if self._bytes + held <= _MOST_BYTES:
+        if self._bytes + held <= MOST_BYTES:
             self._bytes += held
             self._runners[index] = runner
 

@@ -108,16 +108,14 @@ class Objective:
 
     def _measured(self, case: Case, outcome: Outcome) -> tuple[float, str]:
         """Return the metric of one case, and the reason if there is none."""
-        if isinstance(self._metric, str):
-            given = outcome.kept[self._metric]
-        else:
-            try:
-                given = self._metric(MappingProxyType(dict(outcome.kept)), case)
-            except (Exception, SystemExit) as error:
-                return math.nan, f"{self.name} raised {type(error).__name__}: {error}"
+        tokens, metric = MappingProxyType(dict(outcome.kept)), self._metric
+        try:
+            given = tokens[metric] if isinstance(metric, str) else metric(tokens, case)
+        except (Exception, SystemExit) as error:
+            return math.nan, f"{self.name} raised {type(error).__name__}: {error}"
         try:
             value = float(given)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             return math.nan, f"{self.name} gave a {type(given).__name__!r}, no number"
         return value, "" if math.isfinite(value) else f"{self.name} gave {value}"
 

@@ -227,7 +227,7 @@ def test_cases_that_do_not_fit_into_memory_are_run_anew(
     cases, ranges = [np.full((30, 30), 1), np.full((2, 2), 5)], {"k": (0, 9)}
     kept = ep.optimize(runner, "y", cases, 8, ranges=ranges)
     calls["heavy"] = 0
-    monkeypatch.setattr(incremental, "_MOST_BYTES", 1_000)
+    monkeypatch.setattr(incremental, "MOST_BYTES", 1_000)
     anew = ep.optimize(runner, "y", cases, 8, ranges=ranges)
     assert calls["heavy"] == 8 + 1, "the small one is kept"
     assert [trial.value for trial in anew] == [trial.value for trial in kept]
@@ -307,7 +307,7 @@ def test_a_trial_that_fails_says_why_and_the_others_go_on() -> None:
     def metric(tokens: Mapping[str, Any], _case: ep.Case) -> Any:
         if tokens["y"] == 1:
             raise RuntimeError("no label")
-        return {2: float("nan"), 3: "much"}.get(tokens["y"], tokens["y"])
+        return {2: float("nan"), 3: "much", 4: 10**400}.get(tokens["y"], tokens["y"])
 
     result = ep.optimize(runner_of(f, k=0), metric, [1, 2], 40, ranges={"k": (0, 5)})
     frame = result.to_frame()
@@ -317,6 +317,7 @@ def test_a_trial_that_fails_says_why_and_the_others_go_on() -> None:
         1: "#0: metric raised RuntimeError: no label",
         2: "#0: metric gave nan",
         3: "#0: metric gave a 'str', no number",
+        4: "#0: metric gave a 'int', no number",
     }
     assert (result.best, result.best_value) == ({"k": 5}, 5.0)
     assert set(frame.failure[frame.state == "complete"]) == {None}
