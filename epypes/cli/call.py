@@ -33,8 +33,18 @@ if TYPE_CHECKING:
 @click.option("--json", "as_json", is_flag=True, help="Print the times as JSON, in nanoseconds.")
 @keys_option
 @allow_option
-@click.option("--sub", default="", show_default=False, help="As of epypes serve, if a broker asks for a password.")
-@click.option("--pub", default="", show_default=False, help="As of epypes serve, if a broker asks for a password.")
+@click.option(
+    "--sub",
+    default="",
+    show_default=False,
+    help="The address given to epypes serve; needed if its broker asks for a password.",
+)
+@click.option(
+    "--pub",
+    default="",
+    show_default=False,
+    help="The address given to epypes serve; needed if its broker asks for a password.",
+)
 def call(bundle: Path, images: Sequence[str], out: Sequence[str], count: int, as_json: bool, **options: Any) -> None:
     """Send an image to a service, and write its answer to a file.
 

@@ -48,10 +48,10 @@ def failures(
             click.echo(json.dumps(asdict(record)))
     elif found:
         _print_failures(found)
-        click.echo(f"Again, in a process of its own: epypes replay {found[0].id}")
+        click.echo(f"To run it again in a separate process: epypes replay {found[0].id}")
         click.echo(f"In a notebook: ep.load_failure({found[0].id!r})")
     else:
-        click.echo(f"No failures of {source} were kept." if source else "No failures were kept.")
+        click.echo(f"No failures of {source} are stored." if source else "No failures are stored.")
 
 
 def _follow(source: str | None, as_json: bool, keys: Path | None, allow: Sequence[Path] | None) -> None:

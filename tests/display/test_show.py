@@ -119,6 +119,13 @@ def test_what_can_not_be_shown_is_refused_with_what_can(shown):
         ep.show(shown)
 
 
+def test_a_sweep_shows_itself_and_is_no_pipeline(edge_runner, photograph):
+    edge_runner.run(image=photograph)
+    swept = ep.sweep(edge_runner, {"canny_lo": [50]}, progress=False)
+    with pytest.raises(TypeError, match="a Plan or a Pipeline, not 'SweepResult'"):
+        ep.show(swept)
+
+
 def test_a_figure_stays_as_it_was_when_it_was_shown(edge_runner, photograph):
     edge_runner.run(image=photograph)
     figure = ep.show(edge_runner)

@@ -84,11 +84,13 @@ def _graph_of(shown: Any) -> CompGraph:
     """Return the graph of what is shown; raise TypeError if it can't be shown."""
     if isinstance(shown, CompGraph):
         return shown
+    if isinstance(shown, CompGraphRunner | Run | Plan):
+        return shown.cg
     try:
-        runner = shown if isinstance(shown, CompGraphRunner | Run | Plan) else getattr(shown, "runner", None)
-    except Exception:  # the attribute may be anything of anybody's
+        runner = shown.runner if hasattr(shown, "name") else None
+    except Exception:  # an attribute of a user's class may do anything
         runner = None
-    if not isinstance(runner, CompGraphRunner | Run | Plan) or isinstance(shown, type):
+    if not isinstance(runner, CompGraphRunner) or isinstance(shown, type):
         text = "What can be shown is a CompGraph, a CompGraphRunner, a Run, a Plan or a Pipeline"
         raise TypeError(f"{text}, not {type(shown).__name__!r}.")
     return runner.cg
