@@ -37,13 +37,13 @@ if TYPE_CHECKING:
     "--sub",
     default="",
     show_default=False,
-    help="The address given to epypes serve; needed if its broker asks for a password.",
+    help="The address given to epypes serve; if a broker wants a password.",
 )
 @click.option(
     "--pub",
     default="",
     show_default=False,
-    help="The address given to epypes serve; needed if its broker asks for a password.",
+    help="The address given to epypes serve; if a broker wants a password.",
 )
 def call(bundle: Path, images: Sequence[str], out: Sequence[str], count: int, as_json: bool, **options: Any) -> None:
     """Send an image to a service, and write its answer to a file.
