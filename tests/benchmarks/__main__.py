@@ -18,6 +18,7 @@ from tests.benchmarks import (
     peers,
     picture,
     pipeline,
+    promotion,
     service,
     sockets,
     tuning,
@@ -27,7 +28,20 @@ from tests.benchmarks.timing import Effort
 
 _WIDTH = 170
 _MODULES = (
-    *(imports, engine, pipeline, mutable_state, picture, sockets, brokers, service, batch_map, batch_sweep, case),
+    *(
+        imports,
+        engine,
+        pipeline,
+        mutable_state,
+        picture,
+        sockets,
+        brokers,
+        service,
+        promotion,
+        batch_map,
+        batch_sweep,
+        case,
+    ),
     tuning,
 )
 
