@@ -96,7 +96,7 @@ class Definition:
         return self.place_in(next(uses, self.node))
 
 
-def definition(function: types.FunctionType, what: str, decorated: Collection[ast.expr] = ()) -> Definition:
+def definition(function: types.FunctionType, what: str, decorators: Collection[ast.expr] = ()) -> Definition:
     """Return the source of a function that was defined in the notebook or the main script.
 
     Parameters
@@ -105,8 +105,9 @@ def definition(function: types.FunctionType, what: str, decorated: Collection[as
         The function.
     what
         How to call it in a reason, as ``"Function 'blur'"``.
-    decorated
-        Its decorators that are known to have made what the notebook has.
+    decorators
+        Those that stay, besides ``@ep.unguarded``. Without the others its text is this very function: a decorator may
+        have returned another, or the function itself.
 
     Raises
     ------
@@ -121,10 +122,14 @@ def definition(function: types.FunctionType, what: str, decorated: Collection[as
     _check_found(bool(lines), node is not None, what, place)
     if node is None:
         raise Refused(what)
-    _check_decorators(node, function, what, place, {ast.unparse(decorator) for decorator in decorated})
-    names = function.__globals__
-    text = own_text(lines, node, [mark for mark in node.decorator_list if _names_outputs(mark, names)])
-    return _defined(function, text, _without_outputs(node, names), what, place)
+    known, written = {ast.unparse(decorator) for decorator in decorators}, copy.copy(node)
+    written.decorator_list = [
+        decorator
+        for decorator in node.decorator_list
+        if ast.unparse(decorator) in known or evaluated(decorator, function.__globals__) is unguarded
+    ]
+    text = own_text(lines, node, [one for one in node.decorator_list if one not in written.decorator_list])
+    return _defined(function, text, written, what, place)
 
 
 def _lambda(function: types.FunctionType, what: str, place: str) -> Definition:
@@ -139,10 +144,9 @@ def _lambda(function: types.FunctionType, what: str, place: str) -> Definition:
 
 def _defined(function: types.FunctionType, text: str, node: ast.FunctionDef, what: str, place: str) -> Definition:
     check_nonlocal(function, node, what)
-    code = code_on_its_own(text, node, function.__code__)
+    code = code_on_its_own(text, node.name)
     if code is None:
-        reason = f"{what} computes something else if its text is moved to another place ({place})."
-        raise Refused(f"{reason} Define it at the margin of a cell, not in a class.")
+        raise Refused(f"{what} can't be compiled by itself ({place}). Define it at the margin of a cell.")
     captured = _captured(function, what, place)
     return Definition(node.name, function, text, node, place, code, captured, node.name == UNNAMED)
 
@@ -172,15 +176,6 @@ def _check_kind(function: types.FunctionType, what: str, place: str) -> None:
         raise Refused(f"{what} is asynchronous ({place}), which no graph waits for. Write a plain function (def).")
 
 
-def _check_decorators(
-    node: ast.FunctionDef, function: types.FunctionType, what: str, place: str, known: Collection[str]
-) -> None:
-    for decorator in other_decorators(node, function.__globals__):
-        if ast.unparse(decorator) not in known:
-            text = f"{what} is decorated by @{ast.unparse(decorator)} ({place}), and does not say so itself."
-            raise Refused(f"{text} Use functools.wraps in the decorator, or call its work inside the function.")
-
-
 def other_decorators(node: ast.FunctionDef, names: Mapping[str, Any]) -> list[ast.expr]:
     """Return the decorators of a definition that are no marks of EPypes."""
     return [decorator for decorator in node.decorator_list if not _is_our_mark(decorator, names)]
@@ -198,23 +193,25 @@ def _names_outputs(decorator: ast.expr, names: Mapping[str, Any]) -> TypeGuard[a
     return isinstance(decorator, ast.Call) and evaluated(decorator.func, names) is outputs
 
 
-def _without_outputs(node: ast.FunctionDef, names: Mapping[str, Any]) -> ast.FunctionDef:
-    """Return the definition without ``@ep.outputs``: what is written out has the graph's io, and no need of it."""
-    kept = copy.copy(node)
-    kept.decorator_list = [decorator for decorator in node.decorator_list if not _names_outputs(decorator, names)]
-    return kept
-
-
 def found_definition(function: Any, what: str) -> Definition:
     """Return the definition of a function of the notebook, with its decorators.
 
     Raises
     ------
     Refused
-        It has none, or that does not say all of it.
+        It has none, that does not say all of it, or a decorator keeps something from call to call or calls what may
+        give something else in another process.
     """
-    if len(layers(function)) > 1 and (isinstance(function, types.FunctionType) or has_decorators(function)):
-        return decorated(function, what)
+    found = layers(function)
+    innermost = found[-1]
+    node = definition_of(innermost.__code__)[1] if isinstance(innermost, types.FunctionType) else None
+    decorators = other_decorators(node, innermost.__globals__) if node is not None else []
+    if 0 < len(decorators) == len(found) - 1:
+        for decorator, wrapper in zip(decorators, found, strict=False):
+            place = place_in(innermost.__code__.co_filename, decorator.lineno)
+            whole = f"{what} is wrapped by a decorator, @{ast.unparse(decorator)} ({place}):"
+            _check_layer(decorator, wrapper, innermost.__globals__, whole)
+        return definition(innermost, what, decorators)
     if not isinstance(function, types.FunctionType):
         text = f"{what} is {_kind(function)}{_place(function, what)}."
         raise Refused(f"{text} Write a plain function (def) that makes the object and calls it.")
@@ -259,42 +256,6 @@ def _place(value: Any, what: str) -> str:
 def _code_in(kind: type) -> types.CodeType | None:
     methods = (getattr(value, "__code__", None) for value in vars(kind).values())
     return next((code for code in methods if code is not None), None)
-
-
-def has_decorators(function: Any) -> bool:
-    """Whether the text of what an object wraps names decorators that may have made the object."""
-    innermost = layers(function)[-1]
-    if not isinstance(innermost, types.FunctionType):
-        return False
-    _, node = definition_of(innermost.__code__)
-    return node is not None and bool(other_decorators(node, innermost.__globals__))
-
-
-def decorated(function: Any, what: str) -> Definition:
-    """Return the definition, with its decorators, of a function that wraps another.
-
-    Raises
-    ------
-    Refused
-        Its text has no decorator for each layer, a layer keeps something from call to call, or a decorator of the
-        notebook calls what may give something else in another process.
-    """
-    found = layers(function)
-    innermost = found[-1]
-    if not isinstance(innermost, types.FunctionType):
-        raise Refused(f"{what} wraps an object of class {type(innermost).__name__!r}. Wrap a plain function (def).")
-    _, node = definition_of(innermost.__code__)
-    names = innermost.__globals__
-    decorators = other_decorators(node, names) if node else []
-    if node is not None and len(decorators) != len(found) - 1:
-        text = f"{what} is wrapped {len(found) - 1} times and has {len(decorators)} decorators that could do it"
-        place = place_of(innermost.__code__)
-        raise Refused(f"{text} ({place}). Wrap it by @ above its definition, with functools.wraps in each decorator.")
-    for decorator, wrapper in zip(decorators, found, strict=False):
-        place = place_in(innermost.__code__.co_filename, decorator.lineno)
-        whole = f"{what} is wrapped by a decorator, @{ast.unparse(decorator)} ({place}):"
-        _check_layer(decorator, wrapper, names, whole)
-    return definition(innermost, what, decorators)
 
 
 def _check_layer(decorator: ast.expr, wrapper: Any, names: dict[str, Any], what: str) -> None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import ast
 import builtins
+import copyreg
 import dataclasses
 import enum
 import functools
@@ -487,7 +488,8 @@ def _content(value: Any) -> dict[str, Any]:
 
 def _of_library(value: Any) -> dict[str, Any]:
     """Return what a copy of an object is made of."""
-    made = value.__reduce_ex__(4)
+    reduce = copyreg.dispatch_table.get(type(value))
+    made = reduce(value) if reduce is not None else value.__reduce_ex__(4)
     if isinstance(made, str):
         raise TypeError(made)
     by, arguments, state, items, pairs = (*made, None, None, None)[:5]

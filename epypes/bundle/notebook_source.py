@@ -116,7 +116,7 @@ def _givers(text: str) -> dict[str, tuple[ast.stmt, ...]]:
     found: dict[str, tuple[ast.stmt, ...]] = {}
     tree = parsed(text)
     for node in _statements(tree.body) if tree else ():
-        for name in dict.fromkeys(_given(node)):
+        for name in dict.fromkeys(given_names(node)):
             found[name] = (*found.get(name, ()), node)
     return found
 
@@ -130,7 +130,8 @@ def _statements(body: list[ast.stmt]) -> Iterator[ast.stmt]:
                 yield from _statements(getattr(node, field, []))
 
 
-def _given(node: ast.stmt) -> Iterator[str]:
+def given_names(node: ast.stmt) -> Iterator[str]:
+    """Give the names to which a statement gives a value or a module."""
     if isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign):
         targets = node.targets if isinstance(node, ast.Assign) else [node.target]
         for target in targets:
@@ -283,14 +284,6 @@ def names_from_outside(code: types.CodeType) -> Iterator[str]:
             yield instruction.argval
 
 
-def own_parts(node: ast.AST) -> Iterator[ast.AST]:
-    """Return the parts of a function or class, but not those of functions and classes inside of it."""
-    for part in ast.iter_child_nodes(node):
-        yield part
-        if not isinstance(part, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda | ast.ClassDef):
-            yield from own_parts(part)
-
-
 def computes_the_same(one: types.CodeType, other: types.CodeType) -> bool:
     """Whether two pieces of code are the same, but for the place where they stand."""
     return _bare(one) == _bare(other)
@@ -302,25 +295,14 @@ def _bare(code: types.CodeType) -> types.CodeType:
     return code.replace(co_consts=constants, co_filename="", co_firstlineno=1, co_linetable=b"")
 
 
-def same_methods(text: str, node: ast.ClassDef, written: Mapping[str, Sequence[types.FunctionType]]) -> str:
-    """Return the name of a method in the text of a class that is not what the class has; "" if there is none."""
-    for method in node.body:
-        if not isinstance(method, ast.FunctionDef):
-            continue
-        codes = [function.__code__ for function in written[method.name]]
-        late = LATE_ANNOTATIONS if any(code.co_flags & LATE_ANNOTATIONS for code in codes) else 0
-        known = [_definitions(text, late, apart).get((method.name, first_line(method))) for apart in (False, True)]
-        if not any(found and any(computes_the_same(found[1], code) for code in codes) for found in known):
-            return method.name
-    return ""
+def code_on_its_own(text: str, name: str = "<module>") -> types.CodeType | None:
+    """Compile a definition that was taken out, for a module where annotations are read at once; None if that fails.
 
-
-def class_code(text: str, node: ast.ClassDef) -> types.CodeType | None:
-    """Compile a class that was taken out, as a module; None if it means something else there."""
+    Whether it means there what it means in the notebook is found out by the comparison with the module's objects.
+    """
     tree = parsed(text)
-    if tree is None or len(tree.body) != 1 or spelled_tree(tree.body[0]) != spelled_tree(node):
-        return None
-    return compiled(tree, 0)
+    module = compiled(tree, 0) if tree is not None else None
+    return next((code for code in nested_codes(module) if code.co_name == name), None) if module else None
 
 
 def first_line(node: ast.FunctionDef | ast.ClassDef) -> int:
@@ -407,45 +389,6 @@ def _lines_in_strings(text: str) -> Iterator[int]:
         return  # the text is compiled later, and then refused
 
 
-def code_on_its_own(text: str, node: ast.FunctionDef, code: types.CodeType) -> types.CodeType | None:
-    """Compile a definition that was taken out, for a module where annotations are read at once.
-
-    Parameters
-    ----------
-    text
-        What :func:`own_text` returned.
-    node
-        The definition, without the decorators that were dropped.
-    code
-        The function's code. What it captured is global in the module.
-
-    Returns
-    -------
-    types.CodeType or None
-        The code; None if it means something else than the function's.
-    """
-    tree = parsed(text)
-    if tree is None or len(tree.body) != 1 or spelled_tree(tree.body[0]) != spelled_tree(node):
-        return None
-    as_before = _code_of(node.name, _captured(tree, code.co_freevars), code.co_flags & LATE_ANNOTATIONS)
-    # Inside of a class Python renames what begins with two underscores.
-    return _code_of(node.name, tree, 0) if as_before and _names_in(as_before) == _names_in(code) else None
-
-
-def _captured(tree: ast.Module, names: Collection[str]) -> ast.Module:
-    """Return a definition inside of a function that has some names."""
-    if not names:
-        return tree
-    around = ast.parse(f"def around({', '.join(names)}):\n    pass")
-    vars(around.body[0]).update(name="<around>", body=tree.body)
-    return around
-
-
-def _code_of(name: str, tree: ast.Module, flags: int) -> types.CodeType | None:
-    module = compiled(tree, flags)
-    return next((code for code in nested_codes(module) if code.co_name == name), None) if module else None
-
-
 def spelled_tree(tree: ast.AST) -> list[object]:
     """Return all that a syntax tree says, without its lines; not by ast.dump, which a long sum is too deep for."""
     return [(type(node), [_spelled(value) for _, value in ast.iter_fields(node)]) for node in ast.walk(tree)]
@@ -455,10 +398,6 @@ def _spelled(value: object) -> object:
     if isinstance(value, list):
         return [_spelled(item) for item in value]
     return ast.AST if isinstance(value, ast.AST) else (type(value), value)
-
-
-def _names_in(code: types.CodeType) -> list[tuple[tuple[str, ...], ...]]:
-    return [(part.co_names, part.co_varnames, part.co_freevars, part.co_cellvars) for part in nested_codes(code)]
 
 
 # Until its name is known.
