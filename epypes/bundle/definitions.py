@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ast
 import copy
-import dis
 import sys
 import types
 from collections.abc import Collection, Iterator, Mapping
@@ -32,7 +31,7 @@ from epypes.bundle.notebook_source import (
     place_of_object,
 )
 from epypes.bundle.resolve import Importable, Refused, evaluated, importable, layers
-from epypes.bundle.side_effects import CHANGING, check_nonlocal, check_state, unrepeatable
+from epypes.bundle.side_effects import CHANGING, captured_by, check_nonlocal, check_state, unrepeatable
 from epypes.bundle.syntax import literal_source
 from epypes.graph import outputs
 from epypes.run.guard import unguarded
@@ -147,17 +146,7 @@ def _defined(function: types.FunctionType, text: str, node: ast.FunctionDef, wha
     code = code_on_its_own(text, node.name)
     if code is None:
         raise Refused(f"{what} can't be compiled by itself ({place}). Define it at the margin of a cell.")
-    captured = _captured(function, what, place)
-    return Definition(node.name, function, text, node, place, code, captured, node.name == UNNAMED)
-
-
-def _captured(function: types.FunctionType, what: str, place: str) -> dict[str, Any]:
-    try:
-        cells = [cell.cell_contents for cell in function.__closure__ or ()]
-    except ValueError as error:
-        text = f"{what} uses names of the function around it that have no value ({place})."
-        raise Refused(f"{text} Define them before, or define it outside.") from error
-    return dict(zip(function.__code__.co_freevars, cells, strict=True))
+    return Definition(node.name, function, text, node, place, code, captured_by(function), node.name == UNNAMED)
 
 
 def _check_found(has_lines: bool, has_node: bool, what: str, place: str) -> None:
@@ -288,9 +277,6 @@ def _is_of_library(function: types.FunctionType) -> bool:
     return home is not None and home.__name__ != "__main__" and vars(home) is function.__globals__
 
 
-_REBINDS = ("STORE_DEREF", "DELETE_DEREF")
-
-
 @dataclass(frozen=True, slots=True)
 class FactoryCall:
     """A call that makes a closure.
@@ -315,12 +301,11 @@ def factory_call(found: Definition) -> FactoryCall | None:
     call makes what the notebook has is found out by the comparison with the module's objects.
     """
     code = found.function.__code__
-    name, _, inner = code.co_qualname.partition(".<locals>.")
-    factory = found.function.__globals__.get(name)
-    if not isinstance(factory, types.FunctionType) or factory.__closure__ or "." in inner:
+    factory = found.function.__globals__.get(code.co_qualname.partition(".<locals>.")[0])
+    if not isinstance(factory, types.FunctionType) or code not in factory.__code__.co_consts:
         return None
     _, node = definition_of(factory.__code__)
-    if code not in factory.__code__.co_consts or node is None or hasattr(factory, "__wrapped__"):
+    if node is None:
         return None
     if unrepeatable(node, {**factory.__globals__, **found.captured}, code) is not None:
         return None
@@ -332,7 +317,7 @@ def _with_arguments(factory: types.FunctionType, found: Definition) -> FactoryCa
     count, named = code.co_argcount, code.co_kwonlyargcount
     parameters = code.co_varnames[: count + named]
     has_more = code.co_flags & (0x04 | 0x08)  # *args and **kwargs, as inspect.CO_VARARGS and CO_VARKEYWORDS
-    if has_more or not set(parameters) <= found.captured.keys() or _rebound(code) & set(parameters):
+    if has_more or not set(parameters) <= found.captured.keys():
         return None
     positional = [found.captured[name] for name in parameters[:count]]
     while _is_default(factory, positional):
@@ -348,12 +333,6 @@ def _is_default(factory: types.FunctionType, positional: list[Any]) -> bool:
     defaults = factory.__defaults__ or ()
     missing = len(positional) - (factory.__code__.co_argcount - len(defaults))
     return 0 < missing <= len(defaults) and defaults[missing - 1] is positional[-1]
-
-
-def _rebound(code: types.CodeType) -> set[str]:
-    """Return the names that code, or what is defined in it, gives another value though others have captured them."""
-    instructions = (instruction for part in nested_codes(code) for instruction in dis.get_instructions(part))
-    return {instruction.argval for instruction in instructions if instruction.opname in _REBINDS}
 
 
 def global_names(found: Definition, replaced_defaults: Collection[ast.expr] = ()) -> Iterator[str]:

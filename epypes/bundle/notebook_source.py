@@ -411,45 +411,27 @@ def lambdas_of(code: types.CodeType) -> tuple[list[str], list[ast.Lambda]]:
     if tree is None:
         return lines, []
     nodes = [node for node in ast.walk(tree) if isinstance(node, ast.Lambda) and node.lineno == code.co_firstlineno]
-    known = [other for apart in (False, True) for other in _same_lambdas(tree, code, apart)]
-    if not known:
-        return lines, []
+    flags = code.co_flags & LATE_ANNOTATIONS
+    others = [other for apart in (False, True) for other in codes_in(tree, flags, apart)]
     # The table of lines holds the columns too, unless Python runs with -X no_debug_ranges.
-    exact = [other for other in known if other.co_linetable == code.co_linetable]
-    if not exact:
+    if not any(other.co_linetable == code.co_linetable and _is_same_place(other, code) for other in others):
         return lines, []
-    around = [node for node in nodes if _holds(node.body, exact[0])]
+    # Some versions of Python put the return at the line's beginning, without a text.
+    places = [place for place in code.co_positions() if None not in place and place[::2] != place[1::2]]
+    around = [node for node in nodes if places and all(_holds(node.body, place) for place in places)]
     # Of lambdas in one another, the innermost.
-    return lines, [max(around, key=lambda node: _start(node.body))] if around else nodes
+    return lines, [max(around, key=lambda node: (node.body.lineno, node.body.col_offset))] if around else nodes
 
 
-def _same_lambdas(tree: ast.Module, code: types.CodeType, apart: bool) -> Iterator[types.CodeType]:
-    for other in codes_in(tree, code.co_flags & LATE_ANNOTATIONS, apart):
-        place = (other.co_name, other.co_firstlineno)
-        if place == (code.co_name, code.co_firstlineno) and computes_the_same(other, code):
-            yield other
+def _is_same_place(one: types.CodeType, other: types.CodeType) -> bool:
+    return one.co_firstlineno == other.co_firstlineno and one.co_name == other.co_name and computes_the_same(one, other)
 
 
-def _holds(body: ast.expr, code: types.CodeType) -> bool:
-    """Whether code, which has something to show, stands inside of a body."""
-    places = [((line, column), (end_line, end_column)) for line, end_line, column, end_column in _shown(code)]
-    return bool(places) and _start(body) <= min(places)[0] and max(end for _, end in places) <= _end(body)
-
-
-def _shown(code: types.CodeType) -> Iterator[tuple[int, int, int, int]]:
-    """Return the positions of code that have a text: some versions of Python put the return at the line's beginning."""
-    for line, end_line, column, end_column in code.co_positions():
-        is_known = line is not None and end_line is not None and column is not None and end_column is not None
-        if is_known and (line, column) != (end_line, end_column):
-            yield line or 0, end_line or 0, column or 0, end_column or 0
-
-
-def _start(node: ast.expr) -> tuple[int, int]:
-    return node.lineno, node.col_offset
-
-
-def _end(node: ast.expr) -> tuple[int, int]:
-    return node.end_lineno or node.lineno, node.end_col_offset or 0
+def _holds(body: ast.expr, place: Sequence[Any]) -> bool:
+    """Whether a body holds a place: its first and last line, and the columns there."""
+    line, end_line, column, end_column = place
+    ends_inside = (end_line, end_column) <= (body.end_lineno, body.end_col_offset)
+    return (body.lineno, body.col_offset) <= (line, column) and ends_inside
 
 
 def as_function(lines: list[str], node: ast.Lambda) -> tuple[str, ast.FunctionDef]:
@@ -466,7 +448,7 @@ def as_function(lines: list[str], node: ast.Lambda) -> tuple[str, ast.FunctionDe
     if not isinstance(shape, ast.FunctionDef):
         raise TypeError(type(shape).__name__)
     vars(shape).update(args=node.args, body=[ast.copy_location(ast.Return(node.body), node.body)])
-    head = f"def {UNNAMED}({', '.join(_parameters(node.args))}):"
+    head = f"def {UNNAMED}({ast.unparse(node.args)}):"
     text = f"{_comment(lines, node)}{head}\n{_returned(''.join(lines), node.body)}\n"
     return text, ast.copy_location(shape, node)
 
@@ -480,28 +462,6 @@ def _returned(source: str, body: ast.expr) -> str:
     if value is not None and "\n" not in text and len(text) <= LINE and spelled_tree(value) == spelled_tree(body):
         return text
     return "\n".join(laid_out(ast.unparse(body), 1, "return "))
-
-
-def _parameters(arguments: ast.arguments) -> Iterator[str]:
-    """Return the parameters as they stand in a definition."""
-    by_position = [*arguments.posonlyargs, *arguments.args]
-    lone = [None] * (len(by_position) - len(arguments.defaults))
-    for number, (argument, default) in enumerate(zip(by_position, [*lone, *arguments.defaults], strict=True), 1):
-        yield _parameter(argument, default)
-        if number == len(arguments.posonlyargs):
-            yield "/"
-    if arguments.vararg:
-        yield f"*{arguments.vararg.arg}"
-    elif arguments.kwonlyargs:
-        yield "*"
-    for argument, given in zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True):
-        yield _parameter(argument, given)
-    if arguments.kwarg:
-        yield f"**{arguments.kwarg.arg}"
-
-
-def _parameter(argument: ast.arg, default: ast.expr | None) -> str:
-    return f"{argument.arg}={ast.unparse(default)}" if default else argument.arg
 
 
 def _comment(lines: list[str], node: ast.Lambda) -> str:

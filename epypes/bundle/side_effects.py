@@ -280,33 +280,15 @@ _REPEATABLE: Final[Mapping[str, frozenset[str]]] = {
     "pathlib": frozenset(("Path", "PurePath", "PurePosixPath")),
     "logging": frozenset(("getLogger",)),
 }  # fmt: skip
-_REPEATABLE_MODULES: Final = frozenset(
-    {
-        *("abc", "collections", "contextlib", "dataclasses", "decimal", "enum", "fractions", "functools", "itertools"),
-        *("math", "operator", "re", "types", "typing"),
-    }
-)
+_REPEATABLE_MODULES: Final = frozenset((
+    "abc", "collections", "contextlib", "dataclasses", "decimal", "enum", "fractions", "functools", "itertools",
+    "math", "operator", "re", "types", "typing",
+))  # fmt: skip
 _ORDER_FREE: Final = frozenset({"all", "any", "frozenset", "len", "max", "min", "set", "sorted", "sum"})
-_REPEATABLE_METHODS: Final = frozenset(
-    {
-        *(
-            "append",
-            "astype",
-            "copy",
-            "extend",
-            "format",
-            "get",
-            "items",
-            "join",
-            "keys",
-            "lower",
-            "max",
-            "mean",
-            "min",
-        ),
-        *("ravel", "replace", "reshape", "split", "strip", "sum", "transpose", "update", "upper", "values"),
-    }
-)
+_REPEATABLE_METHODS: Final = frozenset((
+    "append", "astype", "copy", "extend", "format", "get", "items", "join", "keys", "lower", "max", "mean", "min",
+    "ravel", "replace", "reshape", "split", "strip", "sum", "transpose", "update", "upper", "values",
+))  # fmt: skip
 
 
 def unrepeatable(node: ast.AST, names: Mapping[str, Any], inner: types.CodeType | None = None) -> ast.expr | None:
