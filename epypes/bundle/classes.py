@@ -7,7 +7,6 @@ out by the comparison with the module's objects.
 from __future__ import annotations
 
 import ast
-import dis
 import linecache
 import sys
 import types
@@ -28,7 +27,7 @@ from epypes.bundle.notebook_source import (
     place_in,
 )
 from epypes.bundle.resolve import Refused
-from epypes.bundle.side_effects import unrepeatable
+from epypes.bundle.side_effects import check_globals, unrepeatable
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,11 +107,7 @@ def class_definition(kind: type, around: Mapping[str, Any], what: str) -> ClassD
     code = code_on_its_own(text)
     if code is None:
         raise Refused(f"{what} can't be compiled by itself ({place}). Define it at the margin of a cell.")
-    for inside in nested_codes(code):
-        for instruction in dis.get_instructions(inside):
-            if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
-                text = f"{what} changes the global {instruction.argval!r} ({place})."
-                raise Refused(f"{text} Keep it in the object.")
+    check_globals(code, node, file, what)
     return ClassDefinition(kind.__name__, text, node, place, code, names, file)
 
 

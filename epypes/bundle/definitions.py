@@ -31,7 +31,7 @@ from epypes.bundle.notebook_source import (
     place_of_object,
 )
 from epypes.bundle.resolve import Importable, Refused, evaluated, importable, layers
-from epypes.bundle.side_effects import CHANGING, captured_by, check_nonlocal, check_state, unrepeatable
+from epypes.bundle.side_effects import CHANGING, captured_by, check_nonlocal, check_state, dotted_name, unrepeatable
 from epypes.bundle.syntax import literal_source
 from epypes.graph import outputs
 from epypes.run.guard import unguarded
@@ -385,26 +385,27 @@ def defaults_in(node: ast.FunctionDef | ast.Lambda) -> list[ast.expr]:
 
 def default_values(node: ast.FunctionDef, function: types.FunctionType) -> list[tuple[str, ast.expr, Any]]:
     """Return the defaults by parameter, as they are written and as they are; none if it has others than are written."""
-    by_position, by_name = function.__defaults__ or (), function.__kwdefaults__ or {}
-    every = [*node.args.posonlyargs, *node.args.args]
-    named = [
-        (one.arg, default) for one, default in zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True) if default
-    ]
-    if len(by_position) != len(node.args.defaults) or by_name.keys() != {name for name, _ in named}:
-        return []
-    last = every[len(every) - len(by_position) :]
-    found = [
-        (one.arg, *pair) for one, pair in zip(last, zip(node.args.defaults, by_position, strict=True), strict=True)
-    ]
-    return found + [(name, default, by_name[name]) for name, default in named]
+    by_position, by_name = [*node.args.posonlyargs, *node.args.args], node.args.kwonlyargs
+    pairs = [*zip(by_position[::-1], node.args.defaults[::-1], strict=False)][::-1]
+    pairs += [(one, default) for one, default in zip(by_name, node.args.kw_defaults, strict=True) if default]
+    known = defaults_of(function)
+    is_as_written = known.keys() == {one.arg for one, _ in pairs}
+    return [(one.arg, default, known[one.arg]) for one, default in pairs] if is_as_written else []
+
+
+def defaults_of(function: types.FunctionType) -> dict[str, Any]:
+    """Return the defaults of a function by parameter, as they are by now."""
+    given, code = function.__defaults__ or (), function.__code__
+    names = code.co_varnames[: code.co_argcount]
+    return dict(zip(names[len(names) - len(given) :], given, strict=True)) | (function.__kwdefaults__ or {})
 
 
 def submodules(tree: ast.AST, name: str, module: types.ModuleType) -> tuple[str, ...]:
     """Return the submodules that are reached as attributes (``skimage.filters``): each needs an import of its own."""
     found: dict[str, None] = {}
     for node in ast.walk(tree):
-        chain = _chain(node)
-        if chain and chain[0] == name:
+        chain = dotted_name(node)
+        if chain[:1] == (name,):
             reached: Any = module
             dotted = name
             for part in chain[1:]:
@@ -415,23 +416,3 @@ def submodules(tree: ast.AST, name: str, module: types.ModuleType) -> tuple[str,
             if dotted != name:
                 found[dotted] = None
     return tuple(found)
-
-
-def replaced(tree: ast.AST, name: str, module: types.ModuleType) -> str:
-    """Return what of a module a notebook has replaced by a function of its own (``cv2.blur = ...``); "" if nothing."""
-    for node in ast.walk(tree):
-        chain = _chain(node)
-        reached: Any = module if chain and chain[0] == name else None
-        for part in chain[1:]:
-            reached = getattr(reached, part, None)
-        if isinstance(reached, types.FunctionType | type) and reached.__module__ == "__main__":
-            return ".".join(chain)
-    return ""
-
-
-def _chain(node: ast.AST) -> list[str]:
-    parts: list[str] = []
-    while isinstance(node, ast.Attribute):
-        parts.append(node.attr)
-        node = node.value
-    return [node.id, *reversed(parts)] if isinstance(node, ast.Name) and parts else []

@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from epypes.bundle.classes import statements_of_class
-from epypes.bundle.definitions import annotated_names
+from epypes.bundle.definitions import annotated_names, defaults_of
 from epypes.bundle.expressions import write_arrays
 from epypes.bundle.instances import is_set_elsewhere
 from epypes.bundle.load import MODULE, execute
@@ -350,11 +350,8 @@ def _asks_for_identity(node: ast.AST) -> bool:
 
 
 def _defaults(function: types.FunctionType) -> dict[str, Any]:
-    """Return the defaults of a function by parameter."""
-    given = function.__defaults__ or ()
-    names = function.__code__.co_varnames[: function.__code__.co_argcount]
-    found = dict(zip(names[len(names) - len(given) :], given, strict=True)) | (function.__kwdefaults__ or {})
-    return {f" default of {name!r}": found[name] for name in sorted(found)}
+    """Return the defaults of a function by how a reason calls them."""
+    return {f" default of {name!r}": value for name, value in sorted(defaults_of(function).items())}
 
 
 def _marks(function: Any) -> dict[str, Any]:

@@ -19,7 +19,6 @@ import tokenize
 import types
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import takewhile
@@ -239,7 +238,7 @@ def codes_in(tree: ast.Module, flags: int, apart: bool) -> Iterator[types.CodeTy
 def parsed(source: str) -> ast.Module | None:
     """Return the syntax tree of text; None if it is no Python."""
     try:
-        with _without_warnings():
+        with warnings.catch_warnings(action="ignore"):  # the notebook has shown them
             return ast.parse(source)
     except (SyntaxError, ValueError):
         return None
@@ -248,20 +247,12 @@ def parsed(source: str) -> ast.Module | None:
 def compiled(tree: ast.Module, flags: int) -> types.CodeType | None:
     """Compile as a cell is compiled, which may await; None if that can't be done."""
     try:
-        with _without_warnings():
+        with warnings.catch_warnings(action="ignore"):  # the notebook has shown them
             flags |= ast.PyCF_ALLOW_TOP_LEVEL_AWAIT
             code: types.CodeType = compile(tree, "text", "exec", flags, dont_inherit=True)
             return code
     except (SyntaxError, ValueError):
         return None
-
-
-@contextmanager
-def _without_warnings() -> Iterator[None]:
-    """Silence the warnings that the notebook has shown when the text was run."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
 
 
 def nested_codes(code: types.CodeType) -> Iterator[types.CodeType]:

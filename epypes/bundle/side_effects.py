@@ -80,11 +80,7 @@ def check_state(function: types.FunctionType, node: ast.AST, what: str) -> None:
         How a reason calls it.
     """
     code = function.__code__
-    for inner in nested_codes(code):
-        for instruction in dis.get_instructions(inner):
-            if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
-                place = place_in(code.co_filename, line_of(node, instruction.argval, code.co_firstlineno))
-                raise Refused(f"{what} changes the global {instruction.argval!r} ({place}). Return the value.")
+    check_globals(code, node, code.co_filename, what)
     check_nonlocal(function, node, what)
     names = {**function.__globals__, **captured_by(function)}
     outside = {*code.co_freevars, *(name for inner in nested_codes(code) for name in names_from_outside(inner))}
@@ -113,6 +109,17 @@ def _is_container(value: Any, root: Any) -> bool:
     return isinstance(value, list | dict | set | bytearray | deque) or is_plain_array(value)
 
 
+def check_globals(code: types.CodeType, node: ast.AST, file: str, what: str) -> None:
+    """Refuse what changes global names of the notebook."""
+    for inner in nested_codes(code):
+        for instruction in dis.get_instructions(inner):
+            if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
+                name = instruction.argval
+                uses = (part.lineno for part in ast.walk(node) if isinstance(part, ast.Name) and part.id == name)
+                place = place_in(file, next(uses, code.co_firstlineno))
+                raise Refused(f"{what} changes the global {name!r} ({place}). Return the value.")
+
+
 def check_nonlocal(function: types.FunctionType, node: ast.AST, what: str) -> None:
     """Refuse a function that keeps something from call to call in the function around it."""
     code = function.__code__
@@ -121,12 +128,6 @@ def check_nonlocal(function: types.FunctionType, node: ast.AST, what: str) -> No
         if kept and isinstance(part, ast.Nonlocal):
             text = f"{what} changes {kept[0]!r} of the function around it ({place_in(code.co_filename, part.lineno)})"
             raise Refused(f"{text}, so that every call finds it different. Make it a token, or return the value.")
-
-
-def line_of(node: ast.AST, name: str, otherwise: int) -> int:
-    """Return the first line of a definition that has a name."""
-    uses = (part.lineno for part in ast.walk(node) if isinstance(part, ast.Name) and part.id == name)
-    return next(uses, otherwise)
 
 
 def captured_by(function: types.FunctionType) -> dict[str, Any]:
@@ -154,21 +155,23 @@ def _asks_for_names(node: ast.AST) -> bool:
 
 # -- monkeypatches ---------------------------------------------------------------------------------------------------
 
-_Key = tuple[int, str]
+_Key = tuple[types.ModuleType, str]
 
 
 def check_patches(found: Any, what: str) -> None:
     """Refuse a definition that reads what the notebook has changed in a module."""
-    known = _patched()
-    for chain in _read_by(found.node) if known else ():
-        key = _key(chain, {**found.names, **_imports_of(found.node)})
-        if key in known:
-            _refuse(what, ".".join(chain), known[key])
+    known, names = _patched(), {**found.names, **_imports_of(found.node)}
+    for chain in _read_by(found.node):
+        key = _key(chain, names)
+        value = getattr(*key, None) if key is not None and key[0].__name__ != "__main__" else None
+        is_own = isinstance(value, types.FunctionType | type) and value.__module__ == "__main__"
+        if key is not None and (is_own or key in known):
+            _refuse(what, ".".join(chain), known.get(key, found.place))
 
 
 def check_home(home: Importable, what: str) -> None:
     """Refuse what can be imported only as the notebook has changed it."""
-    place = _patched().get((id(sys.modules.get(home.module)), home.qualname.partition(".")[0]))
+    place = _patched().get((sys.modules[home.module], home.qualname.partition(".")[0]))
     if place:
         _refuse(what, f"{home.module}.{home.qualname}", place)
 
@@ -202,7 +205,7 @@ def _key(chain: tuple[str, ...], names: Mapping[str, Any]) -> _Key | None:
             return None
         inner = getattr(reached, part, None)
         if not isinstance(inner, types.ModuleType):
-            return id(reached), part
+            return reached, part
         reached = inner
     return None
 
@@ -225,11 +228,11 @@ def _targets(node: ast.AST) -> Iterator[tuple[str, ...]]:
     elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("setattr", "delattr"):
         parts, name = list(node.args[:1]), node.args[1] if len(node.args) > 1 else None
         more = (str(name.value),) if isinstance(name, ast.Constant) else ()
-    chains = (_dotted(part) + more for part in parts)
+    chains = (dotted_name(part) + more for part in parts)
     yield from (chain for chain in chains if len(chain) > 1)
 
 
-def _dotted(node: ast.AST) -> tuple[str, ...]:
+def dotted_name(node: ast.AST) -> tuple[str, ...]:
     """Return the dotted name that an expression begins with; nothing if it is none."""
     parts: list[str] = []
     while isinstance(node, ast.Attribute | ast.Subscript):
@@ -241,7 +244,7 @@ def _dotted(node: ast.AST) -> tuple[str, ...]:
 def _read_by(tree: ast.AST) -> Iterator[tuple[str, ...]]:
     """Give the dotted names that a definition reads, and what it imports from modules."""
     for node in ast.walk(tree):
-        chain = _dotted(node) if isinstance(node, ast.Attribute) else ()
+        chain = dotted_name(node) if isinstance(node, ast.Attribute) else ()
         if len(chain) > 1:
             yield chain
         if isinstance(node, ast.ImportFrom) and node.module and not node.level:
@@ -344,20 +347,16 @@ def _at_once(node: ast.AST, inner: types.CodeType | None) -> Iterator[ast.AST]:
             continue
         for default in (*part.args.defaults, *part.args.kw_defaults):
             yield from ast.walk(default) if default is not None else ()
-        if inner is not None and not is_definition_of(part, inner) and any(_is_in(part, inner)):
+        if inner is not None and not _defines(part, inner) and any(_defines(each, inner) for each in ast.walk(part)):
             yield from _at_once(part, inner)
 
 
-def _is_in(node: ast.AST, code: types.CodeType) -> Iterator[bool]:
-    return (is_definition_of(part, code) for part in ast.walk(node))
-
-
-def is_definition_of(node: ast.AST, code: types.CodeType) -> bool:
+def _defines(node: ast.AST, code: types.CodeType) -> bool:
     """Whether a part of the text that some code is from is its definition."""
     if isinstance(node, ast.Lambda):
         return code.co_name == "<lambda>" and node.lineno == code.co_firstlineno
-    is_function = isinstance(node, ast.FunctionDef) and node.name == code.co_name
-    return is_function and isinstance(node, ast.FunctionDef) and first_line(node) == code.co_firstlineno
+    is_named = isinstance(node, ast.FunctionDef) and node.name == code.co_name
+    return isinstance(node, ast.FunctionDef) and is_named and first_line(node) == code.co_firstlineno
 
 
 def _is_repeatable(call: ast.Call, names: Mapping[str, Any], seen: set[types.CodeType], is_unused: bool) -> bool:

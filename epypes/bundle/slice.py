@@ -26,7 +26,6 @@ from epypes.bundle.definitions import (
     global_names,
     method_of,
     only_in_annotations,
-    replaced,
     submodules,
 )
 from epypes.bundle.expressions import Arrays, expression
@@ -446,10 +445,6 @@ class Slice:
     def _add_module(self, name: str, module: types.ModuleType, found: AnyDefinition, what: str) -> None:
         if module.__name__ == "__main__":
             raise Refused(f"{what} uses the notebook itself as module {name!r} ({found.place_of(name)}).")
-        other = replaced(found.node, name, module)
-        if other:
-            text = f"{what} uses {other!r} ({found.place_of(name)}), which the notebook has replaced by its own"
-            raise Refused(f"{text}. Call yours by a name of its own.")
         if name != module.__name__:
             self._import_as(module.__name__, name, what)
             return
