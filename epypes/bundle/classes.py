@@ -7,7 +7,6 @@ out by the comparison with the module's objects.
 from __future__ import annotations
 
 import ast
-import dis
 import linecache
 import sys
 import types
@@ -17,19 +16,18 @@ from functools import cached_property
 from typing import Any
 
 from epypes.bundle.notebook_source import (
-    class_code,
+    cell_of,
+    code_on_its_own,
+    given_names,
     lines_in,
     names_from_outside,
     nested_codes,
-    own_parts,
     own_text,
     parsed,
     place_in,
-    same_methods,
 )
 from epypes.bundle.resolve import Refused
-from epypes.bundle.side_effects import unrepeatable
-from epypes.bundle.syntax import is_same_data
+from epypes.bundle.side_effects import check_globals, unrepeatable
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,11 +92,10 @@ def class_definition(kind: type, around: Mapping[str, Any], what: str) -> ClassD
     if kind.__qualname__ != kind.__name__:
         text = f"{what} is defined inside {kind.__qualname__.rpartition('.')[0]!r}"
         raise Refused(f"{text}. Define it at the margin of a cell.")
-    found = [*statements_of_class(kind)]
-    if not found:
+    file, node = next(statements_of_class(kind), ("", None))
+    if node is None:
         way_out = "Write a class statement for it, as class P(typing.NamedTuple), and make again what was made of it."
         raise Refused(f"{what} has no class statement: it was made by a call. {way_out}")
-    file, node = next((pair for pair in found if _fits(kind, pair[1], "".join(lines_in(pair[0])))), found[0])
     names = next((function.__globals__ for function in functions_of(kind).values()), around)
     place = place_in(file, node.lineno)
     part = unrepeatable(node, names)
@@ -107,42 +104,29 @@ def class_definition(kind: type, around: Mapping[str, Any], what: str) -> ClassD
         way_out = "Compute it above the class under a name of its own, VALUE = ..., and use that name in the class"
         raise Refused(f"{text}: that may give something else in a service. {way_out}.")
     text = own_text(lines_in(file), node, ())
-    code = class_code(text, node)
+    code = code_on_its_own(text)
     if code is None:
-        raise Refused(f"{what} means something else if its text is moved to another place ({place}).")
-    for inside in nested_codes(code):
-        for instruction in dis.get_instructions(inside):
-            if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
-                text = f"{what} changes the global {instruction.argval!r} ({place})."
-                raise Refused(f"{text} Keep it in the object.")
+        raise Refused(f"{what} can't be compiled by itself ({place}). Define it at the margin of a cell.")
+    check_globals(code, node, file, what)
     return ClassDefinition(kind.__name__, text, node, place, code, names, file)
 
 
-def _fits(kind: type, node: ast.ClassDef, text: str) -> bool:
-    """Whether a class statement may be the one of a class, which may have been changed since."""
-    names = [one.name for one in node.body if isinstance(one, ast.FunctionDef)]
-    methods = {name: list(_functions_in(vars(kind).get(name))) for name in names}
-    fields = vars(kind).get("__dataclass_fields__", {})
-    values = {**vars(kind), **dict.fromkeys(vars(kind).get("_fields", ())), **vars(kind).get("_field_defaults", {})}
-    values |= {name: field.default for name, field in fields.items()}
-    values |= {name: member.value for name, member in getattr(kind, "__members__", {}).items()}
-    bound = {part.id for part in own_parts(node) if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store)}
-    if not bound <= values.keys() or same_methods(text, node, methods):
-        return False
-    for part in node.body:
-        if isinstance(part, ast.Assign | ast.AnnAssign) and isinstance(part.value, ast.Constant):
-            targets = part.targets if isinstance(part, ast.Assign) else [part.target]
-            for name in (target.id for target in targets if isinstance(target, ast.Name)):
-                if not is_same_data(part.value.value, values[name]):
-                    return False
-    return True
-
-
 def statements_of_class(kind: type) -> Iterator[tuple[str, ast.ClassDef]]:
-    """Give the class statements that may be the one of a class, each with its file: the last one first."""
-    for file in _files(kind):
-        for node in _classes(lines_in(file), kind.__name__):
-            yield file, node
+    """Give the class statements that may be the one of a class, each with its file: the last one first.
+
+    They hold the lines of its methods and give a value to nothing that it lacks, if there is such a statement.
+    """
+    found = [(file, node) for file in _files(kind) for node in _classes(lines_in(file), kind.__name__)]
+    lines = [function.__code__.co_firstlineno for function in functions_of(kind).values()]
+    known = {*vars(kind), *vars(kind).get("_fields", ()), *vars(kind).get("__dataclass_fields__", ())}
+    known |= {*vars(kind).get("__members__", ())}
+    cells = vars(sys.modules["__main__"])
+    yield from sorted(found, key=lambda pair: (not _may_make(pair[1], lines, known), -cell_of(pair[0], cells)))
+
+
+def _may_make(node: ast.ClassDef, lines: list[int], known: set[str]) -> bool:
+    bound = {name for part in node.body for name in given_names(part)}
+    return bound <= known and any(node.lineno <= line <= (node.end_lineno or line) for line in lines or [node.lineno])
 
 
 def class_names(found: ClassDefinition) -> Iterator[str]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ast
 import copy
-import dis
 import sys
 import types
 from collections.abc import Collection, Iterator, Mapping
@@ -32,7 +31,7 @@ from epypes.bundle.notebook_source import (
     place_of_object,
 )
 from epypes.bundle.resolve import Importable, Refused, evaluated, importable, layers
-from epypes.bundle.side_effects import CHANGING, check_nonlocal, check_state, unrepeatable
+from epypes.bundle.side_effects import CHANGING, captured_by, check_nonlocal, check_state, dotted_name, unrepeatable
 from epypes.bundle.syntax import literal_source
 from epypes.graph import outputs
 from epypes.run.guard import unguarded
@@ -96,7 +95,7 @@ class Definition:
         return self.place_in(next(uses, self.node))
 
 
-def definition(function: types.FunctionType, what: str, decorated: Collection[ast.expr] = ()) -> Definition:
+def definition(function: types.FunctionType, what: str, decorators: Collection[ast.expr] = ()) -> Definition:
     """Return the source of a function that was defined in the notebook or the main script.
 
     Parameters
@@ -105,8 +104,9 @@ def definition(function: types.FunctionType, what: str, decorated: Collection[as
         The function.
     what
         How to call it in a reason, as ``"Function 'blur'"``.
-    decorated
-        Its decorators that are known to have made what the notebook has.
+    decorators
+        Those that stay, besides ``@ep.unguarded``. Without the others its text is this very function: a decorator may
+        have returned another, or the function itself.
 
     Raises
     ------
@@ -121,10 +121,14 @@ def definition(function: types.FunctionType, what: str, decorated: Collection[as
     _check_found(bool(lines), node is not None, what, place)
     if node is None:
         raise Refused(what)
-    _check_decorators(node, function, what, place, {ast.unparse(decorator) for decorator in decorated})
-    names = function.__globals__
-    text = own_text(lines, node, [mark for mark in node.decorator_list if _names_outputs(mark, names)])
-    return _defined(function, text, _without_outputs(node, names), what, place)
+    known, written = {ast.unparse(decorator) for decorator in decorators}, copy.copy(node)
+    written.decorator_list = [
+        decorator
+        for decorator in node.decorator_list
+        if ast.unparse(decorator) in known or evaluated(decorator, function.__globals__) is unguarded
+    ]
+    text = own_text(lines, node, [one for one in node.decorator_list if one not in written.decorator_list])
+    return _defined(function, text, written, what, place)
 
 
 def _lambda(function: types.FunctionType, what: str, place: str) -> Definition:
@@ -139,21 +143,10 @@ def _lambda(function: types.FunctionType, what: str, place: str) -> Definition:
 
 def _defined(function: types.FunctionType, text: str, node: ast.FunctionDef, what: str, place: str) -> Definition:
     check_nonlocal(function, node, what)
-    code = code_on_its_own(text, node, function.__code__)
+    code = code_on_its_own(text, node.name)
     if code is None:
-        reason = f"{what} computes something else if its text is moved to another place ({place})."
-        raise Refused(f"{reason} Define it at the margin of a cell, not in a class.")
-    captured = _captured(function, what, place)
-    return Definition(node.name, function, text, node, place, code, captured, node.name == UNNAMED)
-
-
-def _captured(function: types.FunctionType, what: str, place: str) -> dict[str, Any]:
-    try:
-        cells = [cell.cell_contents for cell in function.__closure__ or ()]
-    except ValueError as error:
-        text = f"{what} uses names of the function around it that have no value ({place})."
-        raise Refused(f"{text} Define them before, or define it outside.") from error
-    return dict(zip(function.__code__.co_freevars, cells, strict=True))
+        raise Refused(f"{what} can't be compiled by itself ({place}). Define it at the margin of a cell.")
+    return Definition(node.name, function, text, node, place, code, captured_by(function), node.name == UNNAMED)
 
 
 def _check_found(has_lines: bool, has_node: bool, what: str, place: str) -> None:
@@ -170,15 +163,6 @@ def _check_found(has_lines: bool, has_node: bool, what: str, place: str) -> None
 def _check_kind(function: types.FunctionType, what: str, place: str) -> None:
     if function.__code__.co_flags & (CO_COROUTINE | CO_ASYNC_GENERATOR):
         raise Refused(f"{what} is asynchronous ({place}), which no graph waits for. Write a plain function (def).")
-
-
-def _check_decorators(
-    node: ast.FunctionDef, function: types.FunctionType, what: str, place: str, known: Collection[str]
-) -> None:
-    for decorator in other_decorators(node, function.__globals__):
-        if ast.unparse(decorator) not in known:
-            text = f"{what} is decorated by @{ast.unparse(decorator)} ({place}), and does not say so itself."
-            raise Refused(f"{text} Use functools.wraps in the decorator, or call its work inside the function.")
 
 
 def other_decorators(node: ast.FunctionDef, names: Mapping[str, Any]) -> list[ast.expr]:
@@ -198,23 +182,25 @@ def _names_outputs(decorator: ast.expr, names: Mapping[str, Any]) -> TypeGuard[a
     return isinstance(decorator, ast.Call) and evaluated(decorator.func, names) is outputs
 
 
-def _without_outputs(node: ast.FunctionDef, names: Mapping[str, Any]) -> ast.FunctionDef:
-    """Return the definition without ``@ep.outputs``: what is written out has the graph's io, and no need of it."""
-    kept = copy.copy(node)
-    kept.decorator_list = [decorator for decorator in node.decorator_list if not _names_outputs(decorator, names)]
-    return kept
-
-
 def found_definition(function: Any, what: str) -> Definition:
     """Return the definition of a function of the notebook, with its decorators.
 
     Raises
     ------
     Refused
-        It has none, or that does not say all of it.
+        It has none, that does not say all of it, or a decorator keeps something from call to call or calls what may
+        give something else in another process.
     """
-    if len(layers(function)) > 1 and (isinstance(function, types.FunctionType) or has_decorators(function)):
-        return decorated(function, what)
+    found = layers(function)
+    innermost = found[-1]
+    node = definition_of(innermost.__code__)[1] if isinstance(innermost, types.FunctionType) else None
+    decorators = other_decorators(node, innermost.__globals__) if node is not None else []
+    if 0 < len(decorators) == len(found) - 1:
+        for decorator, wrapper in zip(decorators, found, strict=False):
+            place = place_in(innermost.__code__.co_filename, decorator.lineno)
+            whole = f"{what} is wrapped by a decorator, @{ast.unparse(decorator)} ({place}):"
+            _check_layer(decorator, wrapper, innermost.__globals__, whole)
+        return definition(innermost, what, decorators)
     if not isinstance(function, types.FunctionType):
         text = f"{what} is {_kind(function)}{_place(function, what)}."
         raise Refused(f"{text} Write a plain function (def) that makes the object and calls it.")
@@ -261,42 +247,6 @@ def _code_in(kind: type) -> types.CodeType | None:
     return next((code for code in methods if code is not None), None)
 
 
-def has_decorators(function: Any) -> bool:
-    """Whether the text of what an object wraps names decorators that may have made the object."""
-    innermost = layers(function)[-1]
-    if not isinstance(innermost, types.FunctionType):
-        return False
-    _, node = definition_of(innermost.__code__)
-    return node is not None and bool(other_decorators(node, innermost.__globals__))
-
-
-def decorated(function: Any, what: str) -> Definition:
-    """Return the definition, with its decorators, of a function that wraps another.
-
-    Raises
-    ------
-    Refused
-        Its text has no decorator for each layer, a layer keeps something from call to call, or a decorator of the
-        notebook calls what may give something else in another process.
-    """
-    found = layers(function)
-    innermost = found[-1]
-    if not isinstance(innermost, types.FunctionType):
-        raise Refused(f"{what} wraps an object of class {type(innermost).__name__!r}. Wrap a plain function (def).")
-    _, node = definition_of(innermost.__code__)
-    names = innermost.__globals__
-    decorators = other_decorators(node, names) if node else []
-    if node is not None and len(decorators) != len(found) - 1:
-        text = f"{what} is wrapped {len(found) - 1} times and has {len(decorators)} decorators that could do it"
-        place = place_of(innermost.__code__)
-        raise Refused(f"{text} ({place}). Wrap it by @ above its definition, with functools.wraps in each decorator.")
-    for decorator, wrapper in zip(decorators, found, strict=False):
-        place = place_in(innermost.__code__.co_filename, decorator.lineno)
-        whole = f"{what} is wrapped by a decorator, @{ast.unparse(decorator)} ({place}):"
-        _check_layer(decorator, wrapper, names, whole)
-    return definition(innermost, what, decorators)
-
-
 def _check_layer(decorator: ast.expr, wrapper: Any, names: dict[str, Any], what: str) -> None:
     given = [*decorator.args, *(word.value for word in decorator.keywords)] if isinstance(decorator, ast.Call) else []
     for argument in given:
@@ -327,9 +277,6 @@ def _is_of_library(function: types.FunctionType) -> bool:
     return home is not None and home.__name__ != "__main__" and vars(home) is function.__globals__
 
 
-_REBINDS = ("STORE_DEREF", "DELETE_DEREF")
-
-
 @dataclass(frozen=True, slots=True)
 class FactoryCall:
     """A call that makes a closure.
@@ -354,12 +301,11 @@ def factory_call(found: Definition) -> FactoryCall | None:
     call makes what the notebook has is found out by the comparison with the module's objects.
     """
     code = found.function.__code__
-    name, _, inner = code.co_qualname.partition(".<locals>.")
-    factory = found.function.__globals__.get(name)
-    if not isinstance(factory, types.FunctionType) or factory.__closure__ or "." in inner:
+    factory = found.function.__globals__.get(code.co_qualname.partition(".<locals>.")[0])
+    if not isinstance(factory, types.FunctionType) or code not in factory.__code__.co_consts:
         return None
     _, node = definition_of(factory.__code__)
-    if code not in factory.__code__.co_consts or node is None or hasattr(factory, "__wrapped__"):
+    if node is None:
         return None
     if unrepeatable(node, {**factory.__globals__, **found.captured}, code) is not None:
         return None
@@ -371,7 +317,7 @@ def _with_arguments(factory: types.FunctionType, found: Definition) -> FactoryCa
     count, named = code.co_argcount, code.co_kwonlyargcount
     parameters = code.co_varnames[: count + named]
     has_more = code.co_flags & (0x04 | 0x08)  # *args and **kwargs, as inspect.CO_VARARGS and CO_VARKEYWORDS
-    if has_more or not set(parameters) <= found.captured.keys() or _rebound(code) & set(parameters):
+    if has_more or not set(parameters) <= found.captured.keys():
         return None
     positional = [found.captured[name] for name in parameters[:count]]
     while _is_default(factory, positional):
@@ -387,12 +333,6 @@ def _is_default(factory: types.FunctionType, positional: list[Any]) -> bool:
     defaults = factory.__defaults__ or ()
     missing = len(positional) - (factory.__code__.co_argcount - len(defaults))
     return 0 < missing <= len(defaults) and defaults[missing - 1] is positional[-1]
-
-
-def _rebound(code: types.CodeType) -> set[str]:
-    """Return the names that code, or what is defined in it, gives another value though others have captured them."""
-    instructions = (instruction for part in nested_codes(code) for instruction in dis.get_instructions(part))
-    return {instruction.argval for instruction in instructions if instruction.opname in _REBINDS}
 
 
 def global_names(found: Definition, replaced_defaults: Collection[ast.expr] = ()) -> Iterator[str]:
@@ -445,26 +385,27 @@ def defaults_in(node: ast.FunctionDef | ast.Lambda) -> list[ast.expr]:
 
 def default_values(node: ast.FunctionDef, function: types.FunctionType) -> list[tuple[str, ast.expr, Any]]:
     """Return the defaults by parameter, as they are written and as they are; none if it has others than are written."""
-    by_position, by_name = function.__defaults__ or (), function.__kwdefaults__ or {}
-    every = [*node.args.posonlyargs, *node.args.args]
-    named = [
-        (one.arg, default) for one, default in zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True) if default
-    ]
-    if len(by_position) != len(node.args.defaults) or by_name.keys() != {name for name, _ in named}:
-        return []
-    last = every[len(every) - len(by_position) :]
-    found = [
-        (one.arg, *pair) for one, pair in zip(last, zip(node.args.defaults, by_position, strict=True), strict=True)
-    ]
-    return found + [(name, default, by_name[name]) for name, default in named]
+    by_position, by_name = [*node.args.posonlyargs, *node.args.args], node.args.kwonlyargs
+    pairs = [*zip(by_position[::-1], node.args.defaults[::-1], strict=False)][::-1]
+    pairs += [(one, default) for one, default in zip(by_name, node.args.kw_defaults, strict=True) if default]
+    known = defaults_of(function)
+    is_as_written = known.keys() == {one.arg for one, _ in pairs}
+    return [(one.arg, default, known[one.arg]) for one, default in pairs] if is_as_written else []
+
+
+def defaults_of(function: types.FunctionType) -> dict[str, Any]:
+    """Return the defaults of a function by parameter, as they are by now."""
+    given, code = function.__defaults__ or (), function.__code__
+    names = code.co_varnames[: code.co_argcount]
+    return dict(zip(names[len(names) - len(given) :], given, strict=True)) | (function.__kwdefaults__ or {})
 
 
 def submodules(tree: ast.AST, name: str, module: types.ModuleType) -> tuple[str, ...]:
     """Return the submodules that are reached as attributes (``skimage.filters``): each needs an import of its own."""
     found: dict[str, None] = {}
     for node in ast.walk(tree):
-        chain = _chain(node)
-        if chain and chain[0] == name:
+        chain = dotted_name(node)
+        if chain[:1] == (name,):
             reached: Any = module
             dotted = name
             for part in chain[1:]:
@@ -475,23 +416,3 @@ def submodules(tree: ast.AST, name: str, module: types.ModuleType) -> tuple[str,
             if dotted != name:
                 found[dotted] = None
     return tuple(found)
-
-
-def replaced(tree: ast.AST, name: str, module: types.ModuleType) -> str:
-    """Return what of a module a notebook has replaced by a function of its own (``cv2.blur = ...``); "" if nothing."""
-    for node in ast.walk(tree):
-        chain = _chain(node)
-        reached: Any = module if chain and chain[0] == name else None
-        for part in chain[1:]:
-            reached = getattr(reached, part, None)
-        if isinstance(reached, types.FunctionType | type) and reached.__module__ == "__main__":
-            return ".".join(chain)
-    return ""
-
-
-def _chain(node: ast.AST) -> list[str]:
-    parts: list[str] = []
-    while isinstance(node, ast.Attribute):
-        parts.append(node.attr)
-        node = node.value
-    return [node.id, *reversed(parts)] if isinstance(node, ast.Name) and parts else []

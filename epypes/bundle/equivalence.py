@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import ast
 import builtins
+import copyreg
 import dataclasses
 import enum
 import functools
@@ -31,7 +32,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from epypes.bundle.classes import statements_of_class
-from epypes.bundle.definitions import annotated_names
+from epypes.bundle.definitions import annotated_names, defaults_of
 from epypes.bundle.expressions import write_arrays
 from epypes.bundle.instances import is_set_elsewhere
 from epypes.bundle.load import MODULE, execute
@@ -349,11 +350,8 @@ def _asks_for_identity(node: ast.AST) -> bool:
 
 
 def _defaults(function: types.FunctionType) -> dict[str, Any]:
-    """Return the defaults of a function by parameter."""
-    given = function.__defaults__ or ()
-    names = function.__code__.co_varnames[: function.__code__.co_argcount]
-    found = dict(zip(names[len(names) - len(given) :], given, strict=True)) | (function.__kwdefaults__ or {})
-    return {f" default of {name!r}": found[name] for name in sorted(found)}
+    """Return the defaults of a function by how a reason calls them."""
+    return {f" default of {name!r}": value for name, value in sorted(defaults_of(function).items())}
 
 
 def _marks(function: Any) -> dict[str, Any]:
@@ -487,7 +485,8 @@ def _content(value: Any) -> dict[str, Any]:
 
 def _of_library(value: Any) -> dict[str, Any]:
     """Return what a copy of an object is made of."""
-    made = value.__reduce_ex__(4)
+    reduce = copyreg.dispatch_table.get(type(value))
+    made = reduce(value) if reduce is not None else value.__reduce_ex__(4)
     if isinstance(made, str):
         raise TypeError(made)
     by, arguments, state, items, pairs = (*made, None, None, None)[:5]

@@ -58,7 +58,10 @@ def expression(gathered: Slice, value: Any, what: str, function: FunctionWriter 
     Refused
         There would be one, but a name that it needs means something else in the module.
     """
-    return _Writer(gathered, what, function).write(value)
+    try:
+        return _Writer(gathered, what, function).write(value)
+    except RecursionError:  # it holds itself, or is nested deeper than Python reads
+        return ""
 
 
 def expression_or_none(gathered: Slice, value: Any, what: str, reason: str) -> str:
@@ -67,10 +70,7 @@ def expression_or_none(gathered: Slice, value: Any, what: str, reason: str) -> s
     ``reason`` is what stands behind ``what`` then; ``{kind}`` in it is the type of the value.
     """
     with noted_refusals(gathered):
-        try:
-            source = expression(gathered, value, what)
-        except RecursionError:  # it holds itself, or is nested deeper than Python reads
-            source = ""
+        source = expression(gathered, value, what)
         if not source:
             raise Refused(f"{what} {reason.replace('{kind}', type(value).__name__)}")
         return source

@@ -14,9 +14,9 @@ from typing import Any, Final
 from epypes.bundle.classes import functions_of
 from epypes.bundle.notebook_source import nested_codes
 from epypes.bundle.resolve import Refused
-from epypes.bundle.syntax import is_data, is_same_data
+from epypes.bundle.syntax import is_same_data
 from epypes.pipeline import Node, Pipeline
-from epypes.run.guard import as_written, is_plain_array
+from epypes.run.guard import as_written
 
 _GIVEN: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
@@ -35,7 +35,7 @@ def arguments_of(made: Node, what: str) -> dict[str, Any]:
         if value is _MISSING and parameter.default is parameter.empty:
             way_out = f"Keep it in __init__: self.{parameter.name} = {parameter.name}."
             raise Refused(f"{what} is made with {parameter.name!r}, which it does not keep. {way_out}")
-        if value is not _MISSING and not _is_same(value, parameter.default):
+        if value is not _MISSING and value is not parameter.default and not is_same_data(value, parameter.default):
             found[parameter.name] = value
     return found
 
@@ -80,17 +80,6 @@ def _kept(made: Node, name: str) -> Any:
         if attribute in vars(made):
             return as_written(vars(made)[attribute])
     return _MISSING
-
-
-def _is_same(left: Any, right: Any) -> bool:
-    """Whether two attributes are the same; of what is no data, whether they are of one class."""
-    if left is right:
-        return True
-    if type(left) is not type(right):
-        return False
-    if is_plain_array(left):
-        return bool(left.dtype == right.dtype and left.shape == right.shape and left.tobytes() == right.tobytes())
-    return is_same_data(left, right) if is_data(left) else False
 
 
 # What EPypes calls of an object when it runs.

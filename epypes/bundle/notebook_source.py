@@ -19,7 +19,6 @@ import tokenize
 import types
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import takewhile
@@ -116,7 +115,7 @@ def _givers(text: str) -> dict[str, tuple[ast.stmt, ...]]:
     found: dict[str, tuple[ast.stmt, ...]] = {}
     tree = parsed(text)
     for node in _statements(tree.body) if tree else ():
-        for name in dict.fromkeys(_given(node)):
+        for name in dict.fromkeys(given_names(node)):
             found[name] = (*found.get(name, ()), node)
     return found
 
@@ -130,7 +129,8 @@ def _statements(body: list[ast.stmt]) -> Iterator[ast.stmt]:
                 yield from _statements(getattr(node, field, []))
 
 
-def _given(node: ast.stmt) -> Iterator[str]:
+def given_names(node: ast.stmt) -> Iterator[str]:
+    """Give the names to which a statement gives a value or a module."""
     if isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign):
         targets = node.targets if isinstance(node, ast.Assign) else [node.target]
         for target in targets:
@@ -238,7 +238,7 @@ def codes_in(tree: ast.Module, flags: int, apart: bool) -> Iterator[types.CodeTy
 def parsed(source: str) -> ast.Module | None:
     """Return the syntax tree of text; None if it is no Python."""
     try:
-        with _without_warnings():
+        with warnings.catch_warnings(action="ignore"):  # the notebook has shown them
             return ast.parse(source)
     except (SyntaxError, ValueError):
         return None
@@ -247,20 +247,12 @@ def parsed(source: str) -> ast.Module | None:
 def compiled(tree: ast.Module, flags: int) -> types.CodeType | None:
     """Compile as a cell is compiled, which may await; None if that can't be done."""
     try:
-        with _without_warnings():
+        with warnings.catch_warnings(action="ignore"):  # the notebook has shown them
             flags |= ast.PyCF_ALLOW_TOP_LEVEL_AWAIT
             code: types.CodeType = compile(tree, "text", "exec", flags, dont_inherit=True)
             return code
     except (SyntaxError, ValueError):
         return None
-
-
-@contextmanager
-def _without_warnings() -> Iterator[None]:
-    """Silence the warnings that the notebook has shown when the text was run."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
 
 
 def nested_codes(code: types.CodeType) -> Iterator[types.CodeType]:
@@ -283,14 +275,6 @@ def names_from_outside(code: types.CodeType) -> Iterator[str]:
             yield instruction.argval
 
 
-def own_parts(node: ast.AST) -> Iterator[ast.AST]:
-    """Return the parts of a function or class, but not those of functions and classes inside of it."""
-    for part in ast.iter_child_nodes(node):
-        yield part
-        if not isinstance(part, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda | ast.ClassDef):
-            yield from own_parts(part)
-
-
 def computes_the_same(one: types.CodeType, other: types.CodeType) -> bool:
     """Whether two pieces of code are the same, but for the place where they stand."""
     return _bare(one) == _bare(other)
@@ -302,25 +286,14 @@ def _bare(code: types.CodeType) -> types.CodeType:
     return code.replace(co_consts=constants, co_filename="", co_firstlineno=1, co_linetable=b"")
 
 
-def same_methods(text: str, node: ast.ClassDef, written: Mapping[str, Sequence[types.FunctionType]]) -> str:
-    """Return the name of a method in the text of a class that is not what the class has; "" if there is none."""
-    for method in node.body:
-        if not isinstance(method, ast.FunctionDef):
-            continue
-        codes = [function.__code__ for function in written[method.name]]
-        late = LATE_ANNOTATIONS if any(code.co_flags & LATE_ANNOTATIONS for code in codes) else 0
-        known = [_definitions(text, late, apart).get((method.name, first_line(method))) for apart in (False, True)]
-        if not any(found and any(computes_the_same(found[1], code) for code in codes) for found in known):
-            return method.name
-    return ""
+def code_on_its_own(text: str, name: str = "<module>") -> types.CodeType | None:
+    """Compile a definition that was taken out, for a module where annotations are read at once; None if that fails.
 
-
-def class_code(text: str, node: ast.ClassDef) -> types.CodeType | None:
-    """Compile a class that was taken out, as a module; None if it means something else there."""
+    Whether it means there what it means in the notebook is found out by the comparison with the module's objects.
+    """
     tree = parsed(text)
-    if tree is None or len(tree.body) != 1 or spelled_tree(tree.body[0]) != spelled_tree(node):
-        return None
-    return compiled(tree, 0)
+    module = compiled(tree, 0) if tree is not None else None
+    return next((code for code in nested_codes(module) if code.co_name == name), None) if module else None
 
 
 def first_line(node: ast.FunctionDef | ast.ClassDef) -> int:
@@ -407,45 +380,6 @@ def _lines_in_strings(text: str) -> Iterator[int]:
         return  # the text is compiled later, and then refused
 
 
-def code_on_its_own(text: str, node: ast.FunctionDef, code: types.CodeType) -> types.CodeType | None:
-    """Compile a definition that was taken out, for a module where annotations are read at once.
-
-    Parameters
-    ----------
-    text
-        What :func:`own_text` returned.
-    node
-        The definition, without the decorators that were dropped.
-    code
-        The function's code. What it captured is global in the module.
-
-    Returns
-    -------
-    types.CodeType or None
-        The code; None if it means something else than the function's.
-    """
-    tree = parsed(text)
-    if tree is None or len(tree.body) != 1 or spelled_tree(tree.body[0]) != spelled_tree(node):
-        return None
-    as_before = _code_of(node.name, _captured(tree, code.co_freevars), code.co_flags & LATE_ANNOTATIONS)
-    # Inside of a class Python renames what begins with two underscores.
-    return _code_of(node.name, tree, 0) if as_before and _names_in(as_before) == _names_in(code) else None
-
-
-def _captured(tree: ast.Module, names: Collection[str]) -> ast.Module:
-    """Return a definition inside of a function that has some names."""
-    if not names:
-        return tree
-    around = ast.parse(f"def around({', '.join(names)}):\n    pass")
-    vars(around.body[0]).update(name="<around>", body=tree.body)
-    return around
-
-
-def _code_of(name: str, tree: ast.Module, flags: int) -> types.CodeType | None:
-    module = compiled(tree, flags)
-    return next((code for code in nested_codes(module) if code.co_name == name), None) if module else None
-
-
 def spelled_tree(tree: ast.AST) -> list[object]:
     """Return all that a syntax tree says, without its lines; not by ast.dump, which a long sum is too deep for."""
     return [(type(node), [_spelled(value) for _, value in ast.iter_fields(node)]) for node in ast.walk(tree)]
@@ -455,10 +389,6 @@ def _spelled(value: object) -> object:
     if isinstance(value, list):
         return [_spelled(item) for item in value]
     return ast.AST if isinstance(value, ast.AST) else (type(value), value)
-
-
-def _names_in(code: types.CodeType) -> list[tuple[tuple[str, ...], ...]]:
-    return [(part.co_names, part.co_varnames, part.co_freevars, part.co_cellvars) for part in nested_codes(code)]
 
 
 # Until its name is known.
@@ -472,45 +402,27 @@ def lambdas_of(code: types.CodeType) -> tuple[list[str], list[ast.Lambda]]:
     if tree is None:
         return lines, []
     nodes = [node for node in ast.walk(tree) if isinstance(node, ast.Lambda) and node.lineno == code.co_firstlineno]
-    known = [other for apart in (False, True) for other in _same_lambdas(tree, code, apart)]
-    if not known:
-        return lines, []
+    flags = code.co_flags & LATE_ANNOTATIONS
+    others = [other for apart in (False, True) for other in codes_in(tree, flags, apart)]
     # The table of lines holds the columns too, unless Python runs with -X no_debug_ranges.
-    exact = [other for other in known if other.co_linetable == code.co_linetable]
-    if not exact:
+    if not any(other.co_linetable == code.co_linetable and _is_same_place(other, code) for other in others):
         return lines, []
-    around = [node for node in nodes if _holds(node.body, exact[0])]
+    # Some versions of Python put the return at the line's beginning, without a text.
+    places = [place for place in code.co_positions() if None not in place and place[::2] != place[1::2]]
+    around = [node for node in nodes if places and all(_holds(node.body, place) for place in places)]
     # Of lambdas in one another, the innermost.
-    return lines, [max(around, key=lambda node: _start(node.body))] if around else nodes
+    return lines, [max(around, key=lambda node: (node.body.lineno, node.body.col_offset))] if around else nodes
 
 
-def _same_lambdas(tree: ast.Module, code: types.CodeType, apart: bool) -> Iterator[types.CodeType]:
-    for other in codes_in(tree, code.co_flags & LATE_ANNOTATIONS, apart):
-        place = (other.co_name, other.co_firstlineno)
-        if place == (code.co_name, code.co_firstlineno) and computes_the_same(other, code):
-            yield other
+def _is_same_place(one: types.CodeType, other: types.CodeType) -> bool:
+    return one.co_firstlineno == other.co_firstlineno and one.co_name == other.co_name and computes_the_same(one, other)
 
 
-def _holds(body: ast.expr, code: types.CodeType) -> bool:
-    """Whether code, which has something to show, stands inside of a body."""
-    places = [((line, column), (end_line, end_column)) for line, end_line, column, end_column in _shown(code)]
-    return bool(places) and _start(body) <= min(places)[0] and max(end for _, end in places) <= _end(body)
-
-
-def _shown(code: types.CodeType) -> Iterator[tuple[int, int, int, int]]:
-    """Return the positions of code that have a text: some versions of Python put the return at the line's beginning."""
-    for line, end_line, column, end_column in code.co_positions():
-        is_known = line is not None and end_line is not None and column is not None and end_column is not None
-        if is_known and (line, column) != (end_line, end_column):
-            yield line or 0, end_line or 0, column or 0, end_column or 0
-
-
-def _start(node: ast.expr) -> tuple[int, int]:
-    return node.lineno, node.col_offset
-
-
-def _end(node: ast.expr) -> tuple[int, int]:
-    return node.end_lineno or node.lineno, node.end_col_offset or 0
+def _holds(body: ast.expr, place: Sequence[Any]) -> bool:
+    """Whether a body holds a place: its first and last line, and the columns there."""
+    line, end_line, column, end_column = place
+    ends_inside = (end_line, end_column) <= (body.end_lineno, body.end_col_offset)
+    return (body.lineno, body.col_offset) <= (line, column) and ends_inside
 
 
 def as_function(lines: list[str], node: ast.Lambda) -> tuple[str, ast.FunctionDef]:
@@ -527,7 +439,7 @@ def as_function(lines: list[str], node: ast.Lambda) -> tuple[str, ast.FunctionDe
     if not isinstance(shape, ast.FunctionDef):
         raise TypeError(type(shape).__name__)
     vars(shape).update(args=node.args, body=[ast.copy_location(ast.Return(node.body), node.body)])
-    head = f"def {UNNAMED}({', '.join(_parameters(node.args))}):"
+    head = f"def {UNNAMED}({ast.unparse(node.args)}):"
     text = f"{_comment(lines, node)}{head}\n{_returned(''.join(lines), node.body)}\n"
     return text, ast.copy_location(shape, node)
 
@@ -541,28 +453,6 @@ def _returned(source: str, body: ast.expr) -> str:
     if value is not None and "\n" not in text and len(text) <= LINE and spelled_tree(value) == spelled_tree(body):
         return text
     return "\n".join(laid_out(ast.unparse(body), 1, "return "))
-
-
-def _parameters(arguments: ast.arguments) -> Iterator[str]:
-    """Return the parameters as they stand in a definition."""
-    by_position = [*arguments.posonlyargs, *arguments.args]
-    lone = [None] * (len(by_position) - len(arguments.defaults))
-    for number, (argument, default) in enumerate(zip(by_position, [*lone, *arguments.defaults], strict=True), 1):
-        yield _parameter(argument, default)
-        if number == len(arguments.posonlyargs):
-            yield "/"
-    if arguments.vararg:
-        yield f"*{arguments.vararg.arg}"
-    elif arguments.kwonlyargs:
-        yield "*"
-    for argument, given in zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True):
-        yield _parameter(argument, given)
-    if arguments.kwarg:
-        yield f"**{arguments.kwarg.arg}"
-
-
-def _parameter(argument: ast.arg, default: ast.expr | None) -> str:
-    return f"{argument.arg}={ast.unparse(default)}" if default else argument.arg
 
 
 def _comment(lines: list[str], node: ast.Lambda) -> str:

@@ -39,124 +39,7 @@ CHANGING: Final = frozenset(
         *("difference_update", "intersection_update", "symmetric_difference_update", "setfield", "setflags"),
     }
 )
-# Functions of libraries that write into one of their arguments, with its place.
-_WRITES: Final = {
-    **dict.fromkeys(("accumulate", "accumulateSquare", "accumulateWeighted"), 1),
-    "accumulateProduct": 2,
-    **dict.fromkeys(("line", "circle", "rectangle", "ellipse", "putText", "polylines", "fillPoly", "drawContours"), 0),
-    **dict.fromkeys(("fillConvexPoly", "arrowedLine", "drawMarker", "drawChessboardCorners", "floodFill"), 0),
-    **dict.fromkeys(("copyto", "put", "place", "putmask", "fill_diagonal", "at", "shuffle"), 0),
-    **dict.fromkeys(("heappush", "heappop", "heapify", "heapreplace", "insort", "insort_left", "insort_right"), 0),
-    **dict.fromkeys(("setattr", "delattr", "setitem", "delitem"), 0),
-}
 _INTO: Final = frozenset(("out", "dst"))
-# A function that hands its argument on may do so to another one.
-_DEEPEST: Final = 4
-
-
-def changes(tree: ast.AST, names: Mapping[str, Any], depth: int = _DEEPEST) -> Iterator[tuple[ast.AST, str]]:
-    """Return what changes the object that a name means, with the name.
-
-    Parameters
-    ----------
-    tree
-        A function.
-    names
-        What names mean that it has from outside.
-    depth
-        How deep functions that it calls are followed.
-    """
-    aliases = _aliases(tree, names)
-    for node in ast.walk(tree):
-        for written in _written(node, names, depth):
-            root = root_of(written)
-            yield node, aliases.get(root, root)
-        if isinstance(node, ast.AugAssign) and isinstance(node.target, ast.Name) and node.target.id in aliases:
-            of = aliases[node.target.id]
-            if is_container(names.get(of)):
-                yield node, of
-
-
-def _written(node: ast.AST, names: Mapping[str, Any], depth: int) -> Iterator[ast.expr]:
-    """Return the expressions whose objects a part of a function writes into."""
-    if isinstance(node, ast.Subscript | ast.Attribute) and isinstance(node.ctx, ast.Store | ast.Del):
-        yield node
-    if not isinstance(node, ast.Call):
-        return
-    if isinstance(node.func, ast.Attribute) and node.func.attr in CHANGING:
-        of = node.func.value
-        if isinstance(of, ast.Name | ast.Subscript) or is_container(evaluated(of, names)):
-            yield of
-    function = evaluated(node.func, names)
-    if isinstance(function, types.FunctionType) and function.__module__ == "__main__" and depth:
-        yield from _into_arguments(node, function, depth - 1)
-        return
-    yield from (part.value for part in node.keywords if part.arg in _INTO)
-    place = _WRITES.get(getattr(node.func, "attr", getattr(node.func, "id", "")), len(node.args))
-    yield from node.args[place : place + 1]
-
-
-def _into_arguments(node: ast.Call, function: types.FunctionType, depth: int) -> Iterator[ast.expr]:
-    """Return the arguments of a call that a function of the notebook writes into."""
-    _, definition = definition_of(function.__code__)
-    if definition is None:
-        return
-    every = (*definition.args.posonlyargs, *definition.args.args)
-    # Whatever the arguments are, they count as containers here: the caller's are looked at later.
-    own: dict[str, Any] = {argument.arg: [] for argument in (*every, *definition.args.kwonlyargs)}
-    written = {root for _, root in changes(definition, {**function.__globals__, **own}, depth)}
-    written = {name for name in written if _stores(definition, name) == _augmented(definition, name)}
-    by_place = zip(every, node.args, strict=False)
-    yield from (given for argument, given in by_place if argument.arg in written)
-    yield from (part.value for part in node.keywords if part.arg in written)
-
-
-def _aliases(tree: ast.AST, names: Mapping[str, Any]) -> dict[str, str]:
-    """Return the locals that mean nothing but what a name from outside means, or a part of that."""
-    known: dict[str, set[str]] = {}
-    for node in ast.walk(tree):
-        pairs = [(node.targets[0], node.value)] if isinstance(node, ast.Assign) and len(node.targets) == 1 else []
-        pairs += [(node.target, node.iter)] if isinstance(node, ast.For) else []
-        for target, value in pairs:
-            if isinstance(target, ast.Name):
-                known.setdefault(target.id, set()).add(_shared(value, names))
-    arguments = {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
-    once = {
-        name: next(iter(of))
-        for name, of in known.items()
-        if len(of) == 1 and _stores(tree, name) - _augmented(tree, name) == 1 and name not in arguments
-    }
-    for _ in once:
-        once = {name: once.get(of, of) for name, of in once.items()}
-    return {name: of for name, of in once.items() if of and of != name}
-
-
-def _stores(tree: ast.AST, name: str) -> int:
-    """Return how often a name is given a value."""
-    names = (node for node in ast.walk(tree) if isinstance(node, ast.Name) and node.id == name)
-    return sum(isinstance(node.ctx, ast.Store) for node in names)
-
-
-def _augmented(tree: ast.AST, name: str) -> int:
-    parts = (node.target for node in ast.walk(tree) if isinstance(node, ast.AugAssign))
-    return sum(isinstance(target, ast.Name) and target.id == name for target in parts)
-
-
-def _shared(value: ast.expr, names: Mapping[str, Any]) -> str:
-    """Return the name whose object an expression shares; "" if it makes another."""
-    node = value
-    is_sliced = False
-    while isinstance(node, ast.Subscript | ast.Attribute):
-        is_sliced |= isinstance(node, ast.Subscript) and not isinstance(node.slice, ast.Constant | ast.Name)
-        node = node.value
-    root = node.id if isinstance(node, ast.Name) else ""
-    # A slice of an array shares its memory, one of a list is a copy.
-    return "" if is_sliced and not is_plain_array(names.get(root)) else root
-
-
-def is_container(value: Any) -> bool:
-    """Whether a value is of a kind that is written into."""
-    return isinstance(value, list | dict | set | bytearray | deque) or is_plain_array(value)
 
 
 def root_of(node: ast.expr) -> str:
@@ -197,19 +80,44 @@ def check_state(function: types.FunctionType, node: ast.AST, what: str) -> None:
         How a reason calls it.
     """
     code = function.__code__
-    for inner in nested_codes(code):
-        for instruction in dis.get_instructions(inner):
-            if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
-                place = place_in(code.co_filename, line_of(node, instruction.argval, code.co_firstlineno))
-                raise Refused(f"{what} changes the global {instruction.argval!r} ({place}). Return the value.")
+    check_globals(code, node, code.co_filename, what)
     check_nonlocal(function, node, what)
     names = {**function.__globals__, **captured_by(function)}
     outside = {*code.co_freevars, *(name for inner in nested_codes(code) for name in names_from_outside(inner))}
-    for part, name in changes(node, names):
-        if name in outside and (not isinstance(part, ast.Call) or _may_change(names.get(name))):
-            place = place_in(code.co_filename, getattr(part, "lineno", code.co_firstlineno))
-            text = f"{what} writes into {name!r}, which outlives the call ({place})"
-            raise Refused(f"{text}: the next event would find it different. Copy it first, or make it a token.")
+    for part in ast.walk(node):
+        for written in _written(part, names):
+            name = root_of(written)
+            if name in outside:
+                place = place_in(code.co_filename, getattr(part, "lineno", code.co_firstlineno))
+                text = f"{what} writes into {name!r}, which outlives the call ({place})"
+                raise Refused(f"{text}: the next event would find it different. Copy it first, or make it a token.")
+
+
+def _written(node: ast.AST, names: Mapping[str, Any]) -> Iterator[ast.expr]:
+    """Give the expressions whose objects a part of a function plainly writes into."""
+    if isinstance(node, ast.Subscript | ast.Attribute) and isinstance(node.ctx, ast.Store | ast.Del):
+        yield node
+    if isinstance(node, ast.Call):
+        of = node.func.value if isinstance(node.func, ast.Attribute) and node.func.attr in CHANGING else None
+        given = [*([of] if of is not None else []), *(part.value for part in node.keywords if part.arg in _INTO)]
+        yield from (part for part in given if _is_container(evaluated(part, names), names.get(root_of(part))))
+
+
+def _is_container(value: Any, root: Any) -> bool:
+    """Whether a value is of a kind that is written into; of what is no name, whether that in which it is found is."""
+    value = root if value is None else value
+    return isinstance(value, list | dict | set | bytearray | deque) or is_plain_array(value)
+
+
+def check_globals(code: types.CodeType, node: ast.AST, file: str, what: str) -> None:
+    """Refuse what changes global names of the notebook."""
+    for inner in nested_codes(code):
+        for instruction in dis.get_instructions(inner):
+            if instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL"):
+                name = instruction.argval
+                uses = (part.lineno for part in ast.walk(node) if isinstance(part, ast.Name) and part.id == name)
+                place = place_in(file, next(uses, code.co_firstlineno))
+                raise Refused(f"{what} changes the global {name!r} ({place}). Return the value.")
 
 
 def check_nonlocal(function: types.FunctionType, node: ast.AST, what: str) -> None:
@@ -222,21 +130,10 @@ def check_nonlocal(function: types.FunctionType, node: ast.AST, what: str) -> No
             raise Refused(f"{text}, so that every call finds it different. Make it a token, or return the value.")
 
 
-def line_of(node: ast.AST, name: str, otherwise: int) -> int:
-    """Return the first line of a definition that has a name."""
-    uses = (part.lineno for part in ast.walk(node) if isinstance(part, ast.Name) and part.id == name)
-    return next(uses, otherwise)
-
-
 def captured_by(function: types.FunctionType) -> dict[str, Any]:
     """Return what a function has from the functions around it, by name; nothing of a name without a value."""
     cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
     return {name: cell.cell_contents for name, cell in cells if cell != types.CellType()}
-
-
-def _may_change(value: Any) -> bool:
-    """Whether a call of a method may have changed a value."""
-    return is_container(value) or isinstance(value, type)
 
 
 def check_asked(name: str, value: Any, found: Any, what: str) -> None:
@@ -258,21 +155,23 @@ def _asks_for_names(node: ast.AST) -> bool:
 
 # -- monkeypatches ---------------------------------------------------------------------------------------------------
 
-_Key = tuple[int, str]
+_Key = tuple[types.ModuleType, str]
 
 
 def check_patches(found: Any, what: str) -> None:
     """Refuse a definition that reads what the notebook has changed in a module."""
-    known = _patched()
-    for chain in _read_by(found.node) if known else ():
-        key = _key(chain, {**found.names, **_imports_of(found.node)})
-        if key in known:
-            _refuse(what, ".".join(chain), known[key])
+    known, names = _patched(), {**found.names, **_imports_of(found.node)}
+    for chain in _read_by(found.node):
+        key = _key(chain, names)
+        value = getattr(*key, None) if key is not None and key[0].__name__ != "__main__" else None
+        is_own = isinstance(value, types.FunctionType | type) and value.__module__ == "__main__"
+        if key is not None and (is_own or key in known):
+            _refuse(what, ".".join(chain), known.get(key, found.place))
 
 
 def check_home(home: Importable, what: str) -> None:
     """Refuse what can be imported only as the notebook has changed it."""
-    place = _patched().get((id(sys.modules.get(home.module)), home.qualname.partition(".")[0]))
+    place = _patched().get((sys.modules[home.module], home.qualname.partition(".")[0]))
     if place:
         _refuse(what, f"{home.module}.{home.qualname}", place)
 
@@ -306,7 +205,7 @@ def _key(chain: tuple[str, ...], names: Mapping[str, Any]) -> _Key | None:
             return None
         inner = getattr(reached, part, None)
         if not isinstance(inner, types.ModuleType):
-            return id(reached), part
+            return reached, part
         reached = inner
     return None
 
@@ -329,11 +228,11 @@ def _targets(node: ast.AST) -> Iterator[tuple[str, ...]]:
     elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in ("setattr", "delattr"):
         parts, name = list(node.args[:1]), node.args[1] if len(node.args) > 1 else None
         more = (str(name.value),) if isinstance(name, ast.Constant) else ()
-    chains = (_dotted(part) + more for part in parts)
+    chains = (dotted_name(part) + more for part in parts)
     yield from (chain for chain in chains if len(chain) > 1)
 
 
-def _dotted(node: ast.AST) -> tuple[str, ...]:
+def dotted_name(node: ast.AST) -> tuple[str, ...]:
     """Return the dotted name that an expression begins with; nothing if it is none."""
     parts: list[str] = []
     while isinstance(node, ast.Attribute | ast.Subscript):
@@ -345,7 +244,7 @@ def _dotted(node: ast.AST) -> tuple[str, ...]:
 def _read_by(tree: ast.AST) -> Iterator[tuple[str, ...]]:
     """Give the dotted names that a definition reads, and what it imports from modules."""
     for node in ast.walk(tree):
-        chain = _dotted(node) if isinstance(node, ast.Attribute) else ()
+        chain = dotted_name(node) if isinstance(node, ast.Attribute) else ()
         if len(chain) > 1:
             yield chain
         if isinstance(node, ast.ImportFrom) and node.module and not node.level:
@@ -384,33 +283,15 @@ _REPEATABLE: Final[Mapping[str, frozenset[str]]] = {
     "pathlib": frozenset(("Path", "PurePath", "PurePosixPath")),
     "logging": frozenset(("getLogger",)),
 }  # fmt: skip
-_REPEATABLE_MODULES: Final = frozenset(
-    {
-        *("abc", "collections", "contextlib", "dataclasses", "decimal", "enum", "fractions", "functools", "itertools"),
-        *("math", "operator", "re", "types", "typing"),
-    }
-)
+_REPEATABLE_MODULES: Final = frozenset((
+    "abc", "collections", "contextlib", "dataclasses", "decimal", "enum", "fractions", "functools", "itertools",
+    "math", "operator", "re", "types", "typing",
+))  # fmt: skip
 _ORDER_FREE: Final = frozenset({"all", "any", "frozenset", "len", "max", "min", "set", "sorted", "sum"})
-_REPEATABLE_METHODS: Final = frozenset(
-    {
-        *(
-            "append",
-            "astype",
-            "copy",
-            "extend",
-            "format",
-            "get",
-            "items",
-            "join",
-            "keys",
-            "lower",
-            "max",
-            "mean",
-            "min",
-        ),
-        *("ravel", "replace", "reshape", "split", "strip", "sum", "transpose", "update", "upper", "values"),
-    }
-)
+_REPEATABLE_METHODS: Final = frozenset((
+    "append", "astype", "copy", "extend", "format", "get", "items", "join", "keys", "lower", "max", "mean", "min",
+    "ravel", "replace", "reshape", "split", "strip", "sum", "transpose", "update", "upper", "values",
+))  # fmt: skip
 
 
 def unrepeatable(node: ast.AST, names: Mapping[str, Any], inner: types.CodeType | None = None) -> ast.expr | None:
@@ -466,20 +347,16 @@ def _at_once(node: ast.AST, inner: types.CodeType | None) -> Iterator[ast.AST]:
             continue
         for default in (*part.args.defaults, *part.args.kw_defaults):
             yield from ast.walk(default) if default is not None else ()
-        if inner is not None and not is_definition_of(part, inner) and any(_is_in(part, inner)):
+        if inner is not None and not _defines(part, inner) and any(_defines(each, inner) for each in ast.walk(part)):
             yield from _at_once(part, inner)
 
 
-def _is_in(node: ast.AST, code: types.CodeType) -> Iterator[bool]:
-    return (is_definition_of(part, code) for part in ast.walk(node))
-
-
-def is_definition_of(node: ast.AST, code: types.CodeType) -> bool:
+def _defines(node: ast.AST, code: types.CodeType) -> bool:
     """Whether a part of the text that some code is from is its definition."""
     if isinstance(node, ast.Lambda):
         return code.co_name == "<lambda>" and node.lineno == code.co_firstlineno
-    is_function = isinstance(node, ast.FunctionDef) and node.name == code.co_name
-    return is_function and isinstance(node, ast.FunctionDef) and first_line(node) == code.co_firstlineno
+    is_named = isinstance(node, ast.FunctionDef) and node.name == code.co_name
+    return isinstance(node, ast.FunctionDef) and is_named and first_line(node) == code.co_firstlineno
 
 
 def _is_repeatable(call: ast.Call, names: Mapping[str, Any], seen: set[types.CodeType], is_unused: bool) -> bool:

@@ -26,7 +26,6 @@ from epypes.bundle.definitions import (
     global_names,
     method_of,
     only_in_annotations,
-    replaced,
     submodules,
 )
 from epypes.bundle.expressions import Arrays, expression
@@ -378,25 +377,17 @@ class Slice:
         if home is not None:
             self.names.claim(name, of_object(value), what)
             self._import_from(home, name)
-        elif is_function(value):
-            self._add_helper(name, value, found, what)
-        elif isinstance(value, type):
-            self._add_notebook_class(name, value, found, what)
+        elif is_function(value) or isinstance(value, type):
+            around = f"which {what[0].lower()}{what[1:]}"
+            if isinstance(value, type):
+                source = self.add_class(value, found.names, f"Class {value.__name__!r}, {around} uses,")
+            else:
+                source = self._callable(value, f"Function {name!r}, {around} calls,", name)
+            if source != name and name not in self.definitions:
+                self.names.claim(name, of_object(value), what)
+                self._write(name, f"{name} = {source}\n", self._places.of_name(name))
         else:
             self._add_constant(name, value, found, what)
-
-    def _add_helper(self, name: str, helper: Any, found: AnyDefinition, what: str) -> None:
-        """Add something that a function calls, under the name by which it calls it."""
-        source = self._callable(helper, f"Function {name!r}, which {what[0].lower()}{what[1:]} calls,", name)
-        if source != name and name not in self.definitions:
-            self.names.claim(name, of_object(helper), what)
-            self._write(name, f"{name} = {source}\n", self._places.of_name(name))
-
-    def _add_notebook_class(self, name: str, kind: type, found: AnyDefinition, what: str) -> None:
-        own = self.add_class(kind, found.names, f"Class {kind.__name__!r}, which {what[0].lower()}{what[1:]} uses,")
-        if own != name and name not in self.definitions:
-            self.names.claim(name, of_object(kind), what)
-            self._write(name, f"{name} = {own}\n", self._places.of_name(name))
 
     def _add_constant(self, name: str, value: Any, found: AnyDefinition, what: str) -> None:
         module, own = imported_as(name, value, found.names, found.file) if name not in found.captured else ("", "")
@@ -454,10 +445,6 @@ class Slice:
     def _add_module(self, name: str, module: types.ModuleType, found: AnyDefinition, what: str) -> None:
         if module.__name__ == "__main__":
             raise Refused(f"{what} uses the notebook itself as module {name!r} ({found.place_of(name)}).")
-        other = replaced(found.node, name, module)
-        if other:
-            text = f"{what} uses {other!r} ({found.place_of(name)}), which the notebook has replaced by its own"
-            raise Refused(f"{text}. Call yours by a name of its own.")
         if name != module.__name__:
             self._import_as(module.__name__, name, what)
             return

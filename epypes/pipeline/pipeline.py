@@ -68,10 +68,12 @@ class Pipeline(Node):
         names = free if are_names else [f"input_{place}" for place, _ in enumerate(free)]
         return inspect.Signature([inspect.Parameter(name, kind) for name in names])
 
-    @property
-    def __epypes_revision__(self) -> tuple[Any, ...]:
-        """Another value whenever a hyperparameter of this pipeline, or of one inside it, has changed."""
-        return self.runner.revision, *self.runner._program.revisions()
+    def __epypes_revision__(self, around: tuple[Any, ...] = ()) -> tuple[Any, ...]:
+        """Return another value whenever a hyperparameter of this pipeline, or of one inside it, has changed.
+
+        ``around`` are the programs of the pipelines that ask.
+        """
+        return self.runner.revision, *self.runner._program.revisions(around)
 
     @property
     def cg(self) -> CompGraph:

@@ -16,7 +16,8 @@ from epypes.graph.checks import distinct
 from epypes.images import Contracts
 from epypes.run.guard import called_for, is_unguarded
 
-# What a function has that keeps hyperparameters of its own: a value that is another one whenever they have changed.
+# What a function has that keeps hyperparameters of its own: a method that returns another value whenever they have
+# changed, given the programs that ask for it.
 REVISION: Final = "__epypes_revision__"
 # What a function has that keeps account of its calls: where it is true, its ``func`` may be called in its place, if
 # ``count_call`` is called too.
@@ -121,9 +122,15 @@ class Program:
                 consumers[slot].append(step.place)
         return consumers
 
-    def revisions(self) -> tuple[Any, ...]:
-        """Return the present revisions of the functions that have one."""
-        return tuple(tuple([getattr(found, REVISION) for found in objects]) for objects in self._with_revisions)
+    def revisions(self, around: tuple[Program, ...] = ()) -> tuple[Any, ...]:
+        """Return the present revisions of the functions that have one.
+
+        ``around`` are the programs that ask for these: a pipeline's own method may be a function of its graph.
+        """
+        if not self._with_revisions or self in around:
+            return ()
+        around = (*around, self)
+        return tuple(tuple([getattr(found, REVISION)(around) for found in each]) for each in self._with_revisions)
 
     def read_by(self, step: Step, values: Sequence[Any]) -> tuple[int, ...]:
         """Return the slots that a step reads with these values: of a switch, the selector and the chosen branch."""

@@ -99,6 +99,18 @@ PROMOTED: dict[str, tuple[str, dict[str, str]]] = {
         "    return decorate\n\n# Twice.\n@repeated(2)\n@ep.unguarded\ndef twice(a):\n    return a + SHIFT\nSHIFT = 1.5",
         {"twice": "twice"},
     ),
+    "decorator without wraps": (
+        "def unwrapped(g):\n    def w(a):\n        return g(a) + 1\n    return w\n@unwrapped\ndef without_wraps(a):\n    return a * 2",
+        {"without_wraps": "without_wraps"},
+    ),
+    "decorator that returns the function": (
+        "SEEN = []\ndef noted(g):\n    SEEN.append(g)\n    return g\n@noted\ndef noted_one(a):\n    return a * 2", {"noted_one": "noted_one"},
+    ),
+    "decorator that was called": (
+        "def shifted(g):\n    @functools.wraps(g)\n    def w(a):\n        return g(a) + 1\n    return w\n"
+        "def later(a):\n    return a * 2\nlater = shifted(later)",
+        {"later": "later"},
+    ),
     "decorator that derives": (
         "def limited(low, high=5):\n    width = high - low\n    def decorate(f):\n        name = 3\n        @functools.wraps(f)\n"
         "        def limit(a, k=low):\n            return np.clip(f(a), low, low + width) + k + name\n        return limit\n    return decorate\n"
@@ -170,11 +182,6 @@ REFUSED: dict[str, tuple[str, str, str]] = {
         "import types\nlib = types.ModuleType('lib')\nlib.f = lambda a: a\ndef f(a):\n    return lib.f(a)", "f",
         r"'lib\.f', which the notebook has changed \(cell \[1\], line 3\).* Call yours by a name",
     ),
-    "decorator without wraps": (
-        "def d(g):\n    def w(a):\n        return g(a)\n    return w\n@d\ndef f(a):\n    return a", "f",
-        r"decorated by @d \(cell \[1\], line 5\).* Use functools\.wraps",
-    ),
-    "decorator that marks": ("def d(g):\n    return g\n@d\ndef f(a):\n    return a", "f", r"decorated by @d \(cell \[1\], line 3\).* Use functools\.wraps"),
     "decorator that was defined again": (
         "def d(g):\n    @functools.wraps(g)\n    def w(a):\n        return g(a)\n    return w\n@d\ndef f(a):\n    return a\n"
         "def d(g):\n    @functools.wraps(g)\n    def w(a):\n        return g(g(a))\n    return w", "f",
@@ -231,15 +238,6 @@ REFUSED: dict[str, tuple[str, str, str]] = {
     "evaluated text": ("K = 1\ndef f(a):\n    return eval('K')", "f", r"'eval' \(cell \[1\], line 3\), which may use any name\. Write what"),
     "array that a function writes its result into": (
         "K = np.zeros((2, 3))\ndef f(a):\n    return np.maximum(K, a, out=K).copy()", "f", r"writes into 'K', .*\(cell \[1\], line 3\)",
-    ),
-    "array that a library accumulates into": (
-        "K = np.zeros((2, 3))\ndef f(a):\n    cv2.accumulateWeighted(a, K, 1.0)\n    return K.copy()", "f", r"writes into 'K', .*\(cell \[1\], line 3\)",
-    ),
-    "dict under another name": (
-        "LOG = {}\ndef f(a):\n    log = LOG\n    log[a.size] = 1\n    return a", "f", r"writes into 'LOG', .*\(cell \[1\], line 4\)",
-    ),
-    "dict that a helper writes into": (
-        "SEEN = {}\ndef keep(d, v):\n    return d.setdefault(1, v)\ndef f(a):\n    return a - keep(SEEN, a)", "f", r"writes into 'SEEN', .*\(cell \[1\], line 5\)",
     ),
     "set of a class": (
         "class M:\n    seen = set()\ndef f(a):\n    M.seen.add(a.size)\n    return a", "f", r"writes into 'M', .*\(cell \[1\], line 4\)",

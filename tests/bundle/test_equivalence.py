@@ -90,6 +90,7 @@ PROMOTED: dict[str, tuple[str, ...]] = {
     "default of a member of an enumeration": (
         "import enum\nclass Way(enum.Enum):\n    UP = 1\n    DOWN = -1\ndef f(a, way: Way = Way.DOWN):\n    return a * way.value",
     ),
+    "pattern with its flags inside": ("import re\nR = re.compile('(?i)A+')\ndef f(a):\n    return a * len(R.findall('aA b'))",),
     "annotation that nothing defines": (f"{LATE}def f(a: Picture, k: Missing = 3) -> Picture:\n    return a * k",),
     "annotation inside that nothing defines": (
         f"{LATE}def f(a):\n    def g(b: Missing) -> list[Missing]:\n        return b * 2\n    c: Missing = g(a)\n    return c",
@@ -108,6 +109,9 @@ REFUSED: dict[str, tuple[str, str]] = {
         "import dataclasses\n@dataclasses.dataclass(frozen=True)\nclass Box:\n    low: int = 2\nBEST = Box()\n"
         "def f(a, box=BEST):\n    return a * (box is OTHER)\nOTHER, BEST = BEST, None",
         "is one object in the notebook and several in the module",
+    ),
+    "list that holds itself": (
+        "X = [1]\nX.append(X)\ndef f(a):\n    return a * X[0]", r"uses 'X' from it, of type list\. Make X a token",
     ),
     "class with an object that can't be seen through": (
         "class C:\n    ROWS = (i for i in range(3))\ndef f(a):\n    return a, C.ROWS", r"Class .C. .*ROWS.* can.t be compared. Make it inside the function",
@@ -205,6 +209,9 @@ def test_a_factory_is_called_where_that_makes_what_the_notebook_has(monkeypatch)
             "def make(k):\n    def f(a):\n        operator.iadd(k, [1])\n        return a\n    return f\nf = make([1])",
             "k",
         ),
+        ("K = {}\ndef f(a):\n    known = K\n    known[len(K)] = 1\n    return a", "K"),
+        ("K = []\ndef keep(k, v):\n    k.append(v)\ndef f(a):\n    keep(K, 1)\n    return a", "K"),
+        ("K = np.zeros((3, 4))\ndef f(a):\n    cv2.accumulate(a, K)\n    return a", "K"),
     ],
 )
 def test_what_a_function_changes_out_of_sight_is_seen_when_it_is_run_again(monkeypatch, tmp_path, cell, known):

@@ -202,3 +202,20 @@ def test_another_run_of_the_pipeline_does_not_disturb_the_view_of_an_event():
         q_in.put(5)
         assert q_out.get(timeout=TIMEOUT_S) == (5, 6, {"x": 5, "n": 1, "y": 6}, {})
     assert pipe["y"] == 2001
+
+
+def test_a_pipelines_own_method_may_be_a_function_of_its_graph():
+    class Scaled(ep.Pipeline):
+        by = 2
+
+        def __init__(self):
+            super().__init__("p", ep.CompGraph({"f": self._f}, {"f": (("x", "k"), "y")}), {"k": 1})
+
+        def _f(self, x, k):
+            return self.by * x + k
+
+    pipeline = Scaled()
+    outer = ep.CompGraphRunner(ep.CompGraph({"p": pipeline}, {"p": ("x", "y")}))
+    assert (pipeline(3), outer.run(x=3)["y"]) == (7, 7)
+    pipeline.runner.rerun(k=2)
+    assert outer.rerun()["y"] == 8
