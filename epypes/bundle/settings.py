@@ -29,9 +29,6 @@ from epypes.images import Order
 from epypes.optional import optional_import
 
 FORMAT: Final = 1
-# Of a bundle with what the first one has not: ports or a pipeline of its own, groups, attributes, values of new kinds.
-_FORMAT_WITH_MORE: Final = 2
-_FIRST_KINDS: Final = (None, "none", "tuple")
 _LINE: Final = 100
 
 
@@ -146,7 +143,7 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
         )
     )
     bundle = tomlkit.table()
-    bundle.add("format", _format_of(settings))
+    bundle.add("format", FORMAT)
     bundle.add("name", settings.name)
     if not settings.types:
         bundle.add(tomlkit.comment("The annotations of the functions are not compared."))
@@ -171,19 +168,6 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
 
 def _has_member(value: Any) -> bool:
     return any(True for _ in members_in(value))
-
-
-def _format_of(settings: Settings) -> int:
-    values = (*settings.hyperparameters.values(), *settings.defaults.values())
-    is_first = all(map(_is_of_first_kind, values)) and not (settings.own or settings.has_groups or settings.attributes)
-    return FORMAT if is_first else _FORMAT_WITH_MORE
-
-
-def _is_of_first_kind(value: Any) -> bool:
-    entry = written(value)
-    items = entry.get("value")
-    nested = isinstance(items, dict) or (isinstance(items, list) and any(isinstance(x, list | dict) for x in items))
-    return entry.get("kind") in _FIRST_KINDS and not nested
 
 
 def _ports(settings: Settings) -> Any:
@@ -256,16 +240,14 @@ def _item(part: Any) -> Any:
 
     if isinstance(part, dict):
         table = tomlkit.inline_table()
-        for key, item in part.items():
-            table.append(key, _item(item))
+        table.update(part)
         return table
     if not isinstance(part, list):
         return part
-    array = tomlkit.array()
-    for item in part:
-        array.append(_item(item))
-    has_rows = any(isinstance(item, list) for item in part) and len(part) > 1
-    return array.multiline(True) if has_rows or len(array.as_string()) > _LINE else array
+    item = tomlkit.array()
+    item.extend(part)
+    has_rows = any(isinstance(entry, list) for entry in part) and len(part) > 1
+    return item.multiline(True) if has_rows or len(item.as_string()) > _LINE else item
 
 
 def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Settings:
@@ -286,9 +268,8 @@ def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Setting
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
         bundle, ports = document["bundle"], document["ports"]
-        if bundle["format"] not in (FORMAT, _FORMAT_WITH_MORE):
-            known = f"{FORMAT} and {_FORMAT_WITH_MORE}"
-            raise BundleError(path, f"{path} has format {bundle['format']}; this EPypes reads the formats {known}.")
+        if bundle["format"] != FORMAT:
+            raise BundleError(path, f"{path} has format {bundle['format']}; this EPypes reads format {FORMAT}.")
         entries = document.get("hyperparameters", {})
         return Settings(
             str(bundle["name"]),

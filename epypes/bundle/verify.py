@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from epypes.bundle.manifest import changed_since_recorded, check_manifest, environment_differences, recorded_environment
+from epypes.bundle.manifest import check_manifest, environment_differences, recorded_environment
 from epypes.bundle.replay import REPLAY_TIMEOUT_S, ReplayReport, replay_isolated
 from epypes.bundle.requirements import REQUIREMENTS, fresh_environment, pins
 from epypes.errors import BundleChanged, BundleError, ReplayDiffers
@@ -84,7 +84,7 @@ def verify(
     if report.identical:
         return replace(report, notes=(*report.notes, *report.outside, *notes))
     tokens = ", ".join(map(repr, report.unsteady))
-    causes = (*changed_since_recorded(folder), *([_UNSTEADY.format(tokens)] if tokens else []), *notes)
+    causes = (*([_UNSTEADY.format(tokens)] if tokens else []), *notes)
     raise ReplayDiffers(path, replace(report, causes=causes or (_UNKNOWN,)))
 
 
