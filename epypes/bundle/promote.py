@@ -86,8 +86,7 @@ def promote(
             draft = Path(scratch) / target.name
             _write(draft, target, subject, outputs, samples, on_progress)
             on_progress("replaying in a fresh process")
-            for note in prove(draft, target).notes:
-                on_progress(note)
+            prove(draft, target)
             _replace(draft, target)
     except (OSError, UnicodeError) as error:
         if isinstance(error, EpypesError):

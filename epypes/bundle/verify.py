@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -63,12 +65,10 @@ def verify(
             text = f"{error} Nothing of it was run; to run the changed code: epypes verify --run-anyway."
             raise BundleChanged(folder, text) from None
         change = error
+    options = [] if change is None else ["--unsealed"]
     try:
-        if fresh_env:
-            with fresh_environment(folder) as python:
-                report = replay_isolated(folder, sealed=change is None, timeout_s=timeout_s, python=python)
-        else:
-            report = replay_isolated(folder, sealed=change is None, timeout_s=timeout_s)
+        with fresh_environment(folder) if fresh_env else contextlib.nullcontext(sys.executable) as python:
+            report = replay_isolated(folder, options, timeout_s=timeout_s, python=python)
     except BundleError as error:
         if change is None:
             raise
@@ -82,7 +82,7 @@ def verify(
         *environment_differences(recorded_environment(folder), report.environment),
     )
     if report.identical:
-        return replace(report, notes=(*report.notes, *report.outside, *notes))
+        return replace(report, notes=(*report.outside, *notes))
     tokens = ", ".join(map(repr, report.unsteady))
     causes = (*([_UNSTEADY.format(tokens)] if tokens else []), *notes)
     raise ReplayDiffers(path, replace(report, causes=causes or (_UNKNOWN,)))
