@@ -267,20 +267,13 @@ def _array(array: Any) -> dict[str, Any]:
         raise LargeArray(f"an array of {array.size} numbers")
     dtype = array.dtype.name if array.dtype.isnative else array.dtype.str
     numbers = [_of_number(number) for number in array.astype(array.dtype.newbyteorder("=")).reshape(-1)]
-    value = numbers[0] if array.shape == () else _nested(numbers, array.shape)
+    value = np.array(numbers, object).reshape(array.shape).tolist()
     entry = {"value": value, _KIND: "array", "dtype": dtype}
     if array.size == 0:
         entry["shape"] = list(array.shape)
     if np.asarray(read(entry)).tobytes() != array.tobytes():
         raise Unwritable(f"an array of {array.dtype} with numbers that TOML has not")
     return entry
-
-
-def _nested(numbers: list[Any], shape: tuple[int, ...]) -> list[Any]:
-    if len(shape) <= 1:
-        return numbers
-    stride = len(numbers) // shape[0] if shape[0] else 0
-    return [_nested(numbers[row * stride : (row + 1) * stride], shape[1:]) for row in range(shape[0])]
 
 
 def _read_array(entry: Mapping[str, Any], enums: Mapping[str, Any]) -> Any:

@@ -103,7 +103,7 @@ def _replayed(draft: Path, target: Path, scratch: Path, timeout_s: float, change
     try:
         return replay_isolated(draft, options, timeout_s=timeout_s, environment=environment, cwd=cwd)
     except BundleError as error:
-        return ReplayReport(0, 0, (Difference("", "", str(error).replace(str(draft.resolve()), str(target))),))
+        return ReplayReport(0, 0, (Difference(str(error).replace(str(draft.resolve()), str(target))),))
 
 
 def _reasons(
@@ -143,7 +143,7 @@ def _texts(report: ReplayReport) -> dict[str, list[str]]:
 
 def _explained(entry: Difference, causes: Sequence[Condition]) -> str:
     """Return what differs, followed by what it depends on and the way out."""
-    text = str(entry) if entry.token else entry.text
+    text = str(entry)
     names, ways = " and ".join(cause.name for cause in causes), " ".join(cause.way_out for cause in causes)
     return f"{text.rstrip('.')}. It depends on {names}, something that is not a token. {ways}" if names else text
 

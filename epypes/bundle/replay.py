@@ -165,7 +165,7 @@ def replay(bundle: Bundle, *, twice: bool = False) -> ReplayReport:
         if (set(inputs), set(outputs)) != (set(bundle.settings.inputs), set(bundle.settings.outputs)):
             ports = f"{', '.join(inputs) or 'nothing'} -> {', '.join(outputs)}"
             why = f"its ports are {ports}, those of pipeline.toml are not"
-            found.append(Difference(path.stem, ", ".join(bundle.settings.outputs), why))
+            found.append(Difference(why, sample=path.stem, token=", ".join(bundle.settings.outputs)))
         run = _run(bundle, inputs)
         differing = [*_differing(bundle, path.stem, outputs, run)]
         if differing:

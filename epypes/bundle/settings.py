@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +16,6 @@ from epypes.bundle.hyperparameters import (
     LargeArray,
     Unwritable,
     fits,
-    members_in,
     plain,
     range_of,
     read,
@@ -76,24 +75,6 @@ class Settings:
     attributes: Mapping[str, Any] = field(default_factory=dict)
     has_groups: bool = False
     entries: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-
-    @property
-    def has_members(self) -> bool:
-        """Whether a value is a member of an enumeration, which the bundle's module has."""
-        return any(_has_member(value) for values in self._values for value in values.values())
-
-    @property
-    def _values(self) -> tuple[Mapping[str, Any], ...]:
-        return self.hyperparameters, self.defaults, self.attributes
-
-    def with_enums(self, enums: Mapping[str, Any]) -> Settings:
-        """Return the settings with members of enumerations in place of their names."""
-        if not self.has_members:
-            return self
-        hyperparameters, defaults, attributes = (
-            {name: read(written(value), enums) for name, value in values.items()} for values in self._values
-        )
-        return replace(self, hyperparameters=hyperparameters, defaults=defaults, attributes=attributes)
 
     def order(self, token: str) -> Order:
         """Return the order of a token's colours."""
@@ -164,10 +145,6 @@ def write_settings(path: Path, settings: Settings, cg: CompGraph) -> None:
             document.add(section, table)
     add_tolerances(document, settings.tolerances)
     path.write_text(tomlkit.dumps(document), encoding="utf-8")
-
-
-def _has_member(value: Any) -> bool:
-    return any(True for _ in members_in(value))
 
 
 def _ports(settings: Settings) -> Any:
@@ -250,7 +227,7 @@ def _item(part: Any) -> Any:
     return item.multiline(True) if has_rows or len(item.as_string()) > _LINE else item
 
 
-def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Settings:
+def read_settings(path: Path, enums: Mapping[str, Any] | None = None, content: bytes | None = None) -> Settings:
     """Read pipeline.toml.
 
     Parameters
@@ -259,6 +236,8 @@ def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Setting
         The file.
     enums
         The enumerations of the bundle's module by name. Without, members of them are read as :class:`Member`.
+    content
+        What stands in the file, where it is known.
 
     Raises
     ------
@@ -266,7 +245,7 @@ def read_settings(path: Path, enums: Mapping[str, Any] | None = None) -> Setting
         It is not TOML, has another format, or lacks an entry; the entry is named.
     """
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        document = tomllib.loads((path.read_bytes() if content is None else content).decode())
         bundle, ports = document["bundle"], document["ports"]
         if bundle["format"] != FORMAT:
             raise BundleError(path, f"{path} has format {bundle['format']}; this EPypes reads format {FORMAT}.")
