@@ -116,6 +116,8 @@ def why_no_bundle(folder: Path) -> str:
     if not named.keys() >= _NEEDED:
         return no_bundle
     foreign = [name for name in present if name not in named]
+    cached = (path for path in folder.rglob("__pycache__/*") if path.suffix != ".pyc")
+    foreign += [path.relative_to(folder).as_posix() for path in cached]
     return f"{folder} has files that are not the bundle's: {', '.join(foreign):.200}." if foreign else ""
 
 
